@@ -1,0 +1,90 @@
+"""The errors orthocal raises: one tree, each with the exit code that the command line gives it."""
+
+from __future__ import annotations
+
+
+class OrthocalError(Exception):
+    """Base of all errors of orthocal.
+
+    Attributes:
+        where: File and line or key that the error is about, or None.
+        problem: What was found and what was expected.
+    """
+
+    exit_code = 2
+
+    def __init__(self, problem: str, *, where: str | None = None) -> None:
+        self.where = where
+        self.problem = problem
+        super().__init__(problem if where is None else f"{where}: {problem}")
+
+
+class RobotError(OrthocalError):
+    """A robot folder, its URDF or its YAML is not what it should be."""
+
+
+class ParameterError(OrthocalError):
+    """An error parameter, a pattern, a unit or a value given by name does not exist or fit."""
+
+
+class SessionError(OrthocalError):
+    """A session, its YAML or its CSV is not what it should be."""
+
+
+class CalibrationFileError(OrthocalError):
+    """A calibration file cannot be read, or does not belong to the robot it names."""
+
+
+class ClosureError(OrthocalError):
+    """The loops of the robot cannot be closed in a posture.
+
+    Attributes:
+        posture: Name of the posture.
+        residual: Largest closure residual that remained, [m], or None for a singular posture.
+    """
+
+    def __init__(
+        self,
+        problem: str,
+        *,
+        posture: str,
+        residual: float | None = None,
+        where: str | None = None,
+    ) -> None:
+        self.posture = posture
+        self.residual = residual
+        super().__init__(problem, where=where)
+
+
+class UnreachableError(OrthocalError):
+    """A point or a set of joint coordinates has no solution in the closed forms of the paper."""
+
+
+class NotIdentifiableError(OrthocalError):
+    """Neither readings nor a prior fix some parameters.
+
+    Attributes:
+        parameters: Names of the parameters that nothing fixes.
+    """
+
+    def __init__(
+        self, problem: str, *, parameters: tuple[str, ...], where: str | None = None
+    ) -> None:
+        self.parameters = parameters
+        super().__init__(problem, where=where)
+
+
+class SolverError(OrthocalError):
+    """The solver did not converge: there is no result.
+
+    Attributes:
+        status: The solver's own word.
+        iterations: Iterations it took.
+    """
+
+    exit_code = 1
+
+    def __init__(self, problem: str, *, status: str, iterations: int) -> None:
+        self.status = status
+        self.iterations = iterations
+        super().__init__(problem)

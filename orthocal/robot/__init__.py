@@ -1,0 +1,1 @@
+"""What the machine is: description, model, error parameters, symbolic kinematics, assembly."""

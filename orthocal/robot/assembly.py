@@ -1,0 +1,421 @@
+"""Closing the loops of a robot numerically: Newton's method over many postures at once.
+
+Forward: commanded drives to passive coordinates and tool centre point. Inverse: tool centre point
+to drives. A posture that a plain start does not reach is approached along a straight path from the
+mechanical zero, so that the loops stay in the branch of assembly in which the machine was built.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.errors import ClosureError, RobotError
+from orthocal.robot.batch import BatchFunction
+from orthocal.robot.model import Robot, Tcp
+from orthocal.robot.symbolic import SymbolicRobot, closure_row_units, coordinate_units
+
+Array = NDArray[np.float64]
+
+CLOSED = 1e-12
+"""Largest scaled residual of closed loops, relative to max(1 m, characteristic length), [m]."""
+
+SINGULAR_BELOW = 1e-7
+"""Ratio of smallest to largest singular value below which a posture counts as singular."""
+
+MAX_NEWTON_STEPS = 30
+SMALLEST_CONTINUATION_STEP = 1.0 / 512.0
+LARGEST_CONTINUATION_MOVE = 0.3
+"""Change of a passive coordinate in one continuation step, [rad] or characteristic lengths."""
+
+_LIMIT_SLACK = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _System:
+    """A square or redundant system r(x, p) = 0 of many postures, in metres."""
+
+    evaluate: BatchFunction
+    """(x, p, theta) -> residual (n_rows,), Jacobian by x (n_rows, n_x)."""
+    n_rows: int
+    n_x: int
+    start: Array
+    """x of the mechanical zero of the nominal machine, shape (n_x,)."""
+    origin: Array
+    """p of the mechanical zero of the nominal machine, shape (n_p,)."""
+    units: Array
+    """Metres that one unit of x amounts to, shape (n_x,)."""
+    lower: Array
+    upper: Array
+    """Bounds of x, shape (n_x,)."""
+    names: tuple[str, ...]
+    """Joint of each x."""
+
+    def __call__(self, x: Array, p: Array, theta: Array) -> tuple[Array, Array]:
+        """Residuals, shape (K, n_rows), and Jacobians, shape (K, n_rows, n_x)."""
+        residuals, jacobians = self.evaluate(x, p, theta)
+        return residuals, jacobians
+
+    def step(self, residuals: Array, jacobians: Array) -> Array:
+        """Newton steps, shape (K, n_x); least squares where rows depend on each other."""
+        if self.n_rows == self.n_x:
+            try:
+                return np.asarray(np.linalg.solve(jacobians, -residuals[..., None])[..., 0])
+            except np.linalg.LinAlgError:
+                pass
+        inverse = np.linalg.pinv(jacobians, rcond=1e-10)
+        return np.asarray(-(inverse @ residuals[..., None])[..., 0])
+
+    def within_limits(self, x: Array) -> NDArray[np.bool_]:
+        """Whether each posture keeps its joints within their limits, shape (K,)."""
+        inside = (x >= self.lower - _LIMIT_SLACK) & (x <= self.upper + _LIMIT_SLACK)
+        return np.asarray(inside.all(axis=1))
+
+
+class Assembly:
+    """Closes the loops of a robot with some errors fixed and some given at each call.
+
+    Args:
+        robot: The nominal robot.
+        free: Names of the parameters whose values are given at each call as `theta`, in this order.
+        fixed: Values of other parameters, [unit of the parameter]; 0 where absent.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        free: Sequence[str] = (),
+        fixed: Mapping[str, float] | None = None,
+    ) -> None:
+        self.robot = robot
+        self.free = tuple(free)
+        drives = ca.SX.sym("drives", len(robot.drives))
+        passive = ca.SX.sym("passive", robot.passive_index.size)
+        theta = ca.SX.sym("theta", len(self.free))
+        errors: dict[str, ca.SX | float] = {
+            k: v for k, v in (fixed or {}).items() if k not in self.free
+        }
+        errors.update({name: theta[i] for i, name in enumerate(self.free)})
+        self._symbols = (drives, passive, theta)
+        self._symbolic = SymbolicRobot(robot, drives=drives, passive=passive, errors=errors)
+        self._closing = self._build_closing()
+        self._inverting: _System | None = None
+        self._tcp: BatchFunction | None = None
+
+    def close(
+        self,
+        drives: ArrayLike,
+        *,
+        theta: ArrayLike | None = None,
+        start: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+    ) -> Array:
+        """Passive coordinates that close the loops, g(q, θ) = 0.
+
+        Args:
+            drives: Commanded drive coordinates, shape (K, n_drives) or (n_drives,), [m, rad].
+            theta: Values of the free parameters, shape (n_free,); 0 by default.
+            start: Passive coordinates to start from, shape (n_passive,) or (K, n_passive); the
+                mechanical zero by default.
+            names: Names of the postures, for messages.
+
+        Returns:
+            Shape (K, n_passive), or (n_passive,) for one posture.
+
+        Raises:
+            ClosureError: If a posture cannot be reached, is outside the limits of a passive joint
+                or singular; names the posture and the residual.
+        """
+        d = np.asarray(drives, dtype=np.float64)
+        single = d.ndim == 1
+        d = np.atleast_2d(d)
+        passive = self._solve(self._closing, d, self._theta(theta), start, names)
+        self._refuse_singular(d, passive, self._theta(theta), names)
+        return passive[0] if single else passive
+
+    def forward(
+        self,
+        drives: ArrayLike,
+        *,
+        theta: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+    ) -> Array:
+        """Tool centre point of commanded drive coordinates.
+
+        Args:
+            drives: Shape (K, n_drives) or (n_drives,), [m, rad].
+            theta: Values of the free parameters, shape (n_free,); 0 by default.
+            names: Names of the postures, for messages.
+
+        Returns:
+            Shape (K, 3) or (3,), [m].
+
+        Raises:
+            ClosureError: As `close`.
+            RobotError: If the robot has no tool centre point.
+        """
+        d = np.asarray(drives, dtype=np.float64)
+        return self.tcp(d, self.close(d, theta=theta, names=names), theta=theta)
+
+    def inverse(
+        self,
+        points: ArrayLike,
+        *,
+        theta: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+    ) -> Array:
+        """Drive coordinates that bring the tool centre point to given points.
+
+        Args:
+            points: The coordinates of the tool that the drives control, shape (K, n_drives) or
+                (n_drives,), [m].
+            theta: Values of the free parameters, shape (n_free,); 0 by default.
+            names: Names of the postures, for messages.
+
+        Returns:
+            Shape (K, n_drives) or (n_drives,), [m, rad].
+
+        Raises:
+            ClosureError: If a point cannot be reached.
+            RobotError: If the robot has no tool centre point with as many coordinates as drives.
+        """
+        p = np.asarray(points, dtype=np.float64)
+        single = p.ndim == 1
+        p = np.atleast_2d(p)
+        if self._inverting is None:
+            self._inverting = self._build_inverting()
+        x = self._solve(self._inverting, p, self._theta(theta), None, names)
+        drives = x[:, : len(self.robot.drives)]
+        return drives[0] if single else drives
+
+    def tcp(self, drives: ArrayLike, passive: ArrayLike, *, theta: ArrayLike | None = None) -> Array:
+        """Tool centre point of joint coordinates with closed loops, shape (K, 3) or (3,), [m]."""
+        if self._tcp is None:
+            position = self._symbolic.frame_pose(self._require_tcp().frame).position
+            function = ca.Function(
+                "tcp", list(self._symbols), [position], ["drives", "passive", "theta"], ["position"]
+            )
+            self._tcp = BatchFunction(function, shared=["theta"])
+        d = np.atleast_2d(np.asarray(drives, dtype=np.float64))
+        q = np.atleast_2d(np.asarray(passive, dtype=np.float64))
+        (points,) = self._tcp(d, q, self._theta(theta))
+        return points[0] if np.ndim(drives) == 1 else points
+
+    def _theta(self, theta: ArrayLike | None) -> Array:
+        return (
+            np.zeros(len(self.free)) if theta is None else np.asarray(theta, dtype=np.float64)
+        )
+
+    def _require_tcp(self) -> Tcp:
+        if self.robot.tcp is None:
+            raise RobotError(
+                "has no tool centre point; add orthocal.tcp", where=str(self.robot.yaml)
+            )
+        return self.robot.tcp
+
+    def _build_closing(self) -> _System:
+        drives, passive, theta = self._symbols
+        robot = self.robot
+        residual = self._symbolic.closure_residual() * closure_row_units(robot)
+        units = coordinate_units(robot)[robot.passive_index]
+        lower, upper = _limits(robot)
+        return _System(
+            evaluate=_residual_function("closing", passive, drives, theta, residual),
+            n_rows=residual.numel(),
+            n_x=passive.numel(),
+            start=robot.zero[robot.passive_index],
+            origin=robot.drive_zero,
+            units=units,
+            lower=lower[robot.passive_index],
+            upper=upper[robot.passive_index],
+            names=_joint_names(robot, robot.passive_index),
+        )
+
+    def _build_inverting(self) -> _System:
+        drives, passive, theta = self._symbols
+        robot = self.robot
+        tcp = self._require_tcp()
+        if len(tcp.coordinates) != len(robot.drives):
+            raise RobotError(
+                f"orthocal.tcp.coordinates names {len(tcp.coordinates)} coordinates for "
+                f"{len(robot.drives)} drives; the inverse needs as many",
+                where=str(robot.yaml),
+            )
+        target = ca.SX.sym("target", len(tcp.coordinates))
+        reached = self._symbolic.frame_pose(tcp.frame).position[list(tcp.coordinates)]
+        closing = self._symbolic.closure_residual() * closure_row_units(robot)
+        residual = ca.vertcat(closing, reached - target)
+        x = ca.vertcat(drives, passive)
+        index = np.concatenate([robot.drive_index, robot.passive_index])
+        lower, upper = _limits(robot)
+        zero_passive = robot.zero[robot.passive_index]
+        origin = Assembly(robot).tcp(robot.drive_zero, zero_passive)[list(tcp.coordinates)]
+        return _System(
+            evaluate=_residual_function("inverting", x, target, theta, residual),
+            n_rows=residual.numel(),
+            n_x=x.numel(),
+            start=np.concatenate([robot.drive_zero, zero_passive]),
+            origin=origin,
+            units=coordinate_units(robot)[index],
+            lower=lower[index],
+            upper=upper[index],
+            names=_joint_names(robot, index),
+        )
+
+    def _solve(
+        self,
+        system: _System,
+        targets: Array,
+        theta: Array,
+        start: ArrayLike | None,
+        names: Sequence[str] | None,
+    ) -> Array:
+        """Newton along the straight path from the origin (or a given start) to each target.
+
+        The first try is the whole way; a posture that does not converge, or moves so far that it
+        may have changed its branch of assembly, is approached in halved steps.
+        """
+        tolerance = CLOSED * max(1.0, self.robot.characteristic_length)
+        count = len(targets)
+
+        def name(i: int) -> str:
+            return names[i] if names is not None else f"posture {i + 1}"
+
+        for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)):
+            raise ClosureError(f"'{name(i)}' has coordinates that are not numbers", posture=name(i))
+        first = system.start if start is None else np.asarray(start, dtype=np.float64)
+        x = np.array(np.broadcast_to(first, (count, system.n_x)))
+        moves = np.where(system.units == 1.0, self.robot.characteristic_length, 1.0)
+        done, step = np.zeros(count), np.ones(count)
+        pending = np.arange(count)
+        fresh = np.full(count, start is not None)
+        while pending.size:
+            reach = np.minimum(1.0, done[pending] + step[pending])
+            way = system.origin + reach[:, None] * (targets[pending] - system.origin)
+            trial, worst = _newton(system, x[pending], way, theta, tolerance)
+            moved = np.abs((trial - x[pending]) / moves).max(axis=1, initial=0.0)
+            good = (worst < tolerance) & (moved < LARGEST_CONTINUATION_MOVE)
+            x[pending[good]] = trial[good]
+            done[pending[good]] = reach[good]
+            lost = pending[~good & fresh[pending]]  # the given start was no help: begin at zero
+            x[lost], step[lost] = system.start, 2.0
+            fresh[pending] = False
+            step[pending[~good]] *= 0.5
+            for i in pending[~good & (step[pending] < SMALLEST_CONTINUATION_STEP)]:
+                _, final = _newton(system, x[[i]], targets[[i]], theta, tolerance)
+                raise ClosureError(
+                    f"posture '{name(i)}' cannot be reached: the loops stay open by "
+                    f"{final[0] * 1e3:.3g} mm, {done[i]:.0%} of the way from the mechanical zero",
+                    posture=name(i),
+                    residual=float(final[0]),
+                )
+            pending = pending[done[pending] < 1.0]
+        for i in np.flatnonzero(~system.within_limits(x)):
+            over = np.maximum(x[i] - system.upper, system.lower - x[i])
+            j = int(over.argmax())
+            raise ClosureError(
+                f"posture '{name(i)}' cannot be reached: joint '{system.names[j]}' would be at "
+                f"{x[i][j]:.4g}, outside its limits {system.lower[j]:g} ... {system.upper[j]:g}",
+                posture=name(i),
+                residual=0.0,
+            )
+        return x
+
+    def _refuse_singular(
+        self, drives: Array, passive: Array, theta: Array, names: Sequence[str] | None
+    ) -> None:
+        system = self._closing
+        if system.n_x == 0:
+            return
+        _, jacobians = system(passive, drives, theta)
+        values = np.linalg.svd(jacobians / system.units, compute_uv=False)
+        smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
+        ratio = np.broadcast_to(smallest / np.maximum(values[:, 0], 1e-300), len(drives))
+        i = int(ratio.argmin())
+        if ratio[i] < SINGULAR_BELOW:
+            name = names[i] if names is not None else f"posture {i + 1}"
+            free = int((values[i] > SINGULAR_BELOW * values[i, 0]).sum())
+            raise ClosureError(
+                f"posture '{name}' is singular: the drives leave {system.n_x - free} of "
+                f"{system.n_x} passive motions free",
+                posture=name,
+            )
+
+
+def _residual_function(
+    name: str, x: ca.SX, p: ca.SX, theta: ca.SX, residual: ca.SX
+) -> BatchFunction:
+    jacobian = ca.jacobian(residual, x)
+    function = ca.Function(
+        name, [x, p, theta], [residual, jacobian], ["x", "p", "theta"], ["residual", "jacobian"]
+    )
+    return BatchFunction(function, shared=["theta"])
+
+
+def _newton(
+    system: _System, x: Array, p: Array, theta: Array, tolerance: float
+) -> tuple[Array, Array]:
+    """Damped Newton of many postures at once.
+
+    Returns:
+        Solutions, shape (K, n_x), and the largest residual of each, shape (K,), [m].
+    """
+    x = np.array(x)
+    residuals, jacobians = system(x, p, theta)
+    worst = np.abs(residuals).max(axis=1, initial=0.0)
+    active = np.flatnonzero(worst >= tolerance)
+    for _ in range(MAX_NEWTON_STEPS):
+        if not active.size:
+            break
+        step = system.step(residuals[active], jacobians[active])
+        usable = np.isfinite(step).all(axis=1)
+        active, step = active[usable], step[usable]
+        scale = np.ones(len(active))
+        pending = np.arange(len(active))
+        moved = np.zeros(len(active), dtype=bool)
+        for _ in range(6):
+            rows = active[pending]
+            trial = x[rows] + scale[pending, None] * step[pending]
+            r, j = system(trial, p[rows], theta)
+            size = np.abs(r).max(axis=1, initial=0.0)
+            better = size < worst[rows]
+            good = rows[better]
+            x[good], residuals[good], jacobians[good] = trial[better], r[better], j[better]
+            worst[good] = size[better]
+            moved[pending[better]] = True
+            pending = pending[~better]
+            scale[pending] *= 0.25
+            if not pending.size:
+                break
+        active = active[moved]
+        active = active[worst[active] >= tolerance]
+    return x, worst
+
+
+def _limits(robot: Robot) -> tuple[Array, Array]:
+    """Bounds of the joint coordinates, shape (nv,); infinite for unbounded revolute joints."""
+    model = robot.model
+    lower, upper = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
+    for joint in list(model.joints)[1:]:
+        if joint.nq == joint.nv:
+            lower[joint.idx_v : joint.idx_v + joint.nv] = model.lowerPositionLimit[
+                joint.idx_q : joint.idx_q + joint.nq
+            ]
+            upper[joint.idx_v : joint.idx_v + joint.nv] = model.upperPositionLimit[
+                joint.idx_q : joint.idx_q + joint.nq
+            ]
+    return lower, upper
+
+
+def _joint_names(robot: Robot, index: NDArray[np.int64]) -> tuple[str, ...]:
+    owner = {}
+    for i in range(1, robot.model.njoints):
+        joint = robot.model.joints[i]
+        for k in range(joint.nv):
+            owner[joint.idx_v + k] = robot.model.names[i]
+    return tuple(owner[int(i)] for i in index)

@@ -1,0 +1,76 @@
+"""Evaluation of one CasADi function at many points, straight from and into NumPy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+CHUNK = 256
+"""Points evaluated in one call; bounds the memory and the number of maps that are built."""
+
+
+class BatchFunction:
+    """A CasADi function of column vectors, with dense outputs, mapped over points.
+
+    CasADi's own conversion of results goes through Python lists; its buffers do not.
+
+    Args:
+        function: Inputs are column vectors; outputs are taken dense.
+        shared: Names of the inputs that are the same at every point.
+    """
+
+    def __init__(self, function: ca.Function, *, shared: Sequence[str] = ()) -> None:
+        symbols = [function.sx_in(i) for i in range(function.n_in())]
+        outputs = [ca.densify(y) for y in function(*symbols)] if function.n_out() > 1 else [
+            ca.densify(function(*symbols))
+        ]
+        self._function = ca.Function(
+            function.name(), symbols, outputs, function.name_in(), function.name_out()
+        )
+        self._shared = [function.index_in(name) for name in shared]
+        self._shapes = [function.size_out(i) for i in range(function.n_out())]
+        self._maps: dict[int, ca.Function] = {}
+
+    def __call__(self, *inputs: ArrayLike) -> tuple[Array, ...]:
+        """Evaluate at K points.
+
+        Args:
+            inputs: Shape (K, n) each, or (n,) for the shared ones.
+
+        Returns:
+            Each output with shape (K, rows, columns), or (K, rows) for a column vector.
+        """
+        arrays = [np.ascontiguousarray(a, dtype=np.float64) for a in inputs]
+        count = next(len(a) for i, a in enumerate(arrays) if i not in self._shared)
+        results = [np.empty((count, c, r)) for r, c in self._shapes]
+        for first in range(0, count, CHUNK):
+            size = min(CHUNK, count - first)
+            part = slice(first, first + size)
+            buffer, trigger = self._map(size).buffer()
+            held = [
+                a if i in self._shared else np.ascontiguousarray(a[part])
+                for i, a in enumerate(arrays)
+            ]
+            for i, a in enumerate(held):
+                buffer.set_arg(i, memoryview(a.reshape(-1)))
+            for i, result in enumerate(results):
+                buffer.set_res(i, memoryview(result[part].reshape(-1)))
+            trigger()
+        return tuple(
+            np.asarray(y[:, 0, :] if shape[1] == 1 else y.transpose(0, 2, 1))
+            for y, shape in zip(results, self._shapes, strict=True)
+        )
+
+    def _map(self, size: int) -> ca.Function:
+        if size == 1:
+            return self._function
+        if size not in self._maps:
+            self._maps[size] = self._function.map(
+                f"{self._function.name()}_{size}", "serial", size, self._shared, []
+            )
+        return self._maps[size]

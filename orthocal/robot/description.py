@@ -1,0 +1,138 @@
+"""The YAML beside a robot's URDF, validated.
+
+The first three keys are those of the Gepetto "extended URDF"; all else stands under `orthocal`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
+
+from orthocal.documents import read_yaml, validate
+from orthocal.errors import RobotError
+
+Row = Literal["x", "y", "z", "rx", "ry", "rz"]
+Coordinate = Literal["x", "y", "z"]
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class _Keys(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ClosureKeys(_Keys):
+    """What orthocal adds to one pair of `closed_loop`."""
+
+    rows: list[Row] | None = None
+    """Rows that count, in the axes of the pair's first frame; all by default."""
+
+
+class DriveKeys(_Keys):
+    """What orthocal adds to one motor."""
+
+    zero_mm: FiniteFloat | None = None
+    """Commanded coordinate of the mechanical zero, for a prismatic drive."""
+    zero_deg: FiniteFloat | None = None
+    """The same for a revolute drive."""
+
+
+class LegKeys(_Keys):
+    """The line that a gauge touches."""
+
+    root: Name
+    """Frame at the drive's end of the leg."""
+    tip: Name
+    """Frame at the platform's end of the leg."""
+
+
+class TcpKeys(_Keys):
+    """The tool centre point."""
+
+    frame: Name
+    """Its frame."""
+    coordinates: Annotated[list[Coordinate], Field(min_length=1, max_length=3)] = ["x", "y", "z"]
+    """World coordinates that the drives control; as many as drives where postures are
+    commanded by the tool."""
+
+
+class ToleranceKeys(_Keys):
+    """One standard deviation of each kind of error, and of single parameters."""
+
+    offset_mm: PositiveFloat = 5.0
+    offset_mrad: PositiveFloat = 10.0
+    translation_mm: PositiveFloat = 0.1
+    rotation_mrad: PositiveFloat = 1.0
+    scale_ppm: PositiveFloat = 100.0
+    overrides: dict[str, PositiveFloat] = {}
+    """Parameter name or glob, with the unit as suffix, to value; later ones win."""
+
+
+class OrthocalKeys(_Keys):
+    """Everything that is not in Gepetto's three keys."""
+
+    closures: dict[Name, ClosureKeys] | None = None
+    drives: dict[Name, DriveKeys] = {}
+    passive_start: dict[Name, FiniteFloat] = {}
+    """Passive joint with `_mm` or `_deg` suffix to the value from which the loops are first
+    closed; 0 where absent."""
+    legs: dict[Name, LegKeys] = {}
+    tcp: TcpKeys | None = None
+    parameters: dict[Name, Annotated[list[Name], Field(min_length=1)]] = {}
+    """Named sums of elementary errors; a leading '-' subtracts."""
+    tolerances: ToleranceKeys = ToleranceKeys()
+    models: dict[Name, Annotated[list[Name], Field(min_length=1)]] = {}
+
+
+class RobotKeys(_Keys):
+    """A whole robot YAML."""
+
+    closed_loop: list[Annotated[list[Name], Field(min_length=2, max_length=2)]]
+    """Pairs of frames that coincide."""
+    type: list[Literal["3d", "6d"]]
+    """Whether a pair shares its origin only, or its axes too."""
+    name_mot: Annotated[list[Name], Field(min_length=1)]
+    """The actuated joints."""
+    orthocal: OrthocalKeys = OrthocalKeys()
+
+    @model_validator(mode="after")
+    def _lengths_agree(self) -> RobotKeys:
+        pairs = len(self.closed_loop)
+        if len(self.type) != pairs:
+            raise ValueError(f"type has {len(self.type)} entries; closed_loop has {pairs}")
+        closures = self.orthocal.closures
+        if closures is not None and len(closures) != pairs:
+            raise ValueError(
+                f"orthocal.closures has {len(closures)} entries; closed_loop has {pairs}, "
+                "and each needs one, in the same order"
+            )
+        if len(set(self.name_mot)) != len(self.name_mot):
+            raise ValueError("name_mot names a motor twice")
+        for motor in self.orthocal.drives:
+            if motor not in self.name_mot:
+                raise ValueError(
+                    f"orthocal.drives.{motor} is not in name_mot; motors: "
+                    f"{', '.join(self.name_mot)}"
+                )
+        for name, kind in zip(closures or {}, self.type, strict=False):
+            rows = (closures or {})[name].rows
+            if rows is None:
+                continue
+            if not rows or len(set(rows)) != len(rows):
+                raise ValueError(f"orthocal.closures.{name}.rows is empty or names a row twice")
+            if kind == "3d" and any(r.startswith("r") for r in rows):
+                raise ValueError(
+                    f"orthocal.closures.{name}.rows holds a rotation; a 3d closure has x, y, z"
+                )
+        return self
+
+
+def load_description(path: Path) -> RobotKeys:
+    """Read and validate a robot's YAML.
+
+    Raises:
+        RobotError: Naming file and key.
+    """
+    data = read_yaml(path, error=RobotError)
+    return validate(RobotKeys, data, where=str(path), error=RobotError)

@@ -1,0 +1,621 @@
+"""A robot: its URDF in Pinocchio, its loops as Pinocchio constraint models, its drives and legs."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.errors import ClosureError, ParameterError, RobotError
+from orthocal.robot.description import RobotKeys, load_description
+from orthocal.robot.parameters import (
+    AXES,
+    ElementaryError,
+    ParameterSet,
+    Unit,
+    build_parameters,
+    split_unit,
+)
+from orthocal.robot.urdf import load_urdf
+
+Array = NDArray[np.float64]
+
+CLOSED = 1e-12
+"""Largest closure residual of closed loops, [m or rad]."""
+
+
+def read_only(values: ArrayLike) -> Array:
+    """A float64 copy that cannot be written to."""
+    array = np.array(values, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """An actuated joint."""
+
+    name: str
+    unit: Unit
+    """m for a prismatic, rad for a revolute drive."""
+    zero: float
+    """Commanded coordinate of the mechanical zero, [unit]."""
+    lower: float
+    """Least coordinate, [unit]; -inf where the URDF gives none."""
+    upper: float
+    """Largest coordinate, [unit]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Closure:
+    """Two frames that coincide, and the rows of their pose error that count."""
+
+    name: str
+    frame_a: str
+    frame_b: str
+    kind: str
+    """'3d': position of b in a, 3 rows; '6d': log6 of the pose of b in a, 6 rows."""
+    rows: tuple[int, ...]
+    """Rows that count, 0 to 5: x, y, z, rx, ry, rz."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Leg:
+    """The line that a gauge touches."""
+
+    name: str
+    root: str
+    """Frame at the drive's end."""
+    tip: str
+    """Frame at the platform's end."""
+    length: float
+    """Nominal distance from root to tip, [m]."""
+    axis: Array
+    """Unit vector from root to tip in the mechanical zero of the nominal machine, shape (3,)."""
+    zero_root: Array
+    """Root in the mechanical zero of the nominal machine, shape (3,), [m]."""
+    root_driven: bool
+    """Whether the root moves with drives alone, not with passive joints."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tcp:
+    """The tool centre point."""
+
+    frame: str
+    coordinates: tuple[int, ...]
+    """World coordinates that the drives control: 0, 1, 2 for x, y, z."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Robot:
+    """A robot with closed loops.
+
+    Joint coordinates are one number a degree of freedom (an angle also for unbounded revolute
+    joints), in the order of Pinocchio's velocities.
+    """
+
+    name: str
+    folder: Path
+    urdf: Path
+    yaml: Path
+    sha256: str
+    """Of the URDF and the YAML."""
+    model: pin.Model
+    constraints: tuple[pin.PointAnchorConstraintModel | pin.FrameAnchorConstraintModel, ...]
+    """The closures as Pinocchio's constraint models, all rows."""
+    drives: tuple[Drive, ...]
+    closures: tuple[Closure, ...]
+    legs: Mapping[str, Leg]
+    tcp: Tcp | None
+    parameters: ParameterSet
+    drive_index: NDArray[np.int64]
+    """Indices of the actuated coordinates, shape (n_drives,)."""
+    passive_index: NDArray[np.int64]
+    """Indices of the passive coordinates, shape (n_passive,)."""
+    zero: Array
+    """Coordinates of the mechanical zero with its loops closed, shape (nv,), [m, rad]."""
+    drive_gain: Array
+    """1 + scale error of each drive, shape (n_drives,); 1 for the nominal machine."""
+
+    @property
+    def closure_rows(self) -> int:
+        """Number of closure rows that count."""
+        return sum(len(c.rows) for c in self.closures)
+
+    @property
+    def drive_zero(self) -> Array:
+        """Commanded drive coordinates of the mechanical zero, shape (n_drives,), [m, rad]."""
+        return np.array([d.zero for d in self.drives])
+
+    @property
+    def characteristic_length(self) -> float:
+        """Length that turns rotations into displacements when rows are scaled, [m].
+
+        The mean nominal leg length, or the mean distance between joints where there are no legs.
+        """
+        if self.legs:
+            return float(np.mean([leg.length for leg in self.legs.values()]))
+        spans = [float(np.linalg.norm(p.translation)) for p in self.model.jointPlacements]
+        spans = [s for s in spans if s > 0.0]
+        return float(np.mean(spans)) if spans else 1.0
+
+    def frame_id(self, name: str) -> int:
+        """Pinocchio's index of a link's or fixed joint's frame.
+
+        Raises:
+            RobotError: If there is no such frame.
+        """
+        return find_frame(self.model, name, where=str(self.yaml))
+
+    def configuration(self, coordinates: ArrayLike) -> Array:
+        """Pinocchio's configuration of joint coordinates.
+
+        Args:
+            coordinates: Shape (nv,), [m, rad].
+
+        Returns:
+            Shape (nq,): unbounded revolute joints as cosine and sine.
+        """
+        v = np.asarray(coordinates, dtype=np.float64)
+        return np.asarray(pin.integrate(self.model, pin.neutral(self.model), v))
+
+    def joint_coordinates(self, drives: ArrayLike, passive: ArrayLike) -> Array:
+        """Joint coordinates from commanded drive and passive coordinates, offsets not added.
+
+        Args:
+            drives: Shape (..., n_drives), [m, rad].
+            passive: Shape (..., n_passive), [m, rad].
+
+        Returns:
+            Shape (..., nv).
+        """
+        d = np.asarray(drives, dtype=np.float64)
+        p = np.asarray(passive, dtype=np.float64)
+        full = np.zeros((*d.shape[:-1], self.model.nv))
+        full[..., self.drive_index] = d * self.drive_gain
+        full[..., self.passive_index] = p
+        return full
+
+    def close_with_pinocchio(
+        self, drives: ArrayLike, start: ArrayLike, *, posture: str = "posture"
+    ) -> Array:
+        """Passive coordinates that close the loops, by Newton on Pinocchio's constraint models.
+
+        One posture, from a near start; the independent check of `assembly`, which is the way to
+        close many postures from afar.
+
+        Args:
+            drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
+            start: Passive coordinates to start from, shape (n_passive,), [m, rad].
+
+        Returns:
+            Shape (n_passive,), [m, rad].
+
+        Raises:
+            ClosureError: If Newton's method does not converge.
+        """
+        passive = np.array(start, dtype=np.float64)
+        residual, jacobian = self.evaluate_constraints(drives, passive)
+        for _ in range(60):
+            if not residual.size or np.abs(residual).max() < CLOSED:
+                return passive
+            step = np.linalg.lstsq(jacobian[:, self.passive_index], -residual, rcond=1e-10)[0]
+            step *= min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-300))
+            passive = passive + step
+            residual, jacobian = self.evaluate_constraints(drives, passive)
+        worst = float(np.abs(residual).max())
+        raise ClosureError(
+            f"the loops do not close in '{posture}': a residual of {worst:.3g} m remains",
+            posture=posture,
+            residual=worst,
+            where=str(self.yaml),
+        )
+
+    def evaluate_constraints(self, drives: ArrayLike, passive: ArrayLike) -> tuple[Array, Array]:
+        """Closure residual and its Jacobian by Pinocchio, rows that count.
+
+        Args:
+            drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
+            passive: Shape (n_passive,), [m, rad].
+
+        Returns:
+            Residual, shape (closure_rows,), [m, rad], and its derivative by the joint
+            coordinates, shape (closure_rows, nv).
+        """
+        data = self.model.createData()
+        q = self.configuration(self.joint_coordinates(drives, passive))
+        pin.computeJointJacobians(self.model, data, q)
+        residuals, jacobians = [np.zeros(0)], [np.zeros((0, self.model.nv))]
+        for closure, constraint in zip(self.closures, self.constraints, strict=True):
+            cdata = constraint.createData()
+            constraint.calc(self.model, data, cdata)
+            error = np.array(cdata.constraint_position_error)
+            jacobian = constraint.jacobian(self.model, data, cdata)
+            if closure.kind == "6d":  # of the relative velocity; the error is its logarithm
+                c1mc2 = cdata.c1Mc2
+                jacobian = pin.Jlog6(c1mc2) @ c1mc2.toActionMatrixInverse() @ jacobian
+            rows = list(closure.rows)
+            residuals.append(error[rows])
+            jacobians.append(jacobian[rows])
+        return np.concatenate(residuals), np.vstack(jacobians)
+
+    def with_errors(self, values: Mapping[str, float]) -> Robot:
+        """The robot with errors written into its Pinocchio placements.
+
+        Joint and frame placements become placement · exp6(δ); an offset moves the placement of its
+        drive along or about its own axis; a scale error stays with the drive.
+
+        Args:
+            values: Parameter name to value, [unit of the parameter].
+
+        Raises:
+            ParameterError: If a name is unknown.
+        """
+        errors = self.parameters.expand(values)
+        model = self.model.copy()
+        gain = np.array(self.drive_gain)
+        joint_twists: dict[str, Array] = {}
+        frame_twists: dict[str, Array] = {}
+        offsets: dict[str, float] = {}
+        for name, value in errors.items():
+            e = self.parameters.elementary[name]
+            if e.kind == "scale":
+                gain[[d.name for d in self.drives].index(e.owner)] += value
+            elif e.kind == "offset":
+                offsets[e.owner] = value
+            else:
+                twists = frame_twists if e.of_frame else joint_twists
+                twists.setdefault(e.owner, np.zeros(6))[e.axis] += value
+        for owner, twist in joint_twists.items():
+            i = model.getJointId(owner)
+            model.jointPlacements[i] = model.jointPlacements[i] * pin.exp6(twist)
+        for owner, value in offsets.items():
+            i = model.getJointId(owner)
+            shift = pin.exp6(joint_axis(model, i) * value)
+            model.jointPlacements[i] = model.jointPlacements[i] * shift
+        place_frames(model, self.model, frame_twists)
+        return replace(
+            self,
+            model=model,
+            constraints=build_constraints(model, self.closures),
+            drive_gain=read_only(gain),
+        )
+
+
+def joint_axis(model: pin.Model, joint: int) -> Array:
+    """Motion subspace of a joint with one degree of freedom, shape (6,)."""
+    joint_model = model.joints[joint]
+    joint_data = joint_model.createData()
+    joint_model.calc(joint_data, pin.neutral(model))
+    return np.asarray(joint_data.S, dtype=np.float64).reshape(-1)
+
+
+def find_frame(model: pin.Model, name: str, *, where: str) -> int:
+    """Index of the frame of a link, or else of a fixed or moving joint, of this name.
+
+    Raises:
+        RobotError: If there is none.
+    """
+    for kind in (pin.FrameType.BODY, pin.FrameType.FIXED_JOINT, pin.FrameType.JOINT):
+        if model.existFrame(name, kind):
+            return int(model.getFrameId(name, kind))
+    raise RobotError(f"the URDF has no frame '{name}'", where=where)
+
+
+def place_frames(model: pin.Model, nominal: pin.Model, twists: Mapping[str, Array]) -> None:
+    """Write frame errors into a model; frames that hang on a frame move with it."""
+    moved: dict[int, pin.SE3] = {}
+    targets = {find_frame(nominal, name, where="frame"): t for name, t in twists.items()}
+    for i, frame in enumerate(nominal.frames):
+        parent = frame.parentFrame
+        shift = targets.get(i)
+        if frame.type == pin.FrameType.JOINT or (shift is None and parent not in moved):
+            continue
+        placement = frame.placement
+        if parent in moved:
+            placement = moved[parent] * nominal.frames[parent].placement.inverse() * placement
+        moved[i] = placement if shift is None else placement * pin.exp6(shift)
+        model.frames[i].placement = moved[i]
+
+
+def build_constraints(
+    model: pin.Model, closures: Sequence[Closure]
+) -> tuple[pin.PointAnchorConstraintModel | pin.FrameAnchorConstraintModel, ...]:
+    """Pinocchio's constraint models of closures, in the present placements of the model."""
+    result = []
+    for closure in closures:
+        a, b = (
+            model.frames[find_frame(model, name, where="closure")]
+            for name in (closure.frame_a, closure.frame_b)
+        )
+        kind = (
+            pin.PointAnchorConstraintModel
+            if closure.kind == "3d"
+            else pin.FrameAnchorConstraintModel
+        )
+        constraint = kind(model, a.parentJoint, a.placement, b.parentJoint, b.placement)
+        constraint.name = closure.name
+        result.append(constraint)
+    return tuple(result)
+
+
+def packaged_robots() -> dict[str, Path]:
+    """Name to folder of the robots that come with orthocal."""
+    package = Path(str(resources.files("orthocal")))
+    for folder in (package / "_robots", package.parent / "robots"):
+        if folder.is_dir():
+            return {f.name: f for f in sorted(folder.iterdir()) if any(f.glob("*.urdf"))}
+    return {}
+
+
+def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
+    """Load a robot: URDF and YAML, checked against each other, with its loops closed.
+
+    Args:
+        robot: Name of a robot that comes with orthocal, or path to a robot folder.
+        beside: Folder that a relative path counts from; the working directory by default.
+
+    Raises:
+        RobotError: Naming file and line or key, what was found and what was expected.
+    """
+    packaged = packaged_robots()
+    if str(robot) in packaged:
+        return _load_folder(packaged[str(robot)])
+    folder = Path(robot) if beside is None else beside / robot
+    if not folder.is_dir():
+        raise RobotError(
+            f"'{robot}' is neither a robot of orthocal ({', '.join(packaged)}) "
+            f"nor a folder ({folder})"
+        )
+    return _load_folder(folder)
+
+
+def _load_folder(folder: Path) -> Robot:
+    yaml_path, urdf_path = _find_files(folder)
+    keys = load_description(yaml_path)
+    model = load_urdf(urdf_path)
+    where = str(yaml_path)
+    digest = hashlib.sha256(urdf_path.read_bytes() + b"\0" + yaml_path.read_bytes()).hexdigest()
+
+    drives = _build_drives(model, keys, where)
+    drive_index = [model.joints[model.getJointId(d.name)].idx_v for d in drives]
+    passive_index = [i for i in range(model.nv) if i not in drive_index]
+    closures = _build_closures(model, keys, where)
+    try:
+        parameters = _build_parameter_set(model, keys, drives, closures)
+    except ParameterError as e:
+        raise RobotError(e.problem, where=f"{where}: orthocal") from None
+    name = folder.resolve().name
+    robot = Robot(
+        name=name,
+        folder=folder,
+        urdf=urdf_path,
+        yaml=yaml_path,
+        sha256=digest,
+        model=model,
+        constraints=build_constraints(model, closures),
+        drives=drives,
+        closures=closures,
+        legs={},
+        tcp=_build_tcp(model, keys, where),
+        parameters=parameters,
+        drive_index=np.array(drive_index, dtype=np.int64),
+        passive_index=np.array(passive_index, dtype=np.int64),
+        zero=read_only(np.zeros(model.nv)),
+        drive_gain=read_only(np.ones(len(drives))),
+    )
+    start = _passive_start(robot, keys, where)
+    try:
+        passive = robot.close_with_pinocchio(robot.drive_zero, start, posture="mechanical zero")
+    except ClosureError as e:
+        raise RobotError(
+            f"{e.problem}; set orthocal.drives.<motor>.zero_mm (or zero_deg) and "
+            "orthocal.passive_start near a posture that closes",
+            where=where,
+        ) from None
+    zero = read_only(robot.joint_coordinates(robot.drive_zero, passive))
+    robot = replace(robot, zero=zero)
+    return replace(robot, legs=_build_legs(robot, keys, where))
+
+
+def _find_files(folder: Path) -> tuple[Path, Path]:
+    """YAML and URDF of a robot folder: those named as the folder, or the only ones."""
+    found = []
+    for suffix in (".yaml", ".urdf"):
+        own = folder / f"{folder.resolve().name}{suffix}"
+        files = [own] if own.is_file() else sorted(folder.glob(f"*{suffix}"))
+        if len(files) != 1:
+            names = ", ".join(f.name for f in files) or "none"
+            raise RobotError(
+                f"expected one {suffix[1:].upper()} file, or one named {own.name}; found {names}",
+                where=str(folder),
+            )
+        found.append(files[0])
+    return found[0], found[1]
+
+
+def _build_drives(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Drive, ...]:
+    drives = []
+    for motor in keys.name_mot:
+        if not model.existJointName(motor):
+            moving = ", ".join(model.names[1:])
+            raise RobotError(
+                f"the URDF has no moving joint '{motor}'; joints: {moving}",
+                where=f"{where}: name_mot",
+            )
+        joint = model.joints[model.getJointId(motor)]
+        if joint.nv != 1:
+            raise RobotError(
+                f"'{motor}' has {joint.nv} degrees of freedom; a motor has one",
+                where=f"{where}: name_mot",
+            )
+        prismatic = not np.any(joint_axis(model, joint.id)[3:])
+        entry = keys.orthocal.drives.get(motor)
+        zero = 0.0
+        if entry is not None:
+            wrong = "zero_deg" if prismatic else "zero_mm"
+            if getattr(entry, wrong) is not None:
+                kind, right = (
+                    ("prismatic", "zero_mm") if prismatic else ("revolute", "zero_deg")
+                )
+                raise RobotError(
+                    f"the drive is {kind}; expected {right}",
+                    where=f"{where}: orthocal.drives.{motor}.{wrong}",
+                )
+            zero = (entry.zero_mm or 0.0) * 1e-3 if prismatic else np.deg2rad(entry.zero_deg or 0.0)
+        bounded = joint.nq == 1
+        lower = float(model.lowerPositionLimit[joint.idx_q]) if bounded else -np.inf
+        upper = float(model.upperPositionLimit[joint.idx_q]) if bounded else np.inf
+        if entry is not None and not lower <= zero <= upper:
+            factor, unit = (1e3, "mm") if prismatic else (180.0 / np.pi, "deg")
+            raise RobotError(
+                f"the zero, {zero * factor:g} {unit}, is outside the joint's limits "
+                f"{lower * factor:g} ... {upper * factor:g} {unit}",
+                where=f"{where}: orthocal.drives.{motor}",
+            )
+        drives.append(Drive(motor, "m" if prismatic else "rad", float(zero), lower, upper))
+    return tuple(drives)
+
+
+def _build_closures(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Closure, ...]:
+    named = keys.orthocal.closures
+    names = list(named) if named is not None else [f"closure_{i + 1}" for i in range(len(keys.type))]
+    rows_of = {r: i for i, r in enumerate(AXES)}
+    closures = []
+    for i, (name, pair, kind) in enumerate(zip(names, keys.closed_loop, keys.type, strict=True)):
+        for frame in pair:
+            find_frame(model, frame, where=f"{where}: closed_loop[{i}]")
+        if pair[0] == pair[1]:
+            raise RobotError(
+                f"closes the frame '{pair[0]}' on itself", where=f"{where}: closed_loop[{i}]"
+            )
+        rows = named[name].rows if named is not None else None
+        count = 3 if kind == "3d" else 6
+        indices = tuple(range(count)) if rows is None else tuple(sorted(rows_of[r] for r in rows))
+        closures.append(Closure(name, pair[0], pair[1], kind, indices))
+    return tuple(closures)
+
+
+def _build_tcp(model: pin.Model, keys: RobotKeys, where: str) -> Tcp | None:
+    tcp = keys.orthocal.tcp
+    if tcp is None:
+        return None
+    find_frame(model, tcp.frame, where=f"{where}: orthocal.tcp.frame")
+    return Tcp(tcp.frame, tuple(sorted("xyz".index(c) for c in set(tcp.coordinates))))
+
+
+def _build_parameter_set(
+    model: pin.Model, keys: RobotKeys, drives: Sequence[Drive], closures: Sequence[Closure]
+) -> ParameterSet:
+    """All elementary errors: drives, then joints, then the frames that are used.
+
+    The component of a motor's placement along or about its own axis is left out: the offset is the
+    same error.
+    """
+    elementary: list[ElementaryError] = []
+    units: tuple[Unit, ...] = ("m", "m", "m", "rad", "rad", "rad")
+
+    def add_twist(owner: str, prefix: str, *, of_frame: bool, leave_out: int | None) -> None:
+        for axis, letter in enumerate(AXES):
+            if axis != leave_out:
+                kind = "translation" if axis < 3 else "rotation"
+                elementary.append(
+                    ElementaryError(
+                        f"{prefix}{owner}.{letter}", kind, owner, of_frame, axis, units[axis]
+                    )
+                )
+
+    for drive in drives:
+        elementary.append(
+            ElementaryError(f"{drive.name}.offset", "offset", drive.name, False, -1, drive.unit)
+        )
+    for drive in drives:
+        elementary.append(ElementaryError(f"{drive.name}.scale", "scale", drive.name, False, -1, "1"))
+    motors = {d.name for d in drives}
+    for i in range(1, model.njoints):
+        own = int(np.abs(joint_axis(model, i)).argmax()) if model.names[i] in motors else None
+        add_twist(model.names[i], "", of_frame=False, leave_out=own)
+    extra = keys.orthocal
+    frames = [f for c in closures for f in (c.frame_a, c.frame_b)]
+    frames += [f for leg in extra.legs.values() for f in (leg.root, leg.tip)]
+    frames += [extra.tcp.frame] if extra.tcp else []
+    for frame in dict.fromkeys(frames):
+        add_twist(frame, "frame.", of_frame=True, leave_out=None)
+
+    t = extra.tolerances
+    models = dict(extra.models)
+    models.setdefault("offsets", ["*.offset"])
+    models.setdefault(
+        "full", ["*", "!*.scale", *(["!frame.*"] if frames else []),
+                 *(f"!{name}" for name in extra.parameters)]
+    )
+    return build_parameters(
+        elementary,
+        sums=extra.parameters,
+        tolerances={
+            "offset:m": t.offset_mm * 1e-3,
+            "offset:rad": t.offset_mrad * 1e-3,
+            "translation": t.translation_mm * 1e-3,
+            "rotation": t.rotation_mrad * 1e-3,
+            "scale": t.scale_ppm * 1e-6,
+        },
+        overrides=t.overrides,
+        models=models,
+    )
+
+
+def _passive_start(robot: Robot, keys: RobotKeys, where: str) -> Array:
+    start = np.zeros(robot.model.nv)
+    for key, value in keys.orthocal.passive_start.items():
+        here = f"{where}: orthocal.passive_start.{key}"
+        try:
+            name, unit, factor = split_unit(key)
+        except ParameterError as e:
+            raise RobotError(e.problem, where=here) from None
+        model = robot.model
+        if not model.existJointName(name) or name in keys.name_mot:
+            raise RobotError(f"'{name}' is not a passive joint of the URDF", where=here)
+        joint = model.joints[model.getJointId(name)]
+        expected: Unit = "rad" if np.any(joint_axis(model, joint.id)[3:]) else "m"
+        if unit != expected:
+            raise RobotError(f"has the wrong unit; the joint is in {expected}", where=here)
+        start[joint.idx_v] = value * factor
+    return np.asarray(start[robot.passive_index])
+
+
+def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
+    model, legs = robot.model, {}
+    data = model.createData()
+    q = robot.configuration(robot.zero)
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    for name, entry in keys.orthocal.legs.items():
+        here = f"{where}: orthocal.legs.{name}"
+        ids = [find_frame(model, f, where=f"{here}") for f in (entry.root, entry.tip)]
+        root, tip = (np.array(data.oMf[i].translation) for i in ids)
+        length = float(np.linalg.norm(tip - root))
+        if length < 1e-6:
+            raise RobotError(
+                f"root '{entry.root}' and tip '{entry.tip}' are at the same place", where=here
+            )
+        jacobian = pin.getFrameJacobian(
+            model, data, ids[0], pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        )[:3]
+        moved = np.abs(jacobian[:, robot.passive_index]).max(initial=0.0)
+        legs[name] = Leg(
+            name=name,
+            root=entry.root,
+            tip=entry.tip,
+            length=length,
+            axis=read_only((tip - root) / length),
+            zero_root=read_only(root),
+            root_driven=bool(moved < 1e-9),
+        )
+    return legs

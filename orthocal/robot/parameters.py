@@ -1,0 +1,276 @@
+"""Error parameters of a robot: names, units, tolerances, and the elementary errors they stand for.
+
+An elementary error is one component of the twist δ = (translation, rotation) by which a placement
+is off, placement · exp6(δ), or a drive's offset or scale error:
+
+    x_slide.offset    ρ commanded, ρ + Δρ in truth (paper, equation 1)
+    x_slide.scale     ρ (1 + s) in truth
+    x_coupler.rx      rotation of the placement of joint x_coupler about its own x axis
+    frame.tcp.z       translation of frame tcp along its own z axis
+
+A parameter is one elementary error or a named sum of several. All are 0 for the nominal machine.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Literal
+
+from orthocal.errors import ParameterError
+
+Kind = Literal["offset", "scale", "translation", "rotation"]
+Unit = Literal["m", "rad", "1"]
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+"""Components of a twist, translation first."""
+
+UNIT_SUFFIXES: dict[str, tuple[Unit, float]] = {
+    "_mm": ("m", 1e-3),
+    "_um": ("m", 1e-6),
+    "_mrad": ("rad", 1e-3),
+    "_deg": ("rad", 0.017453292519943295),
+    "_ppm": ("1", 1e-6),
+}
+"""Suffix of a name in a file to unit and factor to SI."""
+
+EDGE_UNITS: dict[Unit, tuple[str, float]] = {
+    "m": ("mm", 1e3),
+    "rad": ("mrad", 1e3),
+    "1": ("ppm", 1e6),
+}
+"""Unit to the unit people read, and the factor to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ElementaryError:
+    """One component by which one drive, joint placement or frame placement is off."""
+
+    name: str
+    kind: Kind
+    owner: str
+    """Name of the drive, joint or frame."""
+    of_frame: bool
+    """Whether the owner is a frame, not a joint."""
+    axis: int
+    """Component of the twist, 0 to 5; -1 for offset and scale."""
+    unit: Unit
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A named error parameter."""
+
+    name: str
+    unit: Unit
+    tolerance: float
+    """One standard deviation, [unit]."""
+    terms: tuple[tuple[str, float], ...]
+    """Elementary errors it adds to, with coefficients."""
+
+    @property
+    def edge_unit(self) -> str:
+        """Unit in which people read it: mm, mrad or ppm."""
+        return EDGE_UNITS[self.unit][0]
+
+    @property
+    def edge_factor(self) -> float:
+        """Factor from SI to the unit in which people read it."""
+        return EDGE_UNITS[self.unit][1]
+
+
+class ParameterSet:
+    """All error parameters of a robot, by name, in a fixed order."""
+
+    def __init__(
+        self,
+        elementary: Iterable[ElementaryError],
+        parameters: Iterable[Parameter],
+        models: Mapping[str, Sequence[str]],
+    ) -> None:
+        self.elementary = {e.name: e for e in elementary}
+        self._parameters = {p.name: p for p in parameters}
+        self.models = {name: tuple(patterns) for name, patterns in models.items()}
+
+    def __iter__(self) -> Iterator[Parameter]:
+        return iter(self._parameters.values())
+
+    def __len__(self) -> int:
+        return len(self._parameters)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._parameters
+
+    def __getitem__(self, name: str) -> Parameter:
+        try:
+            return self._parameters[name]
+        except KeyError:
+            raise ParameterError(
+                f"'{name}' is not an error parameter{_suggest(name, self._parameters)}"
+            ) from None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all parameters, in order."""
+        return tuple(self._parameters)
+
+    def select(self, patterns: Iterable[str]) -> tuple[str, ...]:
+        """Names that a list of globs leaves, in the order of the set.
+
+        Each pattern adds the names it matches; one that begins with '!' takes them out again.
+
+        Raises:
+            ParameterError: If a pattern matches no parameter.
+        """
+        chosen: set[str] = set()
+        for pattern in patterns:
+            glob = pattern.removeprefix("!")
+            found = [name for name in self._parameters if fnmatchcase(name, glob)]
+            if not found:
+                raise ParameterError(
+                    f"'{glob}' matches no error parameter{_suggest(glob, self._parameters)}"
+                )
+            chosen.difference_update(found) if pattern != glob else chosen.update(found)
+        return tuple(name for name in self._parameters if name in chosen)
+
+    def select_model(self, model: str) -> tuple[str, ...]:
+        """Names of the free parameters of a model of the robot's YAML.
+
+        Raises:
+            ParameterError: If there is no such model.
+        """
+        if model not in self.models:
+            raise ParameterError(
+                f"'{model}' is not a model of this robot; models: {', '.join(self.models)}"
+            )
+        return self.select(self.models[model])
+
+    def read_quantity(self, key: str, value: float) -> tuple[str, float]:
+        """Parameter name and SI value of a key that carries its unit, such as x_slide.offset_mm.
+
+        Raises:
+            ParameterError: If the suffix is missing or of another unit, or the name unknown.
+        """
+        name, unit, factor = split_unit(key)
+        if name not in self._parameters:
+            raise ParameterError(
+                f"'{name}' is not an error parameter{_suggest(name, self._parameters)}"
+            )
+        _check_unit(key, unit, self[name])
+        return name, value * factor
+
+    def expand(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Elementary errors that parameter values amount to; only those that are not zero.
+
+        Args:
+            values: Parameter name to value, [unit of the parameter].
+
+        Raises:
+            ParameterError: If a name is unknown.
+        """
+        total: dict[str, float] = {}
+        for name, value in values.items():
+            for term, coefficient in self[name].terms:
+                total[term] = total.get(term, 0.0) + coefficient * value
+        return {name: value for name, value in total.items() if value != 0.0}
+
+
+def split_unit(key: str) -> tuple[str, Unit, float]:
+    """Name, unit and factor to SI of a key that carries its unit as suffix.
+
+    Raises:
+        ParameterError: If there is no known suffix.
+    """
+    for suffix, (unit, factor) in UNIT_SUFFIXES.items():
+        if key.endswith(suffix):
+            return key.removesuffix(suffix), unit, factor
+    raise ParameterError(
+        f"'{key}' carries no unit; expected one of the suffixes {', '.join(UNIT_SUFFIXES)}"
+    )
+
+
+def build_parameters(
+    elementary: Sequence[ElementaryError],
+    *,
+    sums: Mapping[str, Sequence[str]],
+    tolerances: Mapping[str, float],
+    overrides: Mapping[str, float],
+    models: Mapping[str, Sequence[str]],
+) -> ParameterSet:
+    """The parameter set of a robot.
+
+    Args:
+        elementary: All elementary errors, in order.
+        sums: Name of a sum to names of elementary errors; a leading '-' subtracts.
+        tolerances: Keys `offset:m`, `offset:rad`, `translation`, `rotation`, `scale` to one
+            standard deviation, [m, rad, m, rad, 1].
+        overrides: Parameter name or glob with its unit as suffix to a tolerance; later ones win.
+        models: Model name to patterns.
+
+    Raises:
+        ParameterError: If a name is unknown, taken twice, or of another unit than its sum.
+    """
+    by_name = {e.name: e for e in elementary}
+
+    def tolerance(error: ElementaryError) -> float:
+        key = f"offset:{error.unit}" if error.kind == "offset" else error.kind
+        return tolerances[key]
+
+    parameters = {
+        e.name: Parameter(e.name, e.unit, tolerance(e), ((e.name, 1.0),)) for e in elementary
+    }
+    for name, members in sums.items():
+        if name in parameters:
+            raise ParameterError(f"parameters.{name}: this name is taken by an elementary error")
+        terms: dict[str, float] = {}
+        for member in members:
+            plain = member.removeprefix("-")
+            if plain not in by_name:
+                raise ParameterError(
+                    f"parameters.{name}: '{plain}' is not an elementary error"
+                    f"{_suggest(plain, by_name)}"
+                )
+            if plain in terms:
+                raise ParameterError(f"parameters.{name}: '{plain}' stands twice")
+            terms[plain] = -1.0 if plain != member else 1.0
+        first = by_name[next(iter(terms))]
+        for plain in terms:
+            if by_name[plain].unit != first.unit:
+                raise ParameterError(
+                    f"parameters.{name}: '{plain}' is in {by_name[plain].unit}, "
+                    f"'{first.name}' in {first.unit}; a sum needs one unit"
+                )
+        parameters[name] = Parameter(name, first.unit, tolerance(first), tuple(terms.items()))
+    for key, value in overrides.items():
+        glob, unit, factor = split_unit(key)
+        found = [name for name in parameters if fnmatchcase(name, glob)]
+        if not found:
+            raise ParameterError(
+                f"tolerances.overrides: '{glob}' matches no error parameter"
+                f"{_suggest(glob, parameters)}"
+            )
+        for name in found:
+            old = parameters[name]
+            _check_unit(key, unit, old)
+            parameters[name] = Parameter(name, old.unit, value * factor, old.terms)
+    result = ParameterSet(elementary, parameters.values(), models)
+    for model, patterns in result.models.items():
+        try:
+            result.select(patterns)
+        except ParameterError as e:
+            raise ParameterError(f"models.{model}: {e.problem}") from None
+    return result
+
+
+def _check_unit(key: str, unit: Unit, parameter: Parameter) -> None:
+    if unit != parameter.unit:
+        raise ParameterError(
+            f"'{key}' has the wrong unit; {parameter.name} is in {parameter.edge_unit}"
+        )
+
+
+def _suggest(name: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(known), n=3, cutoff=0.5)
+    return f"; did you mean {', '.join(close)}?" if close else ""

@@ -1,0 +1,303 @@
+"""Symbolic kinematics (CasADi) of any Pinocchio model, with errors on every placement.
+
+    oM_i = oM_parent · placement_i · exp6(δ_i) · M_i(q)
+
+A pose is a pair (R, p): rotation 3×3 and position 3, as CasADi expressions. All functions are safe
+to differentiate at zero errors and at closed loops: near the identity they take series.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from orthocal.errors import RobotError
+from orthocal.robot.model import Closure, Robot, find_frame, joint_axis
+
+SERIES_BELOW = 0.04
+"""Squared angle below which exponential coefficients come from their series, [rad²]."""
+
+SERIES_COSINE = 0.999
+"""Cosine above which logarithm coefficients come from their series."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """A rigid-body pose: maps coordinates of its own frame into the parent's."""
+
+    rotation: ca.SX
+    """Shape (3, 3)."""
+    position: ca.SX
+    """Shape (3,), [m]."""
+
+    def __mul__(self, other: Pose) -> Pose:
+        return Pose(
+            self.rotation @ other.rotation, self.rotation @ other.position + self.position
+        )
+
+    def relative(self, other: Pose) -> Pose:
+        """Pose of `other` in this frame."""
+        transposed = self.rotation.T
+        return Pose(transposed @ other.rotation, transposed @ (other.position - self.position))
+
+
+def constant_pose(placement: pin.SE3) -> Pose:
+    """A Pinocchio placement as a symbolic pose; rounding zeros become structural zeros."""
+    rotation = np.array(placement.rotation)
+    position = np.array(placement.translation)
+    rotation[np.abs(rotation) < 1e-15] = 0.0
+    position[np.abs(position) < 1e-15] = 0.0
+    return Pose(ca.sparsify(ca.SX(rotation)), ca.sparsify(ca.SX(position)))
+
+
+def exp6(twist: ca.SX) -> Pose:
+    """Exponential of a twist (translation v, rotation ω), as Pinocchio's exp6.
+
+        R = I + a [ω] + b [ω]²,  p = v + b ω × v + c ω × (ω × v)
+        a = sin θ/θ,  b = (1 − cos θ)/θ²,  c = (θ − sin θ)/θ³,  θ = |ω|
+
+    Args:
+        twist: Shape (6,), [m, rad].
+    """
+    v, w = twist[:3], twist[3:]
+    if w.is_zero():
+        return Pose(ca.SX.eye(3), v)
+    square = ca.dot(w, w)
+    near = square < SERIES_BELOW
+    safe = ca.if_else(near, 1.0, square)
+    angle = ca.sqrt(safe)
+    # 1/1!, 1/3!, ... ; 1/2!, 1/4!, ... ; 1/3!, 1/5!, ... with alternating signs
+    a = ca.if_else(near, _alternating(square, 1), ca.sin(angle) / angle)
+    b = ca.if_else(near, _alternating(square, 2), (1.0 - ca.cos(angle)) / safe)
+    c = ca.if_else(near, _alternating(square, 3), (angle - ca.sin(angle)) / (safe * angle))
+    hat = ca.skew(w)
+    rotation = ca.SX.eye(3) + a * hat + b * (hat @ hat)
+    if v.is_zero():
+        return Pose(rotation, ca.SX(3, 1))
+    turned = ca.cross(w, v)
+    return Pose(rotation, v + b * turned + c * ca.cross(w, turned))
+
+
+def _alternating(square: ca.SX, first: int) -> ca.SX:
+    """Σ (−θ²)^k / (first + 2k)!, enough terms for double precision below SERIES_BELOW."""
+    from math import factorial
+
+    total = ca.SX(0.0)
+    for k in reversed(range(7)):
+        total = total * -square + 1.0 / factorial(first + 2 * k)
+    return total
+
+
+def log6(pose: Pose) -> ca.SX:
+    """Logarithm of a pose, as Pinocchio's log6: (translation, rotation), shape (6,).
+
+        ω = (θ/sin θ) ½ vee(R − Rᵀ)
+        v = p − ½ ω × p + (1/θ² − (1 + cos θ)/(2 θ sin θ)) ω × (ω × p)
+    """
+    rotation, p = pose.rotation, pose.position
+    half = 0.5 * ca.inv_skew(rotation - rotation.T)
+    cosine = 0.5 * (ca.trace(rotation) - 1.0)
+    sine2 = ca.dot(half, half)
+    near = cosine > SERIES_COSINE
+    safe_sine = ca.sqrt(ca.if_else(near, 1.0, sine2))
+    safe_cosine = ca.if_else(near, 0.0, cosine)
+    angle = ca.atan2(safe_sine, safe_cosine)
+    asin_series = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
+    w = ca.if_else(near, _horner(sine2, asin_series), angle / safe_sine) * half
+    square = ca.dot(w, w)
+    beta_series = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
+    beta = ca.if_else(
+        near,
+        _horner(square, beta_series),
+        1.0 / angle**2 - (1.0 + safe_cosine) / (2.0 * angle * safe_sine),
+    )
+    turned = ca.cross(w, p)
+    return ca.vertcat(p - 0.5 * turned + beta * ca.cross(w, turned), w)
+
+
+def _horner(x: ca.SX, coefficients: tuple[float, ...]) -> ca.SX:
+    total = ca.SX(0.0)
+    for coefficient in reversed(coefficients):
+        total = total * x + coefficient
+    return total
+
+
+def joint_motion(model: pin.Model, joint: int, coordinates: ca.SX) -> Pose:
+    """M_i(q) = exp6(S q) of a joint.
+
+    Args:
+        coordinates: Shape (nv,): an angle also for an unbounded revolute joint.
+
+    Raises:
+        RobotError: For joints other than revolute, prismatic, helical and translation.
+    """
+    joint_model = model.joints[joint]
+    if "Translation" in joint_model.shortname():
+        return Pose(ca.SX.eye(3), coordinates)
+    if joint_model.nv != 1:
+        raise RobotError(
+            f"joint '{model.names[joint]}' is a {joint_model.shortname()}; supported are "
+            "revolute (bounded or not), prismatic, helical and translation joints"
+        )
+    return screw_motion(joint_axis(model, joint), coordinates)
+
+
+def screw_motion(axis: NDArray[np.float64], angle: ca.SX) -> Pose:
+    """exp6(S q) for a constant S = (v, ω) with |ω| = 1 or ω = 0, shape (6,)."""
+    v, w = np.array(axis[:3]), np.array(axis[3:])
+    if not np.any(w):
+        return Pose(ca.SX.eye(3), ca.sparsify(ca.SX(v)) * angle)
+    hat = pin.skew(w)
+    s, c = ca.sin(angle), ca.cos(angle)
+    rotation = (
+        ca.SX.eye(3)
+        + s * ca.sparsify(ca.SX(hat))
+        + (1.0 - c) * ca.sparsify(ca.SX(hat @ hat))
+    )
+    if not np.any(v):
+        return Pose(rotation, ca.SX(3, 1))
+    position = angle * v + (1.0 - c) * (hat @ v) + (angle - s) * (hat @ hat @ v)
+    return Pose(rotation, position)
+
+
+class SymbolicTree:
+    """Forward kinematics of a Pinocchio model with error twists on joints and frames.
+
+    Attributes:
+        model: The nominal model.
+        coordinates: Joint coordinates, shape (nv,): one an unbounded revolute joint.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        coordinates: ca.SX,
+        *,
+        joint_twists: Mapping[str, ca.SX] | None = None,
+        frame_twists: Mapping[str, ca.SX] | None = None,
+    ) -> None:
+        self.model = model
+        self.coordinates = coordinates
+        self._joint_twists = dict(joint_twists or {})
+        self._frame_twists = {
+            find_frame(model, name, where="frame"): t for name, t in (frame_twists or {}).items()
+        }
+        self._joints: dict[int, Pose] = {0: Pose(ca.SX.eye(3), ca.SX(3, 1))}
+        self._frames: dict[int, Pose] = {}
+
+    def joint_pose(self, joint: int) -> Pose:
+        """Pose of a joint's moving frame in the world."""
+        if joint not in self._joints:
+            m = self.model
+            pose = self.joint_pose(m.parents[joint]) * constant_pose(m.jointPlacements[joint])
+            twist = self._joint_twists.get(m.names[joint])
+            if twist is not None:
+                pose = pose * exp6(twist)
+            first, count = m.joints[joint].idx_v, m.joints[joint].nv
+            motion = joint_motion(m, joint, self.coordinates[first : first + count])
+            self._joints[joint] = pose * motion
+        return self._joints[joint]
+
+    def frame_pose(self, frame: int) -> Pose:
+        """Pose of a frame in the world; the errors of frames that it hangs on act on it."""
+        if frame not in self._frames:
+            f = self.model.frames[frame]
+            placement = constant_pose(f.placement)
+            if f.type == pin.FrameType.JOINT or frame == 0:
+                pose = self.joint_pose(f.parentJoint) * placement
+            else:
+                parent = self.model.frames[f.parentFrame]
+                between = constant_pose(parent.placement.inverse() * f.placement)
+                pose = self.frame_pose(f.parentFrame) * between
+                if frame in self._frame_twists:
+                    pose = pose * exp6(self._frame_twists[frame])
+            self._frames[frame] = pose
+        return self._frames[frame]
+
+
+class SymbolicRobot:
+    """The closed-loop model of a robot as expressions of drives, passive joints and errors.
+
+    Args:
+        robot: The nominal robot.
+        drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
+        passive: Passive coordinates, shape (n_passive,), [m, rad].
+        errors: Parameter name to expression or number, [unit of the parameter].
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        drives: ca.SX,
+        passive: ca.SX,
+        errors: Mapping[str, ca.SX | float] | None = None,
+    ) -> None:
+        self.robot = robot
+        elementary: dict[str, ca.SX] = {}
+        for name, value in (errors or {}).items():
+            for term, coefficient in robot.parameters[name].terms:
+                elementary[term] = elementary.get(term, ca.SX(0.0)) + coefficient * value
+        joint_twists: dict[str, ca.SX] = {}
+        frame_twists: dict[str, ca.SX] = {}
+        offset = ca.SX(len(robot.drives), 1)
+        gain = ca.SX(robot.drive_gain)
+        index = {d.name: i for i, d in enumerate(robot.drives)}
+        for name, expression in elementary.items():
+            e = robot.parameters.elementary[name]
+            if e.kind == "offset":
+                offset[index[e.owner]] += expression
+            elif e.kind == "scale":
+                gain[index[e.owner]] += expression
+            else:
+                twists = frame_twists if e.of_frame else joint_twists
+                twists.setdefault(e.owner, ca.SX(6, 1))[e.axis] += expression
+        coordinates = ca.SX(robot.model.nv, 1)
+        actuated = gain * drives + offset
+        for i, k in enumerate(robot.drive_index):
+            coordinates[int(k)] = actuated[i]
+        for i, k in enumerate(robot.passive_index):
+            coordinates[int(k)] = passive[i]
+        self.tree = SymbolicTree(
+            robot.model, coordinates, joint_twists=joint_twists, frame_twists=frame_twists
+        )
+
+    def frame_pose(self, name: str) -> Pose:
+        """Pose of a named frame in the world."""
+        return self.tree.frame_pose(self.robot.frame_id(name))
+
+    def closure_error(self, closure: Closure) -> ca.SX:
+        """Pose error of one closure, rows that count: position of b in a, or log6, [m, rad]."""
+        a, b = self.frame_pose(closure.frame_a), self.frame_pose(closure.frame_b)
+        relative = a.relative(b)
+        error = relative.position if closure.kind == "3d" else log6(relative)
+        return error[list(closure.rows)]
+
+    def closure_residual(self) -> ca.SX:
+        """g(q, θ) of all closures, shape (closure_rows,), [m, rad]."""
+        return ca.vertcat(*(self.closure_error(c) for c in self.robot.closures))
+
+
+def closure_row_units(robot: Robot) -> NDArray[np.float64]:
+    """Displacement that one unit of each closure row amounts to, shape (closure_rows,).
+
+    1 for translations, the characteristic length for rotations: residual × this is in [m].
+    """
+    length = robot.characteristic_length
+    return np.array([1.0 if row < 3 else length for c in robot.closures for row in c.rows])
+
+
+def coordinate_units(robot: Robot) -> NDArray[np.float64]:
+    """Displacement that one unit of each joint coordinate amounts to, shape (nv,), [m or m/rad]."""
+    model = robot.model
+    units = np.ones(model.nv)
+    for i in range(1, model.njoints):
+        joint = model.joints[i]
+        if joint.nv == 1 and np.any(joint_axis(model, i)[3:]):
+            units[joint.idx_v] = robot.characteristic_length
+    return units

@@ -1,0 +1,204 @@
+"""A URDF file from a stranger: checked element by element, by yourdfpy, and loaded by Pinocchio."""
+
+from __future__ import annotations
+
+import io
+import logging
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pinocchio as pin
+from lxml import etree
+
+from orthocal.documents import read_text
+from orthocal.errors import RobotError
+
+MOVING = ("revolute", "continuous", "prismatic")
+"""Joint types that a robot may have besides `fixed`."""
+
+
+def load_urdf(path: Path) -> pin.Model:
+    """Pinocchio's model of a URDF file, after the file was checked.
+
+    Raises:
+        RobotError: Naming file and line, or file and joint.
+    """
+    text = read_text(path, error=RobotError)
+    root = _parse_xml(text, path)
+    _check_elements(root, path)
+    _validate_with_yourdfpy(text, path)
+    with _captured_stderr() as messages:
+        try:
+            model = pin.buildModelFromXML(etree.tostring(root, encoding="unicode"))
+        except (ValueError, RuntimeError) as e:
+            reason = " ".join((messages() or str(e)).split())
+            raise RobotError(f"Pinocchio cannot load it: {reason}", where=str(path)) from None
+    return model
+
+
+def _parse_xml(text: str, path: Path) -> Any:  # noqa: ANN401 - lxml has no types
+    parser = etree.XMLParser(
+        resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False
+    )
+    try:
+        root = etree.fromstring(text.encode(), parser=parser)
+    except etree.XMLSyntaxError as e:
+        line = "" if not e.lineno else f":{e.lineno}"
+        raise RobotError(
+            f"is not valid XML: {str(e.msg).splitlines()[0]}", where=f"{path}{line}"
+        ) from None
+    if root.getroottree().docinfo.doctype:
+        raise RobotError("has a DOCTYPE; a URDF needs none, and it is refused", where=f"{path}:1")
+    if root.tag != "robot":
+        raise RobotError(
+            f"the outermost element is <{root.tag}>; expected <robot>",
+            where=f"{path}:{root.sourceline}",
+        )
+    etree.strip_tags(root, etree.Comment)
+    return root
+
+
+def _check_elements(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has no types
+    """Names, references and numbers that yourdfpy and urdfdom take or reject without a word."""
+    links: dict[str, int] = {}
+    joints: dict[str, int] = {}
+    parents: dict[str, str] = {}
+
+    def at(element: Any) -> str:  # noqa: ANN401 - lxml has no types
+        return f"{path}:{element.sourceline}"
+
+    for seen, tag in ((links, "link"), (joints, "joint")):
+        for element in root.findall(tag):
+            name = element.get("name")
+            if not name:
+                raise RobotError(f"<{tag}> has no name", where=at(element))
+            if name in seen:
+                raise RobotError(
+                    f"the {tag} '{name}' stands twice; first in line {seen[name]}",
+                    where=at(element),
+                )
+            seen[name] = element.sourceline
+    if not links:
+        raise RobotError("has no <link>", where=str(path))
+    for joint in root.findall("joint"):
+        name, kind = joint.get("name"), joint.get("type")
+        if kind not in (*MOVING, "fixed"):
+            raise RobotError(
+                f"joint '{name}' is of type '{kind}'; expected {', '.join(MOVING)} or fixed",
+                where=at(joint),
+            )
+        if joint.find("mimic") is not None:
+            raise RobotError(
+                f"joint '{name}' mimics another; mimic joints are not supported: Pinocchio's "
+                "constraint Jacobians would be wrong",
+                where=at(joint),
+            )
+        ends = {}
+        for end in ("parent", "child"):
+            element = joint.find(end)
+            link = None if element is None else element.get("link")
+            if link is None:
+                raise RobotError(f"joint '{name}' has no <{end} link=...>", where=at(joint))
+            if link not in links:
+                raise RobotError(
+                    f"joint '{name}': its {end} '{link}' is not a link of this file",
+                    where=at(element),
+                )
+            ends[end] = link
+        if ends["child"] in parents:
+            raise RobotError(
+                f"link '{ends['child']}' is the child of two joints, '{parents[ends['child']]}' "
+                f"and '{name}'; close loops with closed_loop in the YAML instead",
+                where=at(joint),
+            )
+        parents[ends["child"]] = name
+        axis = joint.find("axis")
+        if axis is not None and kind != "fixed":
+            vector = _numbers(axis, "xyz", 3, at(axis))
+            if vector is not None and math.hypot(*vector) < 1e-9:
+                raise RobotError(f"joint '{name}' has a zero axis", where=at(axis))
+        limit = joint.find("limit")
+        if kind in ("revolute", "prismatic"):
+            if limit is None:
+                raise RobotError(f"joint '{name}' of type {kind} has no <limit>", where=at(joint))
+            for bound in ("lower", "upper", "effort", "velocity"):
+                _numbers(limit, bound, 1, at(limit))
+            for bound in ("effort", "velocity"):
+                if limit.get(bound) is None:
+                    raise RobotError(
+                        f"joint '{name}': its <limit> has no {bound}", where=at(limit)
+                    )
+            if float(limit.get("lower", "0")) > float(limit.get("upper", "0")):
+                raise RobotError(
+                    f"joint '{name}': its lower limit is above its upper limit", where=at(limit)
+                )
+    roots = [name for name in links if name not in parents]
+    if len(roots) != 1:
+        found = ", ".join(roots) if roots else "none"
+        raise RobotError(f"has {len(roots)} root links ({found}); expected one", where=str(path))
+    for origin in root.iter("origin"):
+        _numbers(origin, "xyz", 3, at(origin))
+        _numbers(origin, "rpy", 3, at(origin))
+
+
+def _numbers(element: Any, key: str, count: int, where: str) -> list[float] | None:  # noqa: ANN401
+    text = element.get(key)
+    if text is None:
+        return None
+    try:
+        values = [float(part) for part in text.split()]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(math.isfinite(v) for v in values):
+        kind = "a finite number" if count == 1 else f"{count} finite numbers"
+        raise RobotError(f"{key} is '{text}'; expected {kind}", where=where)
+    return values
+
+
+def _validate_with_yourdfpy(text: str, path: Path) -> None:
+    import yourdfpy
+
+    logging.getLogger("yourdfpy").setLevel(logging.CRITICAL)
+    try:
+        urdf = yourdfpy.URDF.load(
+            io.BytesIO(text.encode()), build_scene_graph=False, load_meshes=False
+        )
+        valid = urdf.validate()
+    except Exception as e:  # it raises whatever its parser trips over
+        reason = f"{type(e).__name__}: {e}"
+        raise RobotError(f"yourdfpy cannot read it: {reason}", where=str(path)) from None
+    if not valid:
+        raise RobotError(f"is not a valid URDF: {urdf.errors[0]}", where=str(path))
+
+
+@contextmanager
+def _captured_stderr() -> Iterator[Any]:
+    """Catch what C++ code writes to the error stream; yields a function that returns it."""
+    with tempfile.TemporaryFile() as sink:
+        sys.stderr.flush()
+        saved = os.dup(2)
+        os.dup2(sink.fileno(), 2)
+        restored = False
+
+        def restore() -> None:
+            nonlocal restored
+            if not restored:
+                os.dup2(saved, 2)
+                os.close(saved)
+                restored = True
+
+        def messages() -> str:
+            restore()
+            sink.seek(0)
+            return sink.read().decode(errors="replace")
+
+        try:
+            yield messages
+        finally:
+            restore()
