@@ -590,6 +590,12 @@ def _passive_start(robot: Robot, keys: RobotKeys, where: str) -> Array:
     return np.asarray(start[robot.passive_index])
 
 
+def _without_rounding(unit_vector: Array) -> Array:
+    """A unit vector whose components within rounding of 0 or ±1 are exactly that."""
+    nearest = np.round(unit_vector)
+    return np.where(np.abs(unit_vector - nearest) < 1e-12, nearest, unit_vector)
+
+
 def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
     model, legs = robot.model, {}
     data = model.createData()
@@ -614,7 +620,7 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
             root=entry.root,
             tip=entry.tip,
             length=length,
-            axis=read_only((tip - root) / length),
+            axis=read_only(_without_rounding((tip - root) / length)),
             zero_root=read_only(root),
             root_driven=bool(moved < 1e-9),
         )

@@ -1,0 +1,1 @@
+"""What was seen: sessions of gauge readings, the observation model, synthetic readings."""
