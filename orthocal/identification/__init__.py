@@ -1,0 +1,1 @@
+"""What follows from the readings: linearised and exact identification, results, uncertainty."""

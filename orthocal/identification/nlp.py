@@ -1,0 +1,427 @@
+"""The exact identification as one nonlinear program, solved with Ipopt.
+
+Variables are θ̂, the gauge zeros ẑ and every posture's passive coordinates q̂_k; the closures of
+every posture are constraints. Derivatives are exact. One posture and one reading are written as
+CasADi functions, mapped over postures and readings, and their results gathered into the sparse
+gradient, Jacobian and Hessian of the whole by index: building does not grow with the session.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.errors import SolverError
+from orthocal.identification.problem import LENGTH_SCALE, CalibrationProblem, ReadingPiece
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Hessian = Literal["gauss-newton", "exact"]
+
+CONVERGED = frozenset({"Solve_Succeeded"})
+"""Ipopt's words for a solution; anything else is an error."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolverOptions:
+    """How Ipopt is run."""
+
+    hessian: Hessian = "gauss-newton"
+    """Hessian of the Lagrangian: exact, or without the curvature of readings and closures."""
+    tolerance: float = 1e-9
+    """Ipopt's `tol`, on the scaled problem."""
+    max_iterations: int = 200
+    print_level: int = 0
+    """Ipopt's own printing, 0 (none) to 12."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """What Ipopt found."""
+
+    theta: Array
+    """Free parameters, shape (n_free,), [SI]."""
+    zeros: Array
+    """Gauge zeros, shape (n_zeros,), [m]."""
+    passive: Array
+    """Passive coordinates, shape (n_postures, n_passive), [m, rad]."""
+    objective: float
+    status: str
+    """Ipopt's own word."""
+    iterations: int
+    seconds_build: float
+    seconds_solve: float
+    closure: float
+    """Largest closure residual that is left, rotations times characteristic length, [m]."""
+
+
+class _Gather:
+    """Sums of contributions into the nonzeros of one sparse matrix or vector."""
+
+    def __init__(self, n_rows: int, n_columns: int) -> None:
+        self._shape = (n_rows, n_columns)
+        self._rows: list[Indices] = []
+        self._columns: list[Indices] = []
+        self._values: list[ca.MX] = []
+
+    def add(self, rows: Indices, columns: Indices, values: ca.MX) -> None:
+        """Add values (a column vector) at positions."""
+        self._rows.append(np.asarray(rows, dtype=np.int64).reshape(-1))
+        self._columns.append(np.asarray(columns, dtype=np.int64).reshape(-1))
+        self._values.append(values)
+
+    def build(self) -> ca.MX:
+        """The sparse matrix."""
+        rows, columns = np.concatenate(self._rows), np.concatenate(self._columns)
+        values = ca.vertcat(*self._values)
+        keys = columns * self._shape[0] + rows  # order of compressed columns
+        unique, position = np.unique(keys, return_inverse=True)
+        sparsity = ca.Sparsity(
+            *self._shape,
+            _column_starts(unique // self._shape[0], self._shape[1]),
+            (unique % self._shape[0]).tolist(),
+        )
+        if unique.size == keys.size:
+            order = np.empty(keys.size, dtype=np.int64)
+            order[position] = np.arange(keys.size)
+            nonzeros = values[order.tolist()]
+        else:
+            summing = ca.Sparsity(
+                unique.size, keys.size, list(range(keys.size + 1)), position.tolist()
+            )
+            nonzeros = ca.mtimes(ca.MX(ca.DM.ones(summing)), values)
+        return ca.MX(sparsity, ca.densify(nonzeros))
+
+
+def _column_starts(columns: Indices, count: int) -> list[int]:
+    starts = np.zeros(count + 1, dtype=np.int64)
+    np.cumsum(np.bincount(columns, minlength=count), out=starts[1:])
+    return [int(v) for v in starts]
+
+
+class NonlinearProgram:
+    """A calibration problem as a nonlinear program; solved again and again without rebuilding.
+
+    Args:
+        problem: The problem.
+        options: How Ipopt is run.
+    """
+
+    def __init__(
+        self, problem: CalibrationProblem, *, options: SolverOptions | None = None
+    ) -> None:
+        began = time.perf_counter()
+        self.problem = problem
+        self.options = options or SolverOptions()
+        self._n_theta = problem.n_free
+        self._n_zeros = problem.observations.n_zeros
+        self._n_passive = problem.robot.passive_index.size
+        self._build()
+        self.seconds_build = time.perf_counter() - began
+
+    def solve(
+        self,
+        *,
+        sigma: float,
+        values: ArrayLike | None = None,
+        start: ArrayLike | None = None,
+        start_passive: Array | None = None,
+    ) -> Solution:
+        """Solve for given readings.
+
+        Args:
+            sigma: Standard deviation of one reading, [m].
+            values: Readings as single ones, shape (n_entries,), [m]; the session's by default.
+            start: Free parameters to start from, shape (n_free,), [SI]; by default what the
+                controller already corrects.
+            start_passive: Passive coordinates to start closing the loops from.
+
+        Raises:
+            SolverError: If Ipopt does not converge.
+            ClosureError: If the machine cannot reach a posture with the start values.
+        """
+        problem = self.problem
+        theta = np.array(problem.reference if start is None else start, dtype=np.float64)
+        passive = problem.close(theta, start=start_passive)
+        y = problem.values if values is None else np.asarray(values, dtype=np.float64)
+        residual = y - problem.predict(theta, passive)
+        o = problem.observations
+        counts = np.maximum(np.bincount(o.zero, minlength=o.n_zeros), 1)
+        zeros = np.bincount(o.zero, residual, minlength=o.n_zeros) / counts
+        x0 = np.concatenate(
+            [
+                theta / problem.theta_scale,
+                zeros / LENGTH_SCALE,
+                (passive / problem.passive_scale).reshape(-1),
+            ]
+        )
+        prior = float(problem.prior)
+        began = time.perf_counter()
+        answer = self._solver(
+            x0=x0, p=np.concatenate([y, [sigma, prior]]), lbg=0.0, ubg=0.0
+        )
+        seconds = time.perf_counter() - began
+        stats = self._solver.stats()
+        status, iterations = str(stats["return_status"]), int(stats["iter_count"])
+        if status not in CONVERGED:
+            raise SolverError(
+                f"Ipopt did not converge: {status} after {iterations} iterations; there is no "
+                "result. Look for a reading with a wrong sign or in a wrong row first",
+                status=status,
+                iterations=iterations,
+            )
+        x = np.asarray(answer["x"].full()).reshape(-1)
+        closures = np.abs(np.asarray(answer["g"].full())).max(initial=0.0)
+        return Solution(
+            theta=x[: self._n_theta] * problem.theta_scale,
+            zeros=x[self._n_theta : self._n_theta + self._n_zeros] * LENGTH_SCALE,
+            passive=x[self._n_theta + self._n_zeros :].reshape(-1, self._n_passive)
+            * problem.passive_scale,
+            objective=float(answer["f"]),
+            status=status,
+            iterations=iterations,
+            seconds_build=self.seconds_build,
+            seconds_solve=seconds,
+            closure=float(closures) * LENGTH_SCALE,
+        )
+
+    def functions(self) -> dict[str, ca.Function]:
+        """The program's functions of (x, p[, lam_f, lam_g]), for checks of their derivatives."""
+        return dict(self._functions)
+
+    def _build(self) -> None:
+        problem = self.problem
+        k = problem.n_postures
+        n_fixed = self._n_theta + self._n_zeros
+        n = n_fixed + k * self._n_passive
+        x = ca.MX.sym("x", n)
+        entries = problem.observations.size
+        p = ca.MX.sym("p", entries + 2)
+        lam_f = ca.MX.sym("lam_f")
+        lam_g = ca.MX.sym("lam_g", k * problem.robot.closure_rows)
+        theta = x[: self._n_theta]
+        sigma, prior = p[entries], p[entries + 1]
+
+        objective = 0.5 * prior * ca.dot(theta, theta)
+        gradient, hessian = _Gather(n, 1), _Gather(n, n)
+        diagonal = np.arange(self._n_theta)
+        gradient.add(diagonal, np.zeros_like(diagonal), prior * theta)
+        hessian.add(diagonal, diagonal, lam_f * ca.repmat(prior, self._n_theta, 1))
+        for piece in problem.reading_pieces:
+            objective += self._add_readings(piece, x, p, sigma, lam_f, gradient, hessian)
+        constraints, jacobian = self._add_closures(x, lam_g, hessian)
+
+        f, g = ca.densify(objective), ca.densify(constraints)
+        grad_f = ca.densify(gradient.build())
+        functions = {
+            "nlp": ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"]),
+            "grad_f": ca.Function("grad_f", [x, p], [f, grad_f], ["x", "p"], ["f", "grad_f_x"]),
+            "jac_g": ca.Function("jac_g", [x, p], [g, jacobian], ["x", "p"], ["g", "jac_g_x"]),
+            "hess_lag": ca.Function(
+                "hess_lag",
+                [x, p, lam_f, lam_g],
+                [hessian.build()],
+                ["x", "p", "lam_f", "lam_g"],
+                ["hess_gamma_x_x"],
+            ),
+        }
+        self._functions = functions
+        ipopt: dict[str, Any] = {
+            "tol": self.options.tolerance,
+            "max_iter": self.options.max_iterations,
+            "print_level": self.options.print_level,
+            "sb": "yes",
+            "nlp_scaling_method": "none",  # everything is of order one already
+            "linear_solver": "mumps",
+        }
+        self._solver = ca.nlpsol(
+            "calibration",
+            "ipopt",
+            functions["nlp"],
+            {
+                "grad_f": functions["grad_f"],
+                "jac_g": functions["jac_g"],
+                "hess_lag": functions["hess_lag"],
+                "print_time": False,
+                "calc_lam_p": False,
+                "ipopt": ipopt,
+            },
+        )
+
+    def _passive_variables(self, postures: Indices, index: Indices) -> Indices:
+        """Positions in x of passive coordinates, shape (n_postures, n_index)."""
+        first = self._n_theta + self._n_zeros
+        return np.asarray(first + postures[:, None] * self._n_passive + index[None, :])
+
+    def _add_readings(
+        self,
+        piece: ReadingPiece,
+        x: ca.MX,
+        p: ca.MX,
+        sigma: ca.MX,
+        lam_f: ca.MX,
+        gradient: _Gather,
+        hessian: _Gather,
+    ) -> ca.MX:
+        """Add the readings of one leg to gradient and Hessian; returns their objective.
+
+        Local variables are u = (θ̂, ẑ, q̂) in the order that they have in x.
+        """
+        problem, o = self.problem, self.problem.observations
+        count, n_t = piece.entries.size, piece.theta_index.size
+        postures = o.posture[piece.entries]
+        variables = np.hstack(
+            [
+                np.tile(piece.theta_index, (count, 1)),
+                (self._n_theta + o.zero[piece.entries])[:, None],
+                self._passive_variables(postures, piece.passive_index),
+            ]
+        )
+        objective_f, hessian_f = self._reading_functions(piece)
+        shared = [objective_f.index_in("theta"), objective_f.index_in("sigma")]
+        arguments = [
+            x[piece.theta_index.tolist()],
+            x[variables[:, n_t].tolist()].T,
+            ca.reshape(x[variables[:, n_t + 1 :].reshape(-1).tolist()], -1, count),
+            p[piece.entries.tolist()].T,
+            sigma,
+            ca.MX(ca.DM(problem.drives[postures].T)),
+            ca.MX(ca.DM(problem.setup_columns[o.setup[piece.entries]].T)),
+        ]
+        masks = [i in shared for i in range(len(arguments))]
+        # objective and the part of the gradient by θ̂ are sums over readings
+        total, by_theta, by_local = objective_f.map(count, masks, [True, True, False])(*arguments)
+        zeros = np.zeros_like(piece.theta_index)
+        gradient.add(piece.theta_index, zeros, by_theta)
+        local = variables[:, n_t:]
+        gradient.add(local, np.zeros_like(local), ca.vec(by_local))
+
+        by_theta_theta, by_rest = hessian_f.map(count, masks, [True, False])(*arguments)
+        rows, columns = _triangle(n_t)
+        hessian.add(
+            piece.theta_index[rows], piece.theta_index[columns], lam_f * by_theta_theta
+        )
+        rows, columns = _rest_of_triangle(variables.shape[1], n_t)
+        hessian.add(variables[:, rows], variables[:, columns], lam_f * ca.vec(by_rest))
+        return total
+
+    def _reading_functions(self, piece: ReadingPiece) -> tuple[ca.Function, ca.Function]:
+        """(objective, gradient by θ̂, gradient by ẑ and q̂) and Hessian parts of one reading."""
+        zero, y, sigma = ca.SX.sym("zero"), ca.SX.sym("y"), ca.SX.sym("sigma")
+        n_t = piece.theta.numel()
+        u = ca.vertcat(piece.theta, zero, piece.passive)
+        residual = (y - piece.reading - zero * LENGTH_SCALE) / sigma
+        objective = 0.5 * residual**2
+        slope = ca.densify(ca.jacobian(residual, u))
+        gradient = residual * slope.T
+        if self.options.hessian == "exact":
+            second = ca.densify(ca.hessian(objective, u)[0])
+        else:
+            second = slope.T @ slope
+        inputs = [piece.theta, zero, piece.passive, y, sigma, piece.drives, piece.setup]
+        names = ["theta", "zero", "passive", "y", "sigma", "drives", "setup"]
+        first_f = ca.Function(
+            f"reading_{piece.leg}",
+            inputs,
+            [objective, gradient[:n_t], gradient[n_t:]],
+            names,
+            ["objective", "by_theta", "by_local"],
+        )
+
+        def pick(rows: Indices, columns: Indices) -> ca.SX:
+            return ca.vertcat(
+                *(second[int(i), int(j)] for i, j in zip(rows, columns, strict=True))
+            )
+
+        second_f = ca.Function(
+            f"reading_hessian_{piece.leg}",
+            inputs,
+            [pick(*_triangle(n_t)), pick(*_rest_of_triangle(u.numel(), n_t))],
+            names,
+            ["theta_theta", "rest"],
+        )
+        return first_f, second_f
+
+    def _add_closures(
+        self, x: ca.MX, lam_g: ca.MX, hessian: _Gather
+    ) -> tuple[ca.MX, ca.MX]:
+        """Closures of all postures and their Jacobian; their curvature goes into the Hessian."""
+        problem = self.problem
+        k, n_p = problem.n_postures, self._n_passive
+        n_g = problem.robot.closure_rows
+        piece = problem.posture_piece
+        u = ca.vertcat(piece.theta, piece.passive)
+        slope = ca.jacobian(piece.closure, u)
+        pattern_rows, pattern_columns = (np.array(v) for v in slope.sparsity().get_triplet())
+        closure_f = ca.Function(
+            "closure",
+            [piece.theta, piece.passive, piece.drives],
+            [piece.closure],
+            ["theta", "passive", "drives"],
+            ["closure"],
+        )
+        slope_f = ca.Function(
+            "closure_jacobian",
+            [piece.theta, piece.passive, piece.drives],
+            [ca.densify(piece.closure), ca.densify(slope.nz[:])],
+            ["theta", "passive", "drives"],
+            ["closure", "nonzeros"],
+        )
+        first = self._n_theta + self._n_zeros
+        arguments = [
+            x[: self._n_theta],
+            ca.reshape(x[first:], n_p, k),
+            ca.MX(ca.DM(problem.drives.T)),
+        ]
+        masks = [True, False, False]
+        constraints = ca.vec(closure_f.map(k, masks, [False])(*arguments))
+        _, nonzeros = slope_f.map(k, masks, [False, False])(*arguments)
+
+        postures = np.arange(k)
+        variables = np.hstack(
+            [
+                np.tile(np.arange(self._n_theta), (k, 1)),
+                self._passive_variables(postures, np.arange(n_p)),
+            ]
+        )
+        rows = postures[:, None] * n_g + pattern_rows[None, :]
+        jacobian = _Gather(k * n_g, x.numel())
+        jacobian.add(rows, variables[:, pattern_columns], ca.vec(nonzeros))
+
+        if self.options.hessian == "exact":
+            multiplier = ca.SX.sym("multiplier", n_g)
+            second = ca.triu(ca.hessian(ca.dot(multiplier, piece.closure), u)[0])
+            rows, columns = (np.array(v) for v in second.sparsity().get_triplet())
+            shared = columns < self._n_theta
+            second_f = ca.Function(
+                "closure_hessian",
+                [piece.theta, piece.passive, piece.drives, multiplier],
+                [
+                    ca.densify(second.nz[np.flatnonzero(part).tolist()])
+                    for part in (shared, ~shared)
+                ],
+            )
+            summed, local = second_f.map(k, [*masks, False], [True, False])(
+                *arguments, ca.reshape(lam_g, n_g, k)
+            )
+            hessian.add(rows[shared], columns[shared], summed)
+            hessian.add(variables[:, rows[~shared]], variables[:, columns[~shared]], ca.vec(local))
+        return constraints, jacobian.build()
+
+
+def _triangle(n: int) -> tuple[Indices, Indices]:
+    """Rows and columns of an upper triangle."""
+    rows, columns = np.triu_indices(n)
+    return rows.astype(np.int64), columns.astype(np.int64)
+
+
+def _rest_of_triangle(n: int, n_first: int) -> tuple[Indices, Indices]:
+    """The upper triangle of n variables without that of the first ones."""
+    rows, columns = _triangle(n)
+    rest = columns >= n_first
+    return rows[rest], columns[rest]

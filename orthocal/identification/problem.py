@@ -1,0 +1,359 @@
+"""The calibration problem: which errors are free, and the scaled pieces its solvers are made of.
+
+    min over θ, z, q_1..q_K   ½ Σ ((y − h(q_k, θ) − z)/σ)² + ½ Σ (θ/tolerance)²
+    s.t.                      g(q_k, θ) = 0 for every posture k
+
+A problem is made of two kinds of piece: one posture (its closures) and one reading of a leg. Both
+are CasADi expressions in scaled variables of order one:
+
+    θ̂ = θ/tolerance,  q̂ = q · (1 or characteristic length)/1 mm,  ĝ = g · (1 or length)/1 mm
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.errors import SessionError
+from orthocal.measurement.gauge import (
+    Observations,
+    build_observations,
+    drive_table,
+    reading_expression,
+    setup_columns,
+)
+from orthocal.measurement.session import Session
+from orthocal.robot.assembly import Assembly
+from orthocal.robot.batch import BatchFunction
+from orthocal.robot.parameters import Parameter
+from orthocal.robot.symbolic import SymbolicRobot, closure_row_units, coordinate_units
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+LENGTH_SCALE = 1e-3
+"""What closures, passive motions and gauge zeros are scaled by, [m]."""
+
+PRIOR_BY_DEFAULT = {"offsets": False}
+"""Models without a prior by default; all others have one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosturePiece:
+    """The closures of one posture."""
+
+    passive: ca.SX
+    """q̂, shape (n_passive,)."""
+    drives: ca.SX
+    """Commanded drive coordinates, shape (n_drives,), [m, rad]."""
+    theta: ca.SX
+    """θ̂ of all free parameters, shape (n_free,)."""
+    closure: ca.SX
+    """ĝ, shape (closure_rows,)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadingPiece:
+    """One reading on one leg, in the few variables that it depends on."""
+
+    leg: str
+    entries: Indices
+    """Entries of the observations that are on this leg, shape (n,)."""
+    passive_index: Indices
+    """Which passive coordinates it depends on."""
+    theta_index: Indices
+    """Which free parameters it depends on."""
+    passive: ca.SX
+    """Those q̂."""
+    theta: ca.SX
+    """Those θ̂."""
+    drives: ca.SX
+    """Commanded drive coordinates of the posture, shape (n_drives,), [m, rad]."""
+    setup: ca.SX
+    """Constants of the setup, shape (5,): direction, plane, from_root."""
+    reading: ca.SX
+    """h, [m]."""
+
+
+class CalibrationProblem:
+    """Readings of a session, and the error parameters they are to determine.
+
+    Args:
+        session: The session.
+        free: Names of the free parameters.
+        prior: Whether tolerances act as a prior with mean 0.
+        fixed: Known values of other parameters, [unit of the parameter].
+
+    Raises:
+        SessionError: If there is nothing to identify.
+        ParameterError: If a name is unknown.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        free: Sequence[str],
+        prior: bool,
+        fixed: Mapping[str, float] | None = None,
+    ) -> None:
+        if not free:
+            raise SessionError("no free parameters: there is nothing to identify")
+        self.session = session
+        self.robot = session.robot
+        self.free = tuple(free)
+        self.prior = prior
+        self.parameters: tuple[Parameter, ...] = tuple(
+            self.robot.parameters[name] for name in self.free
+        )
+        self.fixed = {k: v for k, v in (fixed or {}).items() if k not in self.free}
+        self.robot.parameters.expand(self.fixed)  # refuses unknown names
+        self.observations: Observations = build_observations(session)
+        self.drives = drive_table(session)
+        self.setup_columns = setup_columns(session)
+        self.theta_scale = np.array([p.tolerance for p in self.parameters])
+        self.passive_scale = (
+            LENGTH_SCALE / coordinate_units(self.robot)[self.robot.passive_index]
+        )
+
+    @property
+    def n_free(self) -> int:
+        """Number of free parameters."""
+        return len(self.free)
+
+    @property
+    def n_postures(self) -> int:
+        """Number of postures."""
+        return len(self.drives)
+
+    @cached_property
+    def reference(self) -> Array:
+        """Parameters that the controller already corrects, shape (n_free,), [SI].
+
+        The point of linearisation and the default start: nominal where the controller has no
+        offsets.
+        """
+        active = dict(
+            zip(
+                (f"{d.name}.offset" for d in self.robot.drives),
+                self.session.active_offsets,
+                strict=True,
+            )
+        )
+        return np.array([active.get(name, 0.0) for name in self.free])
+
+    @cached_property
+    def values(self) -> Array:
+        """Readings as single ones, shape (n_entries,), [m]."""
+        return self.observations.values(self.session.values)
+
+    @cached_property
+    def zero_incidence(self) -> Array:
+        """1 where an entry (row) has a zero (column), shape (n_entries, n_zeros)."""
+        result = np.zeros((self.observations.size, self.observations.n_zeros))
+        result[np.arange(self.observations.size), self.observations.zero] = 1.0
+        return result
+
+    @cached_property
+    def assembly(self) -> Assembly:
+        """Closes the loops for given values of the free parameters."""
+        return Assembly(self.robot, free=self.free, fixed=self.fixed)
+
+    def close(self, theta: ArrayLike, *, start: Array | None = None) -> Array:
+        """Passive coordinates of every posture, shape (n_postures, n_passive), [m, rad].
+
+        Raises:
+            ClosureError: If the machine with these errors cannot reach a posture.
+        """
+        names = list(self.session.postures)
+        return self.assembly.close(self.drives, theta=theta, start=start, names=names)
+
+    @cached_property
+    def posture_piece(self) -> PosturePiece:
+        """The closures of one posture."""
+        drives, passive, theta = self._symbols()
+        machine = self._machine(drives, passive, theta)
+        scale = closure_row_units(self.robot) / LENGTH_SCALE
+        return PosturePiece(passive, drives, theta, machine.closure_residual() * scale)
+
+    @cached_property
+    def reading_pieces(self) -> tuple[ReadingPiece, ...]:
+        """The readings, leg by leg; legs that are not read are left out."""
+        drives, passive, theta = self._symbols()
+        machine = self._machine(drives, passive, theta)
+        nominal = ca.SX(self.robot.zero[self.robot.passive_index] / self.passive_scale)
+        at_zero = self._machine(ca.SX(self.session.zero_drives), nominal, theta)
+        leg_names = list(self.robot.legs)
+        leg_of_setup = np.array(
+            [leg_names.index(s.leg) for s in self.session.setups.values()], dtype=np.int64
+        )
+        pieces = []
+        for i, leg in enumerate(self.robot.legs.values()):
+            entries = np.flatnonzero(leg_of_setup[self.observations.setup] == i)
+            if not entries.size:
+                continue
+            setup = ca.SX.sym("setup", 5)
+            h = reading_expression(
+                leg,
+                machine,
+                at_zero,
+                direction=setup[:3],
+                plane=setup[3],
+                from_root=setup[4],
+            )
+            used_passive = _dependencies(h, passive)
+            used_theta = _dependencies(h, theta)
+            pieces.append(
+                ReadingPiece(
+                    leg=leg.name,
+                    entries=entries,
+                    passive_index=used_passive,
+                    theta_index=used_theta,
+                    passive=passive[used_passive.tolist()],
+                    theta=theta[used_theta.tolist()],
+                    drives=drives,
+                    setup=setup,
+                    reading=h,
+                )
+            )
+        return tuple(pieces)
+
+    def predict(self, theta: ArrayLike, passive: Array | None = None) -> Array:
+        """Readings h(q(θ), θ) of all entries, gauge zeros at 0, shape (n_entries,), [m]."""
+        q = self.close(theta) if passive is None else passive
+        return self._evaluate_readings(np.asarray(theta), q)[0]
+
+    def linearise(
+        self, theta: ArrayLike, passive: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Readings and identification Jacobian at given parameters.
+
+        The passive coordinates are eliminated by the implicit function theorem,
+        ∂q/∂θ = −g_q⁻¹ g_θ, so that J = h_θ − h_q g_q⁻¹ g_θ.
+
+        Args:
+            theta: Shape (n_free,), [SI].
+            passive: Passive coordinates with closed loops at theta; closed here by default.
+
+        Returns:
+            Readings, shape (n_entries,), [m], and dh/dθ̂, shape (n_entries, n_free),
+            [m per tolerance].
+
+        Raises:
+            ClosureError: If the machine with these errors cannot reach a posture.
+        """
+        q = self.close(theta) if passive is None else passive
+        h, by_passive, by_theta = self._evaluate_readings(np.asarray(theta), q)
+        theta_hat = np.asarray(theta) / self.theta_scale
+        g_q, g_theta = self._closure_jacobians(q / self.passive_scale, self.drives, theta_hat)
+        if g_q.shape[1] == g_q.shape[2]:
+            slopes = -np.linalg.solve(g_q, g_theta)
+        else:
+            slopes = -np.linalg.pinv(g_q, rcond=1e-10) @ g_theta
+        jacobian = by_theta
+        for start in range(0, len(jacobian), 1024):
+            part = slice(start, start + 1024)
+            chosen = slopes[self.observations.posture[part]]
+            jacobian[part] += np.einsum("ni,nij->nj", by_passive[part], chosen)
+        return h, jacobian
+
+    def split_errors(self, theta: ArrayLike) -> dict[str, float]:
+        """Parameter name to value, free and fixed, [SI]."""
+        return {**self.fixed, **dict(zip(self.free, np.asarray(theta).tolist(), strict=True))}
+
+    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        return (
+            ca.SX.sym("drives", len(self.robot.drives)),
+            ca.SX.sym("passive", self.robot.passive_index.size),
+            ca.SX.sym("theta", self.n_free),
+        )
+
+    def _machine(self, drives: ca.SX, passive: ca.SX, theta: ca.SX) -> SymbolicRobot:
+        errors: dict[str, ca.SX | float] = dict(self.fixed)
+        errors.update(
+            {name: theta[i] * self.theta_scale[i] for i, name in enumerate(self.free)}
+        )
+        return SymbolicRobot(
+            self.robot, drives=drives, passive=passive * self.passive_scale, errors=errors
+        )
+
+    @cached_property
+    def _closure_jacobians(self) -> BatchFunction:
+        piece = self.posture_piece
+        inputs = [piece.passive, piece.drives, piece.theta]
+        outputs = [ca.jacobian(piece.closure, piece.passive), ca.jacobian(piece.closure, piece.theta)]
+        function = ca.Function("closure_jacobians", inputs, outputs, ["q", "d", "theta"], ["a", "b"])
+        return BatchFunction(function, shared=["theta"])
+
+    @cached_property
+    def _reading_functions(self) -> tuple[BatchFunction, ...]:
+        functions = []
+        for piece in self.reading_pieces:
+            inputs = [piece.passive, piece.drives, piece.theta, piece.setup]
+            outputs = [
+                piece.reading,
+                ca.jacobian(piece.reading, piece.passive),
+                ca.jacobian(piece.reading, piece.theta),
+            ]
+            function = ca.Function(
+                "reading", inputs, outputs, ["q", "d", "theta", "setup"], ["h", "h_q", "h_theta"]
+            )
+            functions.append(BatchFunction(function, shared=["theta"]))
+        return tuple(functions)
+
+    def _evaluate_readings(self, theta: Array, passive: Array) -> tuple[Array, Array, Array]:
+        """h, ∂h/∂q̂ and ∂h/∂θ̂ at fixed q, shapes (n,), (n, n_passive), (n, n_free)."""
+        o = self.observations
+        h = np.zeros(o.size)
+        by_passive = np.zeros((o.size, self.robot.passive_index.size))
+        by_theta = np.zeros((o.size, self.n_free))
+        theta_hat = theta / self.theta_scale
+        q_hat = passive / self.passive_scale
+        for piece, function in zip(self.reading_pieces, self._reading_functions, strict=True):
+            n, postures = piece.entries, o.posture[piece.entries]
+            value, h_q, h_theta = function(
+                q_hat[postures][:, piece.passive_index],
+                self.drives[postures],
+                theta_hat[piece.theta_index],
+                self.setup_columns[o.setup[n]],
+            )
+            h[n] = value[:, 0]
+            by_passive[np.ix_(n, piece.passive_index)] = h_q.reshape(len(n), -1)
+            by_theta[np.ix_(n, piece.theta_index)] = h_theta.reshape(len(n), -1)
+        return h, by_passive, by_theta
+
+
+def build_problem(
+    session: Session,
+    *,
+    model: str = "offsets",
+    prior: bool | None = None,
+    fixed: Mapping[str, float] | None = None,
+) -> CalibrationProblem:
+    """The problem of a named model of the robot.
+
+    Args:
+        session: The session.
+        model: A model of the robot's YAML.
+        prior: Whether tolerances act as a prior; by default not for `offsets`, else yes.
+        fixed: Known values of parameters, which are then not free, [SI].
+
+    Raises:
+        ParameterError: If the robot has no such model.
+    """
+    known = dict(fixed or {})
+    free = [n for n in session.robot.parameters.select_model(model) if n not in known]
+    use_prior = PRIOR_BY_DEFAULT.get(model, True) if prior is None else prior
+    return CalibrationProblem(session, free=free, prior=use_prior, fixed=known)
+
+
+def _dependencies(expression: ca.SX, symbols: ca.SX) -> Indices:
+    """Indices of the symbols that an expression contains."""
+    present = {s.__hash__() for s in ca.symvar(expression)}
+    found = [i for i in range(symbols.numel()) if symbols[i].__hash__() in present]
+    return np.array(found, dtype=np.int64)
