@@ -1,3 +1,71 @@
-"""orthocal: calibration of Orthoglide-type parallel robots from dial-indicator readings."""
+"""orthocal: calibration of Orthoglide-type parallel robots from dial-indicator readings.
+
+    session = orthocal.load_session("examples/table1/experiment-2")
+    calibration = orthocal.calibrate(session)
+    print(orthocal.summarize(calibration))
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "Calibration": "orthocal.identification.calibration",
+    "OrthocalError": "orthocal.errors",
+    "Robot": "orthocal.robot.model",
+    "Session": "orthocal.measurement.session",
+    "SolverOptions": "orthocal.identification.nlp",
+    "calibrate": "orthocal.identification.calibrate",
+    "draw_errors": "orthocal.measurement.synthetic",
+    "load_calibration": "orthocal.identification.calibration",
+    "load_plan": "orthocal.measurement.session",
+    "load_robot": "orthocal.robot.model",
+    "load_session": "orthocal.measurement.session",
+    "simulate_session": "orthocal.measurement.synthetic",
+    "summarize": "orthocal.output.summary",
+    "validate_calibration": "orthocal.study.validation",
+    "write_session": "orthocal.measurement.session",
+}
+
+__all__ = [
+    "Calibration",
+    "OrthocalError",
+    "Robot",
+    "Session",
+    "SolverOptions",
+    "calibrate",
+    "draw_errors",
+    "load_calibration",
+    "load_plan",
+    "load_robot",
+    "load_session",
+    "simulate_session",
+    "summarize",
+    "validate_calibration",
+    "write_session",
+]
+
+if TYPE_CHECKING:
+    from orthocal.errors import OrthocalError
+    from orthocal.identification.calibrate import calibrate
+    from orthocal.identification.calibration import Calibration, load_calibration
+    from orthocal.identification.nlp import SolverOptions
+    from orthocal.measurement.session import Session, load_plan, load_session, write_session
+    from orthocal.measurement.synthetic import draw_errors, simulate_session
+    from orthocal.output.summary import summarize
+    from orthocal.robot.model import Robot, load_robot
+    from orthocal.study.validation import validate_calibration
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401 - any of the names above
+    """Import what is asked for when it is asked for: start-up stays fast."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'orthocal' has no attribute '{name}'")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

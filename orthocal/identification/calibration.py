@@ -1,0 +1,563 @@
+"""The result of a calibration, in memory and as calibration.json.
+
+It holds all that a report, a scene or an export needs: none of them asks for the session again.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+from orthocal.documents import read_json, validate, write_text
+from orthocal.errors import CalibrationFileError
+from orthocal.identification.uncertainty import NoiseSource, confidence_factor
+from orthocal.robot.assembly import Assembly
+from orthocal.robot.model import Robot, load_robot, packaged_robots, read_only
+from orthocal.robot.parameters import EDGE_UNITS, Unit
+
+Array = NDArray[np.float64]
+
+SCHEMA = "orthocal/calibration/1"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotRecord:
+    """The robot that was calibrated."""
+
+    name: str
+    reference: str
+    """As the session names it: a packaged name or a path."""
+    folder: str | None
+    """Folder of a robot that does not come with orthocal."""
+    sha256: str
+    """Of its URDF and YAML."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionRecord:
+    """The session that it was calibrated from."""
+
+    path: str | None
+    title: str
+    source: str
+    sha256: str
+    gauge_sigma: float | None
+    """[m]."""
+    gauge_resolution: float | None
+    """[m]."""
+    controller_offsets: tuple[float, ...] | None
+    """Offsets active in the controller, [m, rad]; None where not stated."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolverRecord:
+    """How the exact solution was found."""
+
+    name: str
+    status: str
+    iterations: int
+    seconds: float
+    """Building and solving."""
+    hessian: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ParameterEstimate:
+    """One error parameter."""
+
+    name: str
+    unit: Unit
+    value: float
+    """Exact estimate, [unit]."""
+    linear: float
+    """Linearised estimate, [unit]."""
+    std: float
+    """Standard deviation, [unit]; NaN if nothing tells."""
+    tolerance: float
+    """One standard deviation before the calibration, [unit]."""
+    free: bool
+    identifiable: bool
+    """Whether the readings alone determine it."""
+
+    @property
+    def edge_unit(self) -> str:
+        """Unit in which people read it."""
+        return EDGE_UNITS[self.unit][0]
+
+    @property
+    def edge_factor(self) -> float:
+        """Factor to the unit in which people read it."""
+        return EDGE_UNITS[self.unit][1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseRecord:
+    """Standard deviation of one reading of the indicator; see `uncertainty.Noise`."""
+
+    reading_sigma: float
+    """[m]; a difference of two readings has √2 of it."""
+    source: NoiseSource
+    cycles_sigma: float
+    cycles_dof: int
+    residual_sigma: float
+    residual_dof: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResidualRow:
+    """One row of the session's readings; measured = nominal + deviation = predicted + residual."""
+
+    setup: str
+    posture: str
+    minus: str | None
+    cycle: int
+    measured: float
+    """[m]."""
+    nominal: float
+    """What the machine would show as the controller knows it, with the best gauge zero, [m]."""
+    linear: float
+    """The same for the linearised estimate, [m]."""
+    predicted: float
+    """The same for the calibrated machine, [m]."""
+
+    @property
+    def deviation(self) -> float:
+        """Measured less nominal, [m]: the residual before calibration."""
+        return self.measured - self.nominal
+
+    @property
+    def residual(self) -> float:
+        """Measured less predicted, [m]: the residual after calibration."""
+        return self.measured - self.predicted
+
+    @property
+    def label(self) -> str:
+        """Setup and postures in words."""
+        return f"{self.setup} {self.posture}" + (f" − {self.minus}" if self.minus else "")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PostureRecord:
+    """A posture of the session."""
+
+    name: str
+    drives: tuple[float, ...]
+    """Commanded drive coordinates, controller offsets taken off, [m, rad]."""
+    passive: tuple[float, ...]
+    """Passive coordinates of the calibrated machine, [m, rad]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SetupRecord:
+    """A setup of the session."""
+
+    name: str
+    leg: str
+    direction: str
+    section_form: str
+    section_value: float
+    """[m], or 1 for a fraction."""
+    zero: float | None
+    """Estimated zero of the gauge, [m]; None where only differences were given."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ControllerEntry:
+    """What to enter into the controller for one drive."""
+
+    drive: str
+    unit: Unit
+    active: float | None
+    """Offset now in the controller, [unit]; None where the session does not say."""
+    enter: float
+    """Offset to enter, [unit]; what to add to the present one where that is not known."""
+    change: float
+    """enter − active, [unit]."""
+    std: float
+    """[unit]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """Identified error parameters of a robot, with their uncertainty and provenance."""
+
+    robot_record: RobotRecord
+    session: SessionRecord
+    model: str
+    prior: bool
+    """Whether tolerances acted as a prior."""
+    solver: SolverRecord
+    parameters: tuple[ParameterEstimate, ...]
+    """Free parameters, then those held at a known value."""
+    covariance: Array
+    """Of the free parameters, shape (n_free, n_free), [SI]."""
+    noise: NoiseRecord
+    sigma: float
+    """Standard deviation of one row of the readings, [m]: of a difference where all are."""
+    dof: float
+    """Degrees of freedom of sigma."""
+    rows_are_differences: bool
+    residuals: tuple[ResidualRow, ...]
+    postures: tuple[PostureRecord, ...]
+    setups: tuple[SetupRecord, ...]
+    version: str
+    """Of orthocal."""
+    path: Path | None = None
+    """Where it was loaded from."""
+    _robot: list[Robot] = field(default_factory=list)
+
+    def __getitem__(self, name: str) -> ParameterEstimate:
+        for p in self.parameters:
+            if p.name == name:
+                return p
+        raise KeyError(name)
+
+    @property
+    def free(self) -> tuple[ParameterEstimate, ...]:
+        """Free parameters, in the order of the covariance."""
+        return tuple(p for p in self.parameters if p.free)
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Parameter name to exact estimate, [SI]."""
+        return {p.name: p.value for p in self.parameters}
+
+    @property
+    def rms_before(self) -> float:
+        """Root mean square of the deviations, [m]."""
+        return _rms([r.deviation for r in self.residuals])
+
+    @property
+    def rms_after(self) -> float:
+        """Root mean square of the residuals, [m]."""
+        return _rms([r.residual for r in self.residuals])
+
+    @property
+    def largest_before(self) -> float:
+        """Largest absolute deviation, [m]."""
+        return max(abs(r.deviation) for r in self.residuals)
+
+    @property
+    def largest_after(self) -> float:
+        """Largest absolute residual, [m]."""
+        return max(abs(r.residual) for r in self.residuals)
+
+    @property
+    def row_factor(self) -> float:
+        """Standard deviation of a row over that of one reading: √2 if all rows are differences."""
+        return math.sqrt(2.0) if self.rows_are_differences else 1.0
+
+    @property
+    def confidence_factor(self) -> float:
+        """Standard deviations on either side of an estimate in its 95 % interval."""
+        return confidence_factor(self.dof)
+
+    @property
+    def robot(self) -> Robot:
+        """The nominal robot.
+
+        Raises:
+            RobotError: If it cannot be found or loaded.
+            CalibrationFileError: If its files are not those that were calibrated.
+        """
+        if not self._robot:
+            self._robot.append(self._load_robot())
+        return self._robot[0]
+
+    def controller_entries(self) -> tuple[ControllerEntry, ...]:
+        """What to enter into the controller; empty where no offset was identified."""
+        active = self.session.controller_offsets
+        entries = []
+        for i, drive in enumerate(self.robot.drives):
+            estimate = next((p for p in self.parameters if p.name == f"{drive.name}.offset"), None)
+            if estimate is None:
+                continue
+            now = None if active is None else active[i]
+            change = estimate.value - (now or 0.0)
+            entries.append(
+                ControllerEntry(
+                    drive.name, drive.unit, now, estimate.value, change, estimate.std
+                )
+            )
+        return tuple(entries)
+
+    def forward(self, joints: ArrayLike) -> Array:
+        """Tool centre point of the calibrated machine.
+
+        Args:
+            joints: Drive coordinates as the encoders give them, without any offset of the
+                controller, shape (K, n_drives) or (n_drives,), [m, rad].
+
+        Returns:
+            Shape (K, 3) or (3,), [m].
+
+        Raises:
+            ClosureError: If the machine cannot be at such coordinates.
+        """
+        return Assembly(self.robot, fixed=self.errors).forward(joints)
+
+    def inverse(self, points: ArrayLike) -> Array:
+        """Drive coordinates that bring the calibrated machine's tool to given points.
+
+        Args:
+            points: Shape (K, n_drives) or (n_drives,), [m].
+
+        Returns:
+            Drive coordinates as the encoders give them, shape (K, n_drives) or (n_drives,).
+
+        Raises:
+            ClosureError: If a point cannot be reached.
+        """
+        return Assembly(self.robot, fixed=self.errors).inverse(points)
+
+    def to_document(self) -> dict[str, Any]:
+        """As plain data: the content of calibration.json."""
+        return {
+            "schema": SCHEMA,
+            "orthocal": self.version,
+            "robot": _plain(self.robot_record),
+            "session": _plain(self.session),
+            "model": self.model,
+            "prior": self.prior,
+            "solver": _plain(self.solver),
+            "parameters": [_plain(p) for p in self.parameters],
+            "covariance": [[_number(v) for v in row] for row in self.covariance.tolist()],
+            "sigma": _number(self.sigma),
+            "dof": _number(self.dof),
+            "noise": _plain(self.noise),
+            "rows_are_differences": self.rows_are_differences,
+            "rms_before": self.rms_before,
+            "rms_after": self.rms_after,
+            "largest_before": self.largest_before,
+            "largest_after": self.largest_after,
+            "residuals": [{**_plain(r), "residual": r.residual} for r in self.residuals],
+            "postures": [_plain(p) for p in self.postures],
+            "setups": [_plain(s) for s in self.setups],
+        }
+
+    def to_json(self) -> str:
+        """As the text of calibration.json."""
+        return json.dumps(self.to_document(), indent=1, allow_nan=False) + "\n"
+
+    def save(self, path: str | Path) -> Path:
+        """Write calibration.json.
+
+        Raises:
+            OrthocalError: If it cannot be written.
+        """
+        write_text(Path(path), self.to_json())
+        return Path(path)
+
+    def _load_robot(self) -> Robot:
+        record = self.robot_record
+        where = None if self.path is None else str(self.path)
+        if record.folder is None:
+            if record.name not in packaged_robots():
+                raise CalibrationFileError(
+                    f"names the robot '{record.name}', which does not come with this orthocal",
+                    where=where,
+                )
+            robot = load_robot(record.name)
+        else:
+            folder = Path(record.folder)
+            if not folder.is_dir() and self.path is not None:
+                folder = self.path.parent / record.reference
+            robot = load_robot(folder)
+        if robot.sha256 != record.sha256:
+            raise CalibrationFileError(
+                f"was made for another version of robot '{record.name}': the files in "
+                f"{robot.folder} have changed since",
+                where=where,
+            )
+        return robot
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """Read a calibration.json, or the one in a folder.
+
+    Raises:
+        CalibrationFileError: Naming file and key, what was found and what was expected.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = file / "calibration.json"
+    data = read_json(file, error=CalibrationFileError)
+    if isinstance(data, Mapping) and data.get("schema") != SCHEMA:
+        raise CalibrationFileError(
+            f"schema is '{data.get('schema')}'; expected '{SCHEMA}'", where=str(file)
+        )
+    keys = validate(_CalibrationKeys, data, where=str(file), error=CalibrationFileError)
+    free = [p for p in keys.parameters if p.free]
+    covariance = [[math.nan if v is None else v for v in row] for row in keys.covariance]
+    if len(covariance) != len(free) or any(len(row) != len(free) for row in covariance):
+        raise CalibrationFileError(
+            f"expected {len(free)} × {len(free)} numbers, as free parameters", where=f"{file}: covariance"
+        )
+    if not keys.residuals:
+        raise CalibrationFileError("is empty", where=f"{file}: residuals")
+    return Calibration(
+        robot_record=RobotRecord(**keys.robot.model_dump()),
+        session=SessionRecord(
+            **{
+                **keys.session.model_dump(),
+                "controller_offsets": None
+                if keys.session.controller_offsets is None
+                else tuple(keys.session.controller_offsets),
+            }
+        ),
+        model=keys.model,
+        prior=keys.prior,
+        solver=SolverRecord(**keys.solver.model_dump()),
+        parameters=tuple(
+            ParameterEstimate(**{**p.model_dump(), "std": _float(p.std)}) for p in keys.parameters
+        ),
+        covariance=read_only(np.array(covariance).reshape(len(free), len(free))),
+        noise=NoiseRecord(
+            **{k: _float(v) if v is None else v for k, v in keys.noise.model_dump().items()}
+        ),
+        sigma=_float(keys.sigma),
+        dof=math.inf if keys.dof is None else keys.dof,
+        rows_are_differences=keys.rows_are_differences,
+        residuals=tuple(
+            ResidualRow(**{k: v for k, v in r.model_dump().items() if k != "residual"})
+            for r in keys.residuals
+        ),
+        postures=tuple(
+            PostureRecord(p.name, tuple(p.drives), tuple(p.passive)) for p in keys.postures
+        ),
+        setups=tuple(SetupRecord(**s.model_dump()) for s in keys.setups),
+        version=keys.orthocal,
+        path=file,
+    )
+
+
+def _rms(values: list[float]) -> float:
+    return math.sqrt(sum(v * v for v in values) / len(values))
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _float(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _plain(record: Any) -> dict[str, Any]:  # noqa: ANN401 - any of the records above
+    result = {}
+    for name in record.__slots__:
+        value = getattr(record, name)
+        if isinstance(value, float):
+            value = _number(value)
+        elif isinstance(value, tuple):
+            value = list(value)
+        result[name] = value
+    return result
+
+
+class _Keys(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class _RobotKeys(_Keys):
+    name: str
+    reference: str
+    folder: str | None
+    sha256: str
+
+
+class _SessionKeys(_Keys):
+    path: str | None
+    title: str
+    source: str
+    sha256: str
+    gauge_sigma: FiniteFloat | None
+    gauge_resolution: FiniteFloat | None
+    controller_offsets: list[FiniteFloat] | None
+
+
+class _SolverKeys(_Keys):
+    name: str
+    status: str
+    iterations: int
+    seconds: FiniteFloat
+    hessian: str
+
+
+class _ParameterKeys(_Keys):
+    name: str
+    unit: Literal["m", "rad", "1"]
+    value: FiniteFloat
+    linear: FiniteFloat
+    std: FiniteFloat | None
+    tolerance: FiniteFloat
+    free: bool
+    identifiable: bool
+
+
+class _NoiseKeys(_Keys):
+    reading_sigma: FiniteFloat | None
+    source: Literal["cycles", "residuals", "gauge", "unknown"]
+    cycles_sigma: FiniteFloat | None
+    cycles_dof: int
+    residual_sigma: FiniteFloat | None
+    residual_dof: FiniteFloat
+
+
+class _ResidualKeys(_Keys):
+    setup: str
+    posture: str
+    minus: str | None
+    cycle: int
+    measured: FiniteFloat
+    nominal: FiniteFloat
+    linear: FiniteFloat
+    predicted: FiniteFloat
+    residual: FiniteFloat
+
+
+class _PostureKeys(_Keys):
+    name: str
+    drives: list[FiniteFloat]
+    passive: list[FiniteFloat]
+
+
+class _SetupKeys(_Keys):
+    name: str
+    leg: str
+    direction: str
+    section_form: str
+    section_value: FiniteFloat
+    zero: FiniteFloat | None
+
+
+class _CalibrationKeys(_Keys):
+    schema_: Annotated[Literal["orthocal/calibration/1"], Field(alias="schema")]
+    orthocal: str
+    robot: _RobotKeys
+    session: _SessionKeys
+    model: str
+    prior: bool
+    solver: _SolverKeys
+    parameters: Annotated[list[_ParameterKeys], Field(min_length=1)]
+    covariance: list[list[FiniteFloat | None]]
+    sigma: FiniteFloat | None
+    dof: FiniteFloat | None
+    noise: _NoiseKeys
+    rows_are_differences: bool
+    rms_before: FiniteFloat
+    rms_after: FiniteFloat
+    largest_before: FiniteFloat
+    largest_after: FiniteFloat
+    residuals: list[_ResidualKeys]
+    postures: list[_PostureKeys]
+    setups: list[_SetupKeys]
+

@@ -1,0 +1,212 @@
+"""What the readings say of the parameters, and how well: noise, covariance, identifiability.
+
+Everything is in scaled parameters θ̂ = θ/tolerance. Gauge zeros are eliminated exactly: a zero that
+several readings share takes their mean, so what is left of readings and Jacobians is their
+deviation from the mean of their zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from orthocal.errors import NotIdentifiableError
+from orthocal.measurement.gauge import Observations
+
+Array = NDArray[np.float64]
+
+RANK_THRESHOLD = 1e-10
+"""Singular values below this part of the largest count as zero."""
+
+MISFIT_LEVEL = 0.01
+"""Probability below which residuals are too large for repeated cycles to explain (F test)."""
+
+NoiseSource = Literal["cycles", "residuals", "gauge", "unknown"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noise:
+    """Standard deviation of one reading of the indicator, and where it is from."""
+
+    sigma: float
+    """[m]; NaN if nothing tells."""
+    dof: float
+    """Degrees of freedom; infinite for a sigma that was given."""
+    source: NoiseSource
+    cycles_sigma: float
+    """From repeated cycles, [m]; NaN without."""
+    cycles_dof: int
+    residual_sigma: float
+    """√(Σ r²/(m − n)), [m]; NaN without degrees of freedom."""
+    residual_dof: float
+
+    @property
+    def misfit(self) -> bool:
+        """Whether residuals are larger than repeated cycles explain: the model is in error."""
+        return self.source == "residuals" and self.cycles_dof > 0
+
+
+def project_out_zeros(values: Array, observations: Observations) -> Array:
+    """Values less the mean of those that share their gauge zero, shape (n_entries, ...)."""
+    flat = values.reshape(len(values), -1)
+    totals = np.zeros((observations.n_zeros, flat.shape[1]))
+    np.add.at(totals, observations.zero, flat)
+    counts = np.bincount(observations.zero, minlength=observations.n_zeros)
+    means = totals / np.maximum(counts, 1)[:, None]
+    return np.asarray((flat - means[observations.zero]).reshape(values.shape))
+
+
+def estimate_repeatability(values: Array, observations: Observations) -> tuple[float, int]:
+    """Standard deviation of repeated readings of the same setup in the same posture.
+
+    Within a setup the readings are fitted by one value a posture and one zero a group; what is
+    left is noise whatever the machine is like.
+
+    Args:
+        values: Readings as single ones, shape (n_entries,), [m].
+        observations: Which setup, posture and zero each belongs to.
+
+    Returns:
+        Standard deviation [m] (NaN without repetition) and degrees of freedom.
+    """
+    total, dof = 0.0, 0
+    for setup in np.unique(observations.setup):
+        entries = np.flatnonzero(observations.setup == setup)
+        postures, at_posture = np.unique(observations.posture[entries], return_inverse=True)
+        if len(postures) == len(entries):
+            continue
+        zeros, at_zero = np.unique(observations.zero[entries], return_inverse=True)
+        design = np.zeros((len(entries), len(postures) + len(zeros)))
+        rows = np.arange(len(entries))
+        design[rows, at_posture] = 1.0
+        design[rows, len(postures) + at_zero] = 1.0
+        solution, _, rank, _ = np.linalg.lstsq(design, values[entries], rcond=1e-9)
+        left = values[entries] - design @ solution
+        total += float(left @ left)
+        dof += len(entries) - int(rank)
+    return (float(np.sqrt(total / dof)) if dof else float("nan")), dof
+
+
+def estimate_noise(
+    *,
+    repeatability: tuple[float, int],
+    residual_square: float,
+    residual_dof: float,
+    gauge_sigma: float | None,
+) -> Noise:
+    """Standard deviation of a reading: from repeated cycles, else from residuals, else the gauge's.
+
+    Residuals win over cycles where an F test finds them too large for the cycles: then the model
+    is in error, and the spread of the cycles would flatter every standard deviation.
+
+    Args:
+        repeatability: From `estimate_repeatability`.
+        residual_square: Σ r² of single readings, zeros eliminated, [m²].
+        residual_dof: Readings less zeros less (effective) parameters.
+        gauge_sigma: The session's `sigma_mm`, [m].
+    """
+    cycles_sigma, cycles_dof = repeatability
+    enough = residual_dof > 0.5
+    residual_sigma = float(np.sqrt(residual_square / residual_dof)) if enough else float("nan")
+    if cycles_dof > 0:
+        misfit = False
+        if enough and cycles_sigma > 0.0:
+            # the cycles' own scatter is in both: compare the rest with it
+            rest_dof = residual_dof - cycles_dof
+            rest = residual_square - cycles_sigma**2 * cycles_dof
+            if rest_dof > 0.5 and rest > 0.0:
+                ratio = rest / rest_dof / cycles_sigma**2
+                misfit = float(special.fdtrc(rest_dof, cycles_dof, ratio)) < MISFIT_LEVEL
+        source: NoiseSource = "residuals" if misfit else "cycles"
+    elif enough:
+        source = "residuals"
+    else:
+        source = "gauge" if gauge_sigma is not None else "unknown"
+    sigma, dof = {
+        "cycles": (cycles_sigma, float(cycles_dof)),
+        "residuals": (residual_sigma, residual_dof),
+        "gauge": (gauge_sigma or float("nan"), float("inf")),
+        "unknown": (float("nan"), 0.0),
+    }[source]
+    return Noise(
+        sigma, dof, source, cycles_sigma, cycles_dof, residual_sigma, max(residual_dof, 0.0)
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Information:
+    """Singular value decomposition of the identification Jacobian, zeros eliminated."""
+
+    singular_values: Array
+    """Descending, shape (n_free,), padded with zeros, [m per tolerance]."""
+    directions: Array
+    """Right singular vectors as rows, shape (n_free, n_free)."""
+
+    @property
+    def rank(self) -> int:
+        """Number of singular values above RANK_THRESHOLD of the largest."""
+        largest = self.singular_values[0]
+        return int((self.singular_values > RANK_THRESHOLD * largest).sum()) if largest > 0 else 0
+
+    @property
+    def identifiable(self) -> NDArray[np.bool_]:
+        """Whether the readings alone determine a parameter, shape (n_free,)."""
+        null = self.directions[self.rank :]
+        return np.asarray(np.sqrt((null**2).sum(axis=0)) < 1e-6)
+
+    def effective_parameters(self, *, sigma: float, prior: bool) -> float:
+        """Parameters that the readings determine: the rank, or the trace of the prior's share."""
+        if not prior:
+            return float(self.rank)
+        square = self.singular_values**2
+        return float((square / (square + sigma**2)).sum())
+
+    def covariance(self, *, sigma: float, prior: bool) -> Array:
+        """Covariance of θ̂, (Jᵀ J/σ² + P)⁻¹ with P = 1 or 0, shape (n_free, n_free)."""
+        precision = (self.singular_values / sigma) ** 2 + float(prior)
+        variance = np.where(precision > 0.0, 1.0 / np.maximum(precision, 1e-300), np.inf)
+        return np.asarray((self.directions.T * variance) @ self.directions)
+
+
+def decompose(jacobian: Array, observations: Observations) -> Information:
+    """Decompose an identification Jacobian.
+
+    Args:
+        jacobian: dh/dθ̂, shape (n_entries, n_free), [m per tolerance].
+        observations: Which zero each entry has.
+    """
+    projected = project_out_zeros(jacobian, observations)
+    if len(projected) > 2 * projected.shape[1]:  # same singular values, far fewer rows
+        projected = np.linalg.qr(projected, mode="r")
+    _, values, directions = np.linalg.svd(projected, full_matrices=True)
+    padded = np.zeros(projected.shape[1])
+    padded[: len(values)] = values
+    return Information(padded, directions)
+
+
+def require_identifiable(information: Information, names: tuple[str, ...]) -> None:
+    """Refuse a problem without prior whose readings leave parameters undetermined.
+
+    Raises:
+        NotIdentifiableError: Naming the parameters.
+    """
+    lost = tuple(n for n, ok in zip(names, information.identifiable, strict=True) if not ok)
+    if lost:
+        raise NotIdentifiableError(
+            f"the readings do not determine {', '.join(lost)}: "
+            f"{information.rank} of {len(names)} free parameters can be told from them. Read the "
+            "legs that are missing, in postures along their own axes, or use tolerances as a prior",
+            parameters=lost,
+        )
+
+
+def confidence_factor(dof: float, level: float = 0.95) -> float:
+    """Standard deviations on either side of an estimate that hold it with a probability."""
+    tail = 0.5 + level / 2.0
+    if np.isinf(dof):
+        return float(special.ndtri(tail))
+    return float(special.stdtrit(dof, tail)) if dof > 0 else float("inf")

@@ -1,0 +1,175 @@
+"""Readings of a machine whose errors are known. Simulated data always says that it is simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+
+from orthocal.documents import read_yaml, validate
+from orthocal.errors import ParameterError, SessionError
+from orthocal.measurement.gauge import build_observations, predict_entries
+from orthocal.measurement.session import Session, to_mm
+from orthocal.robot.model import Robot
+
+Array = NDArray[np.float64]
+
+LARGEST_ZERO = 0.2e-3
+"""Gauge zeros are drawn from ± this, [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedSession:
+    """A session of simulated readings and what it was simulated from."""
+
+    session: Session
+    errors: Mapping[str, float]
+    """Parameter name to true value, [SI]."""
+    zeros: Mapping[str, float]
+    """Setup to the true zero of its gauge, [m]."""
+
+
+def draw_errors(
+    robot: Robot, patterns: Sequence[str], *, seed: int, tolerances: Mapping[str, float] | None = None
+) -> dict[str, float]:
+    """Errors drawn from the tolerances: independent, normal, with mean 0.
+
+    Args:
+        robot: The robot.
+        patterns: Names or globs of the parameters to draw; '!' takes out.
+        seed: Of the random numbers.
+        tolerances: Other standard deviations, by name, [SI].
+
+    Raises:
+        ParameterError: If a pattern matches nothing.
+    """
+    rng = np.random.default_rng(seed)
+    own = tolerances or {}
+    return {
+        name: float(rng.normal() * own.get(name, robot.parameters[name].tolerance))
+        for name in robot.parameters.select(patterns)
+    }
+
+
+def simulate_session(
+    plan: Session,
+    errors: Mapping[str, float],
+    *,
+    seed: int = 0,
+    sigma: float | None = None,
+    exact: bool = False,
+) -> SimulatedSession:
+    """Readings of a plan (or of another session's rows) on a machine with given errors.
+
+    Args:
+        plan: What is read where.
+        errors: Parameter name to value, [SI]; absent ones are 0.
+        seed: Of noise and gauge zeros.
+        sigma: Standard deviation of a reading, [m]; the plan's gauge by default.
+        exact: No noise, no gauge zeros, no rounding to the gauge's resolution.
+
+    Raises:
+        SessionError: If the noise is not known, or a reading leaves the gauge's range.
+        ClosureError: If the machine cannot reach a posture.
+    """
+    rng = np.random.default_rng(seed)
+    observations = build_observations(plan)
+    entries = predict_entries(plan, observations, errors)
+    zeros = dict.fromkeys(plan.setups, 0.0)
+    if not exact:
+        deviation = plan.gauge.sigma if sigma is None else sigma
+        if deviation is None:
+            raise SessionError(
+                "is missing: the noise to simulate is not known",
+                where="gauge.sigma_mm" if plan.path is None else f"{plan.path}: gauge.sigma_mm",
+            )
+        zeros = {
+            name: round(float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO)), 6) for name in plan.setups
+        }
+        by_setup = np.array(list(zeros.values()))
+        entries = entries + by_setup[observations.setup]
+        entries = entries + deviation * rng.normal(size=observations.size)
+        if plan.gauge.resolution is not None:
+            entries = np.round(entries / plan.gauge.resolution) * plan.gauge.resolution
+    rows = observations.rows(entries)
+    limits = plan.gauge.range
+    if limits is not None:
+        for reading, value in zip(plan.readings, rows, strict=True):
+            lowest, highest = limits if reading.minus is None else (
+                limits[0] - limits[1], limits[1] - limits[0]
+            )
+            if not lowest <= value <= highest:
+                raise SessionError(
+                    f"the simulated reading {reading.label} is {value * 1e3:.3f} mm; the gauge's "
+                    f"range ends at {(lowest if value < lowest else highest) * 1e3:g} mm",
+                    where=None if plan.path is None else f"{plan.path}: gauge.range_mm",
+                )
+    session = replace(
+        plan.with_values(rows),
+        title=plan.title if plan.title.startswith("Simulated") else f"Simulated: {plan.title}",
+        source=f"Simulated by orthocal, not measured (seed {seed})",
+        path=None,
+        readings_path=None,
+    )
+    return SimulatedSession(session, dict(errors), zeros)
+
+
+class _TruthKeys(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    errors: Annotated[dict[str, FiniteFloat], Field(min_length=1)]
+    zeros_mm: dict[str, FiniteFloat] = {}
+
+
+def load_errors(path: str | Path, robot: Robot) -> dict[str, float]:
+    """Errors from a YAML file: `errors:` with keys such as x_slide.offset_mm.
+
+    Returns:
+        Parameter name to value, [SI].
+
+    Raises:
+        ParameterError: Naming file and key.
+    """
+    file = Path(path)
+    data = read_yaml(file, error=ParameterError)
+    keys = validate(_TruthKeys, data, where=str(file), error=ParameterError)
+    return read_errors(keys.errors, robot, where=f"{file}: errors")
+
+
+def read_errors(values: Mapping[str, float], robot: Robot, *, where: str) -> dict[str, float]:
+    """Errors from keys that carry their unit, [SI].
+
+    Raises:
+        ParameterError: Naming the key.
+    """
+    errors: dict[str, float] = {}
+    for key, value in values.items():
+        try:
+            name, si = robot.parameters.read_quantity(key, value)
+        except ParameterError as e:
+            raise ParameterError(e.problem, where=where) from None
+        if name in errors:
+            raise ParameterError(f"'{name}' is given twice", where=where)
+        errors[name] = si
+    return errors
+
+
+def truth_document(simulated: SimulatedSession) -> str:
+    """The text of a truth.yaml: the errors and zeros that a session was simulated from."""
+    parameters = simulated.session.robot.parameters
+    errors = {}
+    for name, value in simulated.errors.items():
+        p = parameters[name]
+        errors[f"{name}_{p.edge_unit}"] = float(f"{value * p.edge_factor:.9g}")
+    document = {
+        "errors": errors,
+        "zeros_mm": {name: to_mm(value) for name, value in simulated.zeros.items()},
+    }
+    head = "# The truth behind the simulated readings beside this file. No calibration reads it.\n"
+    return head + yaml.safe_dump(document, sort_keys=False, default_flow_style=False)

@@ -1,0 +1,1 @@
+"""What if: comparisons and checks made with calibrations."""

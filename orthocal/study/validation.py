@@ -1,0 +1,215 @@
+"""Validation of a calibration by a new session, as the paper's third experiment.
+
+The new session is taken with the identified offsets active in the controller. If the calibration
+is right, the deviations it shows are those that the calibration expected, and a further fit would
+change nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from orthocal.errors import SessionError
+from orthocal.identification.calibrate import calibrate
+from orthocal.identification.calibration import Calibration, ResidualRow
+from orthocal.identification.uncertainty import confidence_factor
+from orthocal.measurement.session import Session
+from orthocal.robot.model import read_only
+from orthocal.robot.parameters import EDGE_UNITS, Unit
+
+Array = NDArray[np.float64]
+
+CHANCE = 0.05
+"""Probability below which something is not put down to chance."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FurtherChange:
+    """What a further fit would still change in one parameter."""
+
+    name: str
+    unit: Unit
+    change: float
+    """[unit]."""
+    std: float
+    """Standard deviation of the change by the new session's own fit, [unit]."""
+    significant: bool
+    """Whether it is outside the 95 % interval around 0."""
+
+    @property
+    def edge_unit(self) -> str:
+        """Unit in which people read it."""
+        return EDGE_UNITS[self.unit][0]
+
+    @property
+    def edge_factor(self) -> float:
+        """Factor to the unit in which people read it."""
+        return EDGE_UNITS[self.unit][1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Validation:
+    """A new session held against what a calibration expected."""
+
+    title: str
+    offsets_stated: bool
+    """Whether the session says which offsets were active; else the identified ones are taken."""
+    expected_rms: float
+    """Of the residuals of the calibration, [m]."""
+    expected_largest: float
+    achieved_rms: float
+    """Of the deviations in the new session, [m]."""
+    achieved_largest: float
+    refit_rms: float
+    """What a further fit would leave, [m]."""
+    refit_largest: float
+    excess_probability: float
+    """Probability that the achieved sum of squares would be as large by chance (F test)."""
+    changes: tuple[FurtherChange, ...]
+    matched: int
+    """Rows that both sessions have."""
+    correlation: float
+    """Of the residuals of both fits over those rows; NaN below three."""
+    chance: float
+    """Probability of such a correlation between residuals that are noise; NaN if unknown."""
+    rows: tuple[ResidualRow, ...]
+    """Rows of the new session: nominal is the machine as the controller knows it."""
+
+    @property
+    def as_expected(self) -> bool:
+        """Whether the achieved deviations are no larger than expected, but for chance."""
+        return not self.excess_probability < CHANCE
+
+    @property
+    def nothing_to_change(self) -> bool:
+        """Whether no parameter would change beyond its standard error."""
+        return not any(c.significant for c in self.changes)
+
+    @property
+    def residuals_repeat(self) -> bool | None:
+        """Whether what is left is the same again: model error, not noise. None if unknown."""
+        if math.isnan(self.chance):
+            return None
+        return self.chance < CHANCE and self.correlation > 0.0
+
+
+def validate_calibration(calibration: Calibration, session: Session) -> Validation:
+    """Hold a new session against a calibration.
+
+    Args:
+        calibration: The calibration whose offsets were entered.
+        session: Taken afterwards, with its offsets active in the controller. Where the session
+            does not state its controller's offsets, they are taken to be the identified ones.
+
+    Raises:
+        SessionError: If the session is of another robot, or states offsets of another calibration.
+        NotIdentifiableError: If the session does not determine the parameters.
+        SolverError: If a further fit does not converge.
+    """
+    where = None if session.path is None else str(session.path)
+    if session.robot.sha256 != calibration.robot_record.sha256:
+        raise SessionError(
+            f"is of robot '{session.robot.name}'; the calibration is of another, or of another "
+            f"version of '{calibration.robot_record.name}'",
+            where=where,
+        )
+    stated = session.controller_offsets is not None
+    entries = calibration.controller_entries()
+    if stated:
+        _require_offsets(calibration, session)
+    elif entries:
+        by_drive = {e.drive: e.enter for e in entries}
+        offsets = np.array([by_drive.get(d.name, 0.0) for d in session.robot.drives])
+        session = _with_controller(session, offsets)
+    fixed = {p.name: p.value for p in calibration.parameters if not p.free}
+    refit = calibrate(session, model=calibration.model, prior=calibration.prior, fixed=fixed)
+    factor = confidence_factor(refit.dof)
+    changes = tuple(
+        FurtherChange(
+            new.name,
+            new.unit,
+            new.value - old.value,
+            new.std,
+            abs(new.value - old.value) > factor * new.std,
+        )
+        for old, new in zip(calibration.free, refit.free, strict=True)
+    )
+    matched, correlation = _correlate(calibration.residuals, refit.residuals)
+    dims = min(calibration.noise.residual_dof, refit.noise.residual_dof)
+    chance = math.nan
+    if matched >= 3 and dims > 1.0 and not math.isnan(correlation):
+        # directions of noise are spread evenly over the space that the fit leaves to residuals
+        tail = float(special.betainc(0.5, 0.5 * (dims - 1.0), correlation**2))
+        chance = 0.5 * (1.0 - tail) if correlation > 0.0 else 1.0 - 0.5 * (1.0 - tail)
+    return Validation(
+        title=session.title,
+        offsets_stated=stated,
+        expected_rms=calibration.rms_after,
+        expected_largest=calibration.largest_after,
+        achieved_rms=refit.rms_before,
+        achieved_largest=refit.largest_before,
+        refit_rms=refit.rms_after,
+        refit_largest=refit.largest_after,
+        excess_probability=_excess_probability(calibration, refit),
+        changes=changes,
+        matched=matched,
+        correlation=correlation,
+        chance=chance,
+        rows=refit.residuals,
+    )
+
+
+def _require_offsets(calibration: Calibration, session: Session) -> None:
+    """The offsets that a session states must be those of the calibration, up to rounding."""
+    for entry, stated in zip(calibration.controller_entries(), session.active_offsets, strict=True):
+        allowed = max(0.5 * entry.std, 0.02e-3)
+        if not math.isnan(allowed) and abs(stated - entry.enter) > allowed:
+            raise SessionError(
+                f"{entry.drive} has {stated * 1e3:g} mm; the calibration identified "
+                f"{entry.enter * 1e3:.3f} mm. A validation needs the identified offsets active",
+                where=f"{session.path or 'session'}: controller.offsets_mm",
+            )
+
+
+def _with_controller(session: Session, offsets: Array) -> Session:
+    """The session with other offsets active in the controller than it states."""
+    shift = session.active_offsets - offsets
+    postures = {
+        name: replace(p, drives=read_only(p.drives + shift)) for name, p in session.postures.items()
+    }
+    return replace(session, postures=postures, controller_offsets=read_only(offsets))
+
+
+def _excess_probability(calibration: Calibration, refit: Calibration) -> float:
+    """Upper tail of the ratio of achieved to expected mean squares."""
+    expected = calibration.noise.residual_sigma
+    dof = calibration.noise.residual_dof
+    n = len(refit.residuals)
+    if not expected > 0.0 or dof <= 0.0:
+        return math.nan
+    factor = 2.0 if refit.rows_are_differences else 1.0
+    achieved = sum(r.deviation**2 for r in refit.residuals) / factor / n
+    return float(special.fdtrc(n, dof, achieved / expected**2))
+
+
+def _correlate(
+    first: tuple[ResidualRow, ...], second: tuple[ResidualRow, ...]
+) -> tuple[int, float]:
+    """Rows that two sessions share, cycles averaged, and the correlation of their residuals."""
+    means = []
+    for rows in (first, second):
+        collected: dict[tuple[str, str, str | None], list[float]] = defaultdict(list)
+        for r in rows:
+            collected[r.setup, r.posture, r.minus].append(r.residual)
+        means.append({key: sum(v) / len(v) for key, v in collected.items()})
+    common = [key for key in means[0] if key in means[1]]
+    a, b = (np.array([m[key] for key in common]) for m in means)
+    if len(common) < 3 or not np.any(a) or not np.any(b):
+        return len(common), math.nan
+    return len(common), float(a @ b / np.sqrt((a @ a) * (b @ b)))
