@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -289,12 +289,13 @@ class Calibration:
             )
         return tuple(entries)
 
-    def forward(self, joints: ArrayLike) -> Array:
+    def forward(self, joints: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
         """Tool centre point of the calibrated machine.
 
         Args:
             joints: Drive coordinates as the encoders give them, without any offset of the
                 controller, shape (K, n_drives) or (n_drives,), [m, rad].
+            names: What to call the rows in messages.
 
         Returns:
             Shape (K, 3) or (3,), [m].
@@ -302,13 +303,14 @@ class Calibration:
         Raises:
             ClosureError: If the machine cannot be at such coordinates.
         """
-        return Assembly(self.robot, fixed=self.errors).forward(joints)
+        return Assembly(self.robot, fixed=self.errors).forward(joints, names=names)
 
-    def inverse(self, points: ArrayLike) -> Array:
+    def inverse(self, points: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
         """Drive coordinates that bring the calibrated machine's tool to given points.
 
         Args:
             points: Shape (K, n_drives) or (n_drives,), [m].
+            names: What to call the rows in messages.
 
         Returns:
             Drive coordinates as the encoders give them, shape (K, n_drives) or (n_drives,).
@@ -316,7 +318,7 @@ class Calibration:
         Raises:
             ClosureError: If a point cannot be reached.
         """
-        return Assembly(self.robot, fixed=self.errors).inverse(points)
+        return Assembly(self.robot, fixed=self.errors).inverse(points, names=names)
 
     def to_document(self) -> dict[str, Any]:
         """As plain data: the content of calibration.json."""

@@ -302,15 +302,18 @@ def load_session(path: str | Path) -> Session:
 
 
 def load_plan(path: str | Path) -> Session:
-    """Read a plan: a session.yaml without readings; each planned reading is 0.
+    """Read a plan: a session.yaml without `readings`; each planned reading is 0.
 
-    A setup is read in all postures, or in those its `postures` names; `cycles` times.
+    A setup is read in all postures, or in those its `postures` names; `cycles` times. A session
+    that has readings is a plan too: that of its rows.
 
     Raises:
         SessionError: Naming file and key.
         RobotError: If the robot does not load.
     """
     file, keys = _read_keys(Path(path))
+    if keys.readings is not None:
+        return load_session(file)
     plan = _build_plan(file, keys)
     readings = []
     for cycle in range(1, keys.cycles + 1):

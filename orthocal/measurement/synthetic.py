@@ -12,7 +12,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from orthocal.documents import read_yaml, validate
+from orthocal.documents import parse_number, read_yaml, validate
 from orthocal.errors import ParameterError, SessionError
 from orthocal.measurement.gauge import build_observations, predict_entries
 from orthocal.measurement.session import Session, to_mm
@@ -140,6 +140,42 @@ def load_errors(path: str | Path, robot: Robot) -> dict[str, float]:
     data = read_yaml(file, error=ParameterError)
     keys = validate(_TruthKeys, data, where=str(file), error=ParameterError)
     return read_errors(keys.errors, robot, where=f"{file}: errors")
+
+
+def collect_errors(
+    robot: Robot,
+    *,
+    file: Path | None = None,
+    single: Sequence[str] = (),
+    draw: str | None = None,
+    seed: int = 0,
+) -> dict[str, float]:
+    """Errors drawn, then from a file, then given singly; later ones win.
+
+    Args:
+        robot: The robot.
+        file: As for `load_errors`.
+        single: Texts such as x_slide.offset_mm=1.2.
+        draw: Model of the robot, or names and globs with commas between, to draw.
+        seed: Of the random numbers.
+
+    Raises:
+        ParameterError: If a name, unit or number does not fit, or nothing is given.
+    """
+    errors: dict[str, float] = {}
+    if draw is not None:
+        models = robot.parameters.models
+        patterns = models[draw] if draw in models else tuple(draw.split(","))
+        errors.update(draw_errors(robot, patterns, seed=seed))
+    if file is not None:
+        errors.update(load_errors(file, robot))
+    for text in single:
+        key, _, number = text.partition("=")
+        value = parse_number(number, where="--error", name=key, error=ParameterError)
+        errors.update(read_errors({key: value}, robot, where="--error"))
+    if not errors:
+        raise ParameterError("no errors: give them by --errors, --error or --draw")
+    return errors
 
 
 def read_errors(values: Mapping[str, float], robot: Robot, *, where: str) -> dict[str, float]:

@@ -7,6 +7,7 @@ change nothing.
 
 from __future__ import annotations
 
+import json
 import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
@@ -91,6 +92,42 @@ class Validation:
         """Whether no parameter would change beyond its standard error."""
         return not any(c.significant for c in self.changes)
 
+    def to_json(self) -> str:
+        """As JSON, SI units."""
+
+        def number(value: float) -> float | None:
+            return value if math.isfinite(value) else None
+
+        document = {
+            "schema": "orthocal/validation/1",
+            "title": self.title,
+            "offsets_stated": self.offsets_stated,
+            "expected_rms": self.expected_rms,
+            "expected_largest": self.expected_largest,
+            "achieved_rms": self.achieved_rms,
+            "achieved_largest": self.achieved_largest,
+            "refit_rms": self.refit_rms,
+            "refit_largest": self.refit_largest,
+            "as_expected": self.as_expected,
+            "excess_probability": number(self.excess_probability),
+            "nothing_to_change": self.nothing_to_change,
+            "changes": [
+                {
+                    "name": c.name,
+                    "unit": c.unit,
+                    "change": c.change,
+                    "std": number(c.std),
+                    "significant": c.significant,
+                }
+                for c in self.changes
+            ],
+            "matched": self.matched,
+            "correlation": number(self.correlation),
+            "chance": number(self.chance),
+            "residuals_repeat": self.residuals_repeat,
+        }
+        return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
     @property
     def residuals_repeat(self) -> bool | None:
         """Whether what is left is the same again: model error, not noise. None if unknown."""
@@ -140,13 +177,13 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         )
         for old, new in zip(calibration.free, refit.free, strict=True)
     )
-    matched, correlation = _correlate(calibration.residuals, refit.residuals)
+    matched, correlation, cosine = _correlate(calibration.residuals, refit.residuals)
     dims = min(calibration.noise.residual_dof, refit.noise.residual_dof)
     chance = math.nan
     if matched >= 3 and dims > 1.0 and not math.isnan(correlation):
         # directions of noise are spread evenly over the space that the fit leaves to residuals
-        tail = float(special.betainc(0.5, 0.5 * (dims - 1.0), correlation**2))
-        chance = 0.5 * (1.0 - tail) if correlation > 0.0 else 1.0 - 0.5 * (1.0 - tail)
+        tail = 0.5 * (1.0 - float(special.betainc(0.5, 0.5 * (dims - 1.0), cosine**2)))
+        chance = tail if cosine > 0.0 else 1.0 - tail
     return Validation(
         title=session.title,
         offsets_stated=stated,
@@ -190,18 +227,17 @@ def _excess_probability(calibration: Calibration, refit: Calibration) -> float:
     """Upper tail of the ratio of achieved to expected mean squares."""
     expected = calibration.noise.residual_sigma
     dof = calibration.noise.residual_dof
-    n = len(refit.residuals)
-    if not expected > 0.0 or dof <= 0.0:
-        return math.nan
-    factor = 2.0 if refit.rows_are_differences else 1.0
-    achieved = sum(r.deviation**2 for r in refit.residuals) / factor / n
-    return float(special.fdtrc(n, dof, achieved / expected**2))
+    rows = refit.residuals
+    zeros = len({r.setup for r in rows if r.minus is None})
+    achieved = sum(r.deviation**2 / (2.0 if r.minus else 1.0) for r in rows)
+    count = len(rows) - zeros
+    return float(special.fdtrc(count, dof, achieved / count / expected**2))
 
 
 def _correlate(
     first: tuple[ResidualRow, ...], second: tuple[ResidualRow, ...]
-) -> tuple[int, float]:
-    """Rows that two sessions share, cycles averaged, and the correlation of their residuals."""
+) -> tuple[int, float, float]:
+    """Rows that two sessions share, cycles averaged; correlation and cosine of their residuals."""
     means = []
     for rows in (first, second):
         collected: dict[tuple[str, str, str | None], list[float]] = defaultdict(list)
@@ -211,5 +247,6 @@ def _correlate(
     common = [key for key in means[0] if key in means[1]]
     a, b = (np.array([m[key] for key in common]) for m in means)
     if len(common) < 3 or not np.any(a) or not np.any(b):
-        return len(common), math.nan
-    return len(common), float(a @ b / np.sqrt((a @ a) * (b @ b)))
+        return len(common), math.nan, math.nan
+    cosine = float(a @ b / np.sqrt((a @ a) * (b @ b)))
+    return len(common), float(np.corrcoef(a, b)[0, 1]), cosine

@@ -1,0 +1,37 @@
+# Everything a fresh machine with Python 3.11 or newer and make needs.
+#   make calibrate   set up, and calibrate the paper's Experiment 2
+#   make test        set up with the test tools, and run all checks
+
+PYTHON ?= python3
+VENV ?= .venv
+SESSION ?= examples/table1/experiment-2
+
+INSTALLED = $(VENV)/.installed
+TESTED = $(VENV)/.installed-test
+
+.PHONY: calibrate test check clean
+
+calibrate: $(INSTALLED)
+	$(VENV)/bin/orthocal calibrate $(SESSION) --out out/$(notdir $(SESSION))
+
+test: $(TESTED) check
+	$(VENV)/bin/python -m pytest
+
+check: $(TESTED)
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+
+clean:
+	rm -rf $(VENV) out build dist
+
+$(VENV)/bin/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(INSTALLED): pyproject.toml | $(VENV)/bin/python
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable .
+	touch $@
+
+$(TESTED): pyproject.toml | $(VENV)/bin/python
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable ".[test]"
+	touch $@ $(INSTALLED)

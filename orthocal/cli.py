@@ -1,0 +1,238 @@
+"""The command line. The only place that prints, and that turns errors into exit codes.
+
+Imports of anything slow stand inside the commands: help answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+import orthocal
+from orthocal.errors import OrthocalError, SessionError
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="Calibrate Orthoglide-type parallel robots from dial-indicator readings.",
+)
+
+SessionPath = Annotated[
+    Path, typer.Argument(metavar="SESSION", help="session.yaml, or the folder that holds it.")
+]
+CalibrationPath = Annotated[
+    Path,
+    typer.Argument(metavar="CALIBRATION", help="calibration.json, or the folder that holds it."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+AllRows = Annotated[bool, typer.Option("--all", help="List every reading, however many.")]
+
+
+def main() -> None:
+    """Run the command line; no traceback ever reaches a user.
+
+    Exit codes: 0 done, 1 a solve did not converge, 2 bad input, 70 a bug of ours.
+    """
+    import os
+
+    try:
+        app()
+    except OrthocalError as e:
+        _note(f"orthocal: {e}")
+        sys.exit(e.exit_code)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except Exception as e:
+        if os.environ.get("ORTHOCAL_DEBUG"):
+            raise
+        _note(
+            f"orthocal: this is a bug of orthocal, not of your input: {type(e).__name__}: {e}\n"
+            "Set ORTHOCAL_DEBUG=1 to see where, and report it."
+        )
+        sys.exit(70)
+
+
+@app.callback(invoke_without_command=True)
+def _version(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", is_eager=True)
+    ] = False,
+) -> None:
+    if version:
+        _out(orthocal.__version__)
+        raise typer.Exit
+
+
+@app.command()
+def calibrate(
+    session: SessionPath,
+    model: Annotated[
+        str, typer.Option(help="Which errors are free: offsets, lengths, or one of the robot's.")
+    ] = "offsets",
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for calibration.json; made if need be.")
+    ] = None,
+    json: Json = False,
+    all_rows: AllRows = False,
+) -> None:
+    """Identify the errors of a machine from a session of readings."""
+    from orthocal.identification.calibrate import calibrate as run
+    from orthocal.measurement.session import load_session
+    from orthocal.output.summary import render_calibration
+
+    result = run(load_session(session), model=model)
+    if json:
+        _out(result.to_json().rstrip("\n"))
+    else:
+        _show(render_calibration(result, all_rows=all_rows))
+    if out is not None:
+        _note(f"Wrote {result.save(out / 'calibration.json')}")
+
+
+@app.command()
+def validate(
+    calibration: CalibrationPath,
+    session: Annotated[
+        Path,
+        typer.Argument(
+            metavar="NEW_SESSION", help="Taken with the identified offsets in the controller."
+        ),
+    ],
+    json: Json = False,
+    all_rows: AllRows = False,
+) -> None:
+    """Hold a new session against a calibration: is it confirmed?"""
+    from orthocal.identification.calibration import load_calibration
+    from orthocal.measurement.session import load_session
+    from orthocal.output.summary import render_validation
+    from orthocal.study.validation import validate_calibration
+
+    result = validate_calibration(load_calibration(calibration), load_session(session))
+    if json:
+        _out(result.to_json().rstrip("\n"))
+    else:
+        _show(render_validation(result, all_rows=all_rows))
+
+
+@app.command()
+def forward(
+    calibration: CalibrationPath,
+    joints: Annotated[
+        Path,
+        typer.Argument(metavar="JOINTS.csv", help="Columns as the drives, such as x_slide_mm."),
+    ],
+) -> None:
+    """Where the calibrated machine's tool is, for drive coordinates: CSV on stdout, mm.
+
+    Drive coordinates are those of the encoders, without any offset of the controller.
+    """
+    from orthocal.identification.calibration import load_calibration
+    from orthocal.measurement.table import TOOL_COLUMNS, format_table, read_joints
+
+    result = load_calibration(calibration)
+    names, values = read_joints(joints, result.robot)
+    points = result.forward(values, names=names)
+    _out(format_table(TOOL_COLUMNS, points))
+
+
+@app.command()
+def inverse(
+    calibration: CalibrationPath,
+    targets: Annotated[
+        Path,
+        typer.Argument(metavar="TARGETS.csv", help="Columns of the tool: x_mm, y_mm, z_mm."),
+    ],
+) -> None:
+    """Drive coordinates that bring the calibrated machine's tool to points: CSV on stdout.
+
+    Drive coordinates are those of the encoders, without any offset of the controller.
+    """
+    from orthocal.identification.calibration import load_calibration
+    from orthocal.measurement.table import drive_columns, format_table, read_points
+
+    result = load_calibration(calibration)
+    names, points = read_points(targets, result.robot)
+    drives = result.inverse(points, names=names)
+    _out(format_table(drive_columns(result.robot), drives))
+
+
+@app.command()
+def simulate(
+    plan: Annotated[
+        Path,
+        typer.Argument(metavar="PLAN", help="A session.yaml without readings, or a session."),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for session.yaml, readings.csv, truth.yaml.")],
+    errors: Annotated[
+        Path | None, typer.Option(help="YAML file with the machine's errors (see a truth.yaml).")
+    ] = None,
+    error: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="One error, such as x_slide.offset_mm=1.2."),
+    ] = None,
+    draw: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODEL|GLOBS",
+            help="Draw errors from the tolerances: a model, or names and globs with commas.",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of noise, gauge zeros and drawn errors.")] = 0,
+    exact: Annotated[
+        bool, typer.Option("--exact", help="No noise, no gauge zeros, no rounding.")
+    ] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Write over a session that is there.")
+    ] = False,
+) -> None:
+    """Make a session of simulated readings of a machine whose errors are known."""
+    from orthocal.measurement.session import load_plan, write_session
+    from orthocal.measurement.synthetic import (
+        collect_errors,
+        simulate_session,
+        truth_document,
+    )
+
+    if (out / "session.yaml").exists() and not force:
+        raise SessionError(
+            "is there already; --force writes over it", where=str(out / "session.yaml")
+        )
+    planned = load_plan(plan)
+    true_errors = collect_errors(
+        planned.robot, file=errors, single=error or [], draw=draw, seed=seed
+    )
+    simulated = simulate_session(planned, true_errors, seed=seed, exact=exact)
+    truth = {"truth.yaml": truth_document(simulated)}
+    comment = "Simulated readings, not measured. The truth behind them is in truth.yaml."
+    path = write_session(simulated.session, out, comment=comment, extra=truth)
+    _note(f"Wrote {path}, {len(simulated.session.readings)} simulated readings, and truth.yaml")
+
+
+def _show(renderable: RenderableType) -> None:
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=100)
+    console.print(renderable)
+
+
+def _out(text: str) -> None:
+    sys.stdout.write(text + "\n")
+
+
+def _note(text: str) -> None:
+    sys.stderr.write(text + "\n")
+
+
+if __name__ == "__main__":
+    main()

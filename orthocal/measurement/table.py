@@ -1,0 +1,88 @@
+"""Tables of joint coordinates and tool points, as CSV with units in the column names."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.documents import parse_number, read_csv_rows
+from orthocal.errors import SessionError
+from orthocal.robot.model import Robot
+
+Array = NDArray[np.float64]
+
+TOOL_COLUMNS = {"x_mm": 1e-3, "y_mm": 1e-3, "z_mm": 1e-3}
+"""Columns of tool points, and their factors to SI."""
+
+
+def drive_columns(robot: Robot) -> dict[str, float]:
+    """Columns of drive coordinates, and their factors to SI."""
+    return {
+        (f"{d.name}_mm" if d.unit == "m" else f"{d.name}_deg"): (
+            1e-3 if d.unit == "m" else math.pi / 180.0
+        )
+        for d in robot.drives
+    }
+
+
+def read_joints(path: Path, robot: Robot) -> tuple[list[str], Array]:
+    """Drive coordinates from a CSV file.
+
+    Returns:
+        Names of the rows for messages, and values, shape (K, n_drives), [m, rad].
+
+    Raises:
+        SessionError: Naming file and line; also for coordinates beyond a drive's travel.
+    """
+    columns = drive_columns(robot)
+    names, values = _read(path, columns)
+    for name, row in zip(names, values, strict=True):
+        for drive, value, (column, factor) in zip(robot.drives, row, columns.items(), strict=True):
+            if not drive.lower <= value <= drive.upper:
+                raise SessionError(
+                    f"{column} is {value / factor:g}; the drive reaches from "
+                    f"{drive.lower / factor:g} to {drive.upper / factor:g}",
+                    where=name,
+                )
+    return names, values
+
+
+def read_points(path: Path, robot: Robot) -> tuple[list[str], Array]:
+    """Tool points from a CSV file: the coordinates that the drives control.
+
+    Returns:
+        Names of the rows for messages, and values, shape (K, n_coordinates), [m].
+
+    Raises:
+        SessionError: Naming file and line.
+    """
+    wanted = range(3) if robot.tcp is None else robot.tcp.coordinates
+    columns = {name: f for i, (name, f) in enumerate(TOOL_COLUMNS.items()) if i in wanted}
+    return _read(path, columns)
+
+
+def format_table(columns: dict[str, float], values: Array) -> str:
+    """Values in SI as CSV text with a header, in the units of the columns."""
+    lines = [",".join(columns)]
+    factors = np.array(list(columns.values()))
+    lines += [",".join(f"{v:.6f}" for v in row) for row in np.atleast_2d(values) / factors]
+    return "\n".join(lines)
+
+
+def _read(path: Path, columns: dict[str, float]) -> tuple[list[str], Array]:
+    names, rows = [], []
+    for line, row in read_csv_rows(path, required=tuple(columns), error=SessionError):
+        where = f"{path}:{line}"
+        names.append(where)
+        rows.append(
+            [
+                parse_number(row[c], where=where, name=c, error=SessionError) * factor
+                for c, factor in columns.items()
+            ]
+        )
+    if not rows:
+        raise SessionError("holds no rows", where=str(path))
+    return names, np.array(rows)
