@@ -15,7 +15,8 @@ import orthocal
 from orthocal.errors import OrthocalError, SessionError
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from orthocal.identification.calibration import Calibration
+    from orthocal.study.validation import Validation
 
 app = typer.Typer(
     add_completion=False,
@@ -87,13 +88,12 @@ def calibrate(
     """Identify the errors of a machine from a session of readings."""
     from orthocal.identification.calibrate import calibrate as run
     from orthocal.measurement.session import load_session
-    from orthocal.output.summary import render_calibration
 
     result = run(load_session(session), model=model)
     if json:
         _out(result.to_json().rstrip("\n"))
     else:
-        _show(render_calibration(result, all_rows=all_rows))
+        _show(result, all_rows=all_rows)
     if out is not None:
         _note(f"Wrote {result.save(out / 'calibration.json')}")
 
@@ -113,14 +113,13 @@ def validate(
     """Hold a new session against a calibration: is it confirmed?"""
     from orthocal.identification.calibration import load_calibration
     from orthocal.measurement.session import load_session
-    from orthocal.output.summary import render_validation
     from orthocal.study.validation import validate_calibration
 
     result = validate_calibration(load_calibration(calibration), load_session(session))
     if json:
         _out(result.to_json().rstrip("\n"))
     else:
-        _show(render_validation(result, all_rows=all_rows))
+        _show(result, all_rows=all_rows)
 
 
 @app.command()
@@ -217,13 +216,14 @@ def simulate(
     _note(f"Wrote {path}, {len(simulated.session.readings)} simulated readings, and truth.yaml")
 
 
-def _show(renderable: RenderableType) -> None:
-    from rich.console import Console
+def _show(result: Calibration | Validation, *, all_rows: bool) -> None:
+    """Print a summary: in colour and as wide as the terminal, or plain where there is none."""
+    from orthocal.output.summary import print_summary, summarize
 
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=100)
-    console.print(renderable)
+    if sys.stdout.isatty():
+        print_summary(result, all_rows=all_rows)
+    else:
+        sys.stdout.write(summarize(result, all_rows=all_rows))
 
 
 def _out(text: str) -> None:

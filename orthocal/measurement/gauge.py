@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.measurement.session import DIRECTIONS, Session, section_plane
-from orthocal.robot.assembly import Assembly
+from orthocal.robot.assembly import Assembly, nominal_assembly
 from orthocal.robot.batch import BatchFunction
 from orthocal.robot.model import Leg, Robot
 from orthocal.robot.symbolic import SymbolicRobot
@@ -275,9 +275,8 @@ def locate_contacts(session: Session) -> dict[tuple[str, str], float]:
         (setup, posture) to the fraction t, for every pair that is read.
     """
     robot = session.robot
-    assembly = Assembly(robot)
     nominal = drive_table(session) + session.active_offsets
-    passive = assembly.close(nominal, names=list(session.postures))
+    passive = nominal_assembly(robot).close(nominal, names=list(session.postures))
     drives_in = ca.SX.sym("drives", len(robot.drives))
     passive_in = ca.SX.sym("passive", robot.passive_index.size)
     machine = SymbolicRobot(robot, drives=drives_in, passive=passive_in)

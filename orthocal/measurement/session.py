@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, m
 
 from orthocal.documents import parse_number, read_csv_rows, read_yaml, validate, write_files
 from orthocal.errors import ClosureError, RobotError, SessionError
-from orthocal.robot.assembly import Assembly
+from orthocal.robot.assembly import nominal_assembly
 from orthocal.robot.model import Robot, load_robot, read_only
 
 Array = NDArray[np.float64]
@@ -316,15 +316,18 @@ def load_plan(path: str | Path) -> Session:
         return load_session(file)
     plan = _build_plan(file, keys)
     readings = []
-    for cycle in range(1, keys.cycles + 1):
-        for name, setup in keys.setups.items():
-            for posture in setup.postures or plan.postures:
-                if posture not in plan.postures:
-                    raise SessionError(
-                        f"'{posture}' is not a posture; postures: {', '.join(plan.postures)}",
-                        where=f"{file}: setups.{name}.postures",
-                    )
-                readings.append(Reading(name, posture, None, cycle, 0.0, None))
+    for name, setup in keys.setups.items():
+        for posture in setup.postures or ():
+            if posture not in plan.postures:
+                raise SessionError(
+                    f"'{posture}' is not a posture; postures: {', '.join(plan.postures)}",
+                    where=f"{file}: setups.{name}.postures",
+                )
+        readings += [
+            Reading(name, posture, None, cycle, 0.0, None)
+            for cycle in range(1, keys.cycles + 1)
+            for posture in setup.postures or plan.postures
+        ]
     session = replace(plan, readings=tuple(readings))
     check_contacts(session)
     return session
@@ -434,7 +437,7 @@ def write_session(
             "posture": r.posture,
             "minus": r.minus or "",
             "cycle": str(r.cycle),
-            "reading_mm": f"{r.value * 1e3:.{decimals}f}",
+            "reading_mm": _trim(f"{r.value * 1e3:.{decimals}f}"),
         }
         table.write(",".join(fields[c] for c in columns) + "\n")
     folder = Path(folder)
@@ -446,6 +449,12 @@ def write_session(
 def to_mm(value: float) -> float:
     """Metres as mm, without the rounding that the factor brings."""
     return _tidy(value * 1e3)
+
+
+def _trim(number: str) -> str:
+    """A decimal number without trailing zeros beyond the second decimal."""
+    whole, _, decimals = number.partition(".")
+    return f"{whole}.{decimals.rstrip('0').ljust(2, '0')}"
 
 
 def _tidy(value: float) -> float:
@@ -548,7 +557,7 @@ def _build_postures(
     keys: SessionKeys, robot: Robot, offsets: Array | None, file: Path
 ) -> dict[str, Posture]:
     """Commanded drive coordinates of all postures, through the nominal inverse kinematics."""
-    assembly = Assembly(robot)
+    assembly = nominal_assembly(robot)
     active = np.zeros(len(robot.drives)) if offsets is None else offsets
     nominal: dict[str, Array] = {}
     given: dict[str, tuple[Any, Array]] = {}

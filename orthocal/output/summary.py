@@ -38,12 +38,21 @@ def summarize(result: Calibration | Validation, *, all_rows: bool = False) -> st
         result: What to summarise.
         all_rows: List every reading, however many there are.
     """
-    console = Console(file=io.StringIO(), width=WIDTH, no_color=True, highlight=False)
-    render = render_calibration if isinstance(result, Calibration) else render_validation
-    console.print(render(result, all_rows=all_rows))  # type: ignore[operator]
-    stream = console.file
-    assert isinstance(stream, io.StringIO)  # it was made so above
+    stream = io.StringIO()
+    console = Console(file=stream, width=WIDTH, no_color=True, highlight=False)
+    console.print(_render(result, all_rows))
     return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()) + "\n"
+
+
+def print_summary(result: Calibration | Validation, *, all_rows: bool = False) -> None:
+    """Print a calibration or a validation on the terminal, in colour."""
+    Console(highlight=False).print(_render(result, all_rows))
+
+
+def _render(result: Calibration | Validation, all_rows: bool) -> RenderableType:
+    if isinstance(result, Calibration):
+        return render_calibration(result, all_rows=all_rows)
+    return render_validation(result, all_rows=all_rows)
 
 
 def render_calibration(calibration: Calibration, *, all_rows: bool = False) -> RenderableType:
@@ -222,7 +231,7 @@ def _ratio_interval(dof: float) -> tuple[float, float]:
 def _heading(calibration: Calibration) -> RenderableType:
     session, solver = calibration.session, calibration.solver
     kind = "differences" if calibration.rows_are_differences else "readings"
-    legs = ", ".join(dict.fromkeys(s.leg for s in calibration.setups))
+    legs = ", ".join(sorted({s.leg for s in calibration.setups}))
     lines = [
         Text(f"Calibration of {calibration.robot_record.name}, model '{calibration.model}'",
              style="bold"),

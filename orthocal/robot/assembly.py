@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
@@ -254,7 +255,7 @@ class Assembly:
         index = np.concatenate([robot.drive_index, robot.passive_index])
         lower, upper = _limits(robot)
         zero_passive = robot.zero[robot.passive_index]
-        origin = Assembly(robot).tcp(robot.drive_zero, zero_passive)[list(tcp.coordinates)]
+        origin = nominal_assembly(robot).tcp(robot.drive_zero, zero_passive)[list(tcp.coordinates)]
         return _System(
             evaluate=_residual_function("inverting", x, target, theta, residual),
             n_rows=residual.numel(),
@@ -345,6 +346,12 @@ class Assembly:
                 f"{system.n_x} passive motions free",
                 posture=name,
             )
+
+
+@lru_cache(maxsize=4)
+def nominal_assembly(robot: Robot) -> Assembly:
+    """The assembly of a robot without errors, built once."""
+    return Assembly(robot)
 
 
 def _residual_function(
