@@ -25,8 +25,10 @@ Array = NDArray[np.float64]
 CLOSED = 1e-12
 """Largest scaled residual of closed loops, relative to max(1 m, characteristic length), [m]."""
 
-SINGULAR_BELOW = 1e-7
-"""Ratio of smallest to largest singular value below which a posture counts as singular."""
+SINGULAR_BELOW = 1e-5
+"""Ratio of smallest to largest singular value below which a posture counts as singular. Near a
+singular posture Newton stops where the residual, quadratic in the distance, is below CLOSED: a
+smaller ratio would not be seen. The Orthoglide has 1/20 to 1/60."""
 
 MAX_NEWTON_STEPS = 30
 SMALLEST_CONTINUATION_STEP = 1.0 / 512.0

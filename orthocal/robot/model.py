@@ -316,10 +316,11 @@ def place_frames(model: pin.Model, nominal: pin.Model, twists: Mapping[str, Arra
     for i, frame in enumerate(nominal.frames):
         parent = frame.parentFrame
         shift = targets.get(i)
-        if frame.type == pin.FrameType.JOINT or (shift is None and parent not in moved):
+        hangs = nominal.frames[parent].parentJoint == frame.parentJoint and parent in moved
+        if frame.type == pin.FrameType.JOINT or (shift is None and not hangs):
             continue
         placement = frame.placement
-        if parent in moved:
+        if hangs:
             placement = moved[parent] * nominal.frames[parent].placement.inverse() * placement
         moved[i] = placement if shift is None else placement * pin.exp6(shift)
         model.frames[i].placement = moved[i]

@@ -208,14 +208,14 @@ class SymbolicTree:
         if frame not in self._frames:
             f = self.model.frames[frame]
             placement = constant_pose(f.placement)
-            if f.type == pin.FrameType.JOINT or frame == 0:
+            parent = self.model.frames[f.parentFrame]
+            if f.type == pin.FrameType.JOINT or frame == 0 or parent.parentJoint != f.parentJoint:
                 pose = self.joint_pose(f.parentJoint) * placement
             else:
-                parent = self.model.frames[f.parentFrame]
                 between = constant_pose(parent.placement.inverse() * f.placement)
                 pose = self.frame_pose(f.parentFrame) * between
-                if frame in self._frame_twists:
-                    pose = pose * exp6(self._frame_twists[frame])
+            if frame in self._frame_twists:
+                pose = pose * exp6(self._frame_twists[frame])
             self._frames[frame] = pose
         return self._frames[frame]
 

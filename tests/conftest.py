@@ -1,0 +1,40 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from orthocal import load_robot, load_session
+from orthocal.measurement.session import Session
+from orthocal.robot.model import Robot
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def orthoglide() -> Robot:
+    return load_robot("orthoglide")
+
+
+@pytest.fixture(scope="session")
+def fivebar() -> Robot:
+    return load_robot(ROOT / "tests/robots/fivebar")
+
+
+@pytest.fixture(scope="session")
+def biglide() -> Robot:
+    return load_robot(ROOT / "tests/robots/biglide")
+
+
+@pytest.fixture(scope="session")
+def experiment_2() -> Session:
+    return load_session(ROOT / "examples/table1/experiment-2")
+
+
+@pytest.fixture(scope="session")
+def raw_cycles() -> Session:
+    return load_session(ROOT / "examples/raw-cycles")

@@ -1,0 +1,140 @@
+"""Sessions in and out: forms of postures and sections, controller offsets, round trips."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from orthocal import load_plan, load_session, write_session
+from orthocal.errors import SessionError
+from orthocal.measurement.session import section_plane
+from tolerances import CLOSED_FORM, KINEMATICS
+
+HEAD = """robot: orthoglide
+postures:
+  zero: {tcp_mm: [0, 0, 0]}
+  x_max: {tcp_mm: [60, 0, 0]}
+"""
+
+
+def write(folder, setup="{leg: x, direction: y, section: {fraction: 0.5}}", head=HEAD, rows=None):
+    folder.mkdir(exist_ok=True)
+    text = f"{head}setups:\n  yx: {setup}\nreadings: readings.csv\n"
+    (folder / "session.yaml").write_text(text)
+    table = rows or "setup,posture,reading_mm\nyx,zero,0.1\nyx,x_max,0.2\n"
+    (folder / "readings.csv").write_text(table)
+    return folder
+
+
+def test_the_papers_experiment_2_is_read_as_printed(experiment_2):
+    assert [r.label for r in experiment_2.readings[:2]] == ["xy y_max − y_min", "xz z_max − z_min"]
+    assert np.allclose(experiment_2.values * 1e3, [-0.43, -0.37, 0.42, -0.18, -1.14, -0.70])
+    assert experiment_2.only_differences
+    assert experiment_2.gauge.sigma == pytest.approx(0.02e-3)
+    assert np.array_equal(experiment_2.controller_offsets, [0.0, 0.0, 0.0])
+
+
+def test_postures_by_tool_and_by_joints_are_the_same(tmp_path, experiment_2):
+    tool = experiment_2.postures["x_max"].drives
+    assert np.abs(tool - [0.37025, 0.304393, 0.304393]).max() < 1e-6
+    mm = ", ".join(f"{v * 1e3:.9f}" for v in tool)
+    head = HEAD.replace("{tcp_mm: [60, 0, 0]}", f"{{joints_mm: [{mm}]}}")
+    by_joints = load_session(write(tmp_path / "s", head=head))
+    assert np.abs(by_joints.postures["x_max"].drives - tool).max() < KINEMATICS
+
+
+def test_offsets_in_the_controller_are_taken_off_the_encoders_coordinates(tmp_path):
+    plain = load_session(write(tmp_path / "plain"))
+    head = HEAD + "controller: {offsets_mm: [0.5, -0.3, 0.2]}\n"
+    active = load_session(write(tmp_path / "active", head=head))
+    for name in ("zero", "x_max"):
+        shift = active.postures[name].drives - plain.postures[name].drives
+        assert np.abs(shift - [-0.0005, 0.0003, -0.0002]).max() < KINEMATICS
+    assert np.abs(active.zero_drives - (0.31025 - active.active_offsets)).max() < KINEMATICS
+
+
+@pytest.mark.parametrize(
+    ("section", "expected"),
+    [
+        ("{fraction: 0.2}", (0.2 * 0.31025, True)),
+        ("{from_root_mm: 100}", (0.1, True)),
+        # the X-leg's axis points to -x, from root to tip
+        ("{coordinate_mm: 150}", (-0.15, False)),
+    ],
+)
+def test_sections_become_planes_along_the_leg(tmp_path, section, expected):
+    setup = f"{{leg: x, direction: -y, section: {section}}}"
+    session = load_session(write(tmp_path / "s", setup))
+    plane, from_root = section_plane(session.robot, session.setups["yx"])
+    assert abs(plane - expected[0]) < KINEMATICS
+    assert from_root is expected[1]
+
+
+def test_a_plan_lists_its_readings_setup_by_setup(root):
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    labels = [(r.setup, r.posture, r.cycle) for r in plan.readings]
+    assert labels[:4] == [("yx", "zero", 1), ("yx", "x_max", 1), ("yx", "x_min", 1), ("yx", "zero", 2)]
+    assert len(labels) == 6 * 3 * 3
+
+
+def test_a_session_is_a_plan_too(root, raw_cycles):
+    plan = load_plan(root / "examples/raw-cycles")
+    assert [r.label for r in plan.readings] == [r.label for r in raw_cycles.readings]
+
+
+@pytest.mark.parametrize("example", ["table1/experiment-2", "table1/experiment-3", "raw-cycles"])
+def test_what_is_written_is_read_back(root, tmp_path, example):
+    session = load_session(root / "examples" / example)
+    again = load_session(write_session(session, tmp_path / "copy"))
+    assert again.title == session.title
+    assert again.source == session.source
+    assert np.abs(again.values - session.values).max() < KINEMATICS
+    key = [(r.setup, r.posture, r.minus, r.cycle) for r in session.readings]
+    assert [(r.setup, r.posture, r.minus, r.cycle) for r in again.readings] == key
+    for name, posture in session.postures.items():
+        assert np.abs(again.postures[name].drives - posture.drives).max() < CLOSED_FORM
+    assert (again.controller_offsets is None) == (session.controller_offsets is None)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    fraction=st.floats(0.4, 0.7),
+    direction=st.sampled_from(["y", "-y", "z", "-z"]),
+    values=st.lists(st.floats(-4.9, 4.9), min_size=2, max_size=2),
+    offsets=st.none() | st.lists(st.floats(-5, 5), min_size=3, max_size=3),
+)
+def test_any_session_survives_a_round_trip(tmp_path_factory, fraction, direction, values, offsets):
+    head = HEAD if offsets is None else f"{HEAD}controller: {{offsets_mm: {offsets}}}\n"
+    rows = f"setup,posture,minus,reading_mm\nyx,zero,,{values[0]}\nyx,x_max,,{values[1]}\n"
+    folder = tmp_path_factory.mktemp("round")
+    setup = f"{{leg: x, direction: {direction}, section: {{fraction: {fraction}}}}}"
+    session = load_session(write(folder / "a", setup, head, rows))
+    again = load_session(write_session(session, folder / "b", decimals=12))
+    assert np.abs(again.values - session.values).max() < 1e-14
+    assert again.setups["yx"].direction == direction
+    assert abs(again.setups["yx"].section.value - fraction) < 1e-11
+    assert np.abs(again.active_offsets - session.active_offsets).max() < 1e-14
+
+
+def test_semicolons_and_a_byte_order_mark_are_read(tmp_path):
+    rows = "\ufeffsetup;posture;reading_mm\nyx;zero;0.1\n\nyx;x_max;0.2\n"
+    session = load_session(write(tmp_path / "s", rows=rows))
+    assert np.allclose(session.values, [0.1e-3, 0.2e-3])
+
+
+def test_the_path_may_be_the_file_or_the_folder(root):
+    a = load_session(root / "examples/raw-cycles/session.yaml")
+    b = load_session(str(root / "examples/raw-cycles"))
+    assert a.sha256 == b.sha256
+
+
+def test_a_robot_beside_the_session_is_found(root, tmp_path):
+    head = HEAD.replace("orthoglide", str(root / "robots/orthoglide"))
+    assert load_session(write(tmp_path / "s", head=head)).robot.name == "orthoglide"
+
+
+def test_a_robot_without_legs_cannot_be_measured(root, tmp_path):
+    head = HEAD.replace("orthoglide", str(root / "tests/robots/fivebar"))
+    with pytest.raises(SessionError, match="'fivebar' has no legs for a gauge to touch"):
+        load_session(write(tmp_path / "s", head=head))

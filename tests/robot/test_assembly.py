@@ -1,0 +1,157 @@
+"""Closing loops: against the closed forms, against Pinocchio, and where it cannot be done."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from orthocal.errors import ClosureError, RobotError
+from orthocal.robot import orthoglide as closed_form
+from orthocal.robot.assembly import Assembly, nominal_assembly
+from tolerances import CLOSED, CLOSED_FORM
+
+LENGTH = 0.31025
+
+
+def reachable_points(count, seed=1):
+    """Random points in the machine's branch and within the drives' travel."""
+    rng = np.random.default_rng(seed)
+    found = np.empty((0, 3))
+    while len(found) < count:
+        points = rng.uniform(-0.15, 0.08, (count, 3))
+        joints = closed_form.inverse(points, length=LENGTH)
+        inside = np.all((joints > 0.12) & (joints < 0.39), axis=1)
+        found = np.vstack([found, points[inside]])
+    return found[:count]
+
+
+def test_closed_loops_equal_the_closed_forms_on_ten_thousand_points(orthoglide):
+    points = reachable_points(10_000)
+    joints = closed_form.inverse(points, length=LENGTH)
+    assembly = Assembly(orthoglide)
+    assert np.abs(assembly.forward(joints) - points).max() < CLOSED_FORM
+    assert np.abs(closed_form.direct(joints, length=LENGTH) - points).max() < CLOSED_FORM
+    assert np.abs(assembly.inverse(points[:2000]) - joints[:2000]).max() < CLOSED_FORM
+
+
+def test_offsets_and_lengths_act_as_in_the_closed_forms(orthoglide):
+    rng = np.random.default_rng(2)
+    points = reachable_points(200, seed=3)
+    offsets = rng.uniform(-0.005, 0.005, 3)
+    stretch = 0.0007
+    errors = {f"{k}_slide.offset": v for k, v in zip("xyz", offsets, strict=True)}
+    errors.update({f"{k}_leg.length": stretch for k in "xyz"})
+    joints = closed_form.inverse(points, length=LENGTH + stretch, offsets=offsets)
+    # a longer leg reaches further in from the same slider: the platform's own offset is unchanged
+    assert np.abs(Assembly(orthoglide, fixed=errors).forward(joints) - points).max() < CLOSED_FORM
+
+
+def test_batches_equal_pinocchios_own_newton(orthoglide):
+    names = orthoglide.parameters.select_model("full")
+    rng = np.random.default_rng(4)
+    scale = np.array([orthoglide.parameters[n].tolerance for n in names])
+    values = 5.0 * scale * rng.normal(size=len(names))
+    joints = closed_form.inverse(reachable_points(20, seed=5), length=LENGTH)
+    passive = Assembly(orthoglide, free=names).close(joints, theta=values)
+    machine = orthoglide.with_errors(dict(zip(names, values, strict=True)))
+    for d, ours in zip(joints, passive, strict=True):
+        theirs = machine.close_with_pinocchio(d, orthoglide.zero[orthoglide.passive_index])
+        assert np.abs(ours - theirs).max() < CLOSED
+
+
+def test_closures_hold_at_the_solution(orthoglide):
+    joints = closed_form.inverse(reachable_points(50, seed=6), length=LENGTH)
+    for d, p in zip(joints, Assembly(orthoglide).close(joints), strict=True):
+        residual, jacobian = orthoglide.evaluate_constraints(d, p)
+        assert np.abs(residual).max() < CLOSED
+        assert np.linalg.matrix_rank(jacobian[:, orthoglide.passive_index]) == 18
+
+
+def test_the_zero_posture_is_as_well_conditioned_as_designed(orthoglide):
+    from orthocal.robot.symbolic import closure_row_units
+
+    passive = orthoglide.zero[orthoglide.passive_index]
+    _, jacobian = orthoglide.evaluate_constraints(orthoglide.drive_zero, passive)
+    scaled = jacobian[:, orthoglide.passive_index] * closure_row_units(orthoglide)[:, None]
+    values = np.linalg.svd(scaled, compute_uv=False)
+    assert 1 / 30 < values[-1] / values[0] < 1 / 10
+
+
+def test_a_robot_with_redundant_closure_rows_closes(fivebar):
+    """Gepetto's three keys only: a planar loop with all six rows, three of them dependent."""
+    assert fivebar.closure_rows == 6
+    motors = np.array([[0.0, 0.0], [0.2, -0.1], [-0.4, 0.3]])
+    passive = nominal_assembly(fivebar).close(motors)
+    for d, p in zip(motors, passive, strict=True):
+        residual, _ = fivebar.evaluate_constraints(d, p)
+        assert np.abs(residual).max() < CLOSED
+    elbow = np.array([-0.15, 0.08])
+    turned = -0.1 + 0.0j + (elbow[0] + 0.1 + 1j * elbow[1]) * np.exp(1j * 0.2)
+    other = 0.1 + (0.05 + 0.08j) * np.exp(-0.1j)
+    rod = abs(0.15 + 0.07j)
+    middle = (turned + other) / 2
+    half = abs(other - turned) / 2
+    apex = middle + 1j * (other - turned) / abs(other - turned) * np.sqrt(rod**2 - half**2)
+    import pinocchio as pin
+
+    data = fivebar.model.createData()
+    q = fivebar.configuration(fivebar.joint_coordinates(motors[1], passive[1]))
+    pin.framesForwardKinematics(fivebar.model, data, q)
+    reached = data.oMf[fivebar.frame_id("end_a")].translation
+    assert np.abs(reached - [apex.real, apex.imag, 0.0]).max() < CLOSED_FORM
+
+
+def test_another_robot_goes_the_same_way(biglide):
+    points = np.random.default_rng(8).uniform(-0.05, 0.05, (100, 2))
+    joints = np.sqrt(0.2**2 - points[:, ::-1] ** 2) + points
+    assembly = nominal_assembly(biglide)
+    assert np.abs(assembly.inverse(points) - joints).max() < CLOSED_FORM
+    assert np.abs(assembly.forward(joints)[:, :2] - points).max() < CLOSED_FORM
+
+
+def test_far_postures_stay_in_the_branch_the_machine_is_built_in(orthoglide):
+    """Plain Newton from the mechanical zero would assemble some of these the other way."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-0.19, 0.19, (2000, 3))
+    joints = closed_form.inverse(points, length=LENGTH)
+    joints = joints[np.all((joints > 0.12) & (joints < 0.39), axis=1)]
+    expected = closed_form.direct(joints, length=LENGTH, root=-1)
+    assert np.abs(nominal_assembly(orthoglide).forward(joints) - expected).max() < CLOSED_FORM
+
+
+def test_an_unreachable_posture_is_named_with_what_stays_open(orthoglide):
+    joints = np.array([[0.31025] * 3, [0.7, 0.3, 0.3]])
+    with pytest.raises(ClosureError, match="posture 'far' cannot be reached") as caught:
+        nominal_assembly(orthoglide).close(joints, names=["near", "far"])
+    assert caught.value.posture == "far"
+    assert caught.value.residual > 0.01
+
+
+def test_coordinates_that_are_not_numbers_are_refused(orthoglide):
+    with pytest.raises(ClosureError, match="'here' has coordinates that are not numbers"):
+        nominal_assembly(orthoglide).close([[np.nan, 0.3, 0.3]], names=["here"])
+
+
+def test_a_singular_posture_is_refused(biglide):
+    """Sliders so far out that both rods lie on one line: the tool is free across it."""
+    far = 0.2 * np.sqrt(2.0)
+    with pytest.raises(ClosureError, match="posture 'line' is singular"):
+        nominal_assembly(biglide).close([[far, far]], names=["line"])
+
+
+def test_underdriven_loops_are_singular(root, tmp_path):
+    folder = tmp_path / "loose"
+    folder.mkdir()
+    urdf = (root / "tests/robots/fivebar/fivebar.urdf").read_text()
+    (folder / "loose.urdf").write_text(urdf)
+    (folder / "loose.yaml").write_text(
+        "closed_loop: [[end_a, end_b]]\ntype: ['3d']\nname_mot: [motor_a, motor_b]\n"
+    )
+    from orthocal import load_robot
+
+    with pytest.raises(ClosureError, match="leave 1 of 3 passive motions free"):
+        Assembly(load_robot(folder)).close([0.1, 0.1])
+
+
+def test_a_robot_without_a_tool_has_no_forward(fivebar):
+    with pytest.raises(RobotError, match="no tool centre point"):
+        nominal_assembly(fivebar).forward([0.0, 0.0])

@@ -1,0 +1,57 @@
+"""Names, units, tolerances and selections of error parameters."""
+
+from __future__ import annotations
+
+import pytest
+from orthocal.errors import ParameterError
+
+
+def test_the_full_model_has_the_designed_126_parameters(orthoglide):
+    p = orthoglide.parameters
+    full = p.select_model("full")
+    assert len(full) == 126
+    assert sum(n.endswith(".offset") for n in full) == 3
+    # of 21 × 6 components the three along the drives are left out: the offsets are the same
+    assert "x_slide.x" not in p
+    assert "x_slide.y" in full
+    assert p.select_model("lengths") == (
+        *p.select_model("offsets"),
+        "x_leg.length",
+        "y_leg.length",
+        "z_leg.length",
+    )
+
+
+def test_patterns_add_and_take_out_in_their_order(orthoglide):
+    p = orthoglide.parameters
+    assert p.select(["*.offset", "!y_*"]) == ("x_slide.offset", "z_slide.offset")
+    assert p.select(["!y_*", "*.offset"]) == tuple(f"{k}_slide.offset" for k in "xyz")
+
+
+def test_a_pattern_that_matches_nothing_suggests(orthoglide):
+    with pytest.raises(ParameterError, match="did you mean x_slide.offset"):
+        orthoglide.parameters.select(["x_slid.offset"])
+
+
+def test_units_are_part_of_the_names_in_files(orthoglide):
+    p = orthoglide.parameters
+    assert p.read_quantity("x_slide.offset_mm", 1.5) == ("x_slide.offset", 0.0015)
+    assert p.read_quantity("x_coupler.rx_mrad", 2.0) == ("x_coupler.rx", 0.002)
+    assert p.read_quantity("x_slide.scale_ppm", 3.0) == ("x_slide.scale", 3e-6)
+    with pytest.raises(ParameterError, match="wrong unit"):
+        p.read_quantity("x_slide.offset_mrad", 1.0)
+    with pytest.raises(ParameterError, match="carries no unit"):
+        p.read_quantity("x_slide.offset", 1.0)
+
+
+def test_named_sums_spread_over_their_elementary_errors(orthoglide):
+    p = orthoglide.parameters
+    found = p.expand({"x_leg.length": 1e-3, "x_coupler.x": 1e-4})
+    assert found == {"x_coupler.x": 1.1e-3, "frame.x_rod_b_tip.x": 1e-3}
+
+
+def test_tolerances_are_those_of_the_yaml(orthoglide):
+    p = orthoglide.parameters
+    assert p["x_slide.offset"].tolerance == 5e-3
+    assert p["x_coupler.x"].tolerance == 1e-4
+    assert p["x_coupler.rz"].tolerance == 1e-3

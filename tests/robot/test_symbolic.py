@@ -1,0 +1,229 @@
+"""Symbolic kinematics against Pinocchio, values and derivatives."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from derivatives import assert_derivative, central_differences
+from orthocal import load_robot
+from orthocal.errors import RobotError
+from orthocal.robot.model import place_frames
+from orthocal.robot.symbolic import Pose, SymbolicRobot, SymbolicTree, exp6, log6
+from orthocal.robot.urdf import load_urdf
+from tolerances import DERIVATIVE, KINEMATICS
+
+
+def models(root):
+    built = pin.Model()  # joints that a URDF cannot have
+    first = built.addJoint(0, pin.JointModelTranslation(), pin.SE3.Random(), "carry")
+    second = built.addJoint(first, pin.JointModelRUBY(), pin.SE3.Random(), "spin")
+    screw = pin.JointModelHelicalUnaligned(np.array([0.0, 0.6, 0.8]), 0.01)
+    third = built.addJoint(second, screw, pin.SE3.Random(), "screw")
+    built.addFrame(pin.Frame("tip", third, 0, pin.SE3.Random(), pin.FrameType.BODY))
+    return {
+        "orthoglide": load_urdf(root / "robots/orthoglide/orthoglide.urdf"),
+        "fivebar": load_urdf(root / "tests/robots/fivebar/fivebar.urdf"),
+        "tilted": load_urdf(root / "tests/robots/tilted/tilted.urdf"),
+        "built": built,
+    }
+
+
+@pytest.fixture(scope="module")
+def all_models(root):
+    np.random.seed(3)  # noqa: NPY002 - pin.SE3.Random draws from its own generator
+    return models(root)
+
+
+NAMES = ["orthoglide", "fivebar", "tilted", "built"]
+
+
+def moving_frames(model):
+    return [
+        i
+        for i, f in enumerate(model.frames)
+        if f.type in (pin.FrameType.BODY, pin.FrameType.FIXED_JOINT) and i > 0
+    ]
+
+
+def build(model, joints, frames):
+    """Poses of all frames as one function of (q, joint twists, frame twists)."""
+    q = ca.SX.sym("q", model.nv)
+    dj = ca.SX.sym("dj", 6, len(joints))
+    df = ca.SX.sym("df", 6, len(frames))
+    tree = SymbolicTree(
+        model,
+        q,
+        joint_twists={name: dj[:, i] for i, name in enumerate(joints)},
+        frame_twists={name: df[:, i] for i, name in enumerate(frames)},
+    )
+    poses = [tree.frame_pose(i) for i in moving_frames(model)]
+    stacked = ca.vertcat(*(ca.vertcat(ca.vec(p.rotation), p.position) for p in poses))
+    return ca.Function("poses", [q, dj, df], [stacked])
+
+
+def pinocchio_poses(model, v, joints, frames, dj, df):
+    moved = model.copy()
+    for i, name in enumerate(joints):
+        k = moved.getJointId(name)
+        moved.jointPlacements[k] = moved.jointPlacements[k] * pin.exp6(dj[:, i])
+    place_frames(moved, model, {name: df[:, i] for i, name in enumerate(frames)})
+    data = moved.createData()
+    pin.framesForwardKinematics(moved, data, pin.integrate(moved, pin.neutral(moved), v))
+    poses = [data.oMf[i] for i in moving_frames(moved)]
+    return np.concatenate([np.r_[p.rotation.T.ravel(), p.translation] for p in poses])
+
+
+def some_frames(model):
+    names = [model.frames[i].name for i in moving_frames(model)]
+    bodies = [n for n in names if model.existFrame(n, pin.FrameType.BODY)]
+    return bodies[:: max(1, len(bodies) // 6)]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 0.15, 0.5, 2.5])
+def test_poses_equal_pinocchios(all_models, name, size):
+    model = all_models[name]
+    joints, frames = list(model.names)[1:], some_frames(model)
+    function = build(model, joints, frames)
+    rng = np.random.default_rng(7)
+    for _ in range(5):
+        v = rng.uniform(-3.0, 3.0, model.nv)
+        dj = size * rng.uniform(-1.0, 1.0, (6, len(joints)))
+        df = size * rng.uniform(-1.0, 1.0, (6, len(frames)))
+        ours = np.asarray(function(v, dj, df)).ravel()
+        theirs = pinocchio_poses(model, v, joints, frames, dj, df)
+        assert np.abs(ours - theirs).max() < KINEMATICS * max(1.0, np.abs(theirs).max())
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("size", [0.0, 0.2])
+def test_derivatives_by_coordinates_and_errors_are_exact(all_models, name, size):
+    model = all_models[name]
+    joints, frames = list(model.names)[1:], some_frames(model)
+    function = build(model, joints, frames)
+    n, m = model.nv, 6 * len(joints)
+    x = ca.MX.sym("x", n + m + 6 * len(frames))
+    split = ca.vertsplit(x, [0, n, n + m, x.numel()])
+    y = function(split[0], ca.reshape(split[1], 6, -1), ca.reshape(split[2], 6, -1))
+    value, slope = ca.Function("y", [x], [y]), ca.Function("dy", [x], [ca.jacobian(y, x)])
+    rng = np.random.default_rng(11)
+    at = np.r_[rng.uniform(-2, 2, n), size * rng.uniform(-1, 1, x.numel() - n)]
+    assert_derivative(
+        np.asarray(slope(at).full()), lambda u: np.asarray(value(u)).ravel(), at, step=1e-5
+    )
+
+
+def test_error_derivatives_equal_pinocchios_kinematic_regressor(orthoglide):
+    """d pose / d placement twist at zero error, as a twist in the frame's own axes."""
+    model = orthoglide.model
+    joints = list(model.names)[1:]
+    frame = orthoglide.frame_id("tcp")
+    q, dj = ca.SX.sym("q", model.nv), ca.SX.sym("dj", 6, len(joints))
+    tree = SymbolicTree(model, q, joint_twists={n: dj[:, i] for i, n in enumerate(joints)})
+    pose = tree.frame_pose(frame)
+    stacked = ca.vertcat(ca.vec(pose.rotation), pose.position)
+    slope = ca.Function("slope", [q, dj], [ca.jacobian(stacked, ca.vec(dj))])
+    v = np.random.default_rng(5).uniform(-1.0, 1.0, model.nv)
+    ours = np.asarray(slope(v, np.zeros((6, len(joints)))).full())
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, orthoglide.configuration(v))
+    theirs = pin.computeFrameKinematicRegressor(model, data, frame, pin.ReferenceFrame.LOCAL)
+    rotation = data.oMf[frame].rotation
+    linear = rotation.T @ ours[9:]
+    turned = ours[:9].reshape(3, 3, -1, order="F")
+    angular = np.stack(
+        [
+            [s[2, 1], s[0, 2], s[1, 0]]
+            for s in (rotation.T @ turned[:, :, i] for i in range(turned.shape[2]))
+        ],
+        axis=1,
+    )
+    assert np.abs(np.vstack([linear, angular]) - theirs).max() < KINEMATICS
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-4, 0.03, 0.0447, 0.045, 0.19, 0.21, 1.0, 3.0])
+def test_exp6_and_log6_equal_pinocchios_and_undo_each_other(angle):
+    rng = np.random.default_rng(2)
+    twist = ca.SX.sym("twist", 6)
+    pose = exp6(twist)
+    forward = ca.Function("f", [twist], [pose.rotation, pose.position])
+    back = ca.Function("g", [twist], [log6(pose)])
+    axis = rng.normal(size=3)
+    xi = np.r_[rng.normal(size=3), angle * axis / np.linalg.norm(axis)]
+    rotation, position = (np.asarray(v) for v in forward(xi))
+    theirs = pin.exp6(xi)
+    assert np.abs(rotation - theirs.rotation).max() < KINEMATICS
+    assert np.abs(position.ravel() - theirs.translation).max() < KINEMATICS
+    # near half a turn the logarithm itself is ill-conditioned
+    slack = KINEMATICS * (1.0 if angle < 2.0 else 100.0)
+    assert np.abs(np.asarray(back(xi)).ravel() - xi).max() < slack
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-8, 0.0447, 0.045, 0.2, 1.0])
+def test_exp6_and_log6_have_exact_first_and_second_derivatives(angle):
+    twist = ca.SX.sym("twist", 6)
+    pose = exp6(twist)
+    weights = np.random.default_rng(4).normal(size=18)
+    relative = Pose(pose.rotation, pose.position) * Pose(ca.SX(pin.exp3(np.full(3, 0.01))), ca.SX(3, 1))
+    outputs = ca.vertcat(ca.vec(pose.rotation), pose.position, log6(relative))
+    scalar = ca.dot(weights, outputs)
+    hessian, gradient = ca.hessian(scalar, twist)
+    value, first, second = (
+        ca.Function(n, [twist], [e]) for n, e in (("v", scalar), ("g", gradient), ("h", hessian))
+    )
+    xi = np.r_[0.3, -0.2, 0.5, angle * np.array([0.36, 0.48, 0.8])]
+    assert_derivative(
+        np.asarray(first(xi)).reshape(1, 6), lambda u: np.asarray(value(u)).ravel(), xi
+    )
+    assert_derivative(np.asarray(second(xi)), lambda u: np.asarray(first(u)).ravel(), xi)
+
+
+@pytest.mark.parametrize("robot", ["orthoglide", "fivebar", "biglide"])
+def test_closure_residual_equals_pinocchios_constraint_error(request, robot):
+    """Also with errors on everything, by a robot that has them in its Pinocchio placements."""
+    r = request.getfixturevalue(robot)
+    names = r.parameters.names
+    drives, passive = ca.SX.sym("d", len(r.drives)), ca.SX.sym("p", r.passive_index.size)
+    theta = ca.SX.sym("t", len(names))
+    symbolic = SymbolicRobot(
+        r, drives=drives, passive=passive, errors={n: theta[i] for i, n in enumerate(names)}
+    )
+    g = symbolic.closure_residual()
+    function = ca.Function("g", [drives, passive, theta], [g, ca.jacobian(g, passive)])
+    rng = np.random.default_rng(9)
+    for size in (0.0, 1e-3, 0.3):
+        errors = size * rng.normal(size=len(names))
+        with_errors = r.with_errors(dict(zip(names, errors, strict=True)))
+        d = r.drive_zero + 0.05 * rng.normal(size=len(r.drives))
+        p = r.zero[r.passive_index] + 0.3 * rng.normal(size=r.passive_index.size)
+        residual, jacobian = with_errors.evaluate_constraints(d, p)
+        ours, slope = (np.asarray(v) for v in function(d, p, errors))
+        assert np.abs(ours.ravel() - residual).max() < KINEMATICS
+        assert np.abs(slope - jacobian[:, r.passive_index]).max() < KINEMATICS * 10
+        numeric = central_differences(lambda u, d=d, e=errors: np.asarray(function(d, u, e)[0]).ravel(), p)
+        assert np.abs(slope - numeric).max() < DERIVATIVE
+
+
+def test_closure_rows_are_those_asked_for(orthoglide):
+    assert orthoglide.closure_rows == 18
+    assert [len(c.rows) for c in orthoglide.closures] == [2, 2, 2, 6, 6]
+    assert orthoglide.closures[0].rows == (0, 2)
+
+
+def test_a_joint_that_is_not_supported_is_refused():
+    model = pin.Model()
+    model.addJoint(0, pin.JointModelSpherical(), pin.SE3.Identity(), "ball")
+    tree = SymbolicTree(model, ca.SX.sym("q", 3))
+    with pytest.raises(RobotError, match="'ball' is a JointModelSpherical"):
+        tree.joint_pose(1)
+
+
+def test_the_robot_of_the_package_is_validated_by_yourdfpy(root):
+    import yourdfpy
+
+    urdf = yourdfpy.URDF.load(str(root / "robots/orthoglide/orthoglide.urdf"), load_meshes=False)
+    assert urdf.validate()
+    assert len(urdf.actuated_joint_names) == 21  # all that move
+    assert load_robot("orthoglide").model.njoints == 22
