@@ -40,6 +40,9 @@ Array = NDArray[np.float64]
 SIGMA_WITHOUT_WORD = 10e-6
 """Standard deviation of a reading assumed at first where nothing tells it, [m]."""
 
+SMALLEST_SIGMA = 1e-9
+"""Standard deviation of a reading below which readings count as perfect, [m]."""
+
 SIGMA_SETTLED = 0.01
 """Relative change of sigma below which it needs no further solution."""
 
@@ -83,15 +86,15 @@ def calibrate(
     solution, noise, information = _solve_with_noise(
         program, sigma=sigma, repeatability=repeatability, start=start
     )
-    weight = noise.sigma if problem.prior and math.isfinite(noise.sigma) else sigma
+    weight = max(noise.sigma, SMALLEST_SIGMA) if math.isfinite(noise.sigma) else sigma
     linear = solve_linearised(problem, sigma=weight)
     return _assemble_result(problem, program, solution, noise, information, linear, model)
 
 
 def _first_sigma(session: Session, repeatability: tuple[float, int]) -> float:
     cycles_sigma, cycles_dof = repeatability
-    if cycles_dof > 0 and cycles_sigma > 0.0:
-        return cycles_sigma
+    if cycles_dof > 0:
+        return max(cycles_sigma, SMALLEST_SIGMA)
     return session.gauge.sigma or SIGMA_WITHOUT_WORD
 
 
@@ -120,11 +123,11 @@ def _solve_with_noise(
             residual_dof=problem.observations.size - problem.observations.n_zeros - used,
             gauge_sigma=problem.session.gauge.sigma,
         )
-        settled = not math.isfinite(noise.sigma) or noise.sigma <= 0.0
-        settled = settled or abs(noise.sigma / sigma - 1.0) < SIGMA_SETTLED
+        found = max(noise.sigma, SMALLEST_SIGMA)
+        settled = not math.isfinite(found) or abs(found / sigma - 1.0) < SIGMA_SETTLED
         if settled or not problem.prior:
             break
-        sigma, start, passive = noise.sigma, solution.theta, solution.passive
+        sigma, start, passive = found, solution.theta, solution.passive
     return solution, noise, information
 
 

@@ -23,6 +23,10 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Hessian = Literal["gauss-newton", "exact"]
 
+FINEST_WEIGHT = 5e-6
+"""Readings are weighted as if they had at least this standard deviation, [m], and the prior is
+scaled down with them: the same optimum, with rounding errors that stay below the tolerance."""
+
 CONVERGED = frozenset({"Solve_Succeeded"})
 """Ipopt's words for a solution; anything else is an error."""
 
@@ -55,6 +59,7 @@ class Solution:
     passive: Array
     """Passive coordinates, shape (n_postures, n_passive), [m, rad]."""
     objective: float
+    """½ Σ ((y − h − z)/σ)², and the prior's share."""
     status: str
     """Ipopt's own word."""
     iterations: int
@@ -164,10 +169,11 @@ class NonlinearProgram:
                 (passive / problem.passive_scale).reshape(-1),
             ]
         )
-        prior = float(problem.prior)
+        weighted = max(sigma, FINEST_WEIGHT)
+        scale = (sigma / weighted) ** 2
         began = time.perf_counter()
         answer = self._solver(
-            x0=x0, p=np.concatenate([y, [sigma, prior]]), lbg=0.0, ubg=0.0
+            x0=x0, p=np.concatenate([y, [weighted, scale * problem.prior]]), lbg=0.0, ubg=0.0
         )
         seconds = time.perf_counter() - began
         stats = self._solver.stats()
@@ -186,7 +192,7 @@ class NonlinearProgram:
             zeros=x[self._n_theta : self._n_theta + self._n_zeros] * LENGTH_SCALE,
             passive=x[self._n_theta + self._n_zeros :].reshape(-1, self._n_passive)
             * problem.passive_scale,
-            objective=float(answer["f"]),
+            objective=float(answer["f"]) / scale,
             status=status,
             iterations=iterations,
             seconds_build=self.seconds_build,

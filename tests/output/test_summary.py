@@ -1,0 +1,91 @@
+"""What people read: everything that was promised is there, and is true."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from orthocal import calibrate, load_session, summarize
+from orthocal.output.summary import explain_fit
+
+
+@pytest.fixture(scope="module")
+def table1(root):
+    return calibrate(load_session(root / "examples/table1/experiment-2"))
+
+
+def line(text, beginning):
+    return next(row for row in text.splitlines() if row.strip().startswith(beginning))
+
+
+def test_linear_and_exact_stand_side_by_side(table1):
+    row = line(summarize(table1), "y_slide.offset").split()
+    assert row[1:4] == ["+0.599", "+0.592", "0.386"]
+    assert row[-3:] == ["-0.0067", "-0.017", "mm"]
+
+
+def test_every_reading_is_listed_before_and_after(table1):
+    text = summarize(table1)
+    assert line(text, "zx").split() == [
+        "zx", "x_max", "−", "x_min", "-1.140", "-1.140", "-0.130", "-0.5",
+    ]
+    assert line(text, "r.m.s.").split()[-3:] == ["0.622", "0.195", "-69%"]
+    assert line(text, "largest").split()[-3:] == ["1.140", "0.278", "-76%"]
+
+
+def test_sigma_is_held_against_the_gauges_own(table1):
+    text = " ".join(summarize(table1).split())
+    assert "σ of a difference: 0.276 mm, from the residuals, 3 degrees of freedom" in text
+    assert "σ given for the gauge: 0.020 mm a reading, 0.028 mm a difference" in text
+    assert "is 10 times what the gauge itself would leave (0.028 mm): it is error of the model" in text
+
+
+def test_it_says_what_to_type_and_what_to_believe(table1):
+    text = summarize(table1)
+    entered = text[text.index("What to enter into the controller") :]
+    assert line(entered, "z_slide").split() == ["z_slide", "+0.000", "-1.761", "0.388", "mm"]
+    assert "Offsets that the readings prove (95 %): z_slide." in text
+
+
+def test_an_unstated_controller_is_said_to_be_so(root):
+    text = summarize(calibrate(load_session(root / "examples/table1/experiment-3")))
+    assert "add to the present offset" in text
+    assert "does not state the offsets that were active" in text
+
+
+def test_readings_that_fit_are_said_to_fit(raw_cycles):
+    sentences = explain_fit(calibrate(raw_cycles))
+    assert "What remains is what repeated cycles scatter by: the model fits." in sentences
+
+
+def test_cycles_that_cannot_explain_the_residuals_are_said_to_be_model_error(raw_cycles):
+    values = raw_cycles.values.copy()
+    for i, r in enumerate(raw_cycles.readings):
+        if (r.setup, r.posture) == ("yx", "x_max"):
+            values[i] += 0.3e-3  # every time again
+    result = calibrate(raw_cycles.with_values(values))
+    assert result.noise.source == "residuals"
+    assert "times what repeated cycles scatter by" in explain_fit(result)[0]
+
+
+def test_a_prior_marks_what_the_readings_leave_open(root):
+    result = calibrate(load_session(root / "examples/table1/experiment-2"), model="lengths")
+    text = summarize(result)
+    assert "x_leg.length *" in text
+    assert "* the readings alone do not determine it" in text
+    assert "tolerances as prior" in text
+
+
+def test_many_readings_are_cut_unless_all_are_asked_for(raw_cycles):
+    result = calibrate(raw_cycles)
+    long = replace(result, residuals=result.residuals * 3)
+    assert "The 20 largest of 162" in summarize(long)
+    assert "The 20 largest" not in summarize(long, all_rows=True)
+
+
+def test_names_from_files_are_not_markup(table1):
+    rows = (replace(table1.residuals[0], setup="[red]yx[/red]"), *table1.residuals[1:])
+    titled = replace(table1.session, title="[bold]x[/nonsense]")
+    text = summarize(replace(table1, residuals=rows, session=titled))
+    assert "[red]yx[/red]" in text
+    assert "[bold]x[/nonsense]" in text

@@ -1,0 +1,98 @@
+"""The paper's third experiment, and validations that must fail."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from orthocal import (
+    calibrate,
+    load_plan,
+    load_session,
+    simulate_session,
+    summarize,
+    validate_calibration,
+)
+from orthocal.errors import SessionError
+from tolerances import THREE_DECIMALS_MM
+
+TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
+
+
+@pytest.fixture(scope="module")
+def table1(root):
+    return {n: load_session(root / f"examples/table1/experiment-{n}") for n in (2, 3)}
+
+
+@pytest.fixture(scope="module")
+def plan(root):
+    return load_plan(root / "examples/raw-cycles/plan.yaml")
+
+
+def with_offsets(plan, offsets):
+    postures = {n: replace(p, drives=p.drives - offsets) for n, p in plan.postures.items()}
+    return replace(plan, postures=postures, controller_offsets=np.array(offsets))
+
+
+def test_experiment_3_validates_experiment_2_as_in_the_paper(table1):
+    result = validate_calibration(calibrate(table1[2]), table1[3])
+    expected, achieved = (0.195e-3, 0.278e-3), (0.213e-3, 0.340e-3)
+    assert abs(result.expected_rms - expected[0]) < THREE_DECIMALS_MM
+    assert abs(result.expected_largest - expected[1]) < THREE_DECIMALS_MM
+    assert abs(result.achieved_rms - achieved[0]) < THREE_DECIMALS_MM
+    assert abs(result.achieved_largest - achieved[1]) < THREE_DECIMALS_MM
+    changes = np.array([c.change for c in result.changes]) * 1e3
+    assert np.abs(changes - [0.0667, 0.1411, 0.0025]).max() < 0.005
+    assert result.as_expected
+    assert result.nothing_to_change
+    assert result.residuals_repeat is True
+    assert result.chance < 0.01
+    assert not result.offsets_stated
+    text = summarize(result)
+    assert "The calibration is confirmed" in text
+    assert "it is error of the model" in text
+
+
+def test_offsets_that_were_entered_with_their_sign_turned_are_found_out(plan):
+    before = calibrate(simulate_session(plan, TRUTH, seed=1).session)
+    turned = with_offsets(plan, [-p.value for p in before.free])
+    after = simulate_session(turned, TRUTH, seed=2).session
+    # the session believes that the right offsets were entered
+    lied = replace(after, controller_offsets=None, postures=plan.postures)
+    result = validate_calibration(before, lied)
+    assert not result.as_expected
+    assert not result.nothing_to_change
+    assert "Check the signs of the offsets" in summarize(result)
+
+
+def test_a_right_calibration_with_noise_alone_does_not_repeat_its_residuals(plan):
+    verdicts = []
+    before = calibrate(simulate_session(plan, TRUTH, seed=1).session)
+    entered = np.round([p.value * 1e3 for p in before.free], 3) * 1e-3
+    for seed in range(2, 22):
+        after = simulate_session(with_offsets(plan, entered), TRUTH, seed=seed).session
+        result = validate_calibration(before, after)
+        assert result.offsets_stated
+        verdicts.append((result.as_expected, result.residuals_repeat))
+    assert sum(not ok for ok, _ in verdicts) <= 4  # 5 % each by construction
+    assert sum(bool(again) for _, again in verdicts) <= 4
+
+
+def test_a_session_with_other_offsets_is_no_validation(table1):
+    stated = with_offsets(table1[3], np.zeros(3))
+    with pytest.raises(SessionError, match="A validation needs the identified offsets active"):
+        validate_calibration(calibrate(table1[2]), stated)
+
+
+def test_json_is_plain(table1):
+    document = json.loads(validate_calibration(calibrate(table1[2]), table1[3]).to_json())
+    assert document["schema"] == "orthocal/validation/1"
+    assert document["nothing_to_change"] is True
+
+
+def test_another_robot_is_refused(table1, biglide):
+    calibration = calibrate(table1[2])
+    with pytest.raises(SessionError, match="is of robot 'biglide'"):
+        validate_calibration(calibration, replace(table1[3], robot=biglide))

@@ -1,0 +1,87 @@
+"""Imports go one way, nothing prints outside cli.py and output/, and start-up stays lazy."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+
+import orthocal
+import pytest
+from conftest import ROOT
+
+STAGES = ["errors", "documents", "robot", "measurement", "identification", "study", "output", "cli"]
+
+MODULES = sorted((ROOT / "orthocal").rglob("*.py"))
+
+
+def stage(path):
+    return path.relative_to(ROOT / "orthocal").with_suffix("").parts[0]
+
+
+def imported(path):
+    """Names of the modules of this package that a module imports, wherever in it."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("orthocal"):
+            yield node.module
+        elif isinstance(node, ast.Import):
+            yield from (a.name for a in node.names if a.name.startswith("orthocal"))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_go_one_way(path):
+    if path == ROOT / "orthocal/__init__.py":
+        return
+    own = STAGES.index(stage(path))
+    for module in imported(path):
+        parts = module.split(".")
+        if len(parts) > 1:
+            assert STAGES.index(parts[1]) <= own, f"{path.name} imports {module}"
+
+
+def test_modules_within_a_stage_do_not_import_in_circles():
+    graph = {
+        ".".join(p.relative_to(ROOT).with_suffix("").parts): set(imported(p))
+        for p in MODULES
+        if p.name != "__init__.py"
+    }
+    done: set[str] = set()
+
+    def visit(module, path):
+        assert module not in path, f"circle: {' → '.join([*path, module])}"
+        if module in graph and module not in done:
+            for other in graph[module]:
+                visit(other, [*path, module])
+            done.add(module)
+
+    for module in graph:
+        visit(module, [])
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_nothing_prints_outside_the_edges(path):
+    if stage(path) in ("cli", "output"):
+        return
+    calls = [n.func for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)]
+    assert not [f for f in calls if isinstance(f, ast.Name) and f.id == "print"]
+
+
+def test_everything_exported_is_there():
+    for name in orthocal.__all__:
+        assert getattr(orthocal, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        orthocal.nonsense  # noqa: B018
+    assert set(orthocal.__all__) == set(orthocal._HOMES)
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys; sys.argv = ['orthocal', '--help']\n"
+        "from orthocal.cli import app\n"
+        "try: app()\n"
+        "except SystemExit: pass\n"
+        "heavy = {'numpy', 'casadi', 'pinocchio', 'scipy', 'yourdfpy', 'pydantic', 'meshcat'}\n"
+        "print('LOADED', sorted(heavy & set(sys.modules)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "LOADED []" in done.stdout

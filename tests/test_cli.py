@@ -1,0 +1,157 @@
+"""The command line from end to end, in a process of its own where that is the point."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from orthocal import cli, load_calibration, load_session
+
+
+def run(monkeypatch, capsys, *words):
+    """Run the command line here; returns exit code, stdout and stderr."""
+    monkeypatch.setattr(sys, "argv", ["orthocal", *map(str, words)])
+    code = 0
+    try:
+        cli.main()
+    except SystemExit as e:
+        code = e.code or 0
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.out + captured.err
+    return code, captured.out, captured.err
+
+
+@pytest.fixture
+def orthocal(monkeypatch, capsys):
+    return lambda *words: run(monkeypatch, capsys, *words)
+
+
+@pytest.fixture(scope="module")
+def experiment(root):
+    return root / "examples/table1/experiment-2"
+
+
+def test_calibrate_prints_and_writes(orthocal, experiment, tmp_path):
+    code, out, err = orthocal("calibrate", experiment, "--out", tmp_path / "new/folder")
+    assert code == 0
+    assert "What to enter into the controller" in out
+    assert err == f"Wrote {tmp_path / 'new/folder/calibration.json'}\n"
+    found = load_calibration(tmp_path / "new/folder")
+    assert found["x_slide.offset"].value == pytest.approx(-0.5268e-3, abs=5e-6)
+    assert [p.name for p in (tmp_path / "new/folder").iterdir()] == ["calibration.json"]
+
+
+def test_calibrate_prints_json_alone_on_stdout(orthocal, experiment):
+    code, out, err = orthocal("calibrate", experiment, "--json", "--model", "lengths")
+    assert code == 0
+    assert err == ""
+    document = json.loads(out)
+    assert document["model"] == "lengths"
+    assert len(document["parameters"]) == 6
+
+
+def test_forward_and_inverse_undo_each_other(orthocal, experiment, tmp_path):
+    orthocal("calibrate", experiment, "--out", tmp_path)
+    joints = tmp_path / "joints.csv"
+    joints.write_text("x_slide_mm,y_slide_mm,z_slide_mm\n310.25,310.25,310.25\n330,290,300.5\n")
+    code, out, _ = orthocal("forward", tmp_path, joints)
+    assert code == 0
+    rows = list(csv.DictReader(io.StringIO(out)))
+    assert list(rows[0]) == ["x_mm", "y_mm", "z_mm"]
+    first = np.array([float(v) for v in rows[0].values()]) * 1e-3
+    expected = load_calibration(tmp_path).forward([0.31025] * 3)
+    assert np.abs(first - expected).max() < 1e-9
+    points = tmp_path / "points.csv"
+    points.write_text(out)
+    code, out, _ = orthocal("inverse", tmp_path / "calibration.json", points)
+    assert code == 0
+    assert out.splitlines()[0] == "x_slide_mm,y_slide_mm,z_slide_mm"
+    back = np.array([[float(v) for v in r.split(",")] for r in out.splitlines()[1:]])
+    assert np.abs(back - [[310.25] * 3, [330, 290, 300.5]]).max() < 2e-5
+
+
+def test_validate_holds_experiment_3_against_2(orthocal, experiment, tmp_path):
+    orthocal("calibrate", experiment, "--out", tmp_path)
+    new = experiment.parent / "experiment-3"
+    code, out, _ = orthocal("validate", tmp_path, new)
+    assert code == 0
+    assert "The calibration is confirmed" in out
+    code, out, _ = orthocal("validate", tmp_path, new, "--json")
+    assert json.loads(out)["as_expected"] is True
+
+
+def test_simulate_writes_a_session_that_calibrates_back(orthocal, root, tmp_path):
+    plan = root / "examples/raw-cycles/plan.yaml"
+    words = ("simulate", plan, "--out", tmp_path / "s", "--exact")
+    code, _, err = orthocal(*words, "--error", "x_slide.offset_mm=1.5", "--error",
+                            "z_slide.offset_mm=-0.25")
+    assert code == 0
+    assert "54 simulated readings" in err
+    assert {p.name for p in (tmp_path / "s").iterdir()} == {
+        "session.yaml", "readings.csv", "truth.yaml",
+    }
+    assert "Simulated" in load_session(tmp_path / "s").title
+    _, out, _ = orthocal("calibrate", tmp_path / "s", "--json")
+    values = {p["name"]: p["value"] for p in json.loads(out)["parameters"]}
+    assert values["x_slide.offset"] == pytest.approx(1.5e-3, abs=1e-8)
+    assert values["y_slide.offset"] == pytest.approx(0.0, abs=1e-8)
+    code, _, err = orthocal(*words, "--error", "x_slide.offset_mm=1")
+    assert code == 2
+    assert "is there already; --force writes over it" in err
+
+
+def test_simulate_draws_by_seed(orthocal, root, tmp_path):
+    plan = root / "examples/raw-cycles/plan.yaml"
+    texts = []
+    for folder, seed in (("a", 3), ("b", 3), ("c", 4)):
+        code, _, _ = orthocal(
+            "simulate", plan, "--out", tmp_path / folder, "--draw", "x_slide.offset,*_leg.length",
+            "--seed", seed,
+        )
+        assert code == 0
+        texts.append((tmp_path / folder / "truth.yaml").read_text())
+    assert texts[0] == texts[1] != texts[2]
+    assert "z_leg.length_mm" in texts[0]
+
+
+def test_a_solve_that_does_not_converge_exits_1(orthocal, experiment, monkeypatch, tmp_path):
+    from orthocal.identification import nlp
+
+    monkeypatch.setattr(nlp, "CONVERGED", frozenset())
+    code, out, err = orthocal("calibrate", experiment, "--out", tmp_path / "none")
+    assert code == 1
+    assert out == ""
+    assert "did not converge" in err
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_bug_is_said_to_be_one(orthocal, experiment, monkeypatch):
+    from orthocal.identification import calibrate
+
+    def broken(*_, **__):
+        raise RuntimeError("no such thing")
+
+    monkeypatch.setattr(calibrate, "calibrate", broken)
+    code, _, err = orthocal("calibrate", experiment)
+    assert code == 70
+    assert "this is a bug of orthocal" in err
+
+
+def test_version_and_help(orthocal):
+    assert orthocal("--version")[1].strip() == cli.orthocal.__version__
+    for command in ("calibrate", "validate", "forward", "inverse", "simulate"):
+        code, out, _ = orthocal(command, "--help")
+        assert code == 0
+        assert "Usage: orthocal" in out
+
+
+def test_a_pipe_that_closes_early_is_no_error(root, experiment):
+    command = f"{sys.executable} -m orthocal.cli calibrate {experiment} | head -n 1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
+    assert "Calibration of orthoglide" in done.stdout
+    assert done.stderr == ""

@@ -1,0 +1,62 @@
+"""The wheel, installed into a clean environment, calibrates from another directory."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import zipfile
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def wheel(root, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    subprocess.run(
+        [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, root],
+        check=True,
+        capture_output=True,
+    )
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+def test_the_wheel_holds_robots_and_types(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    assert "orthocal/_robots/orthoglide/orthoglide.urdf" in names
+    assert "orthocal/_robots/orthoglide/orthoglide.yaml" in names
+    assert "orthocal/py.typed" in names
+    assert not [n for n in names if n.startswith(("tests", "examples"))]
+
+
+def test_the_installed_wheel_calibrates_from_elsewhere(wheel, root, tmp_path):
+    """A fresh environment: the wheel and what it declares, nothing else."""
+    subprocess.run([sys.executable, "-m", "venv", tmp_path / "env"], check=True)
+    python = tmp_path / "env/bin/python"
+    subprocess.run(
+        [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", wheel],
+        check=True,
+    )
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    session = elsewhere / "session"
+    session.mkdir()
+    for name in ("session.yaml", "readings.csv"):
+        text = (root / "examples/table1/experiment-2" / name).read_text()
+        (session / name).write_text(text)
+    done = subprocess.run(
+        [tmp_path / "env/bin/orthocal", "calibrate", "session", "--json"],
+        cwd=elsewhere,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    document = json.loads(done.stdout)
+    assert document["parameters"][0]["value"] == pytest.approx(-0.5268e-3, abs=5e-6)
+    assert document["robot"]["folder"] is None
+    where = subprocess.run(
+        [python, "-c", "import orthocal; print(orthocal.__file__)"],
+        cwd=elsewhere, capture_output=True, text=True, check=True,
+    )
+    assert str(tmp_path) in where.stdout
