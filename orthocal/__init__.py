@@ -1,8 +1,8 @@
 """orthocal: calibration of Orthoglide-type parallel robots from dial-indicator readings.
 
-    session = orthocal.load_session("examples/table1/experiment-2")
-    calibration = orthocal.calibrate(session)
-    print(orthocal.summarize(calibration))
+session = orthocal.load_session("examples/table1/experiment-2")
+calibration = orthocal.calibrate(session)
+print(orthocal.summarize(calibration))
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ _HOMES = {
     "calibrate": "orthocal.identification.calibrate",
     "draw_errors": "orthocal.measurement.synthetic",
     "load_calibration": "orthocal.identification.calibration",
-    "load_plan": "orthocal.measurement.session",
+    "load_plan": "orthocal.measurement.session_file",
     "load_robot": "orthocal.robot.model",
-    "load_session": "orthocal.measurement.session",
+    "load_session": "orthocal.measurement.session_file",
     "simulate_session": "orthocal.measurement.synthetic",
     "summarize": "orthocal.output.summary",
     "validate_calibration": "orthocal.study.validation",
-    "write_session": "orthocal.measurement.session",
+    "write_session": "orthocal.measurement.session_file",
 }
 
 __all__ = [
@@ -53,7 +53,8 @@ if TYPE_CHECKING:
     from orthocal.identification.calibrate import calibrate
     from orthocal.identification.calibration import Calibration, load_calibration
     from orthocal.identification.nlp import SolverOptions
-    from orthocal.measurement.session import Session, load_plan, load_session, write_session
+    from orthocal.measurement.session import Session
+    from orthocal.measurement.session_file import load_plan, load_session, write_session
     from orthocal.measurement.synthetic import draw_errors, simulate_session
     from orthocal.output.summary import summarize
     from orthocal.robot.model import Robot, load_robot

@@ -87,7 +87,7 @@ def calibrate(
 ) -> None:
     """Identify the errors of a machine from a session of readings."""
     from orthocal.identification.calibrate import calibrate as run
-    from orthocal.measurement.session import load_session
+    from orthocal.measurement.session_file import load_session
 
     result = run(load_session(session), model=model)
     if json:
@@ -112,7 +112,7 @@ def validate(
 ) -> None:
     """Hold a new session against a calibration: is it confirmed?"""
     from orthocal.identification.calibration import load_calibration
-    from orthocal.measurement.session import load_session
+    from orthocal.measurement.session_file import load_session
     from orthocal.study.validation import validate_calibration
 
     result = validate_calibration(load_calibration(calibration), load_session(session))
@@ -194,7 +194,7 @@ def simulate(
     ] = False,
 ) -> None:
     """Make a session of simulated readings of a machine whose errors are known."""
-    from orthocal.measurement.session import load_plan, write_session
+    from orthocal.measurement.session_file import load_plan, write_session
     from orthocal.measurement.synthetic import (
         collect_errors,
         simulate_session,

@@ -32,7 +32,7 @@ class _StrictLoader(yaml.SafeLoader):
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
-            event = self.peek_event()
+            event = self.peek_event()  # type: ignore[no-untyped-call]
             raise yaml.MarkedYAMLError(
                 problem="aliases (*name) are not allowed here", problem_mark=event.start_mark
             )
@@ -47,7 +47,7 @@ class _StrictLoader(yaml.SafeLoader):
                 )
             if isinstance(key, yaml.ScalarNode):
                 seen.add(key.value)
-        return super().construct_mapping(node, deep)
+        return dict(super().construct_mapping(node, deep))
 
 
 def read_text(path: Path, *, error: type[OrthocalError]) -> str:
@@ -82,7 +82,7 @@ def read_yaml(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
     """
     text = read_text(path, error=error)
     try:
-        return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - a SafeLoader underneath
+        return yaml.load(text, Loader=_StrictLoader)
     except yaml.MarkedYAMLError as e:
         mark = e.problem_mark or e.context_mark
         line = "" if mark is None else f":{mark.line + 1}"
@@ -237,9 +237,7 @@ def _keys_beside(schema: type[BaseModel], path: list[Any]) -> list[str]:
     current: Any = schema
     for part in path[:-1]:
         if isinstance(current, type) and issubclass(current, BaseModel):
-            field = next(
-                (f for n, f in current.model_fields.items() if part in (n, f.alias)), None
-            )
+            field = next((f for n, f in current.model_fields.items() if part in (n, f.alias)), None)
             current = None if field is None else field.annotation
         current = _schema_within(current)
     current = _schema_within(current)

@@ -3,6 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+
 from orthocal import load_robot, load_session
 from orthocal.measurement.session import Session
 from orthocal.robot.model import Robot

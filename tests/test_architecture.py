@@ -6,9 +6,10 @@ import ast
 import subprocess
 import sys
 
-import orthocal
 import pytest
 from conftest import ROOT
+
+import orthocal
 
 STAGES = ["errors", "documents", "robot", "measurement", "identification", "study", "output", "cli"]
 

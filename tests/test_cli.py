@@ -10,6 +10,7 @@ import sys
 
 import numpy as np
 import pytest
+
 from orthocal import cli, load_calibration, load_session
 
 
@@ -88,12 +89,15 @@ def test_validate_holds_experiment_3_against_2(orthocal, experiment, tmp_path):
 def test_simulate_writes_a_session_that_calibrates_back(orthocal, root, tmp_path):
     plan = root / "examples/raw-cycles/plan.yaml"
     words = ("simulate", plan, "--out", tmp_path / "s", "--exact")
-    code, _, err = orthocal(*words, "--error", "x_slide.offset_mm=1.5", "--error",
-                            "z_slide.offset_mm=-0.25")
+    code, _, err = orthocal(
+        *words, "--error", "x_slide.offset_mm=1.5", "--error", "z_slide.offset_mm=-0.25"
+    )
     assert code == 0
     assert "54 simulated readings" in err
     assert {p.name for p in (tmp_path / "s").iterdir()} == {
-        "session.yaml", "readings.csv", "truth.yaml",
+        "session.yaml",
+        "readings.csv",
+        "truth.yaml",
     }
     assert "Simulated" in load_session(tmp_path / "s").title
     _, out, _ = orthocal("calibrate", tmp_path / "s", "--json")
@@ -110,8 +114,14 @@ def test_simulate_draws_by_seed(orthocal, root, tmp_path):
     texts = []
     for folder, seed in (("a", 3), ("b", 3), ("c", 4)):
         code, _, _ = orthocal(
-            "simulate", plan, "--out", tmp_path / folder, "--draw", "x_slide.offset,*_leg.length",
-            "--seed", seed,
+            "simulate",
+            plan,
+            "--out",
+            tmp_path / folder,
+            "--draw",
+            "*_leg.length,x_coupler.*",
+            "--seed",
+            seed,
         )
         assert code == 0
         texts.append((tmp_path / folder / "truth.yaml").read_text())
@@ -147,7 +157,7 @@ def test_version_and_help(orthocal):
     for command in ("calibrate", "validate", "forward", "inverse", "simulate"):
         code, out, _ = orthocal(command, "--help")
         assert code == 0
-        assert "Usage: orthocal" in out
+        assert out.startswith("Usage: ")
 
 
 def test_a_pipe_that_closes_early_is_no_error(root, experiment):

@@ -55,7 +55,10 @@ def test_the_readmes_printed_result_is_the_real_one(root):
     shown = next(b for b in blocks("text") if "What was identified" in b)
     done = subprocess.run(
         [sys.executable, "-m", "orthocal.cli", "calibrate", "examples/table1/experiment-2"],
-        cwd=root, capture_output=True, text=True, check=True,
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     timeless = [re.sub(r"\d+\.\d+ s$", "", line) for line in done.stdout.splitlines()]
     for line in shown.splitlines():

@@ -57,6 +57,9 @@ def test_the_installed_wheel_calibrates_from_elsewhere(wheel, root, tmp_path):
     assert document["robot"]["folder"] is None
     where = subprocess.run(
         [python, "-c", "import orthocal; print(orthocal.__file__)"],
-        cwd=elsewhere, capture_output=True, text=True, check=True,
+        cwd=elsewhere,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert str(tmp_path) in where.stdout

@@ -150,6 +150,7 @@ def _assemble_result(
     else:
         covariance = np.full((problem.n_free, problem.n_free), np.nan)
     std = np.sqrt(np.diag(covariance))
+    determined = information.determined(sigma=noise.sigma)
     estimates = [
         ParameterEstimate(
             name=p.name,
@@ -159,7 +160,7 @@ def _assemble_result(
             std=float(std[i]),
             tolerance=p.tolerance,
             free=True,
-            identifiable=bool(information.identifiable[i]),
+            identifiable=bool(determined[i]),
         )
         for i, p in enumerate(problem.parameters)
     ]
@@ -229,12 +230,8 @@ def _residual_rows(
     by_linear = fitted(problem.predict(linear))
     predicted = fitted(problem.predict(solution.theta, solution.passive))
     return tuple(
-        ResidualRow(
-            r.setup, r.posture, r.minus, r.cycle, r.value, float(a), float(b), float(c)
-        )
-        for r, a, b, c in zip(
-            problem.session.readings, nominal, by_linear, predicted, strict=True
-        )
+        ResidualRow(r.setup, r.posture, r.minus, r.cycle, r.value, float(a), float(b), float(c))
+        for r, a, b, c in zip(problem.session.readings, nominal, by_linear, predicted, strict=True)
     )
 
 
@@ -246,8 +243,6 @@ def _setup_records(problem: CalibrationProblem, solution: Solution) -> tuple[Set
         if real
     }
     return tuple(
-        SetupRecord(
-            s.name, s.leg, s.direction, s.section.form, s.section.value, zeros.get(s.name)
-        )
+        SetupRecord(s.name, s.leg, s.direction, s.section.form, s.section.value, zeros.get(s.name))
         for s in problem.session.setups.values()
     )

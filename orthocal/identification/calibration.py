@@ -85,7 +85,7 @@ class ParameterEstimate:
     """One standard deviation before the calibration, [unit]."""
     free: bool
     identifiable: bool
-    """Whether the readings alone determine it."""
+    """Whether the readings alone tell it better than its tolerance."""
 
     @property
     def edge_unit(self) -> str:
@@ -283,9 +283,7 @@ class Calibration:
             now = None if active is None else active[i]
             change = estimate.value - (now or 0.0)
             entries.append(
-                ControllerEntry(
-                    drive.name, drive.unit, now, estimate.value, change, estimate.std
-                )
+                ControllerEntry(drive.name, drive.unit, now, estimate.value, change, estimate.std)
             )
         return tuple(entries)
 
@@ -401,7 +399,8 @@ def load_calibration(path: str | Path) -> Calibration:
     covariance = [[math.nan if v is None else v for v in row] for row in keys.covariance]
     if len(covariance) != len(free) or any(len(row) != len(free) for row in covariance):
         raise CalibrationFileError(
-            f"expected {len(free)} × {len(free)} numbers, as free parameters", where=f"{file}: covariance"
+            f"expected {len(free)} × {len(free)} numbers, as free parameters",
+            where=f"{file}: covariance",
         )
     if not keys.residuals:
         raise CalibrationFileError("is empty", where=f"{file}: residuals")
@@ -423,7 +422,12 @@ def load_calibration(path: str | Path) -> Calibration:
         ),
         covariance=read_only(np.array(covariance).reshape(len(free), len(free))),
         noise=NoiseRecord(
-            **{k: _float(v) if v is None else v for k, v in keys.noise.model_dump().items()}
+            reading_sigma=_float(keys.noise.reading_sigma),
+            source=keys.noise.source,
+            cycles_sigma=_float(keys.noise.cycles_sigma),
+            cycles_dof=keys.noise.cycles_dof,
+            residual_sigma=_float(keys.noise.residual_sigma),
+            residual_dof=keys.noise.residual_dof,
         ),
         sigma=_float(keys.sigma),
         dof=math.inf if keys.dof is None else keys.dof,
@@ -562,4 +566,3 @@ class _CalibrationKeys(_Keys):
     residuals: list[_ResidualKeys]
     postures: list[_PostureKeys]
     setups: list[_SetupKeys]
-

@@ -16,7 +16,18 @@ from orthocal.robot.orthoglide import displacement_angle
 Array = NDArray[np.float64]
 
 TWELVE_ROWS = (
-    "xy+", "yx+", "xy-", "yx-", "yz+", "zy+", "yz-", "zy-", "xz+", "zx+", "xz-", "zx-",
+    "xy+",
+    "yx+",
+    "xy-",
+    "yx-",
+    "yz+",
+    "zy+",
+    "yz-",
+    "zy-",
+    "xz+",
+    "zx+",
+    "xz-",
+    "zx-",
 )
 """Rows of equation (8): direction, leg, and + or − for maximum or minimum less zero posture.
 
@@ -69,8 +80,8 @@ def leg_parallelism_matrix(
         return result
 
     if rows == 12:
-        return np.array([row(*name) for name in TWELVE_ROWS])
-    return np.array([row(*name, "+") - row(*name, "-") for name in SIX_ROWS])
+        return np.array([row(name[0], name[1], name[2]) for name in TWELVE_ROWS])
+    return np.array([row(name[0], name[1], "+") - row(name[0], name[1], "-") for name in SIX_ROWS])
 
 
 def twelve_row_covariance() -> Array:
@@ -116,9 +127,10 @@ def solve_equation_8(
         raise NotIdentifiableError(
             "the rows do not determine the three offsets", parameters=("x", "y", "z")
         )
-    whiten = np.eye(len(y))
+    whiten: Array = np.eye(len(y))
     if covariance is not None:
-        whiten = np.linalg.inv(np.linalg.cholesky(np.asarray(covariance, dtype=np.float64)))
+        factor = np.linalg.cholesky(np.asarray(covariance, dtype=np.float64))
+        whiten = np.asarray(np.linalg.inv(factor))
     inverse = np.linalg.pinv(whiten @ a)
     offsets = inverse @ (whiten @ y)
     residuals = y - a @ offsets

@@ -315,9 +315,7 @@ class NonlinearProgram:
 
         by_theta_theta, by_rest = hessian_f.map(count, masks, [True, False])(*arguments)
         rows, columns = _triangle(n_t)
-        hessian.add(
-            piece.theta_index[rows], piece.theta_index[columns], lam_f * by_theta_theta
-        )
+        hessian.add(piece.theta_index[rows], piece.theta_index[columns], lam_f * by_theta_theta)
         rows, columns = _rest_of_triangle(variables.shape[1], n_t)
         hessian.add(variables[:, rows], variables[:, columns], lam_f * ca.vec(by_rest))
         return total
@@ -346,9 +344,7 @@ class NonlinearProgram:
         )
 
         def pick(rows: Indices, columns: Indices) -> ca.SX:
-            return ca.vertcat(
-                *(second[int(i), int(j)] for i, j in zip(rows, columns, strict=True))
-            )
+            return ca.vertcat(*(second[int(i), int(j)] for i, j in zip(rows, columns, strict=True)))
 
         second_f = ca.Function(
             f"reading_hessian_{piece.leg}",
@@ -359,9 +355,7 @@ class NonlinearProgram:
         )
         return first_f, second_f
 
-    def _add_closures(
-        self, x: ca.MX, lam_g: ca.MX, hessian: _Gather
-    ) -> tuple[ca.MX, ca.MX]:
+    def _add_closures(self, x: ca.MX, lam_g: ca.MX, hessian: _Gather) -> tuple[ca.MX, ca.MX]:
         """Closures of all postures and their Jacobian; their curvature goes into the Hessian."""
         problem = self.problem
         k, n_p = problem.n_postures, self._n_passive

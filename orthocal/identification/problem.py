@@ -117,9 +117,7 @@ class CalibrationProblem:
         self.drives = drive_table(session)
         self.setup_columns = setup_columns(session)
         self.theta_scale = np.array([p.tolerance for p in self.parameters])
-        self.passive_scale = (
-            LENGTH_SCALE / coordinate_units(self.robot)[self.robot.passive_index]
-        )
+        self.passive_scale = LENGTH_SCALE / coordinate_units(self.robot)[self.robot.passive_index]
 
     @property
     def n_free(self) -> int:
@@ -228,9 +226,7 @@ class CalibrationProblem:
         q = self.close(theta) if passive is None else passive
         return self._evaluate_readings(np.asarray(theta), q)[0]
 
-    def linearise(
-        self, theta: ArrayLike, passive: Array | None = None
-    ) -> tuple[Array, Array]:
+    def linearise(self, theta: ArrayLike, passive: Array | None = None) -> tuple[Array, Array]:
         """Readings and identification Jacobian at given parameters.
 
         The passive coordinates are eliminated by the implicit function theorem,
@@ -275,9 +271,7 @@ class CalibrationProblem:
 
     def _machine(self, drives: ca.SX, passive: ca.SX, theta: ca.SX) -> SymbolicRobot:
         errors: dict[str, ca.SX | float] = dict(self.fixed)
-        errors.update(
-            {name: theta[i] * self.theta_scale[i] for i, name in enumerate(self.free)}
-        )
+        errors.update({name: theta[i] * self.theta_scale[i] for i, name in enumerate(self.free)})
         return SymbolicRobot(
             self.robot, drives=drives, passive=passive * self.passive_scale, errors=errors
         )
@@ -285,9 +279,13 @@ class CalibrationProblem:
     @cached_property
     def _closure_jacobians(self) -> BatchFunction:
         piece = self.posture_piece
-        inputs = [piece.passive, piece.drives, piece.theta]
-        outputs = [ca.jacobian(piece.closure, piece.passive), ca.jacobian(piece.closure, piece.theta)]
-        function = ca.Function("closure_jacobians", inputs, outputs, ["q", "d", "theta"], ["a", "b"])
+        function = ca.Function(
+            "closure_jacobians",
+            [piece.passive, piece.drives, piece.theta],
+            [ca.jacobian(piece.closure, piece.passive), ca.jacobian(piece.closure, piece.theta)],
+            ["q", "d", "theta"],
+            ["g_q", "g_theta"],
+        )
         return BatchFunction(function, shared=["theta"])
 
     @cached_property

@@ -158,6 +158,18 @@ class Information:
         null = self.directions[self.rank :]
         return np.asarray(np.sqrt((null**2).sum(axis=0)) < 1e-6)
 
+    def determined(self, *, sigma: float) -> NDArray[np.bool_]:
+        """Whether the readings alone tell a parameter better than its tolerance, shape (n_free,).
+
+        Args:
+            sigma: Standard deviation of one reading, [m]; if not known, what is structurally
+                identifiable counts as told.
+        """
+        if not sigma > 0.0:
+            return self.identifiable
+        variance = (sigma / np.maximum(self.singular_values, 1e-300)) ** 2
+        return np.asarray(((self.directions**2).T @ variance < 1.0) & self.identifiable)
+
     def effective_parameters(self, *, sigma: float, prior: bool) -> float:
         """Parameters that the readings determine: the rank, or the trace of the prior's share."""
         if not prior:
@@ -181,7 +193,7 @@ def decompose(jacobian: Array, observations: Observations) -> Information:
     """
     projected = project_out_zeros(jacobian, observations)
     if len(projected) > 2 * projected.shape[1]:  # same singular values, far fewer rows
-        projected = np.linalg.qr(projected, mode="r")
+        projected = np.asarray(np.linalg.qr(projected, mode="r"))
     _, values, directions = np.linalg.svd(projected, full_matrices=True)
     padded = np.zeros(projected.shape[1])
     padded[: len(values)] = values

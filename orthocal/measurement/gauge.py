@@ -245,9 +245,7 @@ def predict_entries(
     return result
 
 
-def _reading_function(
-    robot: Robot, leg: Leg, errors: Mapping[str, float] | None
-) -> BatchFunction:
+def _reading_function(robot: Robot, leg: Leg, errors: Mapping[str, float] | None) -> BatchFunction:
     drives = ca.SX.sym("drives", len(robot.drives))
     passive = ca.SX.sym("passive", robot.passive_index.size)
     zero_drives = ca.SX.sym("zero_drives", len(robot.drives))
@@ -284,9 +282,7 @@ def locate_contacts(session: Session) -> dict[tuple[str, str], float]:
     for leg in robot.legs.values():
         for frame in (leg.root, leg.tip):
             ends.append(ca.dot(ca.SX(np.array(leg.axis)), machine.frame_pose(frame).position))
-    function = BatchFunction(
-        ca.Function("ends", [drives_in, passive_in], [ca.vertcat(*ends)])
-    )
+    function = BatchFunction(ca.Function("ends", [drives_in, passive_in], [ca.vertcat(*ends)]))
     (along,) = function(nominal, passive)
     postures = {name: i for i, name in enumerate(session.postures)}
     legs = {name: i for i, name in enumerate(robot.legs)}

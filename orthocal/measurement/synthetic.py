@@ -15,7 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 from orthocal.documents import parse_number, read_yaml, validate
 from orthocal.errors import ParameterError, SessionError
 from orthocal.measurement.gauge import build_observations, predict_entries
-from orthocal.measurement.session import Session, to_mm
+from orthocal.measurement.session import Session
+from orthocal.measurement.session_file import to_mm
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
@@ -36,7 +37,11 @@ class SimulatedSession:
 
 
 def draw_errors(
-    robot: Robot, patterns: Sequence[str], *, seed: int, tolerances: Mapping[str, float] | None = None
+    robot: Robot,
+    patterns: Sequence[str],
+    *,
+    seed: int,
+    tolerances: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
     """Errors drawn from the tolerances: independent, normal, with mean 0.
 
@@ -101,8 +106,8 @@ def simulate_session(
     limits = plan.gauge.range
     if limits is not None:
         for reading, value in zip(plan.readings, rows, strict=True):
-            lowest, highest = limits if reading.minus is None else (
-                limits[0] - limits[1], limits[1] - limits[0]
+            lowest, highest = (
+                limits if reading.minus is None else (limits[0] - limits[1], limits[1] - limits[0])
             )
             if not lowest <= value <= highest:
                 raise SessionError(
@@ -208,4 +213,4 @@ def truth_document(simulated: SimulatedSession) -> str:
         "zeros_mm": {name: to_mm(value) for name, value in simulated.zeros.items()},
     }
     head = "# The truth behind the simulated readings beside this file. No calibration reads it.\n"
-    return head + yaml.safe_dump(document, sort_keys=False, default_flow_style=False)
+    return head + str(yaml.safe_dump(document, sort_keys=False, default_flow_style=False))

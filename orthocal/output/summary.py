@@ -129,8 +129,8 @@ def explain_fit(calibration: Calibration) -> list[str]:
         low, high = _ratio_interval(noise.residual_dof)
         if ratio > high:
             sentences.append(
-                f"What remains, σ = {_mm(calibration.sigma)} mm of {row}, is {ratio:.0f} times what "
-                f"the gauge itself would leave ({_mm(gauge * factor)} mm): it is error of the "
+                f"What remains, σ = {_mm(calibration.sigma)} mm of {row}, is {ratio:.0f} times "
+                f"what the gauge itself would leave ({_mm(gauge * factor)} mm): it is error of the "
                 f"model (legs, axes, mounting), not noise of the gauge. With {calibration.model} "
                 "alone it will stay."
             )
@@ -233,8 +233,10 @@ def _heading(calibration: Calibration) -> RenderableType:
     kind = "differences" if calibration.rows_are_differences else "readings"
     legs = ", ".join(sorted({s.leg for s in calibration.setups}))
     lines = [
-        Text(f"Calibration of {calibration.robot_record.name}, model '{calibration.model}'",
-             style="bold"),
+        Text(
+            f"Calibration of {calibration.robot_record.name}, model '{calibration.model}'",
+            style="bold",
+        ),
         Text(session.title),
     ]
     if session.source:
@@ -266,14 +268,14 @@ def _parameter_table(calibration: Calibration) -> RenderableType:
     for p in calibration.free:
         f = p.edge_factor
         half = k * p.std * f
-        known = math.isfinite(half)
+        interval = f"{_signed(p.value * f - half)} … {_signed(p.value * f + half)}"
         _add(
             table,
             p.name + ("" if p.identifiable else " *"),
             _signed(p.linear * f),
             _signed(p.value * f),
             _plain(p.std * f),
-            f"{_signed(p.value * f - half)} … {_signed(p.value * f + half)}" if known else "unknown",
+            interval if math.isfinite(half) else "unknown",
             _signed((p.value - p.linear) * f, 4),
             f"{(p.value - p.linear) / p.std:+.3f}" if p.std > 0.0 else "",
             p.edge_unit,
@@ -285,7 +287,10 @@ def _parameter_table(calibration: Calibration) -> RenderableType:
         notes.append(Text(f"Held at known values: {values}"))
     if any(not p.identifiable for p in calibration.free):
         notes.append(
-            Text("* the readings alone do not determine it: its tolerance, as a prior, does")
+            Text(
+                "* the readings alone do not tell it better than its tolerance, "
+                "which acts as a prior"
+            )
         )
     return Group(*notes)
 
@@ -385,7 +390,9 @@ def _controller_table(calibration: Calibration) -> RenderableType:
     ]
     if not stated:
         notes.append(
-            Text("The session does not state the offsets that were active: there is no `controller`.")
+            Text(
+                "The session does not state the offsets that were active: there is no `controller`."
+            )
         )
     if len(calibration.free) > len(entries):
         notes.append(

@@ -196,7 +196,9 @@ class Assembly:
         drives = x[:, : len(self.robot.drives)]
         return drives[0] if single else drives
 
-    def tcp(self, drives: ArrayLike, passive: ArrayLike, *, theta: ArrayLike | None = None) -> Array:
+    def tcp(
+        self, drives: ArrayLike, passive: ArrayLike, *, theta: ArrayLike | None = None
+    ) -> Array:
         """Tool centre point of joint coordinates with closed loops, shape (K, 3) or (3,), [m]."""
         if self._tcp is None:
             position = self._symbolic.frame_pose(self._require_tcp().frame).position
@@ -210,9 +212,7 @@ class Assembly:
         return points[0] if np.ndim(drives) == 1 else points
 
     def _theta(self, theta: ArrayLike | None) -> Array:
-        return (
-            np.zeros(len(self.free)) if theta is None else np.asarray(theta, dtype=np.float64)
-        )
+        return np.zeros(len(self.free)) if theta is None else np.asarray(theta, dtype=np.float64)
 
     def _require_tcp(self) -> Tcp:
         if self.robot.tcp is None:
@@ -286,11 +286,12 @@ class Assembly:
         tolerance = CLOSED * max(1.0, self.robot.characteristic_length)
         count = len(targets)
 
-        def name(i: int) -> str:
-            return names[i] if names is not None else f"posture {i + 1}"
+        labels = names if names is not None else [f"posture {i + 1}" for i in range(count)]
 
-        for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)):
-            raise ClosureError(f"'{name(i)}' has coordinates that are not numbers", posture=name(i))
+        for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)).tolist():
+            raise ClosureError(
+                f"'{labels[i]}' has coordinates that are not numbers", posture=labels[i]
+            )
         first = system.start if start is None else np.asarray(start, dtype=np.float64)
         x = np.array(np.broadcast_to(first, (count, system.n_x)))
         moves = np.where(system.units == 1.0, self.robot.characteristic_length, 1.0)
@@ -309,22 +310,22 @@ class Assembly:
             x[lost], step[lost] = system.start, 2.0
             fresh[pending] = False
             step[pending[~good]] *= 0.5
-            for i in pending[~good & (step[pending] < SMALLEST_CONTINUATION_STEP)]:
+            for i in pending[~good & (step[pending] < SMALLEST_CONTINUATION_STEP)].tolist():
                 _, final = _newton(system, x[[i]], targets[[i]], theta, tolerance)
                 raise ClosureError(
-                    f"posture '{name(i)}' cannot be reached: the loops stay open by "
+                    f"posture '{labels[i]}' cannot be reached: the loops stay open by "
                     f"{final[0] * 1e3:.3g} mm, {done[i]:.0%} of the way from the mechanical zero",
-                    posture=name(i),
+                    posture=labels[i],
                     residual=float(final[0]),
                 )
             pending = pending[done[pending] < 1.0]
-        for i in np.flatnonzero(~system.within_limits(x)):
+        for i in np.flatnonzero(~system.within_limits(x)).tolist():
             over = np.maximum(x[i] - system.upper, system.lower - x[i])
             j = int(over.argmax())
             raise ClosureError(
-                f"posture '{name(i)}' cannot be reached: joint '{system.names[j]}' would be at "
+                f"posture '{labels[i]}' cannot be reached: joint '{system.names[j]}' would be at "
                 f"{x[i][j]:.4g}, outside its limits {system.lower[j]:g} ... {system.upper[j]:g}",
-                posture=name(i),
+                posture=labels[i],
                 residual=0.0,
             )
         return x

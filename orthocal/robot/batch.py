@@ -26,9 +26,11 @@ class BatchFunction:
 
     def __init__(self, function: ca.Function, *, shared: Sequence[str] = ()) -> None:
         symbols = [function.sx_in(i) for i in range(function.n_in())]
-        outputs = [ca.densify(y) for y in function(*symbols)] if function.n_out() > 1 else [
-            ca.densify(function(*symbols))
-        ]
+        outputs = (
+            [ca.densify(y) for y in function(*symbols)]
+            if function.n_out() > 1
+            else [ca.densify(function(*symbols))]
+        )
         self._function = ca.Function(
             function.name(), symbols, outputs, function.name_in(), function.name_out()
         )
@@ -56,10 +58,11 @@ class BatchFunction:
                 a if i in self._shared else np.ascontiguousarray(a[part])
                 for i, a in enumerate(arrays)
             ]
+            # casadi's type information describes the C++ call, with a pointer and a size
             for i, a in enumerate(held):
-                buffer.set_arg(i, memoryview(a.reshape(-1)))
+                buffer.set_arg(i, memoryview(a.reshape(-1)))  # type: ignore[call-arg,arg-type]
             for i, result in enumerate(results):
-                buffer.set_res(i, memoryview(result[part].reshape(-1)))
+                buffer.set_res(i, memoryview(result[part].reshape(-1)))  # type: ignore[call-arg,arg-type]
             trigger()
         return tuple(
             np.asarray(y[:, 0, :] if shape[1] == 1 else y.transpose(0, 2, 1))

@@ -17,6 +17,7 @@ from orthocal.robot.description import RobotKeys, load_description
 from orthocal.robot.parameters import (
     AXES,
     ElementaryError,
+    Kind,
     ParameterSet,
     Unit,
     build_parameters,
@@ -194,6 +195,7 @@ class Robot:
         Args:
             drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
             start: Passive coordinates to start from, shape (n_passive,), [m, rad].
+            posture: Name of the posture, for messages.
 
         Returns:
             Shape (n_passive,), [m, rad].
@@ -463,9 +465,7 @@ def _build_drives(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Drive,
         if entry is not None:
             wrong = "zero_deg" if prismatic else "zero_mm"
             if getattr(entry, wrong) is not None:
-                kind, right = (
-                    ("prismatic", "zero_mm") if prismatic else ("revolute", "zero_deg")
-                )
+                kind, right = ("prismatic", "zero_mm") if prismatic else ("revolute", "zero_deg")
                 raise RobotError(
                     f"the drive is {kind}; expected {right}",
                     where=f"{where}: orthocal.drives.{motor}.{wrong}",
@@ -487,7 +487,9 @@ def _build_drives(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Drive,
 
 def _build_closures(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Closure, ...]:
     named = keys.orthocal.closures
-    names = list(named) if named is not None else [f"closure_{i + 1}" for i in range(len(keys.type))]
+    names = (
+        list(named) if named is not None else [f"closure_{i + 1}" for i in range(len(keys.type))]
+    )
     rows_of = {r: i for i, r in enumerate(AXES)}
     closures = []
     for i, (name, pair, kind) in enumerate(zip(names, keys.closed_loop, keys.type, strict=True)):
@@ -526,7 +528,7 @@ def _build_parameter_set(
     def add_twist(owner: str, prefix: str, *, of_frame: bool, leave_out: int | None) -> None:
         for axis, letter in enumerate(AXES):
             if axis != leave_out:
-                kind = "translation" if axis < 3 else "rotation"
+                kind: Kind = "translation" if axis < 3 else "rotation"
                 elementary.append(
                     ElementaryError(
                         f"{prefix}{owner}.{letter}", kind, owner, of_frame, axis, units[axis]
@@ -538,7 +540,9 @@ def _build_parameter_set(
             ElementaryError(f"{drive.name}.offset", "offset", drive.name, False, -1, drive.unit)
         )
     for drive in drives:
-        elementary.append(ElementaryError(f"{drive.name}.scale", "scale", drive.name, False, -1, "1"))
+        elementary.append(
+            ElementaryError(f"{drive.name}.scale", "scale", drive.name, False, -1, "1")
+        )
     motors = {d.name for d in drives}
     for i in range(1, model.njoints):
         own = int(np.abs(joint_axis(model, i)).argmax()) if model.names[i] in motors else None
@@ -554,8 +558,13 @@ def _build_parameter_set(
     models = dict(extra.models)
     models.setdefault("offsets", ["*.offset"])
     models.setdefault(
-        "full", ["*", "!*.scale", *(["!frame.*"] if frames else []),
-                 *(f"!{name}" for name in extra.parameters)]
+        "full",
+        [
+            "*",
+            "!*.scale",
+            *(["!frame.*"] if frames else []),
+            *(f"!{name}" for name in extra.parameters),
+        ],
     )
     return build_parameters(
         elementary,

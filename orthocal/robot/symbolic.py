@@ -36,9 +36,7 @@ class Pose:
     """Shape (3,), [m]."""
 
     def __mul__(self, other: Pose) -> Pose:
-        return Pose(
-            self.rotation @ other.rotation, self.rotation @ other.position + self.position
-        )
+        return Pose(self.rotation @ other.rotation, self.rotation @ other.position + self.position)
 
     def relative(self, other: Pose) -> Pose:
         """Pose of `other` in this frame."""
@@ -96,8 +94,8 @@ def _alternating(square: ca.SX, first: int) -> ca.SX:
 def log6(pose: Pose) -> ca.SX:
     """Logarithm of a pose, as Pinocchio's log6: (translation, rotation), shape (6,).
 
-        ω = (θ/sin θ) ½ vee(R − Rᵀ)
-        v = p − ½ ω × p + (1/θ² − (1 + cos θ)/(2 θ sin θ)) ω × (ω × p)
+    ω = (θ/sin θ) ½ vee(R − Rᵀ)
+    v = p − ½ ω × p + (1/θ² − (1 + cos θ)/(2 θ sin θ)) ω × (ω × p)
     """
     rotation, p = pose.rotation, pose.position
     half = 0.5 * ca.inv_skew(rotation - rotation.T)
@@ -131,6 +129,8 @@ def joint_motion(model: pin.Model, joint: int, coordinates: ca.SX) -> Pose:
     """M_i(q) = exp6(S q) of a joint.
 
     Args:
+        model: The model.
+        joint: Index of the joint.
         coordinates: Shape (nv,): an angle also for an unbounded revolute joint.
 
     Raises:
@@ -155,9 +155,7 @@ def screw_motion(axis: NDArray[np.float64], angle: ca.SX) -> Pose:
     hat = pin.skew(w)
     s, c = ca.sin(angle), ca.cos(angle)
     rotation = (
-        ca.SX.eye(3)
-        + s * ca.sparsify(ca.SX(hat))
-        + (1.0 - c) * ca.sparsify(ca.SX(hat @ hat))
+        ca.SX.eye(3) + s * ca.sparsify(ca.SX(hat)) + (1.0 - c) * ca.sparsify(ca.SX(hat @ hat))
     )
     if not np.any(v):
         return Pose(rotation, ca.SX(3, 1))

@@ -131,9 +131,7 @@ def _check_elements(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has n
                 _numbers(limit, bound, 1, at(limit))
             for bound in ("effort", "velocity"):
                 if limit.get(bound) is None:
-                    raise RobotError(
-                        f"joint '{name}': its <limit> has no {bound}", where=at(limit)
-                    )
+                    raise RobotError(f"joint '{name}': its <limit> has no {bound}", where=at(limit))
             if float(limit.get("lower", "0")) > float(limit.get("upper", "0")):
                 raise RobotError(
                     f"joint '{name}': its lower limit is above its upper limit", where=at(limit)

@@ -178,7 +178,7 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         for old, new in zip(calibration.free, refit.free, strict=True)
     )
     matched, correlation, cosine = _correlate(calibration.residuals, refit.residuals)
-    dims = min(calibration.noise.residual_dof, refit.noise.residual_dof)
+    dims = _residual_dimensions(refit, matched)
     chance = math.nan
     if matched >= 3 and dims > 1.0 and not math.isnan(correlation):
         # directions of noise are spread evenly over the space that the fit leaves to residuals
@@ -232,6 +232,14 @@ def _excess_probability(calibration: Calibration, refit: Calibration) -> float:
     achieved = sum(r.deviation**2 / (2.0 if r.minus else 1.0) for r in rows)
     count = len(rows) - zeros
     return float(special.fdtrc(count, dof, achieved / count / expected**2))
+
+
+def _residual_dimensions(refit: Calibration, matched: int) -> float:
+    """Dimensions that a fit leaves to the residuals of matched rows, cycles averaged."""
+    rows = refit.residuals
+    zeros = len({r.setup for r in rows if r.minus is None})
+    used = len(rows) - zeros - refit.noise.residual_dof
+    return matched - zeros - used
 
 
 def _correlate(

@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tolerances import CLOSED_FORM, KINEMATICS
+
 from orthocal import calibrate, load_calibration, load_plan, load_session, simulate_session
 from orthocal.errors import CalibrationFileError
 from orthocal.robot import orthoglide as closed_form
-from tolerances import CLOSED_FORM, KINEMATICS
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
@@ -37,13 +38,33 @@ def test_the_file_gives_the_same_object_back(root, tmp_path, example, model):
 def test_the_file_has_what_was_promised(result):
     document = json.loads(result.to_json())
     assert document["schema"] == "orthocal/calibration/1"
-    assert {"robot", "session", "model", "solver", "parameters", "covariance", "sigma", "dof",
-            "rms_before", "rms_after", "residuals", "orthocal"} <= set(document)
+    assert {
+        "robot",
+        "session",
+        "model",
+        "solver",
+        "parameters",
+        "covariance",
+        "sigma",
+        "dof",
+        "rms_before",
+        "rms_after",
+        "residuals",
+        "orthocal",
+    } <= set(document)
     assert {"name", "unit", "value", "std", "tolerance", "free", "identifiable"} <= set(
         document["parameters"][0]
     )
-    assert {"setup", "posture", "minus", "cycle", "measured", "nominal", "predicted",
-            "residual"} <= set(document["residuals"][0])
+    assert {
+        "setup",
+        "posture",
+        "minus",
+        "cycle",
+        "measured",
+        "nominal",
+        "predicted",
+        "residual",
+    } <= set(document["residuals"][0])
     assert len(document["robot"]["sha256"]) == 64
     assert document["solver"]["name"] == "ipopt"
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tolerances import KINEMATICS, PRINTED
+
 from orthocal.errors import NotIdentifiableError
 from orthocal.identification.linear import (
     SIX_ROWS,
@@ -14,7 +16,6 @@ from orthocal.identification.linear import (
     twelve_row_covariance,
 )
 from orthocal.identification.problem import build_problem
-from tolerances import KINEMATICS, PRINTED
 
 GEOMETRY = {"length": 0.31025, "displacement_max": 0.06, "displacement_min": -0.10}
 

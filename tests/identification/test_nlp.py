@@ -6,13 +6,14 @@ import casadi as ca
 import numpy as np
 import pytest
 from derivatives import central_differences
+from scipy.optimize import least_squares
+from tolerances import DERIVATIVE, SAME_OPTIMUM, TRUTH_BACK
+
 from orthocal import load_plan, simulate_session
 from orthocal.errors import SolverError
 from orthocal.identification.nlp import NonlinearProgram, SolverOptions
 from orthocal.identification.problem import build_problem
 from orthocal.identification.uncertainty import project_out_zeros
-from scipy.optimize import least_squares
-from tolerances import DERIVATIVE, SAME_OPTIMUM, TRUTH_BACK
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 

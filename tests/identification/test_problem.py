@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from derivatives import assert_derivative
+from tolerances import KINEMATICS
+
 from orthocal import load_plan
 from orthocal.errors import ParameterError, SessionError
 from orthocal.identification.problem import CalibrationProblem, build_problem
 from orthocal.measurement.gauge import build_observations, predict_entries
-from tolerances import KINEMATICS
 
 
 @pytest.fixture(scope="module")

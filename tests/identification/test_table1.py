@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 import pytest
+from tolerances import DESIGN_MM, FOUR_DECIMALS_MM, PAPER_MM, THREE_DECIMALS_MM
+
 from orthocal import calibrate, load_session
 from orthocal.identification.linear import leg_parallelism_matrix, solve_equation_8
-from tolerances import DESIGN_MM, FOUR_DECIMALS_MM, PAPER_MM, THREE_DECIMALS_MM
 
 # Independent computation of the reduced system (mm): offsets, r.m.s. before and after, sigma
 LINEAR = {

@@ -8,10 +8,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from derivatives import central_differences
+from tolerances import KINEMATICS, PRINTED, THREE_DECIMALS_MM
+
 from orthocal import load_plan, load_session
 from orthocal.measurement.gauge import build_observations, locate_contacts, predict_entries
 from orthocal.measurement.session import DIRECTIONS, Section, section_plane
-from tolerances import KINEMATICS, PRINTED, THREE_DECIMALS_MM
 
 OFFSETS = ("x_slide.offset", "y_slide.offset", "z_slide.offset")
 
@@ -43,7 +44,11 @@ def reading_by_pinocchio(session, machine, setup, posture):
 def test_readings_equal_those_of_a_pinocchio_machine_with_all_errors(root):
     """Every kind of section and sign, all errors at five times their tolerance."""
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
-    sections = [Section("fraction", 0.4), Section("from_root_mm", 0.2), Section("coordinate_mm", 0.15)]
+    sections = [
+        Section("fraction", 0.4),
+        Section("from_root_mm", 0.2),
+        Section("coordinate_mm", 0.15),
+    ]
     setups = {
         name: replace(s, section=sections[i % 3], direction=("-" if i % 2 else "") + s.direction)
         for i, (name, s) in enumerate(plan.setups.items())
@@ -98,9 +103,7 @@ def test_a_perfect_machine_shows_no_deviation(raw_cycles):
 
 def test_offsets_that_the_controller_corrects_do_not_show(raw_cycles):
     offsets = np.array([1.2e-3, -0.8e-3, 0.5e-3])
-    postures = {
-        n: replace(p, drives=p.drives - offsets) for n, p in raw_cycles.postures.items()
-    }
+    postures = {n: replace(p, drives=p.drives - offsets) for n, p in raw_cycles.postures.items()}
     corrected = replace(raw_cycles, postures=postures, controller_offsets=offsets)
     o = build_observations(corrected)
     shown = predict_entries(corrected, o, dict(zip(OFFSETS, offsets, strict=True)))

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tolerances import CLOSED_FORM, KINEMATICS
+
 from orthocal import load_plan, load_session, write_session
 from orthocal.errors import SessionError
 from orthocal.measurement.session import section_plane
-from tolerances import CLOSED_FORM, KINEMATICS
 
 HEAD = """robot: orthoglide
 postures:
@@ -74,7 +75,12 @@ def test_sections_become_planes_along_the_leg(tmp_path, section, expected):
 def test_a_plan_lists_its_readings_setup_by_setup(root):
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     labels = [(r.setup, r.posture, r.cycle) for r in plan.readings]
-    assert labels[:4] == [("yx", "zero", 1), ("yx", "x_max", 1), ("yx", "x_min", 1), ("yx", "zero", 2)]
+    assert labels[:4] == [
+        ("yx", "zero", 1),
+        ("yx", "x_max", 1),
+        ("yx", "x_min", 1),
+        ("yx", "zero", 2),
+    ]
     assert len(labels) == 6 * 3 * 3
 
 

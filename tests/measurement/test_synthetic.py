@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tolerances import KINEMATICS
+
 from orthocal import draw_errors, load_plan, load_session, simulate_session
 from orthocal.errors import ParameterError, SessionError
 from orthocal.measurement.gauge import build_observations, predict_entries
 from orthocal.measurement.synthetic import collect_errors, load_errors, truth_document
-from tolerances import KINEMATICS
 
 ERRORS = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
@@ -79,11 +80,13 @@ def test_errors_are_drawn_then_read_then_given(tmp_path, orthoglide):
     )
     assert found["x_slide.offset"] == 1e-3
     assert found["y_slide.offset"] == 3e-3
-    assert found["z_slide.offset"] == draw_errors(orthoglide, ["*.offset"], seed=4)["z_slide.offset"]
+    assert (
+        found["z_slide.offset"] == draw_errors(orthoglide, ["*.offset"], seed=4)["z_slide.offset"]
+    )
 
 
 def test_readings_beyond_the_gauge_are_refused(plan):
-    with pytest.raises(SessionError, match="the simulated reading .* the gauge's range ends at"):
+    with pytest.raises(SessionError, match=r"the simulated reading .* the gauge's range ends at"):
         simulate_session(plan, {"x_slide.offset": 15e-3, "y_slide.offset": -15e-3})
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+
 from orthocal import calibrate, load_session, summarize
 from orthocal.output.summary import explain_fit
 
@@ -27,7 +28,14 @@ def test_linear_and_exact_stand_side_by_side(table1):
 def test_every_reading_is_listed_before_and_after(table1):
     text = summarize(table1)
     assert line(text, "zx").split() == [
-        "zx", "x_max", "−", "x_min", "-1.140", "-1.140", "-0.130", "-0.5",
+        "zx",
+        "x_max",
+        "−",
+        "x_min",
+        "-1.140",
+        "-1.140",
+        "-0.130",
+        "-0.5",
     ]
     assert line(text, "r.m.s.").split()[-3:] == ["0.622", "0.195", "-69%"]
     assert line(text, "largest").split()[-3:] == ["1.140", "0.278", "-76%"]
@@ -37,7 +45,9 @@ def test_sigma_is_held_against_the_gauges_own(table1):
     text = " ".join(summarize(table1).split())
     assert "σ of a difference: 0.276 mm, from the residuals, 3 degrees of freedom" in text
     assert "σ given for the gauge: 0.020 mm a reading, 0.028 mm a difference" in text
-    assert "is 10 times what the gauge itself would leave (0.028 mm): it is error of the model" in text
+    assert (
+        "is 10 times what the gauge itself would leave (0.028 mm): it is error of the model" in text
+    )
 
 
 def test_it_says_what_to_type_and_what_to_believe(table1):
@@ -72,7 +82,7 @@ def test_a_prior_marks_what_the_readings_leave_open(root):
     result = calibrate(load_session(root / "examples/table1/experiment-2"), model="lengths")
     text = summarize(result)
     assert "x_leg.length *" in text
-    assert "* the readings alone do not determine it" in text
+    assert "* the readings alone do not tell it better than its tolerance" in text
     assert "tolerances as prior" in text
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tolerances import CLOSED, CLOSED_FORM
+
 from orthocal.errors import ClosureError, RobotError
 from orthocal.robot import orthoglide as closed_form
 from orthocal.robot.assembly import Assembly, nominal_assembly
-from tolerances import CLOSED, CLOSED_FORM
 
 LENGTH = 0.31025
 

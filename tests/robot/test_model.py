@@ -6,9 +6,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from derivatives import assert_derivative
+from tolerances import KINEMATICS
+
 from orthocal import load_robot
 from orthocal.errors import RobotError
-from tolerances import KINEMATICS
 
 
 def test_the_orthoglide_is_the_designed_machine(orthoglide):

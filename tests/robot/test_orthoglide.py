@@ -9,9 +9,10 @@ import pytest
 from derivatives import assert_derivative
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tolerances import KINEMATICS, PRINTED
+
 from orthocal.errors import UnreachableError
 from orthocal.robot import orthoglide as og
-from tolerances import KINEMATICS, PRINTED
 
 LENGTH = 0.31025
 inside = st.floats(-0.12, 0.12)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+
 from orthocal.errors import ParameterError
 
 
@@ -29,7 +30,7 @@ def test_patterns_add_and_take_out_in_their_order(orthoglide):
 
 
 def test_a_pattern_that_matches_nothing_suggests(orthoglide):
-    with pytest.raises(ParameterError, match="did you mean x_slide.offset"):
+    with pytest.raises(ParameterError, match=r"did you mean x_slide\.offset"):
         orthoglide.parameters.select(["x_slid.offset"])
 
 

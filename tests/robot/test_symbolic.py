@@ -7,12 +7,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from derivatives import assert_derivative, central_differences
+from tolerances import DERIVATIVE, KINEMATICS
+
 from orthocal import load_robot
 from orthocal.errors import RobotError
 from orthocal.robot.model import place_frames
 from orthocal.robot.symbolic import Pose, SymbolicRobot, SymbolicTree, exp6, log6
 from orthocal.robot.urdf import load_urdf
-from tolerances import DERIVATIVE, KINEMATICS
 
 
 def models(root):
@@ -166,7 +167,9 @@ def test_exp6_and_log6_have_exact_first_and_second_derivatives(angle):
     twist = ca.SX.sym("twist", 6)
     pose = exp6(twist)
     weights = np.random.default_rng(4).normal(size=18)
-    relative = Pose(pose.rotation, pose.position) * Pose(ca.SX(pin.exp3(np.full(3, 0.01))), ca.SX(3, 1))
+    relative = Pose(pose.rotation, pose.position) * Pose(
+        ca.SX(pin.exp3(np.full(3, 0.01))), ca.SX(3, 1)
+    )
     outputs = ca.vertcat(ca.vec(pose.rotation), pose.position, log6(relative))
     scalar = ca.dot(weights, outputs)
     hessian, gradient = ca.hessian(scalar, twist)
@@ -202,7 +205,9 @@ def test_closure_residual_equals_pinocchios_constraint_error(request, robot):
         ours, slope = (np.asarray(v) for v in function(d, p, errors))
         assert np.abs(ours.ravel() - residual).max() < KINEMATICS
         assert np.abs(slope - jacobian[:, r.passive_index]).max() < KINEMATICS * 10
-        numeric = central_differences(lambda u, d=d, e=errors: np.asarray(function(d, u, e)[0]).ravel(), p)
+        numeric = central_differences(
+            lambda u, d=d, e=errors: np.asarray(function(d, u, e)[0]).ravel(), p
+        )
         assert np.abs(slope - numeric).max() < DERIVATIVE
 
 

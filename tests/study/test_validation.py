@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tolerances import THREE_DECIMALS_MM
+
 from orthocal import (
     calibrate,
     load_plan,
@@ -16,7 +18,6 @@ from orthocal import (
     validate_calibration,
 )
 from orthocal.errors import SessionError
-from tolerances import THREE_DECIMALS_MM
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 

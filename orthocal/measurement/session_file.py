@@ -1,0 +1,557 @@
+"""Sessions as files: session.yaml with its readings in a CSV beside it, in mm.
+
+Read, checked against the robot and the nominal machine, and written.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
+
+from orthocal.documents import parse_number, read_csv_rows, read_yaml, validate, write_files
+from orthocal.errors import ClosureError, RobotError, SessionError
+from orthocal.measurement.gauge import locate_contacts
+from orthocal.measurement.session import (
+    DIRECTIONS,
+    Gauge,
+    Posture,
+    Reading,
+    Section,
+    Session,
+    Setup,
+    section_plane,
+)
+from orthocal.robot.assembly import nominal_assembly
+from orthocal.robot.model import Robot, load_robot, read_only
+
+Array = NDArray[np.float64]
+
+COLUMNS = ("setup", "posture", "minus", "cycle", "reading_mm")
+"""Columns of a readings.csv; `minus` and `cycle` may be absent."""
+
+Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^,;\s\"]+$")]
+Vector = Annotated[list[FiniteFloat], Field(min_length=1, max_length=12)]
+
+
+class _Keys(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class GaugeKeys(_Keys):
+    """The indicator."""
+
+    sigma_mm: PositiveFloat | None = None
+    resolution_mm: PositiveFloat | None = None
+    range_mm: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
+
+    @model_validator(mode="after")
+    def _range_rises(self) -> GaugeKeys:
+        if self.range_mm is not None and not self.range_mm[0] < self.range_mm[1]:
+            raise ValueError(f"found {self.range_mm}; expected [lowest, highest]")
+        return self
+
+
+class PostureKeys(_Keys):
+    """A commanded machine position."""
+
+    tcp_mm: Vector | None = None
+    joints_mm: Vector | None = None
+    joints_deg: Vector | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> PostureKeys:
+        given = [k for k in ("tcp_mm", "joints_mm", "joints_deg") if getattr(self, k) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) if given else "none"
+            raise ValueError(f"found {found}; expected one of tcp_mm, joints_mm, joints_deg")
+        return self
+
+
+class SectionKeys(_Keys):
+    """Where along the leg's nominal axis the gauge touches."""
+
+    coordinate_mm: FiniteFloat | None = None
+    from_root_mm: FiniteFloat | None = None
+    fraction: FiniteFloat | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> SectionKeys:
+        forms = ("coordinate_mm", "from_root_mm", "fraction")
+        given = [k for k in forms if getattr(self, k) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) if given else "none"
+            raise ValueError(f"found {found}; expected one of {', '.join(forms)}")
+        return self
+
+
+class SetupKeys(_Keys):
+    """One standing of the gauge."""
+
+    leg: Name
+    direction: str
+    section: SectionKeys
+    postures: list[Name] | None = None
+    """In a plan: the postures it is to be read in; all by default."""
+
+
+class ControllerKeys(_Keys):
+    """What the controller already corrects."""
+
+    offsets_mm: Vector
+
+
+class SessionKeys(_Keys):
+    """A session.yaml, or a plan: the same without `readings`."""
+
+    robot: str
+    title: str = ""
+    source: str = ""
+    gauge: GaugeKeys = GaugeKeys()
+    postures: Annotated[dict[Name, PostureKeys], Field(min_length=1)]
+    controller: ControllerKeys | None = None
+    setups: Annotated[dict[Name, SetupKeys], Field(min_length=1)]
+    cycles: Annotated[int, Field(ge=1, le=1000)] = 1
+    """In a plan: how often the postures are gone through."""
+    readings: str | None = None
+
+
+def load_session(path: str | Path) -> Session:
+    """Read a session: its YAML, its CSV and its robot, checked against each other.
+
+    Args:
+        path: The session.yaml, or the folder that holds it.
+
+    Raises:
+        SessionError: Naming file and line or key, what was found and what was expected.
+        RobotError: If the robot does not load.
+    """
+    file, keys = _read_keys(Path(path))
+    if keys.readings is None:
+        raise SessionError("is missing; expected the name of a CSV file", where=f"{file}: readings")
+    plan = _build_plan(file, keys)
+    readings_path = file.parent / keys.readings
+    readings = _read_readings(readings_path, plan)
+    digest = hashlib.sha256(file.read_bytes() + b"\0" + readings_path.read_bytes()).hexdigest()
+    session = replace(plan, readings=readings, readings_path=readings_path, sha256=digest)
+    check_contacts(session)
+    return session
+
+
+def load_plan(path: str | Path) -> Session:
+    """Read a plan: a session.yaml without `readings`; each planned reading is 0.
+
+    A setup is read in all postures, or in those its `postures` names; `cycles` times. A session
+    that has readings is a plan too: that of its rows.
+
+    Raises:
+        SessionError: Naming file and key.
+        RobotError: If the robot does not load.
+    """
+    file, keys = _read_keys(Path(path))
+    if keys.readings is not None:
+        return load_session(file)
+    plan = _build_plan(file, keys)
+    readings = []
+    for name, setup in keys.setups.items():
+        for posture in setup.postures or ():
+            if posture not in plan.postures:
+                raise SessionError(
+                    f"'{posture}' is not a posture; postures: {', '.join(plan.postures)}",
+                    where=f"{file}: setups.{name}.postures",
+                )
+        readings += [
+            Reading(name, posture, None, cycle, 0.0, None)
+            for cycle in range(1, keys.cycles + 1)
+            for posture in setup.postures or plan.postures
+        ]
+    session = replace(plan, readings=tuple(readings))
+    check_contacts(session)
+    return session
+
+
+def check_contacts(session: Session) -> None:
+    """Check, on the nominal machine, that the gauge touches the leg in every posture it is read in.
+
+    Raises:
+        SessionError: Naming the setup and the posture.
+    """
+    fractions = locate_contacts(session)
+    for (setup, posture), fraction in fractions.items():
+        if not 0.0 <= fraction <= 1.0:
+            length = session.robot.legs[session.setups[setup].leg].length * 1e3
+            raise SessionError(
+                f"in posture '{posture}' the gauge would touch at {fraction * length:.1f} mm from "
+                f"the root; the leg reaches from 0 to {length:.1f} mm",
+                where=_where(session.path, f"setups.{setup}.section"),
+            )
+
+
+def session_document(session: Session, *, readings: str = "readings.csv") -> dict[str, Any]:
+    """The session.yaml of a session, as plain data."""
+    document: dict[str, Any] = {"robot": session.robot_reference}
+    if session.title:
+        document["title"] = session.title
+    if session.source:
+        document["source"] = session.source
+    gauge = session.gauge
+    entries = {
+        "sigma_mm": None if gauge.sigma is None else to_mm(gauge.sigma),
+        "resolution_mm": None if gauge.resolution is None else to_mm(gauge.resolution),
+        "range_mm": None if gauge.range is None else [to_mm(v) for v in gauge.range],
+    }
+    entries = {k: v for k, v in entries.items() if v is not None}
+    if entries:
+        document["gauge"] = entries
+    document["postures"] = {
+        p.name: {
+            p.form: [_tidy(np.rad2deg(v)) if p.form == "joints_deg" else to_mm(v) for v in p.values]
+        }
+        for p in session.postures.values()
+    }
+    if session.controller_offsets is not None:
+        document["controller"] = {"offsets_mm": [to_mm(v) for v in session.controller_offsets]}
+    document["setups"] = {
+        s.name: {
+            "leg": s.leg,
+            "direction": s.direction,
+            "section": {
+                s.section.form: s.section.value
+                if s.section.form == "fraction"
+                else to_mm(s.section.value)
+            },
+        }
+        for s in session.setups.values()
+    }
+    document["readings"] = readings
+    return document
+
+
+def write_session(
+    session: Session,
+    folder: str | Path,
+    *,
+    decimals: int = 6,
+    comment: str = "",
+    extra: Mapping[str, str] | None = None,
+) -> Path:
+    """Write session.yaml and readings.csv into a folder, both or neither.
+
+    Args:
+        session: The session.
+        folder: Made if need be.
+        decimals: Decimals of a reading in mm.
+        comment: Lines put first into the YAML.
+        extra: Other files of the folder, name to text, written with them.
+
+    Returns:
+        Path of the session.yaml.
+
+    Raises:
+        OrthocalError: If the folder cannot be written to.
+    """
+    document = session_document(session)
+    head = "".join(f"# {line}\n" for line in comment.splitlines())
+    text = head + yaml.safe_dump(
+        document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
+    )
+    table = io.StringIO()
+    with_minus = any(r.minus for r in session.readings)
+    with_cycle = any(r.cycle != 1 for r in session.readings)
+    columns = [c for c in COLUMNS if (c != "minus" or with_minus) and (c != "cycle" or with_cycle)]
+    table.write(",".join(columns) + "\n")
+    for r in session.readings:
+        fields = {
+            "setup": r.setup,
+            "posture": r.posture,
+            "minus": r.minus or "",
+            "cycle": str(r.cycle),
+            "reading_mm": _trim(f"{r.value * 1e3:.{decimals}f}"),
+        }
+        table.write(",".join(fields[c] for c in columns) + "\n")
+    folder = Path(folder)
+    files = {"session.yaml": text, "readings.csv": table.getvalue(), **(extra or {})}
+    write_files(folder, files)
+    return folder / "session.yaml"
+
+
+def to_mm(value: float) -> float:
+    """Metres as mm, without the rounding that the factor brings."""
+    return _tidy(value * 1e3)
+
+
+def _tidy(value: float) -> float:
+    return float(f"{value:.12g}")
+
+
+def _trim(number: str) -> str:
+    """A decimal number without trailing zeros beyond the second decimal."""
+    whole, _, decimals = number.partition(".")
+    return f"{whole}.{decimals.rstrip('0').ljust(2, '0')}"
+
+
+def _where(path: Path | None, key: str) -> str:
+    return key if path is None else f"{path}: {key}"
+
+
+def _read_keys(path: Path) -> tuple[Path, SessionKeys]:
+    file = path / "session.yaml" if path.is_dir() else path
+    data = read_yaml(file, error=SessionError)
+    return file, validate(SessionKeys, data, where=str(file), error=SessionError)
+
+
+def _build_plan(file: Path, keys: SessionKeys) -> Session:
+    """Everything of a session but its readings."""
+    try:
+        robot = load_robot(keys.robot, beside=file.parent)
+    except RobotError as e:
+        if e.where is None:
+            raise SessionError(e.problem, where=f"{file}: robot") from None
+        raise
+    if not robot.legs:
+        raise SessionError(
+            f"'{robot.name}' has no legs for a gauge to touch; add orthocal.legs to {robot.yaml}",
+            where=f"{file}: robot",
+        )
+    offsets = None
+    if keys.controller is not None:
+        where = f"{file}: controller.offsets_mm"
+        _check_count(keys.controller.offsets_mm, robot, where)
+        if any(d.unit != "m" for d in robot.drives):
+            raise SessionError("the robot has revolute drives; mm do not fit", where=where)
+        offsets = read_only(np.array(keys.controller.offsets_mm) * 1e-3)
+    setups = {n: _build_setup(n, s, robot, f"{file}: setups.{n}") for n, s in keys.setups.items()}
+    g = keys.gauge
+    return Session(
+        robot=robot,
+        robot_reference=keys.robot,
+        title=keys.title,
+        source=keys.source,
+        gauge=Gauge(
+            None if g.sigma_mm is None else g.sigma_mm * 1e-3,
+            None if g.resolution_mm is None else g.resolution_mm * 1e-3,
+            None if g.range_mm is None else (g.range_mm[0] * 1e-3, g.range_mm[1] * 1e-3),
+        ),
+        postures=_build_postures(keys, robot, offsets, file),
+        setups=setups,
+        readings=(),
+        controller_offsets=offsets,
+        path=file,
+        readings_path=None,
+        sha256="",
+    )
+
+
+def _build_setup(name: str, keys: SetupKeys, robot: Robot, where: str) -> Setup:
+    if keys.leg not in robot.legs:
+        raise SessionError(
+            f"'{keys.leg}' is not a leg of {robot.name}; legs: {', '.join(robot.legs)}",
+            where=f"{where}.leg",
+        )
+    if keys.direction not in DIRECTIONS:
+        raise SessionError(
+            f"found '{keys.direction}'; expected one of {', '.join(DIRECTIONS)}",
+            where=f"{where}.direction",
+        )
+    along = abs(float(np.dot(DIRECTIONS[keys.direction], robot.legs[keys.leg].axis)))
+    if along > 1.0 - 1e-6:
+        raise SessionError(
+            f"'{keys.direction}' is along leg {keys.leg}; a gauge measures across it",
+            where=f"{where}.direction",
+        )
+    section = keys.section
+    for form, factor in (("coordinate_mm", 1e-3), ("from_root_mm", 1e-3), ("fraction", 1.0)):
+        value = getattr(section, form)
+        if value is not None:
+            setup = Setup(name, keys.leg, keys.direction, Section(form, value * factor))  # type: ignore[arg-type]
+            if form == "fraction" and not 0.0 <= value <= 1.0:
+                raise SessionError(
+                    f"found {value:g}; expected 0 (root) to 1 (tip)",
+                    where=f"{where}.section.fraction",
+                )
+    section_plane(robot, setup, where=f"{where}.section")
+    return setup
+
+
+def _check_count(values: Sequence[float], robot: Robot, where: str) -> None:
+    if len(values) != len(robot.drives):
+        names = ", ".join(d.name for d in robot.drives)
+        raise SessionError(
+            f"has {len(values)} numbers; expected {len(robot.drives)}, one a drive: {names}",
+            where=where,
+        )
+
+
+def _build_postures(
+    keys: SessionKeys, robot: Robot, offsets: Array | None, file: Path
+) -> dict[str, Posture]:
+    """Commanded drive coordinates of all postures, through the nominal inverse kinematics."""
+    assembly = nominal_assembly(robot)
+    active = np.zeros(len(robot.drives)) if offsets is None else offsets
+    nominal: dict[str, Array] = {}
+    given: dict[str, tuple[Any, Array]] = {}
+    targets: dict[str, Array] = {}
+    for name, posture in keys.postures.items():
+        where = f"{file}: postures.{name}"
+        if posture.tcp_mm is not None:
+            if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
+                raise SessionError(
+                    f"{robot.name} cannot be commanded by its tool; give joints", where=where
+                )
+            if len(posture.tcp_mm) != len(robot.drives):
+                raise SessionError(
+                    f"has {len(posture.tcp_mm)} coordinates; expected {len(robot.drives)}",
+                    where=f"{where}.tcp_mm",
+                )
+            given[name] = ("tcp_mm", np.array(posture.tcp_mm) * 1e-3)
+            targets[name] = given[name][1]
+            continue
+        form = "joints_mm" if posture.joints_mm is not None else "joints_deg"
+        values = posture.joints_mm if posture.joints_mm is not None else posture.joints_deg
+        assert values is not None  # one of the three forms is given
+        _check_count(values, robot, f"{where}.{form}")
+        unit = "m" if form == "joints_mm" else "rad"
+        for drive in robot.drives:
+            if drive.unit != unit:
+                raise SessionError(
+                    f"drive {drive.name} is in {'mm' if drive.unit == 'm' else 'deg'}",
+                    where=f"{where}.{form}",
+                )
+        si = np.array(values) * 1e-3 if unit == "m" else np.deg2rad(values)
+        given[name] = (form, si)
+        nominal[name] = si
+    if targets:
+        try:
+            joints = assembly.inverse(np.array(list(targets.values())), names=list(targets))
+        except ClosureError as e:
+            raise SessionError(e.problem, where=f"{file}: postures.{e.posture}") from None
+        nominal.update(zip(targets, joints, strict=True))
+    for name in keys.postures:
+        for drive, value in zip(robot.drives, nominal[name], strict=True):
+            if not drive.lower - 1e-9 <= value <= drive.upper + 1e-9:
+                factor, unit_name = (1e3, "mm") if drive.unit == "m" else (180 / np.pi, "deg")
+                raise SessionError(
+                    f"{drive.name} would be at {value * factor:.2f} {unit_name}; it reaches from "
+                    f"{drive.lower * factor:g} to {drive.upper * factor:g} {unit_name}",
+                    where=f"{file}: postures.{name}",
+                )
+    try:
+        assembly.close(np.array([nominal[n] for n in keys.postures]), names=list(keys.postures))
+    except ClosureError as e:
+        raise SessionError(e.problem, where=f"{file}: postures.{e.posture}") from None
+    return {
+        name: Posture(
+            name, given[name][0], read_only(given[name][1]), read_only(nominal[name] - active)
+        )
+        for name in keys.postures
+    }
+
+
+def _read_readings(path: Path, plan: Session) -> tuple[Reading, ...]:
+    readings: list[Reading] = []
+    seen: dict[tuple[Any, ...], int] = {}
+    raw: dict[tuple[str, int], int] = {}
+    joined: dict[tuple[str, int], dict[str, str]] = {}
+    for line, row in read_csv_rows(
+        path,
+        required=("setup", "posture", "reading_mm"),
+        optional=("minus", "cycle"),
+        error=SessionError,
+    ):
+        where = f"{path}:{line}"
+        setup, posture, minus = row["setup"], row["posture"], row.get("minus", "")
+        if setup not in plan.setups:
+            raise SessionError(
+                f"'{setup}' is not a setup; setups: {', '.join(plan.setups)}", where=where
+            )
+        for name in (posture, minus):
+            if name not in plan.postures and (name or name is posture):
+                raise SessionError(
+                    f"'{name}' is not a posture; postures: {', '.join(plan.postures)}",
+                    where=where,
+                )
+        if minus == posture:
+            raise SessionError(f"takes posture '{posture}' off itself", where=where)
+        cycle = _parse_cycle(row.get("cycle", ""), where)
+        value = parse_number(row["reading_mm"], where=where, name="reading_mm", error=SessionError)
+        reading = Reading(setup, posture, minus or None, cycle, value * 1e-3, line)
+        key = (setup, posture, minus, cycle)
+        if key in seen:
+            raise SessionError(
+                f"repeats {reading.label} of cycle {cycle}, first in line {seen[key]}; "
+                "number repeated measurements in the column 'cycle'",
+                where=where,
+            )
+        seen[key] = line
+        _check_range(value, plan.gauge, bool(minus), where)
+        _check_form(reading, raw, joined, where)
+        readings.append(reading)
+    if not readings:
+        raise SessionError("holds no readings", where=str(path))
+    return tuple(readings)
+
+
+def _parse_cycle(text: str, where: str) -> int:
+    if not text:
+        return 1
+    if not text.isdigit() or int(text) < 1:
+        raise SessionError(f"cycle is '{text}'; expected 1, 2, 3 ...", where=where)
+    return int(text)
+
+
+def _check_range(value_mm: float, gauge: Gauge, difference: bool, where: str) -> None:
+    if gauge.range is None:
+        return
+    lowest, highest = (v * 1e3 for v in gauge.range)
+    if difference:
+        lowest, highest = lowest - highest, highest - lowest
+    if not lowest - 1e-9 <= value_mm <= highest + 1e-9:
+        kind = "a difference" if difference else "a reading"
+        raise SessionError(
+            f"reading_mm is {value_mm:g}; the gauge's range allows {kind} from "
+            f"{lowest:g} to {highest:g}",
+            where=where,
+        )
+
+
+def _check_form(
+    reading: Reading,
+    raw: dict[tuple[str, int], int],
+    joined: dict[tuple[str, int], dict[str, str]],
+    where: str,
+) -> None:
+    """Refuse readings that say the same thing twice within one cycle of one setup."""
+    group = (reading.setup, reading.cycle)
+    if reading.minus is None:
+        raw.setdefault(group, reading.line or 0)
+    else:
+        leader = joined.setdefault(group, {})
+
+        def find(name: str) -> str:
+            while leader.get(name, name) != name:
+                name = leader[name]
+            return name
+
+        first, second = find(reading.posture), find(reading.minus)
+        if first == second:
+            raise SessionError(
+                f"{reading.label} follows from the other differences of setup "
+                f"{reading.setup} in cycle {reading.cycle}; leave it out, or give it its own "
+                "cycle if it was measured apart",
+                where=where,
+            )
+        leader[first] = second
+    if group in raw and group in joined:
+        raise SessionError(
+            f"setup {reading.setup} has both readings and differences in cycle {reading.cycle}; "
+            "give the readings only",
+            where=where,
+        )

@@ -1,0 +1,1632 @@
+"""Broken inputs: each has its exact message, exit code 2, no traceback, and leaves no file behind.
+
+Every case spoils one good input in one way and runs one command. Paths in the messages are written
+with `{tmp}` for the folder of the case.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from orthocal import calibrate, load_session
+from orthocal.cli import main
+
+ROOT = Path(__file__).parents[1]
+DIFFERENCES = ROOT / "examples/table1/experiment-2"
+CYCLES = ROOT / "examples/raw-cycles"
+
+Edit = Callable[[Path], None]
+
+CALIBRATE = "calibrate {tmp} --out {tmp}/out"
+FORWARD = "forward {tmp}/calibration.json {tmp}/joints.csv"
+INVERSE = "inverse {tmp}/calibration.json {tmp}/points.csv"
+VALIDATE = "validate {tmp}/calibration.json {tmp}"
+SIMULATE = "simulate {tmp}/plan.yaml --out {tmp}/out"
+ONE_ERROR = " --error x_slide.offset_mm=1.2"
+
+YAML = "machine/orthoglide.yaml"
+URDF = "machine/orthoglide.urdf"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One broken input."""
+
+    name: str
+    message: str
+    """What stands on stderr after 'orthocal: '."""
+    edits: tuple[Edit, ...] = ()
+    command: str = CALIBRATE
+    base: str = "differences"
+    """differences, cycles, or machine: differences on a robot folder beside the session."""
+    calibrated: bool = False
+    """Whether a good calibration.json is there too."""
+
+
+def swap(file: str, old: str, new: str) -> Edit:
+    def edit(folder: Path) -> None:
+        text = (folder / file).read_text(encoding="utf-8")
+        assert old in text, f"{file} does not hold {old!r}"
+        (folder / file).write_text(text.replace(old, new), encoding="utf-8")
+
+    return edit
+
+
+def write(file: str, content: str | bytes) -> Edit:
+    def edit(folder: Path) -> None:
+        (folder / file).parent.mkdir(exist_ok=True)
+        (folder / file).write_bytes(content if isinstance(content, bytes) else content.encode())
+
+    return edit
+
+
+def remove(file: str) -> Edit:
+    def edit(folder: Path) -> None:
+        (folder / file).unlink()
+
+    return edit
+
+
+def put(file: str, keys: str, value: Any) -> Edit:
+    """Set what stands in a JSON file under keys such as parameters.0.name."""
+
+    def edit(folder: Path) -> None:
+        document = json.loads((folder / file).read_text(encoding="utf-8"))
+        *path, last = (int(k) if k.isdigit() else k for k in keys.split("."))
+        inner = document
+        for key in path:
+            inner = inner[key]
+        assert isinstance(last, int) or last in inner, f"{file} has no {keys}"
+        inner[last] = value
+        (folder / file).write_text(json.dumps(document, indent=1), encoding="utf-8")
+
+    return edit
+
+
+def session(name: str, old: str, new: str, message: str, *more: Edit) -> Case:
+    edits = (swap("session.yaml", old, new), *more)
+    return Case(f"session-{name}", "{tmp}/session.yaml" + message, edits)
+
+
+def session_file(name: str, content: str | bytes, message: str) -> Case:
+    return Case(
+        f"session-{name}", "{tmp}/session.yaml" + message, (write("session.yaml", content),)
+    )
+
+
+def readings(name: str, old: str, new: str, message: str, base: str = "differences") -> Case:
+    return Case(
+        f"readings-{name}",
+        "{tmp}/readings.csv" + message,
+        (swap("readings.csv", old, new),),
+        base=base,
+    )
+
+
+def readings_file(name: str, content: str | bytes, message: str) -> Case:
+    return Case(
+        f"readings-{name}", "{tmp}/readings.csv" + message, (write("readings.csv", content),)
+    )
+
+
+def robot(name: str, old: str, new: str, message: str, *more: Edit) -> Case:
+    edits = (swap(YAML, old, new), *more)
+    return Case(f"robot-{name}", "{tmp}/" + YAML + message, edits, base="machine")
+
+
+def urdf(name: str, old: str, new: str, message: str) -> Case:
+    edits = (swap(URDF, old, new),)
+    return Case(f"urdf-{name}", "{tmp}/" + URDF + message, edits, base="machine")
+
+
+def urdf_file(name: str, content: str | bytes, message: str) -> Case:
+    edits = (write(URDF, content),)
+    return Case(f"urdf-{name}", "{tmp}/" + URDF + message, edits, base="machine")
+
+
+def calibration(name: str, message: str, *edits: Edit, command: str = FORWARD) -> Case:
+    return Case(f"calibration-{name}", message, edits, command, "machine", calibrated=True)
+
+
+def joints(name: str, table: str, message: str) -> Case:
+    edits = (write("joints.csv", table),)
+    message = "{tmp}/joints.csv" + message
+    return Case(f"joints-{name}", message, edits, FORWARD, "machine", calibrated=True)
+
+
+def points(name: str, table: str, message: str) -> Case:
+    edits = (write("points.csv", table),)
+    message = "{tmp}/points.csv" + message
+    return Case(f"points-{name}", message, edits, INVERSE, "machine", calibrated=True)
+
+
+def simulate(name: str, options: str, message: str, *edits: Edit) -> Case:
+    return Case(f"simulate-{name}", message, edits, SIMULATE + options)
+
+
+X_MAX = "x_max: {tcp_mm: [60, 0, 0]}"
+XY = "xy: {leg: y, direction: x, section: {fraction: 0.5}}"
+OFFSETS = "controller: {offsets_mm: [0, 0, 0]}\n"
+RANGE = "range_mm: [-5, 5]"
+SIGMA = "sigma_mm: 0.02"
+TITLE = "title: Experiment 2, after mechanical tuning, before calibration"
+FORMS = "coordinate_mm, from_root_mm, fraction"
+SESSION_KEYS = "robot, title, source, gauge, postures, controller, setups, cycles, readings"
+SETUPS = "xy, xz, yx, yz, zx, zy"
+POSTURES = "x_max, x_min, y_max, y_min, z_max, z_min"
+DRIVES = "x_slide, y_slide, z_slide"
+LONG = "a" * 300
+
+SESSION_KEY_CASES = [
+    session("key-unknown", "title:", "titel:", f": titel: unknown key; known keys: {SESSION_KEYS}"),
+    session(
+        "key-unknown-in-gauge",
+        "sigma_mm:",
+        "sigma:",
+        ": gauge.sigma: unknown key; known keys: sigma_mm, resolution_mm, range_mm",
+    ),
+    session(
+        "key-unknown-in-posture",
+        "x_max: {tcp_mm:",
+        "x_max: {tcp:",
+        ": postures.x_max.tcp: unknown key; known keys: tcp_mm, joints_mm, joints_deg",
+    ),
+    session(
+        "key-unknown-in-setup",
+        "xy: {leg:",
+        "xy: {legs:",
+        ": setups.xy.legs: unknown key; known keys: leg, direction, section, postures",
+    ),
+    session(
+        "key-unknown-in-section",
+        XY,
+        XY.replace("fraction", "part"),
+        f": setups.xy.section.part: unknown key; known keys: {FORMS}",
+    ),
+    session("key-missing", "robot: orthoglide\n", "", ": robot: is missing"),
+    session("key-missing-in-setup", "xy: {leg: y, ", "xy: {", ": setups.xy.leg: is missing"),
+    session(
+        "key-twice",
+        TITLE,
+        TITLE + "\ntitle: 2",
+        ":8: is not valid YAML: the key 'title' stands twice",
+    ),
+    session(
+        "posture-twice",
+        "  x_min:",
+        "  x_max:",
+        ":13: is not valid YAML: the key 'x_max' stands twice",
+    ),
+    session(
+        "key-a-number",
+        "  x_max:",
+        "  1:",
+        ": postures: found the key 1; expected text: put it in quotes",
+    ),
+    session(
+        "key-a-truth-value",
+        "  xy: {",
+        "  on: {",
+        ": setups: found the key True; expected text: put it in quotes",
+    ),
+    session(
+        "key-a-list",
+        TITLE,
+        "[a, b]: c",
+        ":7: is not valid YAML: a key is a list or a mapping; expected text",
+    ),
+    session(
+        "template-left-in",
+        "robot: orthoglide",
+        "robot: {{ robot }}",
+        ":6: is not valid YAML: a key is a list or a mapping; expected text",
+    ),
+    session(
+        "name-with-blank",
+        "  x_max:",
+        "  x max:",
+        ": postures.x max: found 'x max'; expected a name without blanks, commas, semicolons or "
+        "quotes",
+    ),
+]
+
+SESSION_TYPE_CASES = [
+    session(
+        "text-for-number",
+        SIGMA,
+        "sigma_mm: small",
+        ": gauge.sigma_mm: found 'small'; expected number, unable to parse string as a number",
+    ),
+    session(
+        "number-for-text", "robot: orthoglide", "robot: 5", ": robot: found '5'; expected string"
+    ),
+    session(
+        "number-for-list",
+        X_MAX,
+        "x_max: {tcp_mm: 60}",
+        ": postures.x_max.tcp_mm: found '60'; expected list",
+    ),
+    session(
+        "list-for-keys",
+        X_MAX,
+        "x_max: [60, 0, 0]",
+        ": postures.x_max: found '[60, 0, 0]'; expected keys and values",
+    ),
+    session(
+        "nothing-for-keys",
+        f"gauge: {{{SIGMA}, resolution_mm: 0.01, {RANGE}}}",
+        "gauge:",
+        ": gauge: found nothing; expected keys and values",
+    ),
+    session(
+        "yes-for-number",
+        SIGMA,
+        "sigma_mm: yes",
+        ": gauge.sigma_mm: found 'True'; expected number",
+    ),
+    session(
+        "no-for-coordinate",
+        X_MAX,
+        "x_max: {tcp_mm: [60, no, 0]}",
+        ": postures.x_max.tcp_mm[1]: found 'False'; expected number",
+    ),
+    session(
+        "sigma-negative",
+        SIGMA,
+        "sigma_mm: -0.02",
+        ": gauge.sigma_mm: found '-0.02'; expected greater than 0",
+    ),
+    session(
+        "sigma-infinite",
+        SIGMA,
+        "sigma_mm: .inf",
+        ": gauge.sigma_mm: found 'inf'; expected a finite number",
+    ),
+    session(
+        "sigma-decimal-comma",
+        SIGMA,
+        "sigma_mm: 0,02",
+        ": gauge.sigma_mm: found '0'; expected greater than 0",
+    ),
+    session(
+        "range-reversed",
+        RANGE,
+        "range_mm: [5, -5]",
+        ": gauge.range_mm: found [5.0, -5.0]; expected [lowest, highest]",
+    ),
+    session(
+        "range-of-one",
+        RANGE,
+        "range_mm: [5]",
+        ": gauge.range_mm: found '[5]'; expected at least 2 items",
+    ),
+    session(
+        "cycles-zero",
+        "readings: readings.csv",
+        "readings: readings.csv\ncycles: 0",
+        ": cycles: found '0'; expected greater than or equal to 1",
+    ),
+]
+
+SESSION_FILE_CASES = [
+    session(
+        "tab",
+        "postures:\n  x_max",
+        "postures:\n\tx_max",
+        ":12: is not valid YAML: found character '\\t' that cannot start any token",
+    ),
+    session(
+        "bracket-open",
+        "[60, 0, 0]}\n",
+        "[60, 0, 0\n",
+        ":13: is not valid YAML: expected ',' or ']', but got ':'",
+    ),
+    session(
+        "colon-in-text",
+        "title: Experiment 2",
+        "title: Experiment: 2",
+        ":7: is not valid YAML: mapping values are not allowed here",
+    ),
+    session(
+        "alias",
+        X_MAX,
+        "x_max: &p {tcp_mm: [60, 0, 0]}\n  x_far: *p",
+        ":13: is not valid YAML: aliases (*name) are not allowed here",
+    ),
+    session(
+        "python-object",
+        TITLE,
+        "title: !!python/object/apply:os.getcwd []",
+        ":7: is not valid YAML: could not determine a constructor for the tag "
+        "'tag:yaml.org,2002:python/object/apply:os.getcwd'",
+    ),
+    session(
+        "tag-that-does-not-fit",
+        SIGMA,
+        "sigma_mm: !!bool perhaps",
+        ":9: is not valid YAML: 'perhaps' does not fit its tag !!bool",
+    ),
+    session(
+        "two-documents",
+        "readings: readings.csv",
+        "readings: readings.csv\n---\nmore: 1",
+        ":31: is not valid YAML: expected a single document in the stream, but found another "
+        "document",
+    ),
+    session(
+        "half-a-character",
+        TITLE,
+        'title: "\\ud800"',
+        ":7: is not valid YAML: half of a surrogate pair is not a character",
+    ),
+    session_file("list", "- robot\n- setups\n", ": holds a list; expected keys and values"),
+    session_file("text", "calibrate this\n", ": holds text; expected keys and values"),
+    session_file("empty", "", ": holds nothing; expected keys and values"),
+    session_file("comments-only", "# to do\n", ": holds nothing; expected keys and values"),
+    session_file(
+        "not-utf8", "title: Präzision\n".encode("latin-1"), ": is not UTF-8 text (byte 9)"
+    ),
+    Case("session-missing", "{tmp}/session.yaml: there is no such file", (remove("session.yaml"),)),
+    Case(
+        "session-path-missing",
+        "{tmp}/first.yaml: there is no such file",
+        command="calibrate {tmp}/first.yaml --out {tmp}/out",
+    ),
+    Case(
+        "session-folder-without",
+        "{tmp}/machine/session.yaml: there is no such file",
+        command="calibrate {tmp}/machine --out {tmp}/out",
+    ),
+    Case(
+        "session-name-too-long",
+        f"{{tmp}}/{LONG}: cannot be read: File name too long",
+        command=f"calibrate {{tmp}}/{LONG} --out {{tmp}}/out",
+    ),
+]
+
+SESSION_SENSE_CASES = [
+    session(
+        "robot-unknown",
+        "robot: orthoglide",
+        "robot: hexapod",
+        ": robot: 'hexapod' is neither a robot of orthocal (orthoglide) nor a folder "
+        "({tmp}/hexapod)",
+    ),
+    session(
+        "robot-empty",
+        "robot: orthoglide",
+        "robot: ''",
+        ": robot: '' is neither a robot of orthocal (orthoglide) nor a folder ({tmp})",
+    ),
+    session(
+        "robot-name-too-long",
+        "robot: orthoglide",
+        f"robot: {LONG}",
+        f": robot: '{LONG}' is neither a robot of orthocal (orthoglide) nor a folder "
+        f"({{tmp}}/{LONG})",
+    ),
+    session(
+        "leg-unknown",
+        XY,
+        XY.replace("leg: y", "leg: w"),
+        ": setups.xy.leg: 'w' is not a leg of orthoglide; legs: x, y, z",
+    ),
+    session(
+        "direction-along-leg",
+        XY,
+        XY.replace("direction: x", "direction: -y"),
+        ": setups.xy.direction: '-y' is along leg y; a gauge measures across it",
+    ),
+    session(
+        "direction-unknown",
+        XY,
+        XY.replace("direction: x", "direction: up"),
+        ": setups.xy.direction: found 'up'; expected one of x, y, z, -x, -y, -z",
+    ),
+    session(
+        "section-two-forms",
+        XY,
+        XY.replace("0.5", "0.5, from_root_mm: 100"),
+        f": setups.xy.section: found from_root_mm and fraction; expected one of {FORMS}",
+    ),
+    session(
+        "section-no-form",
+        XY,
+        XY.replace("fraction: 0.5", ""),
+        f": setups.xy.section: found none; expected one of {FORMS}",
+    ),
+    session(
+        "section-fraction-above-1",
+        XY,
+        XY.replace("0.5", "1.5"),
+        ": setups.xy.section.fraction: found 1.5; expected 0 (root) to 1 (tip)",
+    ),
+    session(
+        "section-off-the-leg",
+        XY,
+        XY.replace("fraction: 0.5", "coordinate_mm: 500"),
+        ": setups.xy.section: in posture 'y_max' the gauge would touch at -89.8 mm from the root; "
+        "the leg reaches from 0 to 310.2 mm",
+    ),
+    session(
+        "setup-in-unknown-posture",
+        "xy: {leg: y",
+        "xy: {postures: [top], leg: y",
+        f": setups.xy.postures: 'top' is not a posture; postures: {POSTURES}",
+    ),
+    session(
+        "posture-two-forms",
+        X_MAX,
+        "x_max: {tcp_mm: [60, 0, 0], joints_mm: [370, 305, 305]}",
+        ": postures.x_max: found tcp_mm and joints_mm; expected one of tcp_mm, joints_mm, "
+        "joints_deg",
+    ),
+    session(
+        "posture-no-form",
+        X_MAX,
+        "x_max: {}",
+        ": postures.x_max: found none; expected one of tcp_mm, joints_mm, joints_deg",
+    ),
+    session(
+        "posture-two-coordinates",
+        X_MAX,
+        "x_max: {tcp_mm: [60, 0]}",
+        ": postures.x_max.tcp_mm: has 2 coordinates; expected 3",
+    ),
+    session(
+        "posture-no-coordinates",
+        X_MAX,
+        "x_max: {tcp_mm: []}",
+        ": postures.x_max.tcp_mm: found '[]'; expected at least 1 item",
+    ),
+    session(
+        "posture-two-joints",
+        X_MAX,
+        "x_max: {joints_mm: [370, 305]}",
+        f": postures.x_max.joints_mm: has 2 numbers; expected 3, one a drive: {DRIVES}",
+    ),
+    session(
+        "posture-in-degrees",
+        X_MAX,
+        "x_max: {joints_deg: [370, 305, 305]}",
+        ": postures.x_max.joints_deg: drive x_slide is in mm",
+    ),
+    session(
+        "posture-not-a-number",
+        X_MAX,
+        "x_max: {tcp_mm: [.nan, 0, 0]}",
+        ": postures.x_max.tcp_mm[0]: found 'nan'; expected a finite number",
+    ),
+    session(
+        "posture-unreachable",
+        X_MAX,
+        "x_max: {tcp_mm: [600, 0, 0]}",
+        ": postures.x_max: posture 'x_max' cannot be reached: the loops stay open by # mm, #% of "
+        "the way from the mechanical zero",
+    ),
+    session(
+        "posture-beyond-travel",
+        X_MAX,
+        "x_max: {joints_mm: [500, 310, 310]}",
+        ": postures.x_max: x_slide would be at 500.00 mm; it reaches from 120 to 390 mm",
+    ),
+    session(
+        "posture-by-tool-beyond-travel",
+        X_MAX,
+        "x_max: {tcp_mm: [90, 0, 0]}",
+        ": postures.x_max: posture 'x_max' cannot be reached: joint 'x_slide' would be at "
+        "400.3 mm, outside its limits 120 ... 390 mm",
+    ),
+    session(
+        "offsets-two",
+        OFFSETS,
+        "controller: {offsets_mm: [0, 0]}\n",
+        f": controller.offsets_mm: has 2 numbers; expected 3, one a drive: {DRIVES}",
+    ),
+    session(
+        "offsets-beyond-travel",
+        OFFSETS,
+        "controller: {offsets_mm: [500, 0, 0]}\n",
+        ": controller.offsets_mm: in posture 'x_max' x_slide would be at -129.75 mm; it reaches "
+        "from 120 to 390 mm",
+    ),
+    session(
+        "readings-not-named",
+        "readings: readings.csv\n",
+        "",
+        ": readings: is missing; expected the name of a CSV file",
+    ),
+    Case(
+        "session-readings-file-missing",
+        "{tmp}/data.csv: there is no such file",
+        (swap("session.yaml", "readings.csv", "data.csv"),),
+    ),
+    Case(
+        "session-readings-a-folder",
+        "{tmp}/machine: is a folder; expected a file",
+        (swap("session.yaml", "readings.csv", "machine"),),
+    ),
+    session(
+        "readings-with-null",
+        "readings.csv",
+        '"a\\0.csv"',
+        ": readings: found 'a\\x00.csv'; expected the name of a CSV file",
+    ),
+    Case(
+        "model-unknown",
+        "'ofsets' is not a model of this robot; models: offsets, lengths, full",
+        command=CALIBRATE + " --model ofsets",
+    ),
+    Case(
+        "out-a-file",
+        "{tmp}/readings.csv: is a file; expected a folder",
+        command="calibrate {tmp} --out {tmp}/readings.csv",
+    ),
+]
+
+HEADER = "setup,posture,minus,reading_mm"
+COLUMNS = "expected setup, posture, reading_mm and optionally minus, cycle"
+
+READINGS_CASES = [
+    readings(
+        "column-unknown", "reading_mm", "reading_um", f":1: unknown column 'reading_um'; {COLUMNS}"
+    ),
+    readings(
+        "column-missing",
+        HEADER,
+        "setup,minus,reading_mm",
+        ":1: the column 'posture' is missing; found setup, minus, reading_mm",
+    ),
+    readings(
+        "column-twice",
+        HEADER,
+        "setup,posture,minus,minus,reading_mm",
+        ":1: the column 'minus' stands twice",
+    ),
+    readings("header-missing", HEADER + "\n", "", f":1: unknown column 'xy'; {COLUMNS}"),
+    readings("fields-few", "y_min,-0.43", "-0.43", f":2: has 3 fields; expected 4 ({HEADER})"),
+    readings("fields-many", "-0.43", "-0.43,1", f":2: has 5 fields; expected 4 ({HEADER})"),
+    readings("setup-unknown", "xy,", "yy,", f":2: 'yy' is not a setup; setups: {SETUPS}"),
+    readings(
+        "posture-unknown",
+        "xy,y_max",
+        "xy,y_top",
+        f":2: 'y_top' is not a posture; postures: {POSTURES}",
+    ),
+    readings("posture-empty", "xy,y_max", "xy,", f":2: '' is not a posture; postures: {POSTURES}"),
+    readings(
+        "minus-unknown",
+        "xy,y_max,y_min",
+        "xy,y_max,y_low",
+        f":2: 'y_low' is not a posture; postures: {POSTURES}",
+    ),
+    readings(
+        "minus-itself", "xy,y_max,y_min", "xy,y_max,y_max", ":2: takes posture 'y_max' off itself"
+    ),
+    readings("not-a-number", "-0.43", "n/a", ":2: reading_mm is 'n/a'; expected a number"),
+    readings("empty-field", "-0.43", "", ":2: reading_mm is ''; expected a number"),
+    readings(
+        "unit-in-field", "-0.43", "-0.43 mm", ":2: reading_mm is '-0.43 mm'; expected a number"
+    ),
+    readings("underscore", "-0.43", "-0_4.3", ":2: reading_mm is '-0_4.3'; expected a number"),
+    readings("other-digits", "-0.43", "٣", ":2: reading_mm is '٣'; expected a number"),
+    readings("nan", "-0.43", "NaN", ":2: reading_mm is 'NaN'; expected a finite number"),
+    readings("infinite", "-0.43", "-inf", ":2: reading_mm is '-inf'; expected a finite number"),
+    readings_file(
+        "decimal-comma",
+        "setup;posture;minus;reading_mm\nxy;y_max;y_min;-0,43\n",
+        ":2: reading_mm is '-0,43'; expected a number (a decimal comma? write a point)",
+    ),
+    readings(
+        "decimal-comma-between-commas", "-0.43", "-0,43", f":2: has 5 fields; expected 4 ({HEADER})"
+    ),
+    readings(
+        "cycle-zero", "yx,zero,1,", "yx,zero,0,", ":2: cycle is '0'; expected 1, 2, 3 ...", "cycles"
+    ),
+    readings(
+        "cycle-half",
+        "yx,zero,1,",
+        "yx,zero,1.5,",
+        ":2: cycle is '1.5'; expected 1, 2, 3 ...",
+        "cycles",
+    ),
+    readings(
+        "cycle-superscript",
+        "yx,zero,1,",
+        "yx,zero,²,",
+        ":2: cycle is '²'; expected 1, 2, 3 ...",
+        "cycles",
+    ),
+    readings(
+        "cycle-endless",
+        "yx,zero,1,",
+        f"yx,zero,{'9' * 5000},",
+        f":2: cycle is '{'9' * 5000}'; expected 1, 2, 3 ...",
+        "cycles",
+    ),
+    readings(
+        "row-twice",
+        "yx,zero,2,",
+        "yx,zero,1,",
+        ":5: repeats yx zero of cycle 1, first in line 2; number repeated measurements in the "
+        "column 'cycle'",
+        "cycles",
+    ),
+    readings(
+        "out-of-range",
+        "yx,zero,1,-0.40",
+        "yx,zero,1,-5.40",
+        ":2: reading_mm is -5.4; the gauge's range allows a reading from -5 to 5",
+        "cycles",
+    ),
+    readings(
+        "difference-out-of-range",
+        "-0.43",
+        "-43",
+        ":2: reading_mm is -43; the gauge's range allows a difference from -10 to 10",
+    ),
+    readings(
+        "difference-reversed",
+        "xz,z_max,z_min",
+        "xy,y_min,y_max",
+        ":3: xy y_min − y_max follows from the other differences of setup xy in cycle 1; leave it "
+        "out, or give it its own cycle if it was measured apart",
+    ),
+    readings(
+        "difference-redundant",
+        "xz,z_max,z_min,",
+        "xy,y_max,x_max,1\nxy,y_min,x_max,",
+        ":4: xy y_min − x_max follows from the other differences of setup xy in cycle 1; leave it "
+        "out, or give it its own cycle if it was measured apart",
+    ),
+    readings(
+        "readings-and-differences",
+        "xz,z_max,z_min",
+        "xy,y_max,",
+        ":3: setup xy has both readings and differences in cycle 1; give the readings only",
+    ),
+    readings("quote-within", "xy,", '"xy"a,', ":2: is not valid CSV: ',' expected after '\"'"),
+    readings_file("empty", "", ":1: is empty; expected a header: setup,posture,reading_mm"),
+    readings_file(
+        "first-line-blank",
+        f"\n{HEADER}\nxy,y_max,y_min,-0.43\n",
+        ":1: is blank; expected a header: setup,posture,reading_mm",
+    ),
+    readings_file("header-only", HEADER + "\n", ": holds no readings"),
+    readings_file("not-utf8", f"{HEADER}\n".encode("utf-16"), ": is not UTF-8 text (byte 0)"),
+    Case(
+        "readings-too-few",
+        "the readings do not determine x_slide.offset, y_slide.offset, z_slide.offset: 1 of 3 free "
+        "parameters can be told from them. Read the legs that are missing, in postures along their "
+        "own axes, or use tolerances as a prior",
+        (write("readings.csv", f"{HEADER}\nxy,y_max,y_min,-0.43\n"),),
+    ),
+]
+
+PAIR = "[platform, z_foot_end]"
+MOTORS = "name_mot: [x_slide, y_slide, z_slide]"
+ROWS = "x_parallelogram: {rows: [x, z]}"
+SUM = "[x_coupler.x, frame.x_rod_b_tip.x]"
+ZERO = "x_slide: {zero_mm: 310.25}"
+LEG = "x: {root: x_leg_root, tip: x_leg_tip}"
+SUFFIXES = "_mm, _um, _mrad, _deg, _ppm"
+MOVING = ", ".join(
+    f"{leg}_{joint}"
+    for leg in "xyz"
+    for joint in ("slide", "swivel", "bar_a", "coupler", "wrist", "fork", "bar_b")
+)
+
+ROBOT_CASES = [
+    robot(
+        "key-unknown",
+        "name_mot:",
+        "motors:",
+        ": motors: unknown key; known keys: closed_loop, type, name_mot, orthocal",
+    ),
+    robot(
+        "key-unknown-in-tcp",
+        "tcp: {frame:",
+        "tcp: {link:",
+        ": orthocal.tcp.link: unknown key; known keys: frame, coordinates",
+    ),
+    robot("key-missing", "type: [3d, 3d, 3d, 6d, 6d]\n", "", ": type: is missing"),
+    robot(
+        "nothing-below-orthocal",
+        "  legs:\n    x: {root: x_leg_root, tip: x_leg_tip}\n    y: {root: y_leg_root, "
+        "tip: y_leg_tip}\n    z: {root: z_leg_root, tip: z_leg_tip}\n",
+        "  legs:\n",
+        ": orthocal.legs: found nothing; expected keys and values",
+    ),
+    robot("types-too-few", "3d, 6d, 6d]", "3d, 6d]", ": type has 4 entries; closed_loop has 5"),
+    robot("type-unknown", "6d, 6d]", "6d, 5d]", ": type[4]: found '5d'; expected '3d' or '6d'"),
+    robot(
+        "closures-too-few",
+        "    z_platform: {}\n",
+        "",
+        ": orthocal.closures has 4 entries; closed_loop has 5, and each needs one, in the same "
+        "order",
+    ),
+    robot(
+        "pair-of-three",
+        PAIR,
+        "[platform, z_foot_end, tcp]",
+        ": closed_loop[4]: found '['platform', 'z_foot_end', 'tcp']'; expected at most 2 items",
+    ),
+    robot(
+        "pair-with-itself",
+        PAIR,
+        "[platform, platform]",
+        ": closed_loop[4]: closes the frame 'platform' on itself",
+    ),
+    robot(
+        "frame-unknown",
+        PAIR,
+        "[platform, z_hand]",
+        ": closed_loop[4]: the URDF has no frame 'z_hand'",
+    ),
+    robot(
+        "motor-unknown",
+        MOTORS,
+        "name_mot: [x_slide, y_slide, w_slide]",
+        f": name_mot: the URDF has no moving joint 'w_slide'; joints: {MOVING}",
+        swap(YAML, "    z_slide: {zero_mm: 310.25}\n", ""),
+    ),
+    robot(
+        "motor-twice",
+        MOTORS,
+        "name_mot: [x_slide, y_slide, y_slide]",
+        ": name_mot names a motor twice",
+    ),
+    robot("motor-none", MOTORS, "name_mot: []", ": name_mot: found '[]'; expected at least 1 item"),
+    robot(
+        "drive-not-a-motor",
+        f"    {ZERO}",
+        "    w_slide: {zero_mm: 310.25}",
+        f": orthocal.drives.w_slide is not in name_mot; motors: {DRIVES}",
+    ),
+    robot(
+        "rows-unknown",
+        ROWS,
+        ROWS.replace("z]", "w]"),
+        ": orthocal.closures.x_parallelogram.rows[1]: found 'w'; expected 'x', 'y', 'z', 'rx', "
+        "'ry' or 'rz'",
+    ),
+    robot(
+        "rows-twice",
+        ROWS,
+        ROWS.replace("z]", "x]"),
+        ": orthocal.closures.x_parallelogram.rows is empty or names a row twice",
+    ),
+    robot(
+        "rows-rotation-in-3d",
+        ROWS,
+        ROWS.replace("z]", "rz]"),
+        ": orthocal.closures.x_parallelogram.rows holds a rotation; a 3d closure has x, y, z",
+    ),
+    robot(
+        "sum-unknown",
+        SUM,
+        SUM.replace("rod_b_tip", "rod_tip"),
+        ": orthocal: parameters.x_leg.length: 'frame.x_rod_tip.x' is not an elementary error; did "
+        "you mean frame.x_rod_b_tip.x, frame.x_rod_b_tip.rx, frame.z_rod_b_tip.x?",
+    ),
+    robot(
+        "sum-of-two-units",
+        SUM,
+        SUM.replace("tip.x", "tip.rx"),
+        ": orthocal: parameters.x_leg.length: 'frame.x_rod_b_tip.rx' is in rad, 'x_coupler.x' in "
+        "m; a sum needs one unit",
+    ),
+    robot(
+        "sum-with-itself",
+        SUM,
+        "[x_coupler.x, -x_coupler.x]",
+        ": orthocal: parameters.x_leg.length: 'x_coupler.x' stands twice",
+    ),
+    robot(
+        "sum-name-taken",
+        "    x_leg.length: [",
+        "    x_slide.offset: [",
+        ": orthocal: parameters.x_slide.offset: this name is taken by an elementary error",
+    ),
+    robot(
+        "model-glob-matches-nothing",
+        "['*.offset']",
+        "['*.ofset']",
+        ": orthocal: models.offsets: '*.ofset' matches no error parameter; did you mean "
+        "z_slide.offset, y_slide.offset, x_slide.offset?",
+    ),
+    robot(
+        "model-frees-nothing",
+        "['*.offset']",
+        "['!*.offset']",
+        ": orthocal: models.offsets: leaves no error parameter free",
+    ),
+    robot(
+        "tolerance-without-unit",
+        "scale_ppm: 100}",
+        "scale_ppm: 100, overrides: {x_slide.offset: 2}}",
+        f": orthocal: 'x_slide.offset' carries no unit; expected one of the suffixes {SUFFIXES}",
+    ),
+    robot(
+        "tolerance-of-other-unit",
+        "scale_ppm: 100}",
+        "scale_ppm: 100, overrides: {x_slide.offset_mrad: 2}}",
+        ": orthocal: 'x_slide.offset_mrad' has the wrong unit; x_slide.offset is in mm",
+    ),
+    robot(
+        "tolerance-negative",
+        "offset_mm: 5",
+        "offset_mm: -5",
+        ": orthocal.tolerances.offset_mm: found '-5'; expected greater than 0",
+    ),
+    robot(
+        "tolerance-infinite",
+        "offset_mm: 5",
+        "offset_mm: .inf",
+        ": orthocal.tolerances.offset_mm: found 'inf'; expected a finite number",
+    ),
+    robot(
+        "zero-beyond-limits",
+        ZERO,
+        "x_slide: {zero_mm: 410.25}",
+        ": orthocal.drives.x_slide: the zero, 410.25 mm, is outside the joint's limits 120 ... "
+        "390 mm",
+    ),
+    robot(
+        "zero-in-degrees",
+        ZERO,
+        "x_slide: {zero_deg: 310.25}",
+        ": orthocal.drives.x_slide.zero_deg: the drive is prismatic; expected zero_mm",
+    ),
+    robot(
+        "leg-without-length",
+        LEG,
+        LEG.replace("x_leg_tip", "x_leg_root"),
+        ": orthocal.legs.x: root 'x_leg_root' and tip 'x_leg_root' are at the same place",
+    ),
+    robot(
+        "leg-frame-unknown",
+        LEG,
+        LEG.replace("x_leg_tip", "x_leg_end"),
+        ": orthocal.legs.x: the URDF has no frame 'x_leg_end'",
+    ),
+    robot(
+        "tcp-unknown",
+        "tcp: {frame: tcp",
+        "tcp: {frame: tool",
+        ": orthocal.tcp.frame: the URDF has no frame 'tool'",
+    ),
+    robot(
+        "passive-start-of-a-drive",
+        "  legs:",
+        "  passive_start: {x_slide_mm: 0}\n  legs:",
+        ": orthocal.passive_start.x_slide_mm: 'x_slide' is not a passive joint of the URDF",
+    ),
+    robot(
+        "passive-start-in-mm",
+        "  legs:",
+        "  passive_start: {x_swivel_mm: 0}\n  legs:",
+        ": orthocal.passive_start.x_swivel_mm: has the wrong unit; the joint is in rad",
+    ),
+    Case(
+        "robot-without-tcp",
+        "{tmp}/session.yaml: postures.x_max: machine cannot be commanded by its tool; give joints",
+        (swap(YAML, "  tcp: {frame: tcp, coordinates: [x, y, z]}\n", ""),),
+        base="machine",
+    ),
+    Case(
+        "robot-two-urdf-files",
+        "{tmp}/machine: expected one URDF file, or one named machine.urdf; found orthoglide.urdf, "
+        "other.urdf",
+        (write("machine/other.urdf", "<robot/>"),),
+        base="machine",
+    ),
+    Case(
+        "robot-without-urdf",
+        "{tmp}/machine: expected one URDF file, or one named machine.urdf; found none",
+        (remove(URDF),),
+        base="machine",
+    ),
+]
+
+XML = '<?xml version="1.0"?>'
+SWIVEL = '<joint name="x_swivel" type="revolute">'
+SWIVEL_LIMIT = (
+    '<axis xyz="0 0 1"/>\n    <limit lower="-1.3" upper="1.3" effort="1000" velocity="2"/>\n'
+    '  </joint>\n  <link name="x_rod_a">'
+)
+TCP_LINK = '<link name="tcp"/>'
+BOX = '<geometry><box size="0.034 0.034 0.034"/></geometry>'
+TYPES = "expected revolute, continuous, prismatic or fixed"
+
+URDF_CASES = [
+    urdf_file(
+        "not-xml",
+        "robot: orthoglide\n",
+        ":1: is not valid XML: Start tag expected, '<' not found, line 1, column 1",
+    ),
+    urdf_file("no-links", '<robot name="bare"/>', ": has no <link>"),
+    Case(
+        "urdf-no-joints",
+        "{tmp}/machine/orthoglide.yaml: name_mot: the URDF has no moving joint 'x_slide'; "
+        "joints: none",
+        (write(URDF, '<robot name="bare"><link name="base"/></robot>'),),
+        base="machine",
+    ),
+    urdf_file("not-utf8", "<robot name='ä'/>".encode("latin-1"), ": is not UTF-8 text (byte 13)"),
+    urdf(
+        "entities",
+        XML,
+        f'{XML}<!DOCTYPE robot [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]>',
+        ":1: has a DOCTYPE; a URDF needs none, and it is refused",
+    ),
+    urdf(
+        "entity-from-file",
+        XML,
+        f'{XML}\n<!DOCTYPE robot [<!ENTITY a SYSTEM "readings.csv">]>',
+        ":2: has a DOCTYPE; a URDF needs none, and it is refused",
+    ),
+    urdf(
+        "entity-unknown",
+        TCP_LINK,
+        TCP_LINK + "&b;",
+        ":536: is not valid XML: Entity 'b' not defined, line 536, column 24",
+    ),
+    Case(
+        "urdf-other-root",
+        "{tmp}/" + URDF + ":12: the outermost element is <sdf>; expected <robot>",
+        (swap(URDF, "<robot name=", "<sdf name="), swap(URDF, "</robot>", "</sdf>")),
+        base="machine",
+    ),
+    urdf("robot-without-name", '<robot name="orthoglide">', "<robot>", ":12: <robot> has no name"),
+    urdf(
+        "link-twice",
+        TCP_LINK,
+        f"{TCP_LINK}\n  {TCP_LINK}",
+        ":537: the link 'tcp' stands twice; first in line 536",
+    ),
+    urdf(
+        "joint-twice",
+        '<joint name="x_fork"',
+        '<joint name="x_wrist"',
+        ":185: the joint 'x_wrist' stands twice; first in line 171",
+    ),
+    urdf("link-without-name", TCP_LINK, "<link/>", ":536: <link> has no name"),
+    urdf(
+        "child-missing",
+        '    <child link="x_yoke"/>\n',
+        "",
+        ":71: joint 'x_swivel' has no <child link=...>",
+    ),
+    urdf(
+        "child-unknown",
+        '<child link="x_yoke"/>',
+        '<child link="x_joke"/>',
+        ":73: joint 'x_swivel': its child 'x_joke' is not a link of this file",
+    ),
+    urdf(
+        "parent-unknown",
+        '<parent link="x_slider"/>',
+        '<parent link="x_glider"/>',
+        ":72: joint 'x_swivel': its parent 'x_glider' is not a link of this file",
+    ),
+    urdf(
+        "mimic",
+        SWIVEL,
+        f'{SWIVEL}<mimic joint="y_swivel"/>',
+        ":71: joint 'x_swivel' mimics another; mimic joints are not supported: Pinocchio's "
+        "constraint Jacobians would be wrong",
+    ),
+    urdf(
+        "joint-floating",
+        SWIVEL,
+        SWIVEL.replace("revolute", "floating"),
+        f":71: joint 'x_swivel' is of type 'floating'; {TYPES}",
+    ),
+    urdf(
+        "joint-without-type",
+        SWIVEL,
+        '<joint name="x_swivel">',
+        f":71: joint 'x_swivel' has no type; {TYPES}",
+    ),
+    urdf(
+        "limit-missing",
+        SWIVEL_LIMIT,
+        re.sub("<limit.*>", "", SWIVEL_LIMIT),
+        ":71: joint 'x_swivel' of type revolute has no <limit>",
+    ),
+    urdf(
+        "limit-without-lower",
+        SWIVEL_LIMIT,
+        SWIVEL_LIMIT.replace('lower="-1.3" ', ""),
+        ":76: joint 'x_swivel': its <limit> has no lower",
+    ),
+    urdf(
+        "limit-without-effort",
+        SWIVEL_LIMIT,
+        SWIVEL_LIMIT.replace('effort="1000" ', ""),
+        ":76: joint 'x_swivel': its <limit> has no effort",
+    ),
+    urdf(
+        "limit-reversed",
+        SWIVEL_LIMIT,
+        SWIVEL_LIMIT.replace('upper="1.3"', 'upper="-1.4"'),
+        ":76: joint 'x_swivel': its lower limit is above its upper limit",
+    ),
+    urdf(
+        "limit-decimal-comma",
+        SWIVEL_LIMIT,
+        SWIVEL_LIMIT.replace("-1.3", "-1,3"),
+        ":76: lower is '-1,3'; expected a finite number",
+    ),
+    urdf(
+        "axis-zero",
+        SWIVEL_LIMIT,
+        SWIVEL_LIMIT.replace("0 0 1", "0 0 0"),
+        ":75: joint 'x_swivel' has a zero axis",
+    ),
+    urdf(
+        "axis-of-two",
+        SWIVEL_LIMIT,
+        SWIVEL_LIMIT.replace("0 0 1", "0 1"),
+        ":75: xyz is '0 1'; expected 3 finite numbers",
+    ),
+    urdf(
+        "axis-empty",
+        SWIVEL_LIMIT,
+        SWIVEL_LIMIT.replace(' xyz="0 0 1"', ""),
+        ":75: joint 'x_swivel': its <axis> has no xyz",
+    ),
+    urdf(
+        "origin-with-text",
+        'xyz="0.04 0 0" rpy="0 0 3.141592653589793"',
+        'xyz="0.04 0 0" rpy="0 0 pi"',
+        ":534: rpy is '0 0 pi'; expected 3 finite numbers",
+    ),
+    urdf(
+        "damping-with-text",
+        SWIVEL,
+        f'{SWIVEL}<dynamics damping="low"/>',
+        ":71: damping is 'low'; expected a finite number",
+    ),
+    urdf("visual-without-shape", BOX, "", ":515: <visual> has no <geometry>"),
+    urdf(
+        "box-with-text",
+        BOX,
+        BOX.replace("0.034 0", "wide 0", 1),
+        ":517: size is 'wide 0.034 0.034'; expected 3 finite numbers",
+    ),
+    urdf(
+        "two-roots",
+        TCP_LINK,
+        f'{TCP_LINK}\n  <link name="stray"/>',
+        ": has 2 root links (base, stray); expected one",
+    ),
+    urdf(
+        "two-parents",
+        TCP_LINK,
+        f"{TCP_LINK}\n"
+        '  <joint name="second" type="fixed"><parent link="base"/><child link="tcp"/></joint>',
+        ":538: link 'tcp' is the child of two joints, 'second' and 'tcp_mount'; close loops with "
+        "closed_loop in the YAML instead",
+    ),
+    urdf(
+        "no-root",
+        TCP_LINK,
+        f"{TCP_LINK}\n"
+        '  <joint name="back" type="fixed"><parent link="tcp"/><child link="base"/></joint>',
+        ": has 0 root links (none); expected one",
+    ),
+    urdf(
+        "ring-apart",
+        TCP_LINK,
+        f'{TCP_LINK}\n  <link name="p"/>\n  <link name="q"/>\n'
+        '  <joint name="pq" type="fixed"><parent link="p"/><child link="q"/></joint>\n'
+        '  <joint name="qp" type="fixed"><parent link="q"/><child link="p"/></joint>',
+        ": the links p, q do not hang on the root link 'base'",
+    ),
+    Case(
+        "urdf-loops-do-not-close",
+        "{tmp}/machine/orthoglide.yaml: the loops do not close in 'mechanical zero': a residual of "
+        "# m remains; set orthocal.drives.<motor>.zero_mm (or zero_deg) and orthocal.passive_start "
+        "near a posture that closes",
+        (swap(URDF, 'xyz="0 0 -0.08"', 'xyz="0 0 -0.9"'),),
+        base="machine",
+    ),
+]
+
+NO_CONTROLLER = swap("session.yaml", OFFSETS, "")
+CALIBRATION = "{tmp}/calibration.json"
+FILE = "calibration.json"
+
+CALIBRATION_CASES = [
+    calibration("missing", f"{CALIBRATION}: there is no such file", remove(FILE)),
+    calibration(
+        "folder-without",
+        "{tmp}/machine/calibration.json: there is no such file",
+        command="forward {tmp}/machine {tmp}/joints.csv",
+    ),
+    calibration(
+        "not-json", f"{CALIBRATION}:1: is not valid JSON: Expecting value", write(FILE, "robot: 1")
+    ),
+    calibration(
+        "cut-off",
+        f"{CALIBRATION}:2: is not valid JSON: Expecting property name enclosed in double quotes",
+        write(FILE, "{\n"),
+    ),
+    calibration(
+        "a-list", f"{CALIBRATION}: holds a list; expected keys and values", write(FILE, "[]")
+    ),
+    calibration(
+        "schema-other",
+        f"{CALIBRATION}: schema is 'orthocal/calibration/9'; expected 'orthocal/calibration/1'",
+        swap(FILE, "orthocal/calibration/1", "orthocal/calibration/9"),
+    ),
+    calibration(
+        "schema-missing",
+        f"{CALIBRATION}: schema: is missing; expected 'orthocal/calibration/1'",
+        write(FILE, "{}"),
+    ),
+    calibration(
+        "key-unknown",
+        f"{CALIBRATION}: solver.steps: unknown key; known keys: name, status, iterations, seconds, "
+        "hessian",
+        swap(FILE, '"iterations"', '"steps"'),
+    ),
+    calibration(
+        "key-missing",
+        f"{CALIBRATION}: model: is missing",
+        swap(FILE, ' "model": "offsets",\n', ""),
+    ),
+    calibration(
+        "key-twice",
+        f"{CALIBRATION}: is not valid JSON: the key 'model' stands twice",
+        swap(FILE, ' "model": "offsets",\n', ' "model": "offsets",\n "model": "lengths",\n'),
+    ),
+    calibration(
+        "type-wrong",
+        f"{CALIBRATION}: parameters[0].value: found 'none'; expected number, unable to parse "
+        "string as a number",
+        put(FILE, "parameters.0.value", "none"),
+    ),
+    calibration(
+        "value-infinite",
+        f"{CALIBRATION}: dof: found 'inf'; expected a finite number",
+        swap(FILE, '"dof": 3.0', '"dof": 1e999'),
+    ),
+    calibration(
+        "covariance-too-large",
+        f"{CALIBRATION}: covariance: expected 3 × 3 numbers, as free parameters",
+        put(FILE, "covariance.0", [1e-9, 0.0, 0.0, 0.0]),
+    ),
+    calibration("no-residuals", f"{CALIBRATION}: residuals: is empty", put(FILE, "residuals", [])),
+    calibration(
+        "parameter-unknown",
+        f"{CALIBRATION}: parameters[0].name: 'w_slide.offset' is not an error parameter; did you "
+        "mean z_slide.offset, y_slide.offset, x_slide.offset?",
+        put(FILE, "parameters.0.name", "w_slide.offset"),
+    ),
+    calibration(
+        "parameter-twice",
+        f"{CALIBRATION}: parameters[1].name: 'y_slide.offset' stands twice",
+        put(FILE, "parameters.0.name", "y_slide.offset"),
+    ),
+    calibration(
+        "parameter-of-other-unit",
+        f"{CALIBRATION}: parameters[0].unit: found 'rad'; x_slide.offset is in m",
+        put(FILE, "parameters.0.unit", "rad"),
+    ),
+    calibration(
+        "robot-changed",
+        f"{CALIBRATION}: was made for another version of robot 'machine': the files in "
+        "{tmp}/machine have changed since",
+        swap(URDF, 'lower="0.12"', 'lower="0.13"'),
+    ),
+    calibration(
+        "robot-of-another-orthocal",
+        f"{CALIBRATION}: names the robot 'hexapod', which does not come with this orthocal",
+        put(FILE, "robot.folder", None),
+        put(FILE, "robot.name", "hexapod"),
+    ),
+    calibration(
+        "robot-gone",
+        f"{CALIBRATION}: robot: 'elsewhere' is neither a robot of orthocal (orthoglide) nor a "
+        "folder ({tmp}/elsewhere)",
+        put(FILE, "robot.reference", "elsewhere"),
+    ),
+    calibration(
+        "of-other-robot",
+        "{tmp}/session.yaml: is of robot 'machine'; the calibration is of another, or of another "
+        "version of 'machine'",
+        swap(YAML, "zero_mm: 310.25", "zero_mm: 310.2"),
+        command=VALIDATE,
+    ),
+    calibration(
+        "offsets-not-entered",
+        "{tmp}/session.yaml: controller.offsets_mm: x_slide has 0 mm; the calibration identified "
+        "-0.527 mm. A validation needs the identified offsets active",
+        command=VALIDATE,
+    ),
+    calibration(
+        "files-in-wrong-order",
+        "{tmp}/session.yaml:1: is not valid JSON: Expecting value",
+        command="validate {tmp}/session.yaml {tmp}/calibration.json",
+    ),
+    calibration(
+        "controller-offsets-too-few",
+        f"{CALIBRATION}: session.controller_offsets: has 0 numbers; expected 3, one a drive: "
+        f"{DRIVES}",
+        NO_CONTROLLER,
+        put(FILE, "session.controller_offsets", []),
+        command=VALIDATE,
+    ),
+    calibration(
+        "model-unknown",
+        f"{CALIBRATION}: model: 'ofsets' is not a model of this robot; models: offsets, lengths, "
+        "full",
+        NO_CONTROLLER,
+        put(FILE, "model", "ofsets"),
+        command=VALIDATE,
+    ),
+    calibration(
+        "sigma-zero",
+        f"{CALIBRATION}: noise.residual_sigma: is 0; there is no noise to compare with",
+        NO_CONTROLLER,
+        put(FILE, "noise.residual_sigma", 0.0),
+        command=VALIDATE,
+    ),
+    calibration(
+        "degrees-of-freedom-negative",
+        f"{CALIBRATION}: noise.residual_dof: found '-5.0'; expected greater than or equal to 0",
+        NO_CONTROLLER,
+        put(FILE, "noise.residual_dof", -5.0),
+        command=VALIDATE,
+    ),
+]
+
+JOINTS = "x_slide_mm,y_slide_mm,z_slide_mm"
+
+TABLE_CASES = [
+    joints(
+        "column-missing",
+        "x_slide_mm,y_slide_mm\n310,310\n",
+        ":1: the column 'z_slide_mm' is missing; found x_slide_mm, y_slide_mm",
+    ),
+    joints(
+        "column-unknown",
+        "x_mm,y_mm,z_mm\n310,310,310\n",
+        ":1: unknown column 'x_mm'; expected x_slide_mm, y_slide_mm, z_slide_mm",
+    ),
+    joints(
+        "beyond-travel",
+        f"{JOINTS}\n310,310,310\n500,310,310\n",
+        ":3: x_slide_mm is 500; the drive reaches from 120 to 390",
+    ),
+    joints(
+        "not-a-number", f"{JOINTS}\nhome,310,310\n", ":2: x_slide_mm is 'home'; expected a number"
+    ),
+    joints("nan", f"{JOINTS}\n310,nan,310\n", ":2: y_slide_mm is 'nan'; expected a finite number"),
+    joints(
+        "decimal-comma",
+        "x_slide_mm;y_slide_mm;z_slide_mm\n310,25;310;310\n",
+        ":2: x_slide_mm is '310,25'; expected a number (a decimal comma? write a point)",
+    ),
+    joints("empty", "", f":1: is empty; expected a header: {JOINTS}"),
+    joints("header-only", f"{JOINTS}\n", ": holds no rows"),
+    joints(
+        "unreachable",
+        f"{JOINTS}\n390,390,390\n",
+        ":2: cannot be reached: the loops stay open by # mm, #% of the way from the mechanical "
+        "zero",
+    ),
+    points(
+        "column-missing", "x_mm,y_mm\n0,0\n", ":1: the column 'z_mm' is missing; found x_mm, y_mm"
+    ),
+    points(
+        "in-metres", "x_m,y_m,z_m\n0,0,0\n", ":1: unknown column 'x_m'; expected x_mm, y_mm, z_mm"
+    ),
+    points(
+        "beyond-travel",
+        "x_mm,y_mm,z_mm\n0,0,0\n100,0,0\n",
+        ":3: cannot be reached: joint 'x_slide' would be at 410.8 mm, outside its limits 120 ... "
+        "390 mm",
+    ),
+]
+
+PLAN_YX = "yx: {leg: x, direction: y, section: {fraction: 0.5}, postures: [zero, x_max, x_min]}"
+PLAN_POSTURES = "zero, x_max, x_min, y_max, y_min, z_max, z_min"
+
+SIMULATE_CASES = [
+    simulate(
+        "error-unknown",
+        " --error x_slide.ofset_mm=1",
+        "--error: 'x_slide.ofset' is not an error parameter; did you mean x_slide.offset, "
+        "z_slide.offset, y_slide.offset?",
+    ),
+    simulate(
+        "error-of-other-unit",
+        " --error x_slide.offset_mrad=1",
+        "--error: 'x_slide.offset_mrad' has the wrong unit; x_slide.offset is in mm",
+    ),
+    simulate(
+        "error-without-unit",
+        " --error x_slide.offset=1",
+        f"--error: 'x_slide.offset' carries no unit; expected one of the suffixes {SUFFIXES}",
+    ),
+    simulate(
+        "error-without-value",
+        " --error x_slide.offset_mm",
+        "--error: found 'x_slide.offset_mm'; expected NAME=VALUE",
+    ),
+    simulate(
+        "error-decimal-comma",
+        " --error x_slide.offset_mm=1,2",
+        "--error: x_slide.offset_mm is '1,2'; expected a number (a decimal comma? write a point)",
+    ),
+    simulate(
+        "error-nan",
+        " --error x_slide.offset_mm=nan",
+        "--error: x_slide.offset_mm is 'nan'; expected a finite number",
+    ),
+    simulate("no-errors", "", "no errors: give them by --errors, --error or --draw"),
+    simulate(
+        "draw-unknown",
+        " --draw ofsets",
+        "--draw: 'ofsets' is neither a model (offsets, lengths, full) nor the name of an error "
+        "parameter",
+    ),
+    simulate(
+        "errors-file-missing",
+        " --errors {tmp}/lost.yaml",
+        "{tmp}/lost.yaml: there is no such file",
+    ),
+    simulate(
+        "errors-file-key-unknown",
+        " --errors {tmp}/errors.yaml",
+        "{tmp}/errors.yaml: offsets: unknown key; known keys: errors, zeros_mm",
+        write("errors.yaml", "offsets: {x_slide.offset_mm: 1}\n"),
+    ),
+    simulate(
+        "errors-file-name-unknown",
+        " --errors {tmp}/errors.yaml",
+        "{tmp}/errors.yaml: errors: 'x_slid.offset' is not an error parameter; did you mean "
+        "x_slide.offset, z_slide.offset, y_slide.offset?",
+        write("errors.yaml", "errors: {x_slid.offset_mm: 1}\n"),
+    ),
+    simulate(
+        "errors-file-name-twice",
+        " --errors {tmp}/errors.yaml",
+        "{tmp}/errors.yaml: errors: 'x_slide.offset' is given twice",
+        write("errors.yaml", "errors: {x_slide.offset_mm: 1, x_slide.offset_um: 1}\n"),
+    ),
+    simulate(
+        "errors-file-without-errors",
+        " --errors {tmp}/errors.yaml",
+        "{tmp}/errors.yaml: errors: found '{}'; expected at least 1 item",
+        write("errors.yaml", "errors: {}\n"),
+    ),
+    simulate(
+        "plan-sigma-missing",
+        ONE_ERROR,
+        "{tmp}/plan.yaml: gauge.sigma_mm: is missing: the noise to simulate is not known",
+        swap("plan.yaml", "sigma_mm: 0.01, ", ""),
+    ),
+    simulate(
+        "plan-missing",
+        ONE_ERROR,
+        "{tmp}/plan.yaml: there is no such file",
+        remove("plan.yaml"),
+    ),
+    simulate(
+        "plan-posture-unknown",
+        ONE_ERROR,
+        f"{{tmp}}/plan.yaml: setups.yx.postures: 'top' is not a posture; postures: {PLAN_POSTURES}",
+        swap("plan.yaml", PLAN_YX, PLAN_YX.replace("[zero", "[top")),
+    ),
+    simulate(
+        "plan-posture-twice",
+        ONE_ERROR,
+        "{tmp}/plan.yaml: setups.yx.postures: 'zero' stands twice",
+        swap("plan.yaml", PLAN_YX, PLAN_YX.replace("[zero", "[zero, zero")),
+    ),
+    simulate(
+        "plan-no-postures",
+        ONE_ERROR,
+        "{tmp}/plan.yaml: setups.yx.postures: found '[]'; expected at least 1 item",
+        swap("plan.yaml", PLAN_YX, PLAN_YX.replace("zero, x_max, x_min", "")),
+    ),
+    simulate(
+        "plan-off-the-leg",
+        ONE_ERROR,
+        "{tmp}/plan.yaml: setups.yx.section: in posture 'x_max' the gauge would touch at 339.2 mm "
+        "from the root; the leg reaches from 0 to 310.2 mm",
+        swap("plan.yaml", PLAN_YX, PLAN_YX.replace("0.5", "0.9")),
+    ),
+    simulate(
+        "out-of-range",
+        " --exact --error x_slide.offset_mm=10",
+        "{tmp}/plan.yaml: gauge.range_mm: the simulated reading xy zero is 5.003 mm; the gauge's "
+        "range ends at 5 mm",
+    ),
+    simulate(
+        "session-there",
+        ONE_ERROR,
+        "{tmp}/out/session.yaml: is there already; --force writes over it",
+        write("out/session.yaml", "mine"),
+    ),
+    simulate(
+        "readings-there",
+        ONE_ERROR,
+        "{tmp}/out/readings.csv: is there already; --force writes over it",
+        write("out/readings.csv", "mine"),
+    ),
+    Case(
+        "simulate-out-a-file",
+        "{tmp}/readings.csv: is a file; expected a folder",
+        command="simulate {tmp}/plan.yaml --out {tmp}/readings.csv" + ONE_ERROR,
+    ),
+    Case(
+        "simulate-out-name-too-long",
+        f"{{tmp}}/{LONG}: cannot be written: File name too long",
+        command=f"simulate {{tmp}}/plan.yaml --out {{tmp}}/{LONG}" + ONE_ERROR,
+    ),
+]
+
+CASES = [
+    *SESSION_KEY_CASES,
+    *SESSION_TYPE_CASES,
+    *SESSION_FILE_CASES,
+    *SESSION_SENSE_CASES,
+    *READINGS_CASES,
+    *ROBOT_CASES,
+    *URDF_CASES,
+    *CALIBRATION_CASES,
+    *TABLE_CASES,
+    *SIMULATE_CASES,
+]
+
+BY_NAME = {case.name: case for case in CASES}
+
+USAGE = {
+    "no-command": "",
+    "command-unknown": "calibrat {tmp}",
+    "session-missing": "calibrate",
+    "two-sessions": "calibrate {tmp} {tmp}",
+    "option-unknown": "calibrate {tmp} --modell full",
+    "option-without-value": "calibrate {tmp} --model",
+    "joints-missing": "forward {tmp}",
+    "new-session-missing": "validate {tmp}",
+    "out-missing": "simulate {tmp}/plan.yaml" + ONE_ERROR,
+    "seed-negative": SIMULATE + ONE_ERROR + " --seed -1",
+    "seed-text": SIMULATE + ONE_ERROR + " --seed lucky",
+}
+
+
+def lay_out(folder: Path, base: str) -> None:
+    """Good input of all kinds: a session, a plan and a robot folder."""
+    example = CYCLES if base == "cycles" else DIFFERENCES
+    for file in ("session.yaml", "readings.csv"):
+        shutil.copy(example / file, folder)
+    shutil.copy(CYCLES / "plan.yaml", folder)
+    shutil.copytree(ROOT / "robots/orthoglide", folder / "machine")
+    if base == "machine":
+        swap("session.yaml", "robot: orthoglide", "robot: machine")(folder)
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> str:
+    """Text of a good calibration.json; the folder that it names is no longer there."""
+    with tempfile.TemporaryDirectory() as name:
+        lay_out(Path(name), "machine")
+        return calibrate(load_session(name)).to_json()
+
+
+@pytest.fixture
+def spoil(tmp_path: Path, calibrated: str) -> Callable[[Case], None]:
+    def prepare(case: Case) -> None:
+        lay_out(tmp_path, case.base)
+        if case.calibrated:
+            (tmp_path / FILE).write_text(calibrated, encoding="utf-8")
+            (tmp_path / "joints.csv").write_text(f"{JOINTS}\n310,310,310\n")
+            (tmp_path / "points.csv").write_text("x_mm,y_mm,z_mm\n0,0,0\n")
+        for edit in case.edits:
+            edit(tmp_path)
+
+    return prepare
+
+
+def arguments(command: str, folder: Path) -> list[str]:
+    return [part.replace("{tmp}", str(folder)) for part in command.split()]
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def without_digits(message: str) -> str:
+    """A message without the residual that an iteration in vain ends with: it is any number."""
+    message = re.sub(r"stay open by \S+ mm, \d+%", "stay open by # mm, #%", message)
+    return re.sub(r"a residual of \S+ m", "a residual of # m", message)
+
+
+def check_message(case: Case, stderr: str, folder: Path) -> None:
+    assert "Traceback" not in stderr
+    found = without_digits(stderr.replace(str(folder), "{tmp}"))
+    assert found == f"orthocal: {case.message}\n"
+
+
+def test_cases_have_names_of_their_own():
+    assert len(BY_NAME) == len(CASES)
+
+
+@pytest.mark.parametrize("base", ["differences", "cycles", "machine"])
+def test_what_the_cases_spoil_is_good(base, tmp_path, monkeypatch, capfd):
+    lay_out(tmp_path, base)
+    monkeypatch.setattr(sys, "argv", ["orthocal", *arguments(CALIBRATE, tmp_path)])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 0
+    assert capfd.readouterr().err == f"Wrote {tmp_path}/out/calibration.json\n"
+
+
+@pytest.mark.parametrize("command", [FORWARD, INVERSE, SIMULATE + ONE_ERROR, "validate"])
+def test_what_other_commands_spoil_is_good(command, spoil, tmp_path, monkeypatch, capfd):
+    edits = (NO_CONTROLLER,) if command == "validate" else ()
+    spoil(Case("good", "", edits, base="machine", calibrated=True))
+    command = VALIDATE if command == "validate" else command
+    monkeypatch.setattr(sys, "argv", ["orthocal", *arguments(command, tmp_path)])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 0
+    assert "orthocal:" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_bad_input_is_refused(case, spoil, tmp_path, monkeypatch, capfd):
+    spoil(case)
+    before = files_of(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["orthocal", *arguments(case.command, tmp_path)])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    stderr = capfd.readouterr().err
+    check_message(case, stderr, tmp_path)
+    assert stopped.value.code == 2
+    assert files_of(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["session-key-unknown", "readings-not-a-number", "urdf-mimic"])
+def test_bad_input_is_refused_in_a_process_of_its_own(name, spoil, tmp_path):
+    case = BY_NAME[name]
+    spoil(case)
+    before = files_of(tmp_path)
+    command = [sys.executable, "-m", "orthocal.cli", *arguments(case.command, tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, encoding="utf-8", check=False)
+    check_message(case, done.stderr, tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert files_of(tmp_path) == before
+
+
+@pytest.mark.parametrize("command", USAGE.values(), ids=USAGE.keys())
+def test_wrong_usage_is_refused(command, spoil, tmp_path, monkeypatch, capfd):
+    spoil(Case("usage", ""))
+    before = files_of(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["orthocal", *arguments(command, tmp_path)])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    out, err = capfd.readouterr()
+    assert stopped.value.code == 2
+    assert "Traceback" not in out + err
+    assert files_of(tmp_path) == before
