@@ -1600,9 +1600,10 @@ def test_bad_input_is_refused(case, spoil, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(sys, "argv", ["orthocal", *arguments(case.command, tmp_path)])
     with pytest.raises(SystemExit) as stopped:
         main()
-    stderr = capfd.readouterr().err
-    check_message(case, stderr, tmp_path)
+    out, err = capfd.readouterr()
+    check_message(case, err, tmp_path)
     assert stopped.value.code == 2
+    assert out == ""
     assert files_of(tmp_path) == before
 
 
