@@ -86,9 +86,12 @@ def calibrate(
     all_rows: AllRows = False,
 ) -> None:
     """Identify the errors of a machine from a session of readings."""
+    from orthocal.documents import require_writable
     from orthocal.identification.calibrate import calibrate as run
     from orthocal.measurement.session_file import load_session
 
+    if out is not None:
+        require_writable(out)
     result = run(load_session(session), model=model)
     if json:
         _out(result.to_json().rstrip("\n"))
@@ -135,11 +138,17 @@ def forward(
     Drive coordinates are those of the encoders, without any offset of the controller.
     """
     from orthocal.identification.calibration import load_calibration
-    from orthocal.measurement.table import TOOL_COLUMNS, format_table, read_joints
+    from orthocal.measurement.table import (
+        TOOL_COLUMNS,
+        closures_named_by_row,
+        format_table,
+        read_joints,
+    )
 
     result = load_calibration(calibration)
     names, values = read_joints(joints, result.robot)
-    points = result.forward(values, names=names)
+    with closures_named_by_row():
+        points = result.forward(values, names=names)
     _out(format_table(TOOL_COLUMNS, points))
 
 
@@ -156,11 +165,17 @@ def inverse(
     Drive coordinates are those of the encoders, without any offset of the controller.
     """
     from orthocal.identification.calibration import load_calibration
-    from orthocal.measurement.table import drive_columns, format_table, read_points
+    from orthocal.measurement.table import (
+        closures_named_by_row,
+        drive_columns,
+        format_table,
+        read_points,
+    )
 
     result = load_calibration(calibration)
     names, points = read_points(targets, result.robot)
-    drives = result.inverse(points, names=names)
+    with closures_named_by_row():
+        drives = result.inverse(points, names=names)
     _out(format_table(drive_columns(result.robot), drives))
 
 
@@ -194,6 +209,7 @@ def simulate(
     ] = False,
 ) -> None:
     """Make a session of simulated readings of a machine whose errors are known."""
+    from orthocal.documents import exists, require_writable
     from orthocal.measurement.session_file import load_plan, write_session
     from orthocal.measurement.synthetic import (
         collect_errors,
@@ -201,10 +217,10 @@ def simulate(
         truth_document,
     )
 
-    if (out / "session.yaml").exists() and not force:
-        raise SessionError(
-            "is there already; --force writes over it", where=str(out / "session.yaml")
-        )
+    require_writable(out)
+    for name in ("session.yaml", "readings.csv", "truth.yaml"):
+        if exists(out / name) and not force:
+            raise SessionError("is there already; --force writes over it", where=str(out / name))
     planned = load_plan(plan)
     true_errors = collect_errors(
         planned.robot, file=errors, single=error or [], draw=draw, seed=seed

@@ -9,26 +9,39 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import yaml
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
+from pydantic_core import PydanticCustomError
 
 from orthocal.errors import OrthocalError
 
-if TYPE_CHECKING:
-    from pydantic import BaseModel, ValidationError
+Model = TypeVar("Model", bound=BaseModel)
 
-    Model = TypeVar("Model", bound=BaseModel)
+
+def _refuse_truth_values(value: object) -> object:
+    if isinstance(value, bool):
+        raise PydanticCustomError("float_type", "Input should be a valid number")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_refuse_truth_values), Field(allow_inf_nan=False)]
+"""A finite number; YAML's yes and no are not numbers."""
+
+PositiveNumber = Annotated[Number, Field(gt=0.0)]
+"""A finite number above 0."""
 
 LARGEST_FILE = 64 * 2**20
 """Files above this size are refused, [bytes]."""
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """SafeLoader that also refuses duplicate keys and aliases."""
+    """SafeLoader that also refuses duplicate keys, aliases and keys that are no scalars."""
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         if self.check_event(yaml.AliasEvent):
@@ -38,16 +51,50 @@ class _StrictLoader(yaml.SafeLoader):
             )
         return super().compose_node(parent, index)
 
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:  # noqa: ANN401
+        try:
+            value = super().construct_object(node, deep)
+        except (ValueError, KeyError, IndexError, AttributeError, TypeError, OverflowError):
+            tag = str(node.tag).replace("tag:yaml.org,2002:", "!!")
+            raise yaml.MarkedYAMLError(
+                problem=f"'{node.value}' does not fit its tag {tag}", problem_mark=node.start_mark
+            ) from None
+        if isinstance(value, str) and any("\ud800" <= c <= "\udfff" for c in value):
+            raise yaml.MarkedYAMLError(
+                problem="half of a surrogate pair is not a character", problem_mark=node.start_mark
+            )
+        return value
+
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
         for key, _ in node.value:
-            if key.value in seen and isinstance(key, yaml.ScalarNode):
+            if not isinstance(key, yaml.ScalarNode):
+                raise yaml.MarkedYAMLError(
+                    problem="a key is a list or a mapping; expected text",
+                    problem_mark=key.start_mark,
+                )
+            if key.value in seen:
                 raise yaml.MarkedYAMLError(
                     problem=f"the key '{key.value}' stands twice", problem_mark=key.start_mark
                 )
-            if isinstance(key, yaml.ScalarNode):
-                seen.add(key.value)
+            seen.add(key.value)
         return dict(super().construct_mapping(node, deep))
+
+
+def is_folder(path: Path) -> bool:
+    """Whether there is such a folder; names that no file system takes are none."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def exists(path: Path) -> bool:
+    """Whether there is such a file or folder; names that no file system takes are none."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
 
 
 def read_text(path: Path, *, error: type[OrthocalError]) -> str:
@@ -86,7 +133,10 @@ def read_yaml(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
     except yaml.MarkedYAMLError as e:
         mark = e.problem_mark or e.context_mark
         line = "" if mark is None else f":{mark.line + 1}"
-        raise error(f"is not valid YAML: {e.problem}", where=f"{path}{line}") from None
+        problem = str(e.problem)
+        if problem.startswith("but "):  # the sentence begins in the context
+            problem = f"{e.context}, {problem}"
+        raise error(f"is not valid YAML: {problem}", where=f"{path}{line}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as e:
         text = " ".join(str(e).split())
         raise error(f"is not valid YAML: {text or type(e).__name__}", where=str(path)) from None
@@ -99,8 +149,16 @@ def read_json(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
         OrthocalError: Of the kind given, naming file and line.
     """
     text = read_text(path, error=error)
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        keys = [key for key, _ in pairs]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise ValueError(f"the key '{key}' stands twice")
+        return dict(pairs)
+
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=unique)
     except json.JSONDecodeError as e:
         raise error(f"is not valid JSON: {e.msg}", where=f"{path}:{e.lineno}") from None
     except (ValueError, RecursionError) as e:
@@ -124,7 +182,8 @@ def read_csv_rows(
     text = read_text(path, error=error)
     lines = text.splitlines()
     if not lines or not lines[0].strip():
-        raise error(f"is empty; expected a header: {','.join(required)}", where=f"{path}:1")
+        found = "is blank" if any(line.strip() for line in lines) else "is empty"
+        raise error(f"{found}; expected a header: {','.join(required)}", where=f"{path}:1")
     delimiter = ";" if "," not in lines[0] and ";" in lines[0] else ","
     reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
     try:
@@ -158,6 +217,9 @@ def read_csv_rows(
         raise error(f"is not valid CSV: {e}", where=f"{path}:{reader.line_num}") from None
 
 
+_DECIMAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?(nan|inf\w*)", re.I)
+
+
 def parse_number(text: str, *, where: str, name: str, error: type[OrthocalError]) -> float:
     """A finite number from a CSV field.
 
@@ -165,6 +227,8 @@ def parse_number(text: str, *, where: str, name: str, error: type[OrthocalError]
         OrthocalError: Of the kind given, for text, NaN, infinity or a decimal comma.
     """
     try:
+        if not _DECIMAL.fullmatch(text):
+            raise ValueError
         value = float(text)
     except ValueError:
         hint = " (a decimal comma? write a point)" if "," in text else ""
@@ -186,10 +250,9 @@ def validate(
     Raises:
         OrthocalError: Of the kind given, with the first key that does not fit.
     """
-    from pydantic import ValidationError
-
     if not isinstance(data, Mapping):
-        found = "nothing" if data is None else f"a {type(data).__name__}"
+        kinds = {str: "text", int: "a number", float: "a number", list: "a list", bool: "a word"}
+        found = "nothing" if data is None else kinds.get(type(data), f"a {type(data).__name__}")
         raise error(f"holds {found}; expected keys and values", where=where)
     try:
         return schema.model_validate(data)
@@ -206,23 +269,44 @@ def explain_validation_error(
     findings = sorted(exception.errors(), key=lambda f: f["type"] != "extra_forbidden")
     first = findings[0]
     path = [part for part in first["loc"] if not _is_pydantic_tag(part)]
-    key = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
-    if first["type"] == "extra_forbidden":
-        known = _keys_beside(schema, path)
+    found, kind = first.get("input"), first["type"]
+    if "[key]" in first["loc"] and not isinstance(found, str):
+        return _join(path[:-1]), f"found the key {found}; expected text: put it in quotes"
+    key = _join(path)
+    if kind == "extra_forbidden":
+        known = _keys_at(schema, path[:-1])
         hint = f"; known keys: {', '.join(known)}" if known else ""
         return key, f"unknown key{hint}"
-    if first["type"] == "missing":
+    if kind == "missing":
         return key, "is missing"
-    found = first.get("input")
     words = str(first["msg"]).removeprefix("Value error, ")
-    if first["type"] in ("value_error", "assertion_error"):
-        return key, words
+    if kind in ("value_error", "assertion_error"):
+        # a validator over several keys begins its message with the one that it is about
+        inner, separator, rest = words.partition("|")
+        return (_join([*path, inner]), rest) if separator else (key, words)
     shown = "nothing" if found is None else f"'{found}'"
     if len(shown) > 60:
         shown = shown[:56] + "...'"
+    return key, f"found {shown}; expected {_expectation(kind, words, first.get('ctx') or {})}"
+
+
+def _expectation(kind: str, words: str, context: Mapping[str, Any]) -> str:
+    """What pydantic expected, in words of this program."""
+    if kind in ("dict_type", "model_type", "model_attributes_type", "mapping_type"):
+        return "keys and values"
+    if kind == "string_pattern_mismatch":
+        return "a name without blanks, commas, semicolons or quotes"
+    if kind in ("too_short", "too_long"):
+        count = context["min_length" if kind == "too_short" else "max_length"]
+        bound = "least" if kind == "too_short" else "most"
+        return f"at {bound} {count} item{'' if count == 1 else 's'}"
     words = words[0].lower() + words[1:]
-    words = words.removeprefix("input should be ").removeprefix("a valid ")
-    return key, f"found {shown}; expected {words}"
+    return words.removeprefix("input should be ").removeprefix("a valid ")
+
+
+def _join(path: list[Any]) -> str:
+    """A location as text: setups.yx.section or closed_loop[2]."""
+    return "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
 
 
 def _is_pydantic_tag(part: object) -> bool:
@@ -230,35 +314,30 @@ def _is_pydantic_tag(part: object) -> bool:
     return isinstance(part, str) and ("[" in part or part in {"float", "int", "str", "bool"})
 
 
-def _keys_beside(schema: type[BaseModel], path: list[Any]) -> list[str]:
-    """Names of the fields that stand where an unknown key was found."""
-    from pydantic import BaseModel
-
-    current: Any = schema
-    for part in path[:-1]:
-        if isinstance(current, type) and issubclass(current, BaseModel):
-            field = next((f for n, f in current.model_fields.items() if part in (n, f.alias)), None)
-            current = None if field is None else field.annotation
-        current = _schema_within(current)
-    current = _schema_within(current)
-    if current is None:
-        return []
-    return [f.alias or n for n, f in current.model_fields.items()]
-
-
-def _schema_within(annotation: Any) -> Any:  # noqa: ANN401 - typing objects
-    """The pydantic schema inside an annotation such as dict[str, Schema] or Schema | None."""
-    from typing import get_args
-
-    from pydantic import BaseModel
-
+def _keys_at(annotation: Any, path: list[Any]) -> list[str]:  # noqa: ANN401 - typing objects
+    """Names of the fields that a schema has at a location."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for inner in get_args(annotation):
-        found = _schema_within(inner)
-        if found is not None:
-            return found
-    return None
+        fields = {f.alias or n: f.annotation for n, f in annotation.model_fields.items()}
+        if not path:
+            return list(fields)
+        return _keys_at(fields[path[0]], path[1:]) if path[0] in fields else []
+    arguments = get_args(annotation)
+    if get_origin(annotation) in (dict, list):
+        return _keys_at(arguments[-1], path[1:])
+    return next((found for a in arguments if (found := _keys_at(a, path))), [])
+
+
+def require_writable(folder: Path) -> None:
+    """Refuse a folder to be written to later that cannot be one: before the work is done.
+
+    Raises:
+        OrthocalError: If it is a file, or has a name that no file system takes.
+    """
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise OrthocalError("is a file; expected a folder", where=str(folder))
+    except OSError as e:
+        raise OrthocalError(f"cannot be written: {e.strerror}", where=str(folder)) from None
 
 
 def write_text(path: Path, text: str) -> None:
@@ -287,6 +366,8 @@ def write_files(folder: Path, files: Mapping[str, str]) -> None:
             os.chmod(temporary, 0o644)
         for temporary, final in pending:
             os.replace(temporary, final)
+    except FileExistsError:
+        raise OrthocalError("is a file; expected a folder", where=str(folder)) from None
     except OSError as e:
         raise OrthocalError(f"cannot be written: {e.strerror}", where=str(folder)) from None
     finally:

@@ -40,20 +40,15 @@ class ClosureError(OrthocalError):
 
     Attributes:
         posture: Name of the posture.
+        reason: What is wrong there, to be read after the name of the posture.
         residual: Largest closure residual that remained, [m], or None for a singular posture.
     """
 
-    def __init__(
-        self,
-        problem: str,
-        *,
-        posture: str,
-        residual: float | None = None,
-        where: str | None = None,
-    ) -> None:
+    def __init__(self, reason: str, *, posture: str, residual: float | None = None) -> None:
         self.posture = posture
+        self.reason = reason
         self.residual = residual
-        super().__init__(problem, where=where)
+        super().__init__(f"posture '{posture}' {reason}")
 
 
 class UnreachableError(OrthocalError):

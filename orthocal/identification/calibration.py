@@ -14,10 +14,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, ConfigDict, Field
 
-from orthocal.documents import read_json, validate, write_text
-from orthocal.errors import CalibrationFileError
+from orthocal.documents import Number, is_folder, read_json, validate, write_text
+from orthocal.errors import CalibrationFileError, ParameterError, RobotError
 from orthocal.identification.uncertainty import NoiseSource, confidence_factor
 from orthocal.robot.assembly import Assembly
 from orthocal.robot.model import Robot, load_robot, packaged_robots, read_only
@@ -370,14 +370,51 @@ class Calibration:
             folder = Path(record.folder)
             if not folder.is_dir() and self.path is not None:
                 folder = self.path.parent / record.reference
-            robot = load_robot(folder)
+            try:
+                robot = load_robot(folder)
+            except RobotError as e:
+                if e.where is not None:
+                    raise
+                raise CalibrationFileError(
+                    f"'{record.reference}' is neither a robot of orthocal "
+                    f"({', '.join(packaged_robots())}) nor a folder ({folder})",
+                    where=None if where is None else f"{where}: robot",
+                ) from None
         if robot.sha256 != record.sha256:
             raise CalibrationFileError(
                 f"was made for another version of robot '{record.name}': the files in "
                 f"{robot.folder} have changed since",
                 where=where,
             )
+        self._check_against(robot)
         return robot
+
+    def _check_against(self, robot: Robot) -> None:
+        """Refuse names and numbers that do not fit the robot: a file can be edited."""
+        prefix = "" if self.path is None else f"{self.path}: "
+        if self.model not in robot.parameters.models:
+            raise CalibrationFileError(
+                f"'{self.model}' is not a model of this robot; "
+                f"models: {', '.join(robot.parameters.models)}",
+                where=f"{prefix}model",
+            )
+        for i, p in enumerate(self.parameters):
+            where = f"{prefix}parameters[{i}]"
+            try:
+                known = robot.parameters[p.name]
+            except ParameterError as e:
+                raise CalibrationFileError(e.problem, where=f"{where}.name") from None
+            if p.unit != known.unit:
+                raise CalibrationFileError(
+                    f"found '{p.unit}'; {p.name} is in {known.unit}", where=f"{where}.unit"
+                )
+        offsets = self.session.controller_offsets
+        if offsets is not None and len(offsets) != len(robot.drives):
+            raise CalibrationFileError(
+                f"has {len(offsets)} numbers; expected {len(robot.drives)}, one a drive: "
+                f"{', '.join(d.name for d in robot.drives)}",
+                where=f"{prefix}session.controller_offsets",
+            )
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -387,10 +424,12 @@ def load_calibration(path: str | Path) -> Calibration:
         CalibrationFileError: Naming file and key, what was found and what was expected.
     """
     file = Path(path)
-    if file.is_dir():
+    if is_folder(file):
         file = file / "calibration.json"
     data = read_json(file, error=CalibrationFileError)
-    if isinstance(data, Mapping) and data.get("schema") != SCHEMA:
+    if isinstance(data, Mapping) and "schema" not in data:
+        raise CalibrationFileError(f"is missing; expected '{SCHEMA}'", where=f"{file}: schema")
+    if isinstance(data, Mapping) and data["schema"] != SCHEMA:
         raise CalibrationFileError(
             f"schema is '{data.get('schema')}'; expected '{SCHEMA}'", where=str(file)
         )
@@ -402,6 +441,12 @@ def load_calibration(path: str | Path) -> Calibration:
             f"expected {len(free)} × {len(free)} numbers, as free parameters",
             where=f"{file}: covariance",
         )
+    names = [p.name for p in keys.parameters]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise CalibrationFileError(
+                f"'{name}' stands twice", where=f"{file}: parameters[{i}].name"
+            )
     if not keys.residuals:
         raise CalibrationFileError("is empty", where=f"{file}: residuals")
     return Calibration(
@@ -485,37 +530,37 @@ class _SessionKeys(_Keys):
     title: str
     source: str
     sha256: str
-    gauge_sigma: FiniteFloat | None
-    gauge_resolution: FiniteFloat | None
-    controller_offsets: list[FiniteFloat] | None
+    gauge_sigma: Number | None
+    gauge_resolution: Number | None
+    controller_offsets: list[Number] | None
 
 
 class _SolverKeys(_Keys):
     name: str
     status: str
     iterations: int
-    seconds: FiniteFloat
+    seconds: Number
     hessian: str
 
 
 class _ParameterKeys(_Keys):
     name: str
     unit: Literal["m", "rad", "1"]
-    value: FiniteFloat
-    linear: FiniteFloat
-    std: FiniteFloat | None
-    tolerance: FiniteFloat
+    value: Number
+    linear: Number
+    std: Number | None
+    tolerance: Number
     free: bool
     identifiable: bool
 
 
 class _NoiseKeys(_Keys):
-    reading_sigma: FiniteFloat | None
+    reading_sigma: Number | None
     source: Literal["cycles", "residuals", "gauge", "unknown"]
-    cycles_sigma: FiniteFloat | None
+    cycles_sigma: Number | None
     cycles_dof: int
-    residual_sigma: FiniteFloat | None
-    residual_dof: FiniteFloat
+    residual_sigma: Number | None
+    residual_dof: Annotated[Number, Field(ge=0.0)]
 
 
 class _ResidualKeys(_Keys):
@@ -523,17 +568,17 @@ class _ResidualKeys(_Keys):
     posture: str
     minus: str | None
     cycle: int
-    measured: FiniteFloat
-    nominal: FiniteFloat
-    linear: FiniteFloat
-    predicted: FiniteFloat
-    residual: FiniteFloat
+    measured: Number
+    nominal: Number
+    linear: Number
+    predicted: Number
+    residual: Number
 
 
 class _PostureKeys(_Keys):
     name: str
-    drives: list[FiniteFloat]
-    passive: list[FiniteFloat]
+    drives: list[Number]
+    passive: list[Number]
 
 
 class _SetupKeys(_Keys):
@@ -541,8 +586,8 @@ class _SetupKeys(_Keys):
     leg: str
     direction: str
     section_form: str
-    section_value: FiniteFloat
-    zero: FiniteFloat | None
+    section_value: Number
+    zero: Number | None
 
 
 class _CalibrationKeys(_Keys):
@@ -554,15 +599,15 @@ class _CalibrationKeys(_Keys):
     prior: bool
     solver: _SolverKeys
     parameters: Annotated[list[_ParameterKeys], Field(min_length=1)]
-    covariance: list[list[FiniteFloat | None]]
-    sigma: FiniteFloat | None
-    dof: FiniteFloat | None
+    covariance: list[list[Number | None]]
+    sigma: Number | None
+    dof: Number | None
     noise: _NoiseKeys
     rows_are_differences: bool
-    rms_before: FiniteFloat
-    rms_after: FiniteFloat
-    largest_before: FiniteFloat
-    largest_after: FiniteFloat
+    rms_before: Number
+    rms_after: Number
+    largest_before: Number
+    largest_after: Number
     residuals: list[_ResidualKeys]
     postures: list[_PostureKeys]
     setups: list[_SetupKeys]

@@ -15,9 +15,18 @@ from typing import Annotated, Any
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from orthocal.documents import parse_number, read_csv_rows, read_yaml, validate, write_files
+from orthocal.documents import (
+    Number,
+    PositiveNumber,
+    is_folder,
+    parse_number,
+    read_csv_rows,
+    read_yaml,
+    validate,
+    write_files,
+)
 from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.measurement.gauge import locate_contacts
 from orthocal.measurement.session import (
@@ -39,7 +48,7 @@ COLUMNS = ("setup", "posture", "minus", "cycle", "reading_mm")
 """Columns of a readings.csv; `minus` and `cycle` may be absent."""
 
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^,;\s\"]+$")]
-Vector = Annotated[list[FiniteFloat], Field(min_length=1, max_length=12)]
+Vector = Annotated[list[Number], Field(min_length=1, max_length=12)]
 
 
 class _Keys(BaseModel):
@@ -49,14 +58,14 @@ class _Keys(BaseModel):
 class GaugeKeys(_Keys):
     """The indicator."""
 
-    sigma_mm: PositiveFloat | None = None
-    resolution_mm: PositiveFloat | None = None
-    range_mm: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
+    sigma_mm: PositiveNumber | None = None
+    resolution_mm: PositiveNumber | None = None
+    range_mm: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = None
 
     @model_validator(mode="after")
     def _range_rises(self) -> GaugeKeys:
         if self.range_mm is not None and not self.range_mm[0] < self.range_mm[1]:
-            raise ValueError(f"found {self.range_mm}; expected [lowest, highest]")
+            raise ValueError(f"range_mm|found {self.range_mm}; expected [lowest, highest]")
         return self
 
 
@@ -79,9 +88,9 @@ class PostureKeys(_Keys):
 class SectionKeys(_Keys):
     """Where along the leg's nominal axis the gauge touches."""
 
-    coordinate_mm: FiniteFloat | None = None
-    from_root_mm: FiniteFloat | None = None
-    fraction: FiniteFloat | None = None
+    coordinate_mm: Number | None = None
+    from_root_mm: Number | None = None
+    fraction: Number | None = None
 
     @model_validator(mode="after")
     def _one_form(self) -> SectionKeys:
@@ -99,7 +108,7 @@ class SetupKeys(_Keys):
     leg: Name
     direction: str
     section: SectionKeys
-    postures: list[Name] | None = None
+    postures: Annotated[list[Name], Field(min_length=1)] | None = None
     """In a plan: the postures it is to be read in; all by default."""
 
 
@@ -138,6 +147,10 @@ def load_session(path: str | Path) -> Session:
     if keys.readings is None:
         raise SessionError("is missing; expected the name of a CSV file", where=f"{file}: readings")
     plan = _build_plan(file, keys)
+    if not keys.readings.strip() or "\0" in keys.readings:
+        raise SessionError(
+            f"found {keys.readings!r}; expected the name of a CSV file", where=f"{file}: readings"
+        )
     readings_path = file.parent / keys.readings
     readings = _read_readings(readings_path, plan)
     digest = hashlib.sha256(file.read_bytes() + b"\0" + readings_path.read_bytes()).hexdigest()
@@ -162,12 +175,6 @@ def load_plan(path: str | Path) -> Session:
     plan = _build_plan(file, keys)
     readings = []
     for name, setup in keys.setups.items():
-        for posture in setup.postures or ():
-            if posture not in plan.postures:
-                raise SessionError(
-                    f"'{posture}' is not a posture; postures: {', '.join(plan.postures)}",
-                    where=f"{file}: setups.{name}.postures",
-                )
         readings += [
             Reading(name, posture, None, cycle, 0.0, None)
             for cycle in range(1, keys.cycles + 1)
@@ -303,7 +310,7 @@ def _where(path: Path | None, key: str) -> str:
 
 
 def _read_keys(path: Path) -> tuple[Path, SessionKeys]:
-    file = path / "session.yaml" if path.is_dir() else path
+    file = path / "session.yaml" if is_folder(path) else path
     data = read_yaml(file, error=SessionError)
     return file, validate(SessionKeys, data, where=str(file), error=SessionError)
 
@@ -329,6 +336,7 @@ def _build_plan(file: Path, keys: SessionKeys) -> Session:
             raise SessionError("the robot has revolute drives; mm do not fit", where=where)
         offsets = read_only(np.array(keys.controller.offsets_mm) * 1e-3)
     setups = {n: _build_setup(n, s, robot, f"{file}: setups.{n}") for n, s in keys.setups.items()}
+    _check_planned_postures(file, keys)
     g = keys.gauge
     return Session(
         robot=robot,
@@ -348,6 +356,19 @@ def _build_plan(file: Path, keys: SessionKeys) -> Session:
         readings_path=None,
         sha256="",
     )
+
+
+def _check_planned_postures(file: Path, keys: SessionKeys) -> None:
+    for name, setup in keys.setups.items():
+        where = f"{file}: setups.{name}.postures"
+        for posture in setup.postures or ():
+            if posture not in keys.postures:
+                raise SessionError(
+                    f"'{posture}' is not a posture; postures: {', '.join(keys.postures)}",
+                    where=where,
+                )
+            if (setup.postures or []).count(posture) > 1:
+                raise SessionError(f"'{posture}' stands twice", where=where)
 
 
 def _build_setup(name: str, keys: SetupKeys, robot: Robot, where: str) -> Setup:
@@ -432,27 +453,35 @@ def _build_postures(
         try:
             joints = assembly.inverse(np.array(list(targets.values())), names=list(targets))
         except ClosureError as e:
-            raise SessionError(e.problem, where=f"{file}: postures.{e.posture}") from None
+            raise SessionError(e.reason, where=f"{file}: postures.{e.posture}") from None
         nominal.update(zip(targets, joints, strict=True))
     for name in keys.postures:
-        for drive, value in zip(robot.drives, nominal[name], strict=True):
-            if not drive.lower - 1e-9 <= value <= drive.upper + 1e-9:
-                factor, unit_name = (1e3, "mm") if drive.unit == "m" else (180 / np.pi, "deg")
-                raise SessionError(
-                    f"{drive.name} would be at {value * factor:.2f} {unit_name}; it reaches from "
-                    f"{drive.lower * factor:g} to {drive.upper * factor:g} {unit_name}",
-                    where=f"{file}: postures.{name}",
-                )
+        _check_travel(robot, nominal[name], where=f"{file}: postures.{name}")
+        where = f"{file}: controller.offsets_mm: in posture '{name}'"
+        _check_travel(robot, nominal[name] - active, where=where, joiner=" ")
     try:
         assembly.close(np.array([nominal[n] for n in keys.postures]), names=list(keys.postures))
     except ClosureError as e:
-        raise SessionError(e.problem, where=f"{file}: postures.{e.posture}") from None
+        raise SessionError(e.reason, where=f"{file}: postures.{e.posture}") from None
     return {
         name: Posture(
             name, given[name][0], read_only(given[name][1]), read_only(nominal[name] - active)
         )
         for name in keys.postures
     }
+
+
+def _check_travel(robot: Robot, drives: Array, *, where: str, joiner: str = ": ") -> None:
+    """Refuse drive coordinates beyond a drive's travel."""
+    for drive, value in zip(robot.drives, drives, strict=True):
+        if not drive.lower - 1e-9 <= value <= drive.upper + 1e-9:
+            factor, unit = (1e3, "mm") if drive.unit == "m" else (180 / np.pi, "deg")
+            file, _, key = where.partition(": ")
+            problem = (
+                f"{key}{joiner}{drive.name} would be at {value * factor:.2f} {unit}; it reaches "
+                f"from {drive.lower * factor:g} to {drive.upper * factor:g} {unit}"
+            )
+            raise SessionError(problem, where=file)
 
 
 def _read_readings(path: Path, plan: Session) -> tuple[Reading, ...]:
@@ -502,7 +531,7 @@ def _read_readings(path: Path, plan: Session) -> tuple[Reading, ...]:
 def _parse_cycle(text: str, where: str) -> int:
     if not text:
         return 1
-    if not text.isdigit() or int(text) < 1:
+    if not (text.isascii() and text.isdigit() and len(text) < 10 and int(text) >= 1):
         raise SessionError(f"cycle is '{text}'; expected 1, 2, 3 ...", where=where)
     return int(text)
 

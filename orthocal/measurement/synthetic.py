@@ -10,9 +10,9 @@ from typing import Annotated
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, ConfigDict, Field
 
-from orthocal.documents import parse_number, read_yaml, validate
+from orthocal.documents import Number, parse_number, read_yaml, validate
 from orthocal.errors import ParameterError, SessionError
 from orthocal.measurement.gauge import build_observations, predict_entries
 from orthocal.measurement.session import Session
@@ -128,8 +128,8 @@ def simulate_session(
 class _TruthKeys(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    errors: Annotated[dict[str, FiniteFloat], Field(min_length=1)]
-    zeros_mm: dict[str, FiniteFloat] = {}
+    errors: Annotated[dict[str, Number], Field(min_length=1)]
+    zeros_mm: dict[str, Number] = {}
 
 
 def load_errors(path: str | Path, robot: Robot) -> dict[str, float]:
@@ -171,11 +171,20 @@ def collect_errors(
     if draw is not None:
         models = robot.parameters.models
         patterns = models[draw] if draw in models else tuple(draw.split(","))
-        errors.update(draw_errors(robot, patterns, seed=seed))
+        try:
+            errors.update(draw_errors(robot, patterns, seed=seed))
+        except ParameterError:
+            raise ParameterError(
+                f"'{draw}' is neither a model ({', '.join(models)}) nor the name of an error "
+                "parameter",
+                where="--draw",
+            ) from None
     if file is not None:
         errors.update(load_errors(file, robot))
     for text in single:
-        key, _, number = text.partition("=")
+        key, equals, number = text.partition("=")
+        if not equals:
+            raise ParameterError(f"found '{text}'; expected NAME=VALUE", where="--error")
         value = parse_number(number, where="--error", name=key, error=ParameterError)
         errors.update(read_errors({key: value}, robot, where="--error"))
     if not errors:

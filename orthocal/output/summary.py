@@ -155,7 +155,12 @@ def explain_validation(validation: Validation) -> list[str]:
     """The verdict of a validation and its reasons."""
     sentences = []
     achieved, expected = _mm(validation.achieved_rms), _mm(validation.expected_rms)
-    if validation.as_expected and validation.nothing_to_change:
+    if validation.as_expected is None:
+        sentences.append(
+            "Whether this is as expected cannot be told: the calibration had no readings to spare "
+            "that would say what to expect."
+        )
+    elif validation.as_expected and validation.nothing_to_change:
         sentences.append(
             f"The calibration is confirmed: r.m.s. {achieved} mm was achieved where {expected} mm "
             "was expected, and a further fit would change no parameter beyond its standard error."

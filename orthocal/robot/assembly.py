@@ -289,9 +289,7 @@ class Assembly:
         labels = names if names is not None else [f"posture {i + 1}" for i in range(count)]
 
         for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)).tolist():
-            raise ClosureError(
-                f"'{labels[i]}' has coordinates that are not numbers", posture=labels[i]
-            )
+            raise ClosureError("has coordinates that are not numbers", posture=labels[i])
         first = system.start if start is None else np.asarray(start, dtype=np.float64)
         x = np.array(np.broadcast_to(first, (count, system.n_x)))
         moves = np.where(system.units == 1.0, self.robot.characteristic_length, 1.0)
@@ -313,7 +311,7 @@ class Assembly:
             for i in pending[~good & (step[pending] < SMALLEST_CONTINUATION_STEP)].tolist():
                 _, final = _newton(system, x[[i]], targets[[i]], theta, tolerance)
                 raise ClosureError(
-                    f"posture '{labels[i]}' cannot be reached: the loops stay open by "
+                    "cannot be reached: the loops stay open by "
                     f"{final[0] * 1e3:.3g} mm, {done[i]:.0%} of the way from the mechanical zero",
                     posture=labels[i],
                     residual=float(final[0]),
@@ -322,9 +320,11 @@ class Assembly:
         for i in np.flatnonzero(~system.within_limits(x)).tolist():
             over = np.maximum(x[i] - system.upper, system.lower - x[i])
             j = int(over.argmax())
+            unit, factor = ("mm", 1e3) if system.units[j] == 1.0 else ("deg", 180.0 / np.pi)
             raise ClosureError(
-                f"posture '{labels[i]}' cannot be reached: joint '{system.names[j]}' would be at "
-                f"{x[i][j]:.4g}, outside its limits {system.lower[j]:g} ... {system.upper[j]:g}",
+                f"cannot be reached: joint '{system.names[j]}' would be at "
+                f"{x[i][j] * factor:.4g} {unit}, outside its limits "
+                f"{system.lower[j] * factor:g} ... {system.upper[j] * factor:g} {unit}",
                 posture=labels[i],
                 residual=0.0,
             )
@@ -345,7 +345,7 @@ class Assembly:
             name = names[i] if names is not None else f"posture {i + 1}"
             free = int((values[i] > SINGULAR_BELOW * values[i, 0]).sum())
             raise ClosureError(
-                f"posture '{name}' is singular: the drives leave {system.n_x - free} of "
+                f"is singular: the drives leave {system.n_x - free} of "
                 f"{system.n_x} passive motions free",
                 posture=name,
             )

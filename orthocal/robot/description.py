@@ -8,9 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from orthocal.documents import read_yaml, validate
+from orthocal.documents import Number, PositiveNumber, read_yaml, validate
 from orthocal.errors import RobotError
 
 Row = Literal["x", "y", "z", "rx", "ry", "rz"]
@@ -32,9 +32,9 @@ class ClosureKeys(_Keys):
 class DriveKeys(_Keys):
     """What orthocal adds to one motor."""
 
-    zero_mm: FiniteFloat | None = None
+    zero_mm: Number | None = None
     """Commanded coordinate of the mechanical zero, for a prismatic drive."""
-    zero_deg: FiniteFloat | None = None
+    zero_deg: Number | None = None
     """The same for a revolute drive."""
 
 
@@ -60,12 +60,12 @@ class TcpKeys(_Keys):
 class ToleranceKeys(_Keys):
     """One standard deviation of each kind of error, and of single parameters."""
 
-    offset_mm: PositiveFloat = 5.0
-    offset_mrad: PositiveFloat = 10.0
-    translation_mm: PositiveFloat = 0.1
-    rotation_mrad: PositiveFloat = 1.0
-    scale_ppm: PositiveFloat = 100.0
-    overrides: dict[str, PositiveFloat] = {}
+    offset_mm: PositiveNumber = 5.0
+    offset_mrad: PositiveNumber = 10.0
+    translation_mm: PositiveNumber = 0.1
+    rotation_mrad: PositiveNumber = 1.0
+    scale_ppm: PositiveNumber = 100.0
+    overrides: dict[str, PositiveNumber] = {}
     """Parameter name or glob, with the unit as suffix, to value; later ones win."""
 
 
@@ -74,7 +74,7 @@ class OrthocalKeys(_Keys):
 
     closures: dict[Name, ClosureKeys] | None = None
     drives: dict[Name, DriveKeys] = {}
-    passive_start: dict[Name, FiniteFloat] = {}
+    passive_start: dict[Name, Number] = {}
     """Passive joint with `_mm` or `_deg` suffix to the value from which the loops are first
     closed; 0 where absent."""
     legs: dict[Name, LegKeys] = {}

@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.documents import is_folder
 from orthocal.errors import ClosureError, ParameterError, RobotError
 from orthocal.robot.description import RobotKeys, load_description
 from orthocal.robot.parameters import (
@@ -214,10 +215,9 @@ class Robot:
             residual, jacobian = self.evaluate_constraints(drives, passive)
         worst = float(np.abs(residual).max())
         raise ClosureError(
-            f"the loops do not close in '{posture}': a residual of {worst:.3g} m remains",
+            f"does not close: a residual of {worst:.3g} m remains",
             posture=posture,
             residual=worst,
-            where=str(self.yaml),
         )
 
     def evaluate_constraints(self, drives: ArrayLike, passive: ArrayLike) -> tuple[Array, Array]:
@@ -372,7 +372,7 @@ def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
     if str(robot) in packaged:
         return _load_folder(packaged[str(robot)])
     folder = Path(robot) if beside is None else beside / robot
-    if not folder.is_dir():
+    if not str(robot) or not is_folder(folder):
         raise RobotError(
             f"'{robot}' is neither a robot of orthocal ({', '.join(packaged)}) "
             f"nor a folder ({folder})"
@@ -419,7 +419,7 @@ def _load_folder(folder: Path) -> Robot:
         passive = robot.close_with_pinocchio(robot.drive_zero, start, posture="mechanical zero")
     except ClosureError as e:
         raise RobotError(
-            f"{e.problem}; set orthocal.drives.<motor>.zero_mm (or zero_deg) and "
+            f"{e}; set orthocal.drives.<motor>.zero_mm (or zero_deg) and "
             "orthocal.passive_start near a posture that closes",
             where=where,
         ) from None
@@ -448,7 +448,7 @@ def _build_drives(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Drive,
     drives = []
     for motor in keys.name_mot:
         if not model.existJointName(motor):
-            moving = ", ".join(model.names[1:])
+            moving = ", ".join(list(model.names)[1:]) or "none"
             raise RobotError(
                 f"the URDF has no moving joint '{motor}'; joints: {moving}",
                 where=f"{where}: name_mot",

@@ -258,9 +258,11 @@ def build_parameters(
     result = ParameterSet(elementary, parameters.values(), models)
     for model, patterns in result.models.items():
         try:
-            result.select(patterns)
+            chosen = result.select(patterns)
         except ParameterError as e:
             raise ParameterError(f"models.{model}: {e.problem}") from None
+        if not chosen:
+            raise ParameterError(f"models.{model}: leaves no error parameter free")
     return result
 
 

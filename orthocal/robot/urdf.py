@@ -23,6 +23,19 @@ MOVING = ("revolute", "continuous", "prismatic")
 """Joint types that a robot may have besides `fixed`."""
 
 
+_NUMBERS: dict[str, dict[str, int]] = {
+    "origin": {"xyz": 3, "rpy": 3},
+    "dynamics": {"damping": 1, "friction": 1},
+    "mass": {"value": 1},
+    "inertia": dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), 1),
+    "box": {"size": 3},
+    "cylinder": {"radius": 1, "length": 1},
+    "sphere": {"radius": 1},
+    "color": {"rgba": 4},
+}
+"""Elements and how many numbers each of their attributes holds."""
+
+
 def load_urdf(path: Path) -> pin.Model:
     """Pinocchio's model of a URDF file, after the file was checked.
 
@@ -54,12 +67,17 @@ def _parse_xml(text: str, path: Path) -> Any:  # noqa: ANN401 - lxml has no type
             f"is not valid XML: {str(e.msg).splitlines()[0]}", where=f"{path}{line}"
         ) from None
     if root.getroottree().docinfo.doctype:
-        raise RobotError("has a DOCTYPE; a URDF needs none, and it is refused", where=f"{path}:1")
+        number = text[: text.upper().index("<!DOCTYPE")].count("\n") + 1
+        raise RobotError(
+            "has a DOCTYPE; a URDF needs none, and it is refused", where=f"{path}:{number}"
+        )
     if root.tag != "robot":
         raise RobotError(
             f"the outermost element is <{root.tag}>; expected <robot>",
             where=f"{path}:{root.sourceline}",
         )
+    if not root.get("name"):
+        raise RobotError("<robot> has no name", where=f"{path}:{root.sourceline}")
     etree.strip_tags(root, etree.Comment)
     return root
 
@@ -89,8 +107,9 @@ def _check_elements(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has n
     for joint in root.findall("joint"):
         name, kind = joint.get("name"), joint.get("type")
         if kind not in (*MOVING, "fixed"):
+            found = "has no type" if kind is None else f"is of type '{kind}'"
             raise RobotError(
-                f"joint '{name}' is of type '{kind}'; expected {', '.join(MOVING)} or fixed",
+                f"joint '{name}' {found}; expected {', '.join(MOVING)} or fixed",
                 where=at(joint),
             )
         if joint.find("mimic") is not None:
@@ -121,7 +140,9 @@ def _check_elements(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has n
         axis = joint.find("axis")
         if axis is not None and kind != "fixed":
             vector = _numbers(axis, "xyz", 3, at(axis))
-            if vector is not None and math.hypot(*vector) < 1e-9:
+            if vector is None:
+                raise RobotError(f"joint '{name}': its <axis> has no xyz", where=at(axis))
+            if math.hypot(*vector) < 1e-9:
                 raise RobotError(f"joint '{name}' has a zero axis", where=at(axis))
         limit = joint.find("limit")
         if kind in ("revolute", "prismatic"):
@@ -129,10 +150,10 @@ def _check_elements(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has n
                 raise RobotError(f"joint '{name}' of type {kind} has no <limit>", where=at(joint))
             for bound in ("lower", "upper", "effort", "velocity"):
                 _numbers(limit, bound, 1, at(limit))
-            for bound in ("effort", "velocity"):
+            for bound in ("lower", "upper", "effort", "velocity"):
                 if limit.get(bound) is None:
                     raise RobotError(f"joint '{name}': its <limit> has no {bound}", where=at(limit))
-            if float(limit.get("lower", "0")) > float(limit.get("upper", "0")):
+            if float(limit.get("lower")) > float(limit.get("upper")):
                 raise RobotError(
                     f"joint '{name}': its lower limit is above its upper limit", where=at(limit)
                 )
@@ -140,9 +161,34 @@ def _check_elements(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has n
     if len(roots) != 1:
         found = ", ".join(roots) if roots else "none"
         raise RobotError(f"has {len(roots)} root links ({found}); expected one", where=str(path))
-    for origin in root.iter("origin"):
-        _numbers(origin, "xyz", 3, at(origin))
-        _numbers(origin, "rpy", 3, at(origin))
+    _check_connected(roots[0], links, root, path)
+    for tag, keys in _NUMBERS.items():
+        for element in root.iter(tag):
+            for key, count in keys.items():
+                _numbers(element, key, count, at(element))
+    for tag in ("visual", "collision"):
+        for element in root.iter(tag):
+            if element.find("geometry") is None:
+                raise RobotError(f"<{tag}> has no <geometry>", where=at(element))
+
+
+def _check_connected(top: str, links: dict[str, int], root: Any, path: Path) -> None:  # noqa: ANN401
+    """Refuse links that hang on each other in a ring, apart from the root."""
+    children: dict[str, list[str]] = {}
+    for joint in root.findall("joint"):
+        parent = joint.find("parent").get("link")
+        children.setdefault(parent, []).append(joint.find("child").get("link"))
+    reached, pending = {top}, [top]
+    while pending:
+        for child in children.get(pending.pop(), []):
+            if child not in reached:
+                reached.add(child)
+                pending.append(child)
+    apart = [name for name in links if name not in reached]
+    if apart:
+        raise RobotError(
+            f"the links {', '.join(apart)} do not hang on the root link '{top}'", where=str(path)
+        )
 
 
 def _numbers(element: Any, key: str, count: int, where: str) -> list[float] | None:  # noqa: ANN401

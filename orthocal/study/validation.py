@@ -71,7 +71,8 @@ class Validation:
     """What a further fit would leave, [m]."""
     refit_largest: float
     excess_probability: float
-    """Probability that the achieved sum of squares would be as large by chance (F test)."""
+    """Probability that the achieved sum of squares would be as large by chance (F test); NaN if
+    the calibration had no readings to spare."""
     changes: tuple[FurtherChange, ...]
     matched: int
     """Rows that both sessions have."""
@@ -83,9 +84,14 @@ class Validation:
     """Rows of the new session: nominal is the machine as the controller knows it."""
 
     @property
-    def as_expected(self) -> bool:
-        """Whether the achieved deviations are no larger than expected, but for chance."""
-        return not self.excess_probability < CHANCE
+    def as_expected(self) -> bool | None:
+        """Whether the achieved deviations are no larger than expected, but for chance.
+
+        None if the calibration had no readings to spare: then it expected nothing.
+        """
+        if math.isnan(self.excess_probability):
+            return None
+        return self.excess_probability >= CHANCE
 
     @property
     def nothing_to_change(self) -> bool:
@@ -227,6 +233,8 @@ def _excess_probability(calibration: Calibration, refit: Calibration) -> float:
     """Upper tail of the ratio of achieved to expected mean squares."""
     expected = calibration.noise.residual_sigma
     dof = calibration.noise.residual_dof
+    if not (expected > 0.0 and dof > 0.0):
+        return math.nan
     rows = refit.residuals
     zeros = len({r.setup for r in rows if r.minus is None})
     achieved = sum(r.deviation**2 / (2.0 if r.minus else 1.0) for r in rows)

@@ -128,7 +128,7 @@ def test_an_unreachable_posture_is_named_with_what_stays_open(orthoglide):
 
 
 def test_coordinates_that_are_not_numbers_are_refused(orthoglide):
-    with pytest.raises(ClosureError, match="'here' has coordinates that are not numbers"):
+    with pytest.raises(ClosureError, match="posture 'here' has coordinates that are not numbers"):
         nominal_assembly(orthoglide).close([[np.nan, 0.3, 0.3]], names=["here"])
 
 

@@ -63,7 +63,7 @@ def test_offsets_that_were_entered_with_their_sign_turned_are_found_out(plan):
     # the session believes that the right offsets were entered
     lied = replace(after, controller_offsets=None, postures=plan.postures)
     result = validate_calibration(before, lied)
-    assert not result.as_expected
+    assert result.as_expected is False
     assert not result.nothing_to_change
     assert "Check the signs of the offsets" in summarize(result)
 
@@ -77,7 +77,7 @@ def test_a_right_calibration_with_noise_alone_does_not_repeat_its_residuals(plan
         result = validate_calibration(before, after)
         assert result.offsets_stated
         verdicts.append((result.as_expected, result.residuals_repeat))
-    assert sum(not ok for ok, _ in verdicts) <= 4  # 5 % each by construction
+    assert sum(ok is False for ok, _ in verdicts) <= 4  # 5 % each by construction
     assert sum(bool(again) for _, again in verdicts) <= 4
 
 
@@ -97,3 +97,10 @@ def test_another_robot_is_refused(table1, biglide):
     calibration = calibrate(table1[2])
     with pytest.raises(SessionError, match="is of robot 'biglide'"):
         validate_calibration(calibration, replace(table1[3], robot=biglide))
+
+
+def test_a_calibration_without_readings_to_spare_expects_nothing(table1):
+    few = tuple(r for r in table1[2].readings if r.setup in ("yx", "xy", "xz"))
+    result = validate_calibration(calibrate(replace(table1[2], readings=few)), table1[3])
+    assert result.as_expected is None
+    assert "no readings to spare" in summarize(result)
