@@ -5,6 +5,7 @@ Imports of anything slow stand inside the commands: help answers at once.
 
 from __future__ import annotations
 
+import io
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -44,6 +45,9 @@ def main() -> None:
     """
     import os
 
+    for stream in (sys.stdout, sys.stderr):  # a terminal without ± prints a question mark
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         app()
     except OrthocalError as e:
@@ -79,6 +83,13 @@ def calibrate(
     model: Annotated[
         str, typer.Option(help="Which errors are free: offsets, lengths, or one of the robot's.")
     ] = "offsets",
+    prior: Annotated[
+        bool | None,
+        typer.Option(
+            "--prior/--no-prior",
+            help="Whether tolerances act as a prior; by default not for offsets, else yes.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for calibration.json; made if need be.")
     ] = None,
@@ -92,7 +103,7 @@ def calibrate(
 
     if out is not None:
         require_writable(out)
-    result = run(load_session(session), model=model)
+    result = run(load_session(session), model=model, prior=prior)
     if json:
         _out(result.to_json().rstrip("\n"))
     else:

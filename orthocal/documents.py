@@ -11,12 +11,13 @@ import json
 import os
 import re
 import tempfile
+import unicodedata
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
 from orthocal.errors import OrthocalError
@@ -30,11 +31,35 @@ def _refuse_truth_values(value: object) -> object:
     return value
 
 
-Number = Annotated[float, BeforeValidator(_refuse_truth_values), Field(allow_inf_nan=False)]
-"""A finite number; YAML's yes and no are not numbers."""
+LARGEST_NUMBER = 1e9
+"""No length, angle or coordinate in a file is larger, whatever its unit."""
 
-PositiveNumber = Annotated[Number, Field(gt=0.0)]
-"""A finite number above 0."""
+SMALLEST_POSITIVE = 1e-9
+"""No standard deviation, tolerance or resolution in a file is smaller, whatever its unit."""
+
+
+def _refuse_huge(value: float) -> float:
+    if abs(value) > LARGEST_NUMBER:
+        raise PydanticCustomError("huge", f"Input should be within ±{LARGEST_NUMBER:g}")
+    return value
+
+
+def _refuse_tiny(value: float) -> float:
+    if value < SMALLEST_POSITIVE:
+        raise PydanticCustomError("tiny", f"Input should be at least {SMALLEST_POSITIVE:g}")
+    return value
+
+
+Number = Annotated[
+    float,
+    BeforeValidator(_refuse_truth_values),
+    Field(allow_inf_nan=False),
+    AfterValidator(_refuse_huge),
+]
+"""A number of sane size; YAML's yes and no are not numbers."""
+
+PositiveNumber = Annotated[Number, Field(gt=0.0), AfterValidator(_refuse_tiny)]
+"""A number of sane size above 0."""
 
 LARGEST_FILE = 64 * 2**20
 """Files above this size are refused, [bytes]."""
@@ -59,10 +84,9 @@ class _StrictLoader(yaml.SafeLoader):
             raise yaml.MarkedYAMLError(
                 problem=f"'{node.value}' does not fit its tag {tag}", problem_mark=node.start_mark
             ) from None
-        if isinstance(value, str) and any("\ud800" <= c <= "\udfff" for c in value):
-            raise yaml.MarkedYAMLError(
-                problem="half of a surrogate pair is not a character", problem_mark=node.start_mark
-            )
+        problem = _text_problem(value)
+        if problem:
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
         return value
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
@@ -79,6 +103,17 @@ class _StrictLoader(yaml.SafeLoader):
                 )
             seen.add(key.value)
         return dict(super().construct_mapping(node, deep))
+
+
+def _text_problem(value: object) -> str | None:
+    """What is wrong with the characters of a text, if anything."""
+    if not isinstance(value, str):
+        return None
+    if any("\ud800" <= c <= "\udfff" for c in value):
+        return "half of a surrogate pair is not a character"
+    if any(unicodedata.category(c) == "Cc" and c not in "\n\t" for c in value):
+        return "a text holds a control character"
+    return None
 
 
 def is_folder(path: Path) -> bool:
@@ -155,6 +190,10 @@ def read_json(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
         for key in keys:
             if keys.count(key) > 1:
                 raise ValueError(f"the key '{key}' stands twice")
+        for key, value in pairs:
+            problem = _text_problem(key) or _text_problem(value)
+            if problem:
+                raise ValueError(problem)
         return dict(pairs)
 
     try:
@@ -235,6 +274,10 @@ def parse_number(text: str, *, where: str, name: str, error: type[OrthocalError]
         raise error(f"{name} is '{text}'; expected a number{hint}", where=where) from None
     if value - value != 0.0:
         raise error(f"{name} is '{text}'; expected a finite number", where=where)
+    if abs(value) > LARGEST_NUMBER:
+        raise error(
+            f"{name} is '{text}'; expected a number within ±{LARGEST_NUMBER:g}", where=where
+        )
     return value
 
 

@@ -561,7 +561,7 @@ SESSION_SENSE_CASES = [
         "readings-with-null",
         "readings.csv",
         '"a\\0.csv"',
-        ": readings: found 'a\\x00.csv'; expected the name of a CSV file",
+        ":30: is not valid YAML: a text holds a control character",
     ),
     Case(
         "model-unknown",
@@ -707,9 +707,9 @@ READINGS_CASES = [
     readings_file("not-utf8", f"{HEADER}\n".encode("utf-16"), ": is not UTF-8 text (byte 0)"),
     Case(
         "readings-too-few",
-        "the readings do not determine x_slide.offset, y_slide.offset, z_slide.offset: 1 of 3 free "
-        "parameters can be told from them. Read the legs that are missing, in postures along their "
-        "own axes, or use tolerances as a prior",
+        "{tmp}/readings.csv: the readings do not determine x_slide.offset, y_slide.offset, "
+        "z_slide.offset: 1 of 3 free parameters can be told from them. Read the legs that are "
+        "missing, in postures along their own axes, or use tolerances as a prior",
         (write("readings.csv", f"{HEADER}\nxy,y_max,y_min,-0.43\n"),),
     ),
 ]

@@ -78,7 +78,10 @@ def calibrate(
     _, reference_jacobian = problem.linearise(problem.reference)
     at_reference = decompose(reference_jacobian, problem.observations)
     if not problem.prior:
-        require_identifiable(at_reference, problem.free)
+        where = session.readings_path or session.path
+        require_identifiable(
+            at_reference, problem.free, where=None if where is None else str(where)
+        )
 
     repeatability = estimate_repeatability(problem.values, problem.observations)
     sigma = _first_sigma(session, repeatability)

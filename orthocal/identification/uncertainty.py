@@ -200,8 +200,15 @@ def decompose(jacobian: Array, observations: Observations) -> Information:
     return Information(padded, directions)
 
 
-def require_identifiable(information: Information, names: tuple[str, ...]) -> None:
+def require_identifiable(
+    information: Information, names: tuple[str, ...], *, where: str | None = None
+) -> None:
     """Refuse a problem without prior whose readings leave parameters undetermined.
+
+    Args:
+        information: Of the readings.
+        names: Of the free parameters.
+        where: File, for messages.
 
     Raises:
         NotIdentifiableError: Naming the parameters.
@@ -213,6 +220,7 @@ def require_identifiable(information: Information, names: tuple[str, ...]) -> No
             f"{information.rank} of {len(names)} free parameters can be told from them. Read the "
             "legs that are missing, in postures along their own axes, or use tolerances as a prior",
             parameters=lost,
+            where=where,
         )
 
 
