@@ -17,7 +17,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from orthocal.errors import RobotError
-from orthocal.robot.model import Closure, Robot, find_frame, joint_axis
+from orthocal.robot.model import Closure, Robot, joint_axis
 
 SERIES_BELOW = 0.04
 """Squared angle below which exponential coefficients come from their series, [rad²]."""
@@ -164,11 +164,15 @@ def screw_motion(axis: NDArray[np.float64], angle: ca.SX) -> Pose:
 
 
 class SymbolicTree:
-    """Forward kinematics of a Pinocchio model with error twists on joints and frames.
+    """Forward kinematics of a Pinocchio model whose placements may be expressions.
 
-    Attributes:
+    Args:
         model: The nominal model.
         coordinates: Joint coordinates, shape (nv,): one an unbounded revolute joint.
+        joint_placements: Joint to its placement in its parent's moving frame, where that is not
+            the model's own.
+        frame_placements: Index of a frame to its placement in the frame that it hangs on (see
+            `hangs_on`), where that is not the model's own.
     """
 
     def __init__(
@@ -176,46 +180,113 @@ class SymbolicTree:
         model: pin.Model,
         coordinates: ca.SX,
         *,
-        joint_twists: Mapping[str, ca.SX] | None = None,
-        frame_twists: Mapping[str, ca.SX] | None = None,
+        joint_placements: Mapping[int, Pose] | None = None,
+        frame_placements: Mapping[int, Pose] | None = None,
     ) -> None:
         self.model = model
         self.coordinates = coordinates
-        self._joint_twists = dict(joint_twists or {})
-        self._frame_twists = {
-            find_frame(model, name, where="frame"): t for name, t in (frame_twists or {}).items()
-        }
+        self._joint_placements = dict(joint_placements or {})
+        self._frame_placements = dict(frame_placements or {})
+        self._bases: dict[int, Pose] = {}
         self._joints: dict[int, Pose] = {0: Pose(ca.SX.eye(3), ca.SX(3, 1))}
         self._frames: dict[int, Pose] = {}
+
+    def joint_base(self, joint: int) -> Pose:
+        """Pose of a joint's frame in the world before its own motion: where its errors act."""
+        if joint not in self._bases:
+            m = self.model
+            placement = self._joint_placements.get(joint)
+            if placement is None:
+                placement = constant_pose(m.jointPlacements[joint])
+            self._bases[joint] = self.joint_pose(m.parents[joint]) * placement
+        return self._bases[joint]
 
     def joint_pose(self, joint: int) -> Pose:
         """Pose of a joint's moving frame in the world."""
         if joint not in self._joints:
-            m = self.model
-            pose = self.joint_pose(m.parents[joint]) * constant_pose(m.jointPlacements[joint])
-            twist = self._joint_twists.get(m.names[joint])
-            if twist is not None:
-                pose = pose * exp6(twist)
-            first, count = m.joints[joint].idx_v, m.joints[joint].nv
-            motion = joint_motion(m, joint, self.coordinates[first : first + count])
-            self._joints[joint] = pose * motion
+            first, count = self.model.joints[joint].idx_v, self.model.joints[joint].nv
+            motion = joint_motion(self.model, joint, self.coordinates[first : first + count])
+            self._joints[joint] = self.joint_base(joint) * motion
         return self._joints[joint]
 
     def frame_pose(self, frame: int) -> Pose:
         """Pose of a frame in the world; the errors of frames that it hangs on act on it."""
         if frame not in self._frames:
-            f = self.model.frames[frame]
-            placement = constant_pose(f.placement)
-            parent = self.model.frames[f.parentFrame]
-            if f.type == pin.FrameType.JOINT or frame == 0 or parent.parentJoint != f.parentJoint:
-                pose = self.joint_pose(f.parentJoint) * placement
+            parent = hangs_on(self.model, frame)
+            placement = self._frame_placements.get(frame)
+            if placement is None:
+                placement = constant_pose(nominal_frame_placement(self.model, frame))
+            if parent is None:
+                pose = self.joint_pose(self.model.frames[frame].parentJoint) * placement
             else:
-                between = constant_pose(parent.placement.inverse() * f.placement)
-                pose = self.frame_pose(f.parentFrame) * between
-            if frame in self._frame_twists:
-                pose = pose * exp6(self._frame_twists[frame])
+                pose = self.frame_pose(parent) * placement
             self._frames[frame] = pose
         return self._frames[frame]
+
+    def joints_to(self, frame: int) -> list[int]:
+        """Joints that move a frame, from it to the base."""
+        joint, found = int(self.model.frames[frame].parentJoint), []
+        while joint > 0:
+            found.append(joint)
+            joint = int(self.model.parents[joint])
+        return found
+
+
+def hangs_on(model: pin.Model, frame: int) -> int | None:
+    """The frame of the same joint that a frame hangs on, whose errors move it; None if none."""
+    f = model.frames[frame]
+    parent = int(f.parentFrame)
+    if f.type == pin.FrameType.JOINT or frame == parent:
+        return None
+    return parent if model.frames[parent].parentJoint == f.parentJoint else None
+
+
+def nominal_frame_placement(model: pin.Model, frame: int) -> pin.SE3:
+    """Placement of a frame in the frame that it hangs on, or else in its joint."""
+    parent = hangs_on(model, frame)
+    placement = model.frames[frame].placement
+    return placement if parent is None else model.frames[parent].placement.inverse() * placement
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorExpressions:
+    """Errors of a robot as expressions: twists of placements, and what drives add."""
+
+    joint_twists: Mapping[int, ca.SX]
+    """Joint to its placement twist δ, shape (6,)."""
+    frame_twists: Mapping[int, ca.SX]
+    """Frame to its placement twist δ, shape (6,)."""
+    offset: ca.SX
+    """Offsets Δρ, shape (n_drives,)."""
+    gain: ca.SX
+    """1 + scale error, shape (n_drives,)."""
+
+
+def express_errors(
+    robot: Robot, errors: Mapping[str, ca.SX | float] | None = None
+) -> ErrorExpressions:
+    """Twists, offsets and gains of parameter values, which may be expressions."""
+    elementary: dict[str, ca.SX] = {}
+    for name, value in (errors or {}).items():
+        for term, coefficient in robot.parameters[name].terms:
+            elementary[term] = elementary.get(term, ca.SX(0.0)) + coefficient * value
+    joint_twists: dict[int, ca.SX] = {}
+    frame_twists: dict[int, ca.SX] = {}
+    offset = ca.SX(len(robot.drives), 1)
+    gain = ca.SX(robot.drive_gain)
+    index = {d.name: i for i, d in enumerate(robot.drives)}
+    for name, expression in elementary.items():
+        e = robot.parameters.elementary[name]
+        if e.kind == "offset":
+            offset[index[e.owner]] += expression
+        elif e.kind == "scale":
+            gain[index[e.owner]] += expression
+        elif e.of_frame:
+            frame_twists.setdefault(robot.frame_id(e.owner), ca.SX(6, 1))[e.axis] += expression
+        else:
+            joint = int(robot.model.getJointId(e.owner))
+            joint_twists.setdefault(joint, ca.SX(6, 1))[e.axis] += expression
+    return ErrorExpressions(joint_twists, frame_twists, offset, gain)
 
 
 class SymbolicRobot:
@@ -226,6 +297,8 @@ class SymbolicRobot:
         drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
         passive: Passive coordinates, shape (n_passive,), [m, rad].
         errors: Parameter name to expression or number, [unit of the parameter].
+        placements: Placements of joints and of frames (by index) to take instead of those that
+            the errors' twists make.
     """
 
     def __init__(
@@ -235,34 +308,20 @@ class SymbolicRobot:
         drives: ca.SX,
         passive: ca.SX,
         errors: Mapping[str, ca.SX | float] | None = None,
+        placements: tuple[Mapping[int, Pose], Mapping[int, Pose]] | None = None,
     ) -> None:
         self.robot = robot
-        elementary: dict[str, ca.SX] = {}
-        for name, value in (errors or {}).items():
-            for term, coefficient in robot.parameters[name].terms:
-                elementary[term] = elementary.get(term, ca.SX(0.0)) + coefficient * value
-        joint_twists: dict[str, ca.SX] = {}
-        frame_twists: dict[str, ca.SX] = {}
-        offset = ca.SX(len(robot.drives), 1)
-        gain = ca.SX(robot.drive_gain)
-        index = {d.name: i for i, d in enumerate(robot.drives)}
-        for name, expression in elementary.items():
-            e = robot.parameters.elementary[name]
-            if e.kind == "offset":
-                offset[index[e.owner]] += expression
-            elif e.kind == "scale":
-                gain[index[e.owner]] += expression
-            else:
-                twists = frame_twists if e.of_frame else joint_twists
-                twists.setdefault(e.owner, ca.SX(6, 1))[e.axis] += expression
+        expressions = express_errors(robot, errors)
+        self.actuated = expressions.gain * drives + expressions.offset
+        """Where the drives really are, shape (n_drives,), [m, rad]."""
         coordinates = ca.SX(robot.model.nv, 1)
-        actuated = gain * drives + offset
         for i, k in enumerate(robot.drive_index):
-            coordinates[int(k)] = actuated[i]
+            coordinates[int(k)] = self.actuated[i]
         for i, k in enumerate(robot.passive_index):
             coordinates[int(k)] = passive[i]
+        joints, frames = placements or erroneous_placements(robot.model, expressions)
         self.tree = SymbolicTree(
-            robot.model, coordinates, joint_twists=joint_twists, frame_twists=frame_twists
+            robot.model, coordinates, joint_placements=joints, frame_placements=frames
         )
 
     def frame_pose(self, name: str) -> Pose:
@@ -279,6 +338,21 @@ class SymbolicRobot:
     def closure_residual(self) -> ca.SX:
         """g(q, θ) of all closures, shape (closure_rows,), [m, rad]."""
         return ca.vertcat(*(self.closure_error(c) for c in self.robot.closures))
+
+
+def erroneous_placements(
+    model: pin.Model, expressions: ErrorExpressions
+) -> tuple[dict[int, Pose], dict[int, Pose]]:
+    """Placement · exp6(δ) of every joint and frame that has an error."""
+    joints = {
+        i: constant_pose(model.jointPlacements[i]) * exp6(twist)
+        for i, twist in expressions.joint_twists.items()
+    }
+    frames = {
+        i: constant_pose(nominal_frame_placement(model, i)) * exp6(twist)
+        for i, twist in expressions.frame_twists.items()
+    }
+    return joints, frames
 
 
 def closure_row_units(robot: Robot) -> NDArray[np.float64]:

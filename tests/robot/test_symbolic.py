@@ -11,8 +11,16 @@ from tolerances import DERIVATIVE, KINEMATICS
 
 from orthocal import load_robot
 from orthocal.errors import RobotError
-from orthocal.robot.model import place_frames
-from orthocal.robot.symbolic import Pose, SymbolicRobot, SymbolicTree, exp6, log6
+from orthocal.robot.model import find_frame, place_frames
+from orthocal.robot.symbolic import (
+    ErrorExpressions,
+    Pose,
+    SymbolicRobot,
+    SymbolicTree,
+    erroneous_placements,
+    exp6,
+    log6,
+)
 from orthocal.robot.urdf import load_urdf
 
 
@@ -53,12 +61,14 @@ def build(model, joints, frames):
     q = ca.SX.sym("q", model.nv)
     dj = ca.SX.sym("dj", 6, len(joints))
     df = ca.SX.sym("df", 6, len(frames))
-    tree = SymbolicTree(
-        model,
-        q,
-        joint_twists={name: dj[:, i] for i, name in enumerate(joints)},
-        frame_twists={name: df[:, i] for i, name in enumerate(frames)},
+    errors = ErrorExpressions(
+        {model.getJointId(name): dj[:, i] for i, name in enumerate(joints)},
+        {find_frame(model, name, where=""): df[:, i] for i, name in enumerate(frames)},
+        ca.SX(0, 1),
+        ca.SX(0, 1),
     )
+    at_joints, at_frames = erroneous_placements(model, errors)
+    tree = SymbolicTree(model, q, joint_placements=at_joints, frame_placements=at_frames)
     poses = [tree.frame_pose(i) for i in moving_frames(model)]
     stacked = ca.vertcat(*(ca.vertcat(ca.vec(p.rotation), p.position) for p in poses))
     return ca.Function("poses", [q, dj, df], [stacked])
@@ -122,7 +132,10 @@ def test_error_derivatives_equal_pinocchios_kinematic_regressor(orthoglide):
     joints = list(model.names)[1:]
     frame = orthoglide.frame_id("tcp")
     q, dj = ca.SX.sym("q", model.nv), ca.SX.sym("dj", 6, len(joints))
-    tree = SymbolicTree(model, q, joint_twists={n: dj[:, i] for i, n in enumerate(joints)})
+    errors = ErrorExpressions(
+        {model.getJointId(n): dj[:, i] for i, n in enumerate(joints)}, {}, ca.SX(0, 1), ca.SX(0, 1)
+    )
+    tree = SymbolicTree(model, q, joint_placements=erroneous_placements(model, errors)[0])
     pose = tree.frame_pose(frame)
     stacked = ca.vertcat(ca.vec(pose.rotation), pose.position)
     slope = ca.Function("slope", [q, dj], [ca.jacobian(stacked, ca.vec(dj))])
