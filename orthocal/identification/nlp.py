@@ -215,16 +215,17 @@ class NonlinearProgram:
         lam_f = ca.MX.sym("lam_f")
         lam_g = ca.MX.sym("lam_g", k * problem.robot.closure_rows)
         theta = x[: self._n_theta]
-        sigma, prior = p[entries], p[entries + 1]
+        prior = p[entries + 1]
 
+        shared = list(self._shared_call(theta))
         objective = 0.5 * prior * ca.dot(theta, theta)
         gradient, hessian = _Gather(n, 1), _Gather(n, n)
         diagonal = np.arange(self._n_theta)
         gradient.add(diagonal, np.zeros_like(diagonal), prior * theta)
         hessian.add(diagonal, diagonal, lam_f * ca.repmat(prior, self._n_theta, 1))
         for piece in problem.reading_pieces:
-            objective += self._add_readings(piece, x, p, sigma, lam_f, gradient, hessian)
-        constraints, jacobian = self._add_closures(x, lam_g, hessian)
+            objective += self._add_readings(piece, x, p, shared, lam_f, gradient, hessian)
+        constraints, jacobian = self._add_closures(x, lam_g, shared, hessian)
 
         f, g = ca.densify(objective), ca.densify(constraints)
         grad_f = ca.densify(gradient.build())
@@ -250,6 +251,7 @@ class NonlinearProgram:
             "sb": "yes",
             "nlp_scaling_method": "none",  # everything is of order one already
             "linear_solver": "mumps",
+            "mumps_pivot_order": 6,  # QAMD, made for a few dense rows: the parameters
         }
         self._solver = ca.nlpsol(
             "calibration",
@@ -270,12 +272,16 @@ class NonlinearProgram:
         first = self._n_theta + self._n_zeros
         return np.asarray(first + postures[:, None] * self._n_passive + index[None, :])
 
+    def _shared_call(self, theta: ca.MX) -> tuple[ca.MX, ...]:
+        """What depends on θ̂ alone, once for all postures and readings."""
+        return tuple(self.problem.shared.function(theta))
+
     def _add_readings(
         self,
         piece: ReadingPiece,
         x: ca.MX,
         p: ca.MX,
-        sigma: ca.MX,
+        shared: list[ca.MX],
         lam_f: ca.MX,
         gradient: _Gather,
         hessian: _Gather,
@@ -294,99 +300,93 @@ class NonlinearProgram:
                 self._passive_variables(postures, piece.passive_index),
             ]
         )
-        objective_f, hessian_f = self._reading_functions(piece)
-        shared = [objective_f.index_in("theta"), objective_f.index_in("sigma")]
-        arguments = [
-            x[piece.theta_index.tolist()],
-            x[variables[:, n_t].tolist()].T,
-            ca.reshape(x[variables[:, n_t + 1 :].reshape(-1).tolist()], -1, count),
+        local = variables[:, n_t:]
+        own = [
+            x[local[:, 0].tolist()].T,
+            ca.reshape(x[local[:, 1:].reshape(-1).tolist()], -1, count),
             p[piece.entries.tolist()].T,
-            sigma,
             ca.MX(ca.DM(problem.drives[postures].T)),
             ca.MX(ca.DM(problem.setup_columns[o.setup[piece.entries]].T)),
         ]
-        masks = [i in shared for i in range(len(arguments))]
-        # objective and the part of the gradient by θ̂ are sums over readings
-        total, by_theta, by_local = objective_f.map(count, masks, [True, True, False])(*arguments)
-        zeros = np.zeros_like(piece.theta_index)
-        gradient.add(piece.theta_index, zeros, by_theta)
-        local = variables[:, n_t:]
+        common = [p[problem.observations.size], *shared]
+        arguments = [*own, *common]
+        masks = [*(False for _ in own), *(True for _ in common)]
+        functions = self._reading_functions(piece)
+
+        total = functions["objective"].map(count, masks, [True])(*arguments)
+        # the part of the gradient by θ̂ is a sum over readings, and so is that of the Hessian
+        by_theta, by_local = functions["gradient"].map(count, masks, [True, False])(*arguments)
+        gradient.add(piece.theta_index, np.zeros_like(piece.theta_index), by_theta)
         gradient.add(local, np.zeros_like(local), ca.vec(by_local))
 
-        by_theta_theta, by_rest = hessian_f.map(count, masks, [True, False])(*arguments)
+        summed, rest = functions["hessian"].map(count, masks, [True, False])(*arguments)
         rows, columns = _triangle(n_t)
-        hessian.add(piece.theta_index[rows], piece.theta_index[columns], lam_f * by_theta_theta)
+        hessian.add(piece.theta_index[rows], piece.theta_index[columns], lam_f * summed)
         rows, columns = _rest_of_triangle(variables.shape[1], n_t)
-        hessian.add(variables[:, rows], variables[:, columns], lam_f * ca.vec(by_rest))
+        hessian.add(variables[:, rows], variables[:, columns], lam_f * ca.vec(rest))
         return total
 
-    def _reading_functions(self, piece: ReadingPiece) -> tuple[ca.Function, ca.Function]:
-        """(objective, gradient by θ̂, gradient by ẑ and q̂) and Hessian parts of one reading."""
+    def _reading_functions(self, piece: ReadingPiece) -> dict[str, ca.Function]:
+        """Objective, gradient (by θ̂; by ẑ and q̂) and Hessian (θ̂ with θ̂; the rest) of one."""
         zero, y, sigma = ca.SX.sym("zero"), ca.SX.sym("y"), ca.SX.sym("sigma")
-        n_t = piece.theta.numel()
-        u = ca.vertcat(piece.theta, zero, piece.passive)
+        n_t = piece.theta_index.size
         residual = (y - piece.reading - zero * LENGTH_SCALE) / sigma
-        objective = 0.5 * residual**2
-        slope = ca.densify(ca.jacobian(residual, u))
-        gradient = residual * slope.T
+        slope = -ca.horzcat(piece.by_theta, LENGTH_SCALE, piece.by_passive) / sigma
+        slope = ca.densify(slope)
+        gradient = (residual * slope).T
+        second = slope.T @ slope
         if self.options.hessian == "exact":
-            second = ca.densify(ca.hessian(objective, u)[0])
-        else:
-            second = slope.T @ slope
-        inputs = [piece.theta, zero, piece.passive, y, sigma, piece.drives, piece.setup]
-        names = ["theta", "zero", "passive", "y", "sigma", "drives", "setup"]
-        first_f = ca.Function(
-            f"reading_{piece.leg}",
-            inputs,
-            [objective, gradient[:n_t], gradient[n_t:]],
-            names,
-            ["objective", "by_theta", "by_local"],
-        )
+            second += residual * self._reading_curvature(piece) / -sigma
+        inputs = [zero, piece.passive, y, piece.drives, piece.setup, sigma]
+        inputs += self.problem.shared.symbols
 
         def pick(rows: Indices, columns: Indices) -> ca.SX:
             return ca.vertcat(*(second[int(i), int(j)] for i, j in zip(rows, columns, strict=True)))
 
-        second_f = ca.Function(
-            f"reading_hessian_{piece.leg}",
-            inputs,
-            [pick(*_triangle(n_t)), pick(*_rest_of_triangle(u.numel(), n_t))],
-            names,
-            ["theta_theta", "rest"],
-        )
-        return first_f, second_f
+        triangle = _triangle(n_t), _rest_of_triangle(slope.numel(), n_t)
+        outputs = {
+            "objective": [0.5 * residual**2],
+            "gradient": [gradient[:n_t], gradient[n_t:]],
+            "hessian": [pick(*triangle[0]), pick(*triangle[1])],
+        }
+        return {
+            name: ca.Function(f"{name}_{piece.leg}", inputs, [ca.densify(v) for v in values])
+            for name, values in outputs.items()
+        }
 
-    def _add_closures(self, x: ca.MX, lam_g: ca.MX, hessian: _Gather) -> tuple[ca.MX, ca.MX]:
+    def _reading_curvature(self, piece: ReadingPiece) -> ca.SX:
+        """Second derivatives of h by u = (θ̂, ẑ, q̂), in the variables of the piece."""
+        direct = self.problem.direct
+        theta = direct.theta[piece.theta_index.tolist()]
+        passive = direct.passive[piece.passive_index.tolist()]
+        u = ca.vertcat(theta, ca.SX.sym("zero"), passive)
+        second, _ = ca.hessian(direct.readings[piece.leg], u)
+        function = ca.Function(
+            "curvature", [direct.theta, passive, direct.drives, direct.setup], [ca.densify(second)]
+        )
+        return function(self.problem.shared.symbols[0], piece.passive, piece.drives, piece.setup)
+
+    def _add_closures(
+        self, x: ca.MX, lam_g: ca.MX, shared: list[ca.MX], hessian: _Gather
+    ) -> tuple[ca.MX, ca.MX]:
         """Closures of all postures and their Jacobian; their curvature goes into the Hessian."""
         problem = self.problem
         k, n_p = problem.n_postures, self._n_passive
         n_g = problem.robot.closure_rows
         piece = problem.posture_piece
-        u = ca.vertcat(piece.theta, piece.passive)
-        slope = ca.jacobian(piece.closure, u)
+        slope = ca.sparsify(ca.horzcat(piece.by_theta, piece.by_passive))
         pattern_rows, pattern_columns = (np.array(v) for v in slope.sparsity().get_triplet())
-        closure_f = ca.Function(
-            "closure",
-            [piece.theta, piece.passive, piece.drives],
-            [piece.closure],
-            ["theta", "passive", "drives"],
-            ["closure"],
-        )
-        slope_f = ca.Function(
-            "closure_jacobian",
-            [piece.theta, piece.passive, piece.drives],
-            [ca.densify(piece.closure), ca.densify(slope.nz[:])],
-            ["theta", "passive", "drives"],
-            ["closure", "nonzeros"],
-        )
-        first = self._n_theta + self._n_zeros
+        inputs = [piece.passive, piece.drives, *problem.shared.symbols]
+        closure_f = ca.Function("closure", inputs, [ca.densify(piece.closure)])
+        slope_f = ca.Function("closure_slope", inputs, [ca.densify(slope.nz[:])])
         arguments = [
-            x[: self._n_theta],
-            ca.reshape(x[first:], n_p, k),
+            ca.reshape(x[self._n_theta + self._n_zeros :], n_p, k),
             ca.MX(ca.DM(problem.drives.T)),
+            *shared,
         ]
-        masks = [True, False, False]
+        masks = [False, False, *(True for _ in shared)]
         constraints = ca.vec(closure_f.map(k, masks, [False])(*arguments))
-        _, nonzeros = slope_f.map(k, masks, [False, False])(*arguments)
+        nonzeros = slope_f.map(k, masks, [False])(*arguments)
 
         postures = np.arange(k)
         variables = np.hstack(
@@ -398,26 +398,35 @@ class NonlinearProgram:
         rows = postures[:, None] * n_g + pattern_rows[None, :]
         jacobian = _Gather(k * n_g, x.numel())
         jacobian.add(rows, variables[:, pattern_columns], ca.vec(nonzeros))
-
         if self.options.hessian == "exact":
-            multiplier = ca.SX.sym("multiplier", n_g)
-            second = ca.triu(ca.hessian(ca.dot(multiplier, piece.closure), u)[0])
-            rows, columns = (np.array(v) for v in second.sparsity().get_triplet())
-            shared = columns < self._n_theta
-            second_f = ca.Function(
-                "closure_hessian",
-                [piece.theta, piece.passive, piece.drives, multiplier],
-                [
-                    ca.densify(second.nz[np.flatnonzero(part).tolist()])
-                    for part in (shared, ~shared)
-                ],
-            )
-            summed, local = second_f.map(k, [*masks, False], [True, False])(
-                *arguments, ca.reshape(lam_g, n_g, k)
-            )
-            hessian.add(rows[shared], columns[shared], summed)
-            hessian.add(variables[:, rows[~shared]], variables[:, columns[~shared]], ca.vec(local))
+            self._add_closure_curvature(arguments[:3], lam_g, variables, hessian)
         return constraints, jacobian.build()
+
+    def _add_closure_curvature(
+        self, arguments: list[ca.MX], lam_g: ca.MX, variables: Indices, hessian: _Gather
+    ) -> None:
+        """Σ λᵀ ∇²ĝ of every posture; arguments are q̂, drives and θ̂."""
+        direct = self.problem.direct
+        k, n_g = self.problem.n_postures, self.problem.robot.closure_rows
+        multiplier = ca.SX.sym("multiplier", n_g)
+        u = ca.vertcat(direct.theta, direct.passive)
+        second = ca.triu(ca.hessian(ca.dot(multiplier, direct.closure), u)[0])
+        rows, columns = (np.array(v) for v in second.sparsity().get_triplet())
+        summed_part = columns < self._n_theta
+        function = ca.Function(
+            "closure_hessian",
+            [direct.passive, direct.drives, direct.theta, multiplier],
+            [
+                ca.densify(second.nz[np.flatnonzero(part).tolist()])
+                for part in (summed_part, ~summed_part)
+            ],
+        )
+        summed, local = function.map(k, [False, False, True, False], [True, False])(
+            *arguments, ca.reshape(lam_g, n_g, k)
+        )
+        hessian.add(rows[summed_part], columns[summed_part], summed)
+        rest = variables[:, rows[~summed_part]], variables[:, columns[~summed_part]]
+        hessian.add(*rest, ca.vec(local))
 
 
 def _triangle(n: int) -> tuple[Indices, Indices]:

@@ -26,11 +26,13 @@ from orthocal.measurement.gauge import (
     drive_table,
     reading_expression,
     setup_columns,
+    zero_root_coordinate,
 )
 from orthocal.measurement.session import Session
 from orthocal.robot.assembly import Assembly
 from orthocal.robot.batch import BatchFunction
 from orthocal.robot.parameters import Parameter
+from orthocal.robot.slopes import SharedPlacements
 from orthocal.robot.symbolic import SymbolicRobot, closure_row_units, coordinate_units
 
 Array = NDArray[np.float64]
@@ -44,17 +46,30 @@ PRIOR_BY_DEFAULT = {"offsets": False}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SharedInputs:
+    """What depends on θ̂ alone: evaluated once, and given to every piece."""
+
+    symbols: tuple[ca.SX, ...]
+    """Column vectors: θ̂, placements, their slopes, and per leg that is read the coordinate of its
+    root in the zero posture with its slope."""
+    function: ca.Function
+    """θ̂ to the values of the symbols."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PosturePiece:
-    """The closures of one posture."""
+    """The closures of one posture and their derivatives."""
 
     passive: ca.SX
     """q̂, shape (n_passive,)."""
     drives: ca.SX
     """Commanded drive coordinates, shape (n_drives,), [m, rad]."""
-    theta: ca.SX
-    """θ̂ of all free parameters, shape (n_free,)."""
     closure: ca.SX
     """ĝ, shape (closure_rows,)."""
+    by_passive: ca.SX
+    """∂ĝ/∂q̂, shape (closure_rows, n_passive)."""
+    by_theta: ca.SX
+    """∂ĝ/∂θ̂, shape (closure_rows, n_free)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,14 +85,30 @@ class ReadingPiece:
     """Which free parameters it depends on."""
     passive: ca.SX
     """Those q̂."""
-    theta: ca.SX
-    """Those θ̂."""
     drives: ca.SX
     """Commanded drive coordinates of the posture, shape (n_drives,), [m, rad]."""
     setup: ca.SX
     """Constants of the setup, shape (5,): direction, plane, from_root."""
     reading: ca.SX
     """h, [m]."""
+    by_passive: ca.SX
+    """∂h/∂q̂ of those, shape (1, n), [m]."""
+    by_theta: ca.SX
+    """∂h/∂θ̂ of those, shape (1, n), [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DirectExpressions:
+    """Closures and readings as expressions of θ̂ itself, for second derivatives."""
+
+    theta: ca.SX
+    passive: ca.SX
+    drives: ca.SX
+    setup: ca.SX
+    closure: ca.SX
+    """ĝ, shape (closure_rows,)."""
+    readings: Mapping[str, ca.SX]
+    """Leg to h, [m]."""
 
 
 class CalibrationProblem:
@@ -172,54 +203,123 @@ class CalibrationProblem:
         return self.assembly.close(self.drives, theta=theta, start=start, names=names)
 
     @cached_property
+    def shared(self) -> SharedInputs:
+        """What depends on θ̂ alone."""
+        theta, placements = self._placements.theta, self._placements
+        machine = placements.machine(
+            drives=ca.SX(self.session.zero_drives), passive=self._nominal_zero_passive
+        )
+        values, symbols = [], []
+        for leg, (coordinate, slope) in self._zero_roots.items():
+            frame = self.robot.frame_id(self.robot.legs[leg].root)
+            axis = ca.SX(np.array(self.robot.legs[leg].axis)).T
+            _, by_theta = placements.position_slopes(machine, frame, axis)
+            index = self._leg_theta[leg].tolist()
+            values += [zero_root_coordinate(self.robot.legs[leg], machine), by_theta[0, index].T]
+            symbols += [coordinate, slope]
+        inner = ca.Function("roots", [theta, placements.values, placements.slope_nonzeros], values)
+        values_at, slopes_at = placements.function(theta)
+        outputs = [theta, values_at, slopes_at]
+        if values:
+            found = inner(theta, values_at, slopes_at)
+            outputs += [ca.densify(v) for v in (found if isinstance(found, tuple) else (found,))]
+        return SharedInputs(
+            (theta, placements.values, placements.slope_nonzeros, *symbols),
+            ca.Function("shared", [theta], outputs),
+        )
+
+    @cached_property
     def posture_piece(self) -> PosturePiece:
         """The closures of one posture."""
-        drives, passive, theta = self._symbols()
-        machine = self._machine(drives, passive, theta)
+        drives, passive = self._posture_symbols()
+        machine = self._placements.machine(drives=drives, passive=passive * self.passive_scale)
         scale = closure_row_units(self.robot) / LENGTH_SCALE
-        return PosturePiece(passive, drives, theta, machine.closure_residual() * scale)
+        by_joints, by_theta = self._placements.closure_slopes(machine)
+        rows = ca.diag(ca.SX(scale))
+        columns = ca.diag(ca.SX(self.passive_scale))
+        return PosturePiece(
+            passive=passive,
+            drives=drives,
+            closure=machine.closure_residual() * scale,
+            by_passive=rows @ by_joints[:, self.robot.passive_index.tolist()] @ columns,
+            by_theta=rows @ by_theta,
+        )
 
     @cached_property
     def reading_pieces(self) -> tuple[ReadingPiece, ...]:
         """The readings, leg by leg; legs that are not read are left out."""
-        drives, passive, theta = self._symbols()
-        machine = self._machine(drives, passive, theta)
-        nominal = ca.SX(self.robot.zero[self.robot.passive_index] / self.passive_scale)
-        at_zero = self._machine(ca.SX(self.session.zero_drives), nominal, theta)
-        leg_names = list(self.robot.legs)
+        drives, passive = self._posture_symbols()
+        machine = self._placements.machine(drives=drives, passive=passive * self.passive_scale)
+        legs = list(self.robot.legs)
         leg_of_setup = np.array(
-            [leg_names.index(s.leg) for s in self.session.setups.values()], dtype=np.int64
+            [legs.index(s.leg) for s in self.session.setups.values()], dtype=np.int64
         )
         pieces = []
-        for i, leg in enumerate(self.robot.legs.values()):
-            entries = np.flatnonzero(leg_of_setup[self.observations.setup] == i)
-            if not entries.size:
-                continue
+        for name, (zero_root, zero_slope) in self._zero_roots.items():
+            leg = self.robot.legs[name]
             setup = ca.SX.sym("setup", 5)
-            h = reading_expression(
-                leg,
-                machine,
-                at_zero,
-                direction=setup[:3],
-                plane=setup[3],
-                from_root=setup[4],
+            root, tip = ca.SX.sym("root", 3), ca.SX.sym("tip", 3)
+            section = ca.SX.sym("section")
+            h = reading_expression(root, tip, axis=leg.axis, direction=setup[:3], section=section)
+            rows = [ca.jacobian(h, v) for v in (root, tip, section)]
+            local = ca.Function("local", [root, tip, section, setup], [h, *rows])
+            places = [machine.frame_pose(f).position for f in (leg.root, leg.tip)]
+            value, by_root, by_tip, by_section = local(
+                *places, setup[3] + setup[4] * zero_root, setup
             )
-            used_passive = _dependencies(h, passive)
-            used_theta = _dependencies(h, theta)
+            by_joints, by_theta = ca.SX(1, self.robot.model.nv), ca.SX(1, self.n_free)
+            for frame, row in ((leg.root, by_root), (leg.tip, by_tip)):
+                joints, theta = self._placements.position_slopes(
+                    machine, self.robot.frame_id(frame), row
+                )
+                by_joints, by_theta = by_joints + joints, by_theta + theta
+            theta_index = self._leg_theta[name]
+            by_passive = ca.sparsify(by_joints[0, self.robot.passive_index.tolist()])
+            used = _dependencies(value, passive)
             pieces.append(
                 ReadingPiece(
-                    leg=leg.name,
-                    entries=entries,
-                    passive_index=used_passive,
-                    theta_index=used_theta,
-                    passive=passive[used_passive.tolist()],
-                    theta=theta[used_theta.tolist()],
+                    leg=name,
+                    entries=np.flatnonzero(
+                        leg_of_setup[self.observations.setup] == legs.index(name)
+                    ),
+                    passive_index=used,
+                    theta_index=theta_index,
+                    passive=passive[used.tolist()],
                     drives=drives,
                     setup=setup,
-                    reading=h,
+                    reading=value,
+                    by_passive=by_passive[0, used.tolist()] * ca.SX(self.passive_scale[used]).T,
+                    by_theta=by_theta[0, theta_index.tolist()]
+                    + by_section * setup[4] * zero_slope.T,
                 )
             )
         return tuple(pieces)
+
+    @cached_property
+    def direct(self) -> DirectExpressions:
+        """Closures and readings as expressions of θ̂ itself."""
+        drives, passive = self._posture_symbols()
+        theta, setup = ca.SX.sym("theta", self.n_free), ca.SX.sym("setup", 5)
+        errors = self._errors(theta)
+        machine, at_zero = (
+            SymbolicRobot(self.robot, drives=d, passive=p, errors=errors)
+            for d, p in (
+                (drives, passive * self.passive_scale),
+                (ca.SX(self.session.zero_drives), self._nominal_zero_passive),
+            )
+        )
+        readings = {}
+        for name in self._zero_roots:
+            leg = self.robot.legs[name]
+            root, tip = (machine.frame_pose(f).position for f in (leg.root, leg.tip))
+            section = setup[3] + setup[4] * zero_root_coordinate(leg, at_zero)
+            readings[name] = reading_expression(
+                root, tip, axis=leg.axis, direction=setup[:3], section=section
+            )
+        scale = closure_row_units(self.robot) / LENGTH_SCALE
+        return DirectExpressions(
+            theta, passive, drives, setup, machine.closure_residual() * scale, readings
+        )
 
     def predict(self, theta: ArrayLike, passive: Array | None = None) -> Array:
         """Readings h(q(θ), θ) of all entries, gauge zeros at 0, shape (n_entries,), [m]."""
@@ -245,8 +345,9 @@ class CalibrationProblem:
         """
         q = self.close(theta) if passive is None else passive
         h, by_passive, by_theta = self._evaluate_readings(np.asarray(theta), q)
-        theta_hat = np.asarray(theta) / self.theta_scale
-        g_q, g_theta = self._closure_jacobians(q / self.passive_scale, self.drives, theta_hat)
+        g_q, g_theta = self._closure_jacobians(
+            q / self.passive_scale, self.drives, *self._shared_values(np.asarray(theta))
+        )
         if g_q.shape[1] == g_q.shape[2]:
             slopes = -np.linalg.solve(g_q, g_theta)
         else:
@@ -262,47 +363,79 @@ class CalibrationProblem:
         """Parameter name to value, free and fixed, [SI]."""
         return {**self.fixed, **dict(zip(self.free, np.asarray(theta).tolist(), strict=True))}
 
-    def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+    def _errors(self, theta: ca.SX) -> dict[str, ca.SX | float]:
+        errors: dict[str, ca.SX | float] = dict(self.fixed)
+        errors.update({name: theta[i] * self.theta_scale[i] for i, name in enumerate(self.free)})
+        return errors
+
+    def _posture_symbols(self) -> tuple[ca.SX, ca.SX]:
         return (
             ca.SX.sym("drives", len(self.robot.drives)),
             ca.SX.sym("passive", self.robot.passive_index.size),
-            ca.SX.sym("theta", self.n_free),
         )
 
-    def _machine(self, drives: ca.SX, passive: ca.SX, theta: ca.SX) -> SymbolicRobot:
-        errors: dict[str, ca.SX | float] = dict(self.fixed)
-        errors.update({name: theta[i] * self.theta_scale[i] for i, name in enumerate(self.free)})
-        return SymbolicRobot(
-            self.robot, drives=drives, passive=passive * self.passive_scale, errors=errors
-        )
+    @cached_property
+    def _placements(self) -> SharedPlacements:
+        theta = ca.SX.sym("theta", self.n_free)
+        return SharedPlacements(self.robot, theta, self._errors(theta))
+
+    @property
+    def _nominal_zero_passive(self) -> ca.SX:
+        return ca.SX(self.robot.zero[self.robot.passive_index])
+
+    @cached_property
+    def _leg_theta(self) -> dict[str, Indices]:
+        """Leg that is read to the free parameters that its readings depend on."""
+        drives, passive = self._posture_symbols()
+        machine = self._placements.machine(drives=drives, passive=passive)
+        found = {}
+        read = {list(self.session.setups.values())[i].leg for i in self.observations.setup}
+        for name, leg in self.robot.legs.items():
+            if name not in read:
+                continue
+            used: set[int] = set()
+            for frame in (leg.root, leg.tip):
+                row = ca.SX.sym("row", 1, 3)
+                _, by_theta = self._placements.position_slopes(
+                    machine, self.robot.frame_id(frame), row
+                )
+                used.update(ca.sparsify(by_theta).sparsity().get_col())
+            found[name] = np.array(sorted(used), dtype=np.int64)
+        return found
+
+    @cached_property
+    def _zero_roots(self) -> dict[str, tuple[ca.SX, ca.SX]]:
+        """Leg that is read to symbols for its root's coordinate in the zero posture and slope."""
+        return {
+            name: (ca.SX.sym("zero_root"), ca.SX.sym("zero_slope", index.size))
+            for name, index in self._leg_theta.items()
+        }
 
     @cached_property
     def _closure_jacobians(self) -> BatchFunction:
         piece = self.posture_piece
         function = ca.Function(
             "closure_jacobians",
-            [piece.passive, piece.drives, piece.theta],
-            [ca.jacobian(piece.closure, piece.passive), ca.jacobian(piece.closure, piece.theta)],
-            ["q", "d", "theta"],
-            ["g_q", "g_theta"],
+            [piece.passive, piece.drives, *self.shared.symbols],
+            [piece.by_passive, piece.by_theta],
         )
-        return BatchFunction(function, shared=["theta"])
+        return BatchFunction(function, shared=function.name_in()[2:])
 
     @cached_property
     def _reading_functions(self) -> tuple[BatchFunction, ...]:
         functions = []
         for piece in self.reading_pieces:
-            inputs = [piece.passive, piece.drives, piece.theta, piece.setup]
-            outputs = [
-                piece.reading,
-                ca.jacobian(piece.reading, piece.passive),
-                ca.jacobian(piece.reading, piece.theta),
-            ]
             function = ca.Function(
-                "reading", inputs, outputs, ["q", "d", "theta", "setup"], ["h", "h_q", "h_theta"]
+                "reading",
+                [piece.passive, piece.drives, piece.setup, *self.shared.symbols],
+                [piece.reading, piece.by_passive, piece.by_theta],
             )
-            functions.append(BatchFunction(function, shared=["theta"]))
+            functions.append(BatchFunction(function, shared=function.name_in()[3:]))
         return tuple(functions)
+
+    def _shared_values(self, theta: Array) -> list[Array]:
+        values = self.shared.function(theta / self.theta_scale)
+        return [np.asarray(v.full()).reshape(-1) for v in values]
 
     def _evaluate_readings(self, theta: Array, passive: Array) -> tuple[Array, Array, Array]:
         """h, ∂h/∂q̂ and ∂h/∂θ̂ at fixed q, shapes (n,), (n, n_passive), (n, n_free)."""
@@ -310,15 +443,15 @@ class CalibrationProblem:
         h = np.zeros(o.size)
         by_passive = np.zeros((o.size, self.robot.passive_index.size))
         by_theta = np.zeros((o.size, self.n_free))
-        theta_hat = theta / self.theta_scale
         q_hat = passive / self.passive_scale
+        shared = self._shared_values(theta)
         for piece, function in zip(self.reading_pieces, self._reading_functions, strict=True):
             n, postures = piece.entries, o.posture[piece.entries]
             value, h_q, h_theta = function(
                 q_hat[postures][:, piece.passive_index],
                 self.drives[postures],
-                theta_hat[piece.theta_index],
                 self.setup_columns[o.setup[n]],
+                *shared,
             )
             h[n] = value[:, 0]
             by_passive[np.ix_(n, piece.passive_index)] = h_q.reshape(len(n), -1)

@@ -161,32 +161,31 @@ def _difference_groups(session: Session) -> dict[tuple[str, int, str], str]:
 
 
 def reading_expression(
-    leg: Leg,
-    at_posture: SymbolicRobot,
-    at_zero: SymbolicRobot,
-    *,
-    direction: ca.SX,
-    plane: ca.SX,
-    from_root: ca.SX,
+    root: ca.SX, tip: ca.SX, *, axis: Array, direction: ca.SX, section: ca.SX
 ) -> ca.SX:
-    """h(q, θ) of a gauge on a leg, [m].
+    """H of a gauge on a leg, [m].
+
+    Args:
+        root: Position of the leg's root, shape (3,), [m].
+        tip: Position of its tip, shape (3,), [m].
+        axis: The leg's nominal axis, shape (3,).
+        direction: Unit vector of a growing reading, shape (3,).
+        section: Coordinate of the section's plane along the axis, [m].
+    """
+    a = ca.sparsify(ca.SX(np.array(axis)))
+    t = (section - ca.dot(a, root)) / ca.dot(a, tip - root)
+    return ca.dot(direction, root + t * (tip - root))
+
+
+def zero_root_coordinate(leg: Leg, at_zero: SymbolicRobot) -> ca.SX:
+    """Where sections that count from the root begin: a · root in the zero posture, [m].
 
     Args:
         leg: The leg.
-        at_posture: The machine in the posture.
         at_zero: The machine in the zero posture, passive joints as nominal: the root needs only
             its drive.
-        direction: Unit vector of a growing reading, shape (3,).
-        plane: Coordinate of the section along the leg's axis, [m].
-        from_root: 1 if the plane counts from the root in the zero posture, else 0.
     """
-    root = at_posture.frame_pose(leg.root).position
-    tip = at_posture.frame_pose(leg.tip).position
-    zero_root = at_zero.frame_pose(leg.root).position
-    axis = ca.sparsify(ca.SX(np.array(leg.axis)))
-    section = plane + from_root * ca.dot(axis, zero_root)
-    t = (section - ca.dot(axis, root)) / ca.dot(axis, tip - root)
-    return ca.dot(direction, root + t * (tip - root))
+    return ca.dot(ca.sparsify(ca.SX(np.array(leg.axis))), at_zero.frame_pose(leg.root).position)
 
 
 def setup_columns(session: Session) -> Array:
@@ -253,9 +252,9 @@ def _reading_function(robot: Robot, leg: Leg, errors: Mapping[str, float] | None
     at_posture = SymbolicRobot(robot, drives=drives, passive=passive, errors=errors)
     zero_passive = ca.SX(robot.zero[robot.passive_index])
     at_zero = SymbolicRobot(robot, drives=zero_drives, passive=zero_passive, errors=errors)
-    h = reading_expression(
-        leg, at_posture, at_zero, direction=column[:3], plane=column[3], from_root=column[4]
-    )
+    section = column[3] + column[4] * zero_root_coordinate(leg, at_zero)
+    root, tip = (at_posture.frame_pose(f).position for f in (leg.root, leg.tip))
+    h = reading_expression(root, tip, axis=leg.axis, direction=column[:3], section=section)
     function = ca.Function(
         "reading",
         [drives, passive, zero_drives, column],
