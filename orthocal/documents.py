@@ -247,8 +247,11 @@ def read_csv_rows(
             if not any(cell.strip() for cell in row):
                 continue
             if len(row) != len(header):
+                comma = delimiter == "," and len(row) > len(header)
+                hint = "; a decimal comma? write a point" if comma else ""
                 raise error(
-                    f"has {len(row)} fields; expected {len(header)} ({delimiter.join(header)})",
+                    f"has {len(row)} fields; expected {len(header)} "
+                    f"({delimiter.join(header)}){hint}",
                     where=f"{path}:{line}",
                 )
             yield line, {name: cell.strip() for name, cell in zip(header, row, strict=True)}

@@ -35,6 +35,9 @@ VALIDATE = "validate {tmp}/calibration.json {tmp}"
 SIMULATE = "simulate {tmp}/plan.yaml --out {tmp}/out"
 ONE_ERROR = " --error x_slide.offset_mm=1.2"
 
+COMMA = "; a decimal comma? write a point"
+MAKE_ONE = "; `orthocal calibrate SESSION --out FOLDER` makes one"
+
 YAML = "machine/orthoglide.yaml"
 URDF = "machine/orthoglide.urdf"
 
@@ -596,7 +599,7 @@ READINGS_CASES = [
     ),
     readings("header-missing", HEADER + "\n", "", f":1: unknown column 'xy'; {COLUMNS}"),
     readings("fields-few", "y_min,-0.43", "-0.43", f":2: has 3 fields; expected 4 ({HEADER})"),
-    readings("fields-many", "-0.43", "-0.43,1", f":2: has 5 fields; expected 4 ({HEADER})"),
+    readings("fields-many", "-0.43", "-0.43,1", f":2: has 5 fields; expected 4 ({HEADER}){COMMA}"),
     readings("setup-unknown", "xy,", "yy,", f":2: 'yy' is not a setup; setups: {SETUPS}"),
     readings(
         "posture-unknown",
@@ -629,7 +632,10 @@ READINGS_CASES = [
         ":2: reading_mm is '-0,43'; expected a number (a decimal comma? write a point)",
     ),
     readings(
-        "decimal-comma-between-commas", "-0.43", "-0,43", f":2: has 5 fields; expected 4 ({HEADER})"
+        "decimal-comma-between-commas",
+        "-0.43",
+        "-0,43",
+        f":2: has 5 fields; expected 4 ({HEADER}){COMMA}",
     ),
     readings(
         "cycle-zero", "yx,zero,1,", "yx,zero,0,", ":2: cycle is '0'; expected 1, 2, 3 ...", "cycles"
@@ -1152,10 +1158,10 @@ CALIBRATION = "{tmp}/calibration.json"
 FILE = "calibration.json"
 
 CALIBRATION_CASES = [
-    calibration("missing", f"{CALIBRATION}: there is no such file", remove(FILE)),
+    calibration("missing", f"{CALIBRATION}: there is no such file{MAKE_ONE}", remove(FILE)),
     calibration(
         "folder-without",
-        "{tmp}/machine/calibration.json: there is no such file",
+        f"{{tmp}}/machine/calibration.json: there is no such file{MAKE_ONE}",
         command="forward {tmp}/machine {tmp}/joints.csv",
     ),
     calibration(

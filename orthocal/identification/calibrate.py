@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +34,7 @@ from orthocal.identification.uncertainty import (
     require_identifiable,
 )
 from orthocal.measurement.session import Session
+from orthocal.measurement.session_file import load_session
 from orthocal.robot.model import packaged_robots, read_only
 
 Array = NDArray[np.float64]
@@ -50,7 +52,7 @@ MAX_SIGMA_ROUNDS = 8
 
 
 def calibrate(
-    session: Session,
+    session: Session | str | Path,
     *,
     model: str = "offsets",
     prior: bool | None = None,
@@ -61,7 +63,7 @@ def calibrate(
     """Identify the errors of a machine from a session, exactly, with their uncertainty.
 
     Args:
-        session: The session.
+        session: The session, or the path to one.
         model: A model of the robot's YAML: `offsets`, `lengths`, `full` or one's own.
         prior: Whether tolerances act as a prior; by default not for `offsets`, else yes.
         fixed: Known values of parameters, which are then not free, [SI].
@@ -74,6 +76,8 @@ def calibrate(
         ClosureError: If the machine cannot reach a posture.
         ParameterError: If the model or a name is unknown.
     """
+    if not isinstance(session, Session):
+        session = load_session(session)
     problem = build_problem(session, model=model, prior=prior, fixed=fixed)
     _, reference_jacobian = problem.linearise(problem.reference)
     at_reference = decompose(reference_jacobian, problem.observations)

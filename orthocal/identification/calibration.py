@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from orthocal.documents import Number, is_folder, read_json, validate, write_text
+from orthocal.documents import Number, exists, is_folder, read_json, validate, write_text
 from orthocal.errors import CalibrationFileError, ParameterError, RobotError
 from orthocal.identification.uncertainty import NoiseSource, confidence_factor
 from orthocal.robot.assembly import Assembly
@@ -426,6 +426,11 @@ def load_calibration(path: str | Path) -> Calibration:
     file = Path(path)
     if is_folder(file):
         file = file / "calibration.json"
+    if not exists(file):
+        raise CalibrationFileError(
+            "there is no such file; `orthocal calibrate SESSION --out FOLDER` makes one",
+            where=str(file),
+        )
     data = read_json(file, error=CalibrationFileError)
     if isinstance(data, Mapping) and "schema" not in data:
         raise CalibrationFileError(f"is missing; expected '{SCHEMA}'", where=f"{file}: schema")

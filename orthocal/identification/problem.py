@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.errors import SessionError
+from orthocal.errors import RobotError, SessionError
 from orthocal.measurement.gauge import (
     Observations,
     build_observations,
@@ -31,7 +31,8 @@ from orthocal.measurement.gauge import (
 from orthocal.measurement.session import Session
 from orthocal.robot.assembly import Assembly
 from orthocal.robot.batch import BatchFunction
-from orthocal.robot.parameters import Parameter
+from orthocal.robot.model import Robot
+from orthocal.robot.parameters import AXES, Parameter
 from orthocal.robot.slopes import SharedPlacements
 from orthocal.robot.symbolic import SymbolicRobot, closure_row_units, coordinate_units
 
@@ -144,6 +145,7 @@ class CalibrationProblem:
         )
         self.fixed = {k: v for k, v in (fixed or {}).items() if k not in self.free}
         self.robot.parameters.expand(self.fixed)  # refuses unknown names
+        _require_independent_rows(self.robot)
         self.observations: Observations = build_observations(session)
         self.drives = drive_table(session)
         self.setup_columns = setup_columns(session)
@@ -481,6 +483,33 @@ def build_problem(
     free = [n for n in session.robot.parameters.select_model(model) if n not in known]
     use_prior = PRIOR_BY_DEFAULT.get(model, True) if prior is None else prior
     return CalibrationProblem(session, free=free, prior=use_prior, fixed=known)
+
+
+def _require_independent_rows(robot: Robot) -> None:
+    """Refuse closures with rows that depend on others: as constraints they cannot all be met.
+
+    Raises:
+        RobotError: Naming the closures and the rows.
+    """
+    passive = robot.zero[robot.passive_index]
+    _, jacobian = robot.evaluate_constraints(robot.drive_zero, passive)
+    slopes = (jacobian * closure_row_units(robot)[:, None])[:, robot.passive_index]
+    rows = [(c.name, AXES[row]) for c in robot.closures for row in c.rows]
+    kept = np.zeros((0, slopes.shape[1]))
+    dependent = []
+    for row, slope in zip(rows, slopes, strict=True):
+        trial = np.vstack([kept, slope])
+        if np.linalg.matrix_rank(trial, tol=1e-8) == len(trial):
+            kept = trial
+        else:
+            dependent.append(row)
+    if dependent:
+        named = ", ".join(f"{row} of {closure}" for closure, row in dependent)
+        raise RobotError(
+            f"closure rows depend on others: {named}; leave them out of "
+            "orthocal.closures.<name>.rows",
+            where=str(robot.yaml),
+        )
 
 
 def _dependencies(expression: ca.SX, symbols: ca.SX) -> Indices:

@@ -167,7 +167,9 @@ class Information:
         """
         if not sigma > 0.0:
             return self.identifiable
-        variance = (sigma / np.maximum(self.singular_values, 1e-300)) ** 2
+        told = self.singular_values > RANK_THRESHOLD * self.singular_values[0]
+        variance = np.zeros_like(self.singular_values)
+        variance[told] = (sigma / self.singular_values[told]) ** 2
         return np.asarray(((self.directions**2).T @ variance < 1.0) & self.identifiable)
 
     def effective_parameters(self, *, sigma: float, prior: bool) -> float:
@@ -180,7 +182,8 @@ class Information:
     def covariance(self, *, sigma: float, prior: bool) -> Array:
         """Covariance of θ̂, (Jᵀ J/σ² + P)⁻¹ with P = 1 or 0, shape (n_free, n_free)."""
         precision = (self.singular_values / sigma) ** 2 + float(prior)
-        variance = np.where(precision > 0.0, 1.0 / np.maximum(precision, 1e-300), np.inf)
+        with np.errstate(divide="ignore"):
+            variance = 1.0 / precision
         return np.asarray((self.directions.T * variance) @ self.directions)
 
 

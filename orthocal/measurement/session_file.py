@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -40,7 +41,7 @@ from orthocal.measurement.session import (
     section_plane,
 )
 from orthocal.robot.assembly import nominal_assembly
-from orthocal.robot.model import Robot, load_robot, read_only
+from orthocal.robot.model import Robot, load_robot, packaged_robots, read_only
 
 Array = NDArray[np.float64]
 
@@ -265,7 +266,10 @@ def write_session(
     Raises:
         OrthocalError: If the folder cannot be written to.
     """
+    folder = Path(folder)
     document = session_document(session)
+    if session.robot_reference not in packaged_robots():
+        document["robot"] = os.path.relpath(session.robot.folder.resolve(), folder.resolve())
     head = "".join(f"# {line}\n" for line in comment.splitlines())
     text = head + yaml.safe_dump(
         document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
@@ -284,7 +288,6 @@ def write_session(
             "reading_mm": _trim(f"{r.value * 1e3:.{decimals}f}"),
         }
         table.write(",".join(fields[c] for c in columns) + "\n")
-    folder = Path(folder)
     files = {"session.yaml": text, "readings.csv": table.getvalue(), **(extra or {})}
     write_files(folder, files)
     return folder / "session.yaml"

@@ -53,7 +53,7 @@ def read_joints(path: Path, robot: Robot) -> tuple[list[str], Array]:
 
 
 def read_points(path: Path, robot: Robot) -> tuple[list[str], Array]:
-    """Tool points from a CSV file: the coordinates that the drives control.
+    """Tool points from a CSV file: the coordinates that the drives control; others are ignored.
 
     Returns:
         Names of the rows for messages, and values, shape (K, n_coordinates), [m].
@@ -63,7 +63,8 @@ def read_points(path: Path, robot: Robot) -> tuple[list[str], Array]:
     """
     wanted = range(3) if robot.tcp is None else robot.tcp.coordinates
     columns = {name: f for i, (name, f) in enumerate(TOOL_COLUMNS.items()) if i in wanted}
-    return _read(path, columns)
+    others = tuple(name for name in TOOL_COLUMNS if name not in columns)
+    return _read(path, columns, ignored=others)
 
 
 def format_table(columns: dict[str, float], values: Array) -> str:
@@ -83,9 +84,13 @@ def closures_named_by_row() -> Iterator[None]:
         raise SessionError(e.reason, where=e.posture) from None
 
 
-def _read(path: Path, columns: dict[str, float]) -> tuple[list[str], Array]:
+def _read(
+    path: Path, columns: dict[str, float], *, ignored: tuple[str, ...] = ()
+) -> tuple[list[str], Array]:
     names, rows = [], []
-    for line, row in read_csv_rows(path, required=tuple(columns), error=SessionError):
+    for line, row in read_csv_rows(
+        path, required=tuple(columns), optional=ignored, error=SessionError
+    ):
         where = f"{path}:{line}"
         names.append(where)
         rows.append(

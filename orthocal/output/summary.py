@@ -131,8 +131,8 @@ def explain_fit(calibration: Calibration) -> list[str]:
             sentences.append(
                 f"What remains, σ = {_mm(calibration.sigma)} mm of {row}, is {ratio:.0f} times "
                 f"what the gauge itself would leave ({_mm(gauge * factor)} mm): it is error of the "
-                f"model (legs, axes, mounting), not noise of the gauge. With {calibration.model} "
-                "alone it will stay."
+                f"model (legs, axes, mounting), or a wrong sign, direction or setup; not noise of "
+                f"the gauge. With the model '{calibration.model}' it will stay."
             )
         elif ratio < low:
             sentences.append(
@@ -146,6 +146,7 @@ def explain_fit(calibration: Calibration) -> list[str]:
             )
     elif noise.source == "cycles":
         sentences.append("What remains is what repeated cycles scatter by: the model fits.")
+    sentences += _explain_cycles(calibration)
     sentences += _explain_linearisation(calibration)
     sentences += _explain_trust(calibration)
     return sentences
@@ -168,8 +169,13 @@ def explain_validation(validation: Validation) -> list[str]:
     elif not validation.as_expected:
         sentences.append(
             f"The calibration is not confirmed: r.m.s. {achieved} mm was achieved where {expected} "
-            "mm was expected, more than chance explains. Check the signs of the offsets in the "
-            "controller first."
+            "mm was expected, more than chance explains. "
+            + (
+                "No parameter would change, so the offsets are not to blame: the readings scatter "
+                "more than before, or something has moved."
+                if validation.nothing_to_change
+                else "Check the signs of the offsets in the controller first."
+            )
         )
     else:
         names = ", ".join(c.name for c in validation.changes if c.significant)
@@ -211,9 +217,10 @@ def _explain_linearisation(calibration: Calibration) -> list[str]:
 
 def _explain_trust(calibration: Calibration) -> list[str]:
     k = calibration.confidence_factor
-    if math.isinf(k) or math.isnan(calibration.sigma):
+    if math.isinf(k) or math.isnan(calibration.sigma) or calibration.noise.source == "gauge":
         return []
-    entries = calibration.controller_entries()
+    told = {p.name for p in calibration.free if p.identifiable}
+    entries = [e for e in calibration.controller_entries() if f"{e.drive}.offset" in told]
     vague = [e.drive for e in entries if abs(e.change) <= k * e.std]
     clear = [e.drive for e in entries if abs(e.change) > k * e.std]
     sentences = []
@@ -221,10 +228,38 @@ def _explain_trust(calibration: Calibration) -> list[str]:
         sentences.append(f"Offsets that the readings prove (95 %): {', '.join(clear)}.")
     if vague:
         sentences.append(
-            f"Offsets within their own uncertainty, which may be 0: {', '.join(vague)}. They "
-            "are still the best estimate, but do not expect much of them."
+            f"Offsets whose 95 % interval holds no change at all: {', '.join(vague)}. They are "
+            "still the best estimate, but do not expect much of them."
+        )
+    if len(calibration.free) == len(calibration.controller_entries()):
+        sentences.append(
+            "± σ is what the scatter leaves open if legs and axes are perfect; where they are "
+            "not, these are the offsets that make up for it best in the postures measured."
         )
     return sentences
+
+
+def _explain_cycles(calibration: Calibration) -> list[str]:
+    """Whether repeated readings scatter more than the gauge's σ allows, and where most."""
+    noise, gauge = calibration.noise, calibration.session.gauge_sigma
+    if noise.cycles_dof == 0 or gauge is None:
+        return []
+    if noise.cycles_sigma / gauge <= _ratio_interval(noise.cycles_dof)[1]:
+        return []
+    groups: dict[tuple[str, str], list[ResidualRow]] = {}
+    for row in calibration.residuals:
+        groups.setdefault((row.setup, row.label), []).append(row)
+
+    def spread(rows: list[ResidualRow]) -> float:
+        return max(r.measured for r in rows) - min(r.measured for r in rows)
+
+    worst = max(groups.values(), key=spread)
+    shown = ", ".join(f"{_signed(r.measured * 1e3)} in cycle {r.cycle}" for r in worst[:6])
+    return [
+        f"Repeated readings scatter by {_mm(noise.cycles_sigma)} mm, more than the gauge's "
+        f"{_mm(gauge)} mm explain. They differ most at {worst[0].label}: {shown} mm. Check these "
+        "for a wrong sign or row before anything is entered."
+    ]
 
 
 def _ratio_interval(dof: float) -> tuple[float, float]:
@@ -333,10 +368,24 @@ def _residual_table(calibration: Calibration, all_rows: bool) -> RenderableType:
 
 def _validation_rows(validation: Validation, all_rows: bool) -> RenderableType:
     rows, note = _choose_rows(validation.rows, all_rows)
-    table = _table("setup", "posture", "deviation [mm]", "after a further fit [mm]", left=2)
+    cycles = any(r.cycle != 1 for r in validation.rows)
+    table = _table(
+        "setup",
+        "posture",
+        *(["cycle"] if cycles else []),
+        "deviation [mm]",
+        "after a further fit [mm]",
+        left=2,
+    )
     for r in rows:
-        where = f"{r.posture} − {r.minus}" if r.minus else r.posture
-        _add(table, r.setup, where, _signed(r.deviation * 1e3), _signed(r.residual * 1e3))
+        _add(
+            table,
+            r.setup,
+            f"{r.posture} − {r.minus}" if r.minus else r.posture,
+            *([str(r.cycle)] if cycles else []),
+            _signed(r.deviation * 1e3),
+            _signed(r.residual * 1e3),
+        )
     return Group(table, Text(note)) if note else table
 
 

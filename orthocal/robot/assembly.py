@@ -310,6 +310,13 @@ class Assembly:
             step[pending[~good]] *= 0.5
             for i in pending[~good & (step[pending] < SMALLEST_CONTINUATION_STEP)].tolist():
                 _, final = _newton(system, x[[i]], targets[[i]], theta, tolerance)
+                if final[0] < tolerance:
+                    raise ClosureError(
+                        "cannot be reached from the mechanical zero without changing the way in "
+                        f"which the loops are assembled, {done[i]:.0%} of the way",
+                        posture=labels[i],
+                        residual=float(final[0]),
+                    )
                 raise ClosureError(
                     "cannot be reached: the loops stay open by "
                     f"{final[0] * 1e3:.3g} mm, {done[i]:.0%} of the way from the mechanical zero",

@@ -27,7 +27,10 @@ from orthocal.robot.parameters import EDGE_UNITS, Unit
 Array = NDArray[np.float64]
 
 CHANCE = 0.05
-"""Probability below which something is not put down to chance."""
+"""Probability below which a repetition of residuals is not put down to chance."""
+
+EXCESS_CHANCE = 0.01
+"""Probability below which larger deviations than expected are not put down to chance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +94,7 @@ class Validation:
         """
         if math.isnan(self.excess_probability):
             return None
-        return self.excess_probability >= CHANCE
+        return self.excess_probability >= EXCESS_CHANCE
 
     @property
     def nothing_to_change(self) -> bool:
@@ -239,7 +242,9 @@ def _excess_probability(calibration: Calibration, refit: Calibration) -> float:
     zeros = len({r.setup for r in rows if r.minus is None})
     achieved = sum(r.deviation**2 / (2.0 if r.minus else 1.0) for r in rows)
     count = len(rows) - zeros
-    return float(special.fdtrc(count, dof, achieved / count / expected**2))
+    # what the calibration did not know of its parameters adds to what the new readings show
+    mean = expected**2 * (1.0 + (count - refit.noise.residual_dof) / count)
+    return float(special.fdtrc(count, dof, achieved / count / mean))
 
 
 def _residual_dimensions(refit: Calibration, matched: int) -> float:

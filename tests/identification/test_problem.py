@@ -8,7 +8,7 @@ from derivatives import assert_derivative
 from tolerances import KINEMATICS
 
 from orthocal import load_plan
-from orthocal.errors import ParameterError, SessionError
+from orthocal.errors import ParameterError, RobotError, SessionError
 from orthocal.identification.problem import CalibrationProblem, build_problem
 from orthocal.measurement.gauge import build_observations, predict_entries
 
@@ -88,3 +88,17 @@ def test_nothing_free_is_refused(plan):
 def test_an_unknown_model_is_named_with_what_there_is(plan):
     with pytest.raises(ParameterError, match="'all' is not a model of this robot; models: offsets"):
         build_problem(plan, model="all")
+
+
+def test_closure_rows_that_depend_on_others_are_named(root, tmp_path):
+    folder = tmp_path / "biglide"
+    folder.mkdir()
+    for name in ("biglide.urdf", "biglide.yaml"):
+        text = (root / "tests/robots/biglide" / name).read_text()
+        (folder / name).write_text(text.replace("{rows: [x, y]}", "{}"))
+    (tmp_path / "plan.yaml").write_text(
+        "robot: biglide\npostures: {zero: {tcp_mm: [0, 0]}}\n"
+        "setups:\n  yx: {leg: x, direction: y, section: {fraction: 0.5}}\n"
+    )
+    with pytest.raises(RobotError, match=r"closure rows depend on others: z of apex; leave them"):
+        build_problem(load_plan(tmp_path / "plan.yaml"))

@@ -144,3 +144,10 @@ def test_a_robot_without_legs_cannot_be_measured(root, tmp_path):
     head = HEAD.replace("orthoglide", str(root / "tests/robots/fivebar"))
     with pytest.raises(SessionError, match="'fivebar' has no legs for a gauge to touch"):
         load_session(write(tmp_path / "s", head=head))
+
+
+def test_a_session_written_elsewhere_still_finds_its_robot(root, tmp_path):
+    head = HEAD.replace("orthoglide", str(root / "robots/orthoglide"))
+    session = load_session(write(tmp_path / "s", head=head))
+    again = load_session(write_session(session, tmp_path / "deep/er/copy"))
+    assert again.robot.sha256 == session.robot.sha256

@@ -78,6 +78,17 @@ def test_cycles_that_cannot_explain_the_residuals_are_said_to_be_model_error(raw
     assert "times what repeated cycles scatter by" in explain_fit(result)[0]
 
 
+def test_one_wrong_sign_among_cycles_is_pointed_at(raw_cycles):
+    """Every single reading of 0.1 mm or more, its sign turned in one cycle of three."""
+    for i, r in enumerate(raw_cycles.readings):
+        if abs(r.value) >= 0.1e-3 and i % 4 == 0:
+            values = raw_cycles.values.copy()
+            values[i] = -values[i]
+            text = " ".join(explain_fit(calibrate(raw_cycles.with_values(values))))
+            assert f"They differ most at {r.label}" in text
+            assert "Check these for a wrong sign or row" in text
+
+
 def test_a_prior_marks_what_the_readings_leave_open(root):
     result = calibrate(load_session(root / "examples/table1/experiment-2"), model="lengths")
     text = summarize(result)
