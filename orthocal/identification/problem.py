@@ -12,7 +12,7 @@ are CasADi expressions in scaled variables of order one:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
@@ -120,6 +120,7 @@ class CalibrationProblem:
         free: Names of the free parameters.
         prior: Whether tolerances act as a prior with mean 0.
         fixed: Known values of other parameters, [unit of the parameter].
+        tolerances: Other tolerances than the robot's, by name, [unit of the parameter].
 
     Raises:
         SessionError: If there is nothing to identify.
@@ -133,6 +134,7 @@ class CalibrationProblem:
         free: Sequence[str],
         prior: bool,
         fixed: Mapping[str, float] | None = None,
+        tolerances: Mapping[str, float] | None = None,
     ) -> None:
         if not free:
             raise SessionError("no free parameters: there is nothing to identify")
@@ -140,8 +142,10 @@ class CalibrationProblem:
         self.robot = session.robot
         self.free = tuple(free)
         self.prior = prior
+        own = dict(tolerances or {})
         self.parameters: tuple[Parameter, ...] = tuple(
-            self.robot.parameters[name] for name in self.free
+            replace(p, tolerance=own.get(p.name, p.tolerance))
+            for p in (self.robot.parameters[name] for name in self.free)
         )
         self.fixed = {k: v for k, v in (fixed or {}).items() if k not in self.free}
         self.robot.parameters.expand(self.fixed)  # refuses unknown names
