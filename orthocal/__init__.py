@@ -20,9 +20,9 @@ _HOMES = {
     "SolverOptions": "orthocal.identification.nlp",
     "calibrate": "orthocal.identification.calibrate",
     "draw_errors": "orthocal.measurement.synthetic",
-    "load_calibration": "orthocal.identification.calibration",
+    "load_calibration": "orthocal.identification.calibration_file",
     "load_plan": "orthocal.measurement.session_file",
-    "load_robot": "orthocal.robot.model",
+    "load_robot": "orthocal.robot.loading",
     "load_session": "orthocal.measurement.session_file",
     "simulate_session": "orthocal.measurement.synthetic",
     "summarize": "orthocal.output.summary",
@@ -51,13 +51,15 @@ __all__ = [
 if TYPE_CHECKING:
     from orthocal.errors import OrthocalError
     from orthocal.identification.calibrate import calibrate
-    from orthocal.identification.calibration import Calibration, load_calibration
+    from orthocal.identification.calibration import Calibration
+    from orthocal.identification.calibration_file import load_calibration
     from orthocal.identification.nlp import SolverOptions
     from orthocal.measurement.session import Session
     from orthocal.measurement.session_file import load_plan, load_session, write_session
     from orthocal.measurement.synthetic import draw_errors, simulate_session
     from orthocal.output.summary import summarize
-    from orthocal.robot.model import Robot, load_robot
+    from orthocal.robot.loading import load_robot
+    from orthocal.robot.model import Robot
     from orthocal.study.validation import validate_calibration
 
 

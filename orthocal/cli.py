@@ -125,7 +125,7 @@ def validate(
     all_rows: AllRows = False,
 ) -> None:
     """Hold a new session against a calibration: is it confirmed?"""
-    from orthocal.identification.calibration import load_calibration
+    from orthocal.identification.calibration_file import load_calibration
     from orthocal.measurement.session_file import load_session
     from orthocal.study.validation import validate_calibration
 
@@ -148,7 +148,7 @@ def forward(
 
     Drive coordinates are those of the encoders, without any offset of the controller.
     """
-    from orthocal.identification.calibration import load_calibration
+    from orthocal.identification.calibration_file import load_calibration
     from orthocal.measurement.table import (
         TOOL_COLUMNS,
         closures_named_by_row,
@@ -175,7 +175,7 @@ def inverse(
 
     Drive coordinates are those of the encoders, without any offset of the controller.
     """
-    from orthocal.identification.calibration import load_calibration
+    from orthocal.identification.calibration_file import load_calibration
     from orthocal.measurement.table import (
         closures_named_by_row,
         drive_columns,

@@ -35,7 +35,8 @@ from orthocal.identification.uncertainty import (
 )
 from orthocal.measurement.session import Session
 from orthocal.measurement.session_file import load_session
-from orthocal.robot.model import packaged_robots, read_only
+from orthocal.robot.loading import packaged_robots
+from orthocal.robot.model import read_only
 
 Array = NDArray[np.float64]
 

@@ -7,21 +7,21 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
-from orthocal.documents import Number, exists, is_folder, read_json, validate, write_text
+from orthocal.documents import write_text
 from orthocal.errors import CalibrationFileError, ParameterError, RobotError
 from orthocal.identification.uncertainty import NoiseSource, confidence_factor
 from orthocal.robot.assembly import Assembly
-from orthocal.robot.model import Robot, load_robot, packaged_robots, read_only
-from orthocal.robot.parameters import EDGE_UNITS, Unit
+from orthocal.robot.loading import load_robot, packaged_robots
+from orthocal.robot.model import Robot
+from orthocal.robot.parameters import InUnit, Unit
 
 Array = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ class SolverRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ParameterEstimate:
+class ParameterEstimate(InUnit):
     """One error parameter."""
 
     name: str
@@ -86,16 +86,6 @@ class ParameterEstimate:
     free: bool
     identifiable: bool
     """Whether the readings alone tell it better than its tolerance."""
-
-    @property
-    def edge_unit(self) -> str:
-        """Unit in which people read it."""
-        return EDGE_UNITS[self.unit][0]
-
-    @property
-    def edge_factor(self) -> float:
-        """Factor to the unit in which people read it."""
-        return EDGE_UNITS[self.unit][1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -417,94 +407,12 @@ class Calibration:
             )
 
 
-def load_calibration(path: str | Path) -> Calibration:
-    """Read a calibration.json, or the one in a folder.
-
-    Raises:
-        CalibrationFileError: Naming file and key, what was found and what was expected.
-    """
-    file = Path(path)
-    if is_folder(file):
-        file = file / "calibration.json"
-    if not exists(file):
-        raise CalibrationFileError(
-            "there is no such file; `orthocal calibrate SESSION --out FOLDER` makes one",
-            where=str(file),
-        )
-    data = read_json(file, error=CalibrationFileError)
-    if isinstance(data, Mapping) and "schema" not in data:
-        raise CalibrationFileError(f"is missing; expected '{SCHEMA}'", where=f"{file}: schema")
-    if isinstance(data, Mapping) and data["schema"] != SCHEMA:
-        raise CalibrationFileError(
-            f"schema is '{data.get('schema')}'; expected '{SCHEMA}'", where=str(file)
-        )
-    keys = validate(_CalibrationKeys, data, where=str(file), error=CalibrationFileError)
-    free = [p for p in keys.parameters if p.free]
-    covariance = [[math.nan if v is None else v for v in row] for row in keys.covariance]
-    if len(covariance) != len(free) or any(len(row) != len(free) for row in covariance):
-        raise CalibrationFileError(
-            f"expected {len(free)} × {len(free)} numbers, as free parameters",
-            where=f"{file}: covariance",
-        )
-    names = [p.name for p in keys.parameters]
-    for i, name in enumerate(names):
-        if name in names[:i]:
-            raise CalibrationFileError(
-                f"'{name}' stands twice", where=f"{file}: parameters[{i}].name"
-            )
-    if not keys.residuals:
-        raise CalibrationFileError("is empty", where=f"{file}: residuals")
-    return Calibration(
-        robot_record=RobotRecord(**keys.robot.model_dump()),
-        session=SessionRecord(
-            **{
-                **keys.session.model_dump(),
-                "controller_offsets": None
-                if keys.session.controller_offsets is None
-                else tuple(keys.session.controller_offsets),
-            }
-        ),
-        model=keys.model,
-        prior=keys.prior,
-        solver=SolverRecord(**keys.solver.model_dump()),
-        parameters=tuple(
-            ParameterEstimate(**{**p.model_dump(), "std": _float(p.std)}) for p in keys.parameters
-        ),
-        covariance=read_only(np.array(covariance).reshape(len(free), len(free))),
-        noise=NoiseRecord(
-            reading_sigma=_float(keys.noise.reading_sigma),
-            source=keys.noise.source,
-            cycles_sigma=_float(keys.noise.cycles_sigma),
-            cycles_dof=keys.noise.cycles_dof,
-            residual_sigma=_float(keys.noise.residual_sigma),
-            residual_dof=keys.noise.residual_dof,
-        ),
-        sigma=_float(keys.sigma),
-        dof=math.inf if keys.dof is None else keys.dof,
-        rows_are_differences=keys.rows_are_differences,
-        residuals=tuple(
-            ResidualRow(**{k: v for k, v in r.model_dump().items() if k != "residual"})
-            for r in keys.residuals
-        ),
-        postures=tuple(
-            PostureRecord(p.name, tuple(p.drives), tuple(p.passive)) for p in keys.postures
-        ),
-        setups=tuple(SetupRecord(**s.model_dump()) for s in keys.setups),
-        version=keys.orthocal,
-        path=file,
-    )
-
-
 def _rms(values: list[float]) -> float:
     return math.sqrt(sum(v * v for v in values) / len(values))
 
 
 def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _float(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def _plain(record: Any) -> dict[str, Any]:  # noqa: ANN401 - any of the records above
@@ -517,102 +425,3 @@ def _plain(record: Any) -> dict[str, Any]:  # noqa: ANN401 - any of the records 
             value = list(value)
         result[name] = value
     return result
-
-
-class _Keys(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class _RobotKeys(_Keys):
-    name: str
-    reference: str
-    folder: str | None
-    sha256: str
-
-
-class _SessionKeys(_Keys):
-    path: str | None
-    title: str
-    source: str
-    sha256: str
-    gauge_sigma: Number | None
-    gauge_resolution: Number | None
-    controller_offsets: list[Number] | None
-
-
-class _SolverKeys(_Keys):
-    name: str
-    status: str
-    iterations: int
-    seconds: Number
-    hessian: str
-
-
-class _ParameterKeys(_Keys):
-    name: str
-    unit: Literal["m", "rad", "1"]
-    value: Number
-    linear: Number
-    std: Number | None
-    tolerance: Number
-    free: bool
-    identifiable: bool
-
-
-class _NoiseKeys(_Keys):
-    reading_sigma: Number | None
-    source: Literal["cycles", "residuals", "gauge", "unknown"]
-    cycles_sigma: Number | None
-    cycles_dof: int
-    residual_sigma: Number | None
-    residual_dof: Annotated[Number, Field(ge=0.0)]
-
-
-class _ResidualKeys(_Keys):
-    setup: str
-    posture: str
-    minus: str | None
-    cycle: int
-    measured: Number
-    nominal: Number
-    linear: Number
-    predicted: Number
-    residual: Number
-
-
-class _PostureKeys(_Keys):
-    name: str
-    drives: list[Number]
-    passive: list[Number]
-
-
-class _SetupKeys(_Keys):
-    name: str
-    leg: str
-    direction: str
-    section_form: str
-    section_value: Number
-    zero: Number | None
-
-
-class _CalibrationKeys(_Keys):
-    schema_: Annotated[Literal["orthocal/calibration/1"], Field(alias="schema")]
-    orthocal: str
-    robot: _RobotKeys
-    session: _SessionKeys
-    model: str
-    prior: bool
-    solver: _SolverKeys
-    parameters: Annotated[list[_ParameterKeys], Field(min_length=1)]
-    covariance: list[list[Number | None]]
-    sigma: Number | None
-    dof: Number | None
-    noise: _NoiseKeys
-    rows_are_differences: bool
-    rms_before: Number
-    rms_after: Number
-    largest_before: Number
-    largest_after: Number
-    residuals: list[_ResidualKeys]
-    postures: list[_PostureKeys]
-    setups: list[_SetupKeys]

@@ -11,16 +11,13 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from orthocal.documents import (
-    Number,
-    PositiveNumber,
     is_folder,
     parse_number,
     read_csv_rows,
@@ -30,6 +27,7 @@ from orthocal.documents import (
 )
 from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.measurement.gauge import locate_contacts
+from orthocal.measurement.schema import SessionKeys, SetupKeys
 from orthocal.measurement.session import (
     DIRECTIONS,
     Gauge,
@@ -41,97 +39,13 @@ from orthocal.measurement.session import (
     section_plane,
 )
 from orthocal.robot.assembly import nominal_assembly
-from orthocal.robot.model import Robot, load_robot, packaged_robots, read_only
+from orthocal.robot.loading import load_robot, packaged_robots
+from orthocal.robot.model import Robot, read_only
 
 Array = NDArray[np.float64]
 
 COLUMNS = ("setup", "posture", "minus", "cycle", "reading_mm")
 """Columns of a readings.csv; `minus` and `cycle` may be absent."""
-
-Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^,;\s\"]+$")]
-Vector = Annotated[list[Number], Field(min_length=1, max_length=12)]
-
-
-class _Keys(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class GaugeKeys(_Keys):
-    """The indicator."""
-
-    sigma_mm: PositiveNumber | None = None
-    resolution_mm: PositiveNumber | None = None
-    range_mm: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = None
-
-    @model_validator(mode="after")
-    def _range_rises(self) -> GaugeKeys:
-        if self.range_mm is not None and not self.range_mm[0] < self.range_mm[1]:
-            raise ValueError(f"range_mm|found {self.range_mm}; expected [lowest, highest]")
-        return self
-
-
-class PostureKeys(_Keys):
-    """A commanded machine position."""
-
-    tcp_mm: Vector | None = None
-    joints_mm: Vector | None = None
-    joints_deg: Vector | None = None
-
-    @model_validator(mode="after")
-    def _one_form(self) -> PostureKeys:
-        given = [k for k in ("tcp_mm", "joints_mm", "joints_deg") if getattr(self, k) is not None]
-        if len(given) != 1:
-            found = " and ".join(given) if given else "none"
-            raise ValueError(f"found {found}; expected one of tcp_mm, joints_mm, joints_deg")
-        return self
-
-
-class SectionKeys(_Keys):
-    """Where along the leg's nominal axis the gauge touches."""
-
-    coordinate_mm: Number | None = None
-    from_root_mm: Number | None = None
-    fraction: Number | None = None
-
-    @model_validator(mode="after")
-    def _one_form(self) -> SectionKeys:
-        forms = ("coordinate_mm", "from_root_mm", "fraction")
-        given = [k for k in forms if getattr(self, k) is not None]
-        if len(given) != 1:
-            found = " and ".join(given) if given else "none"
-            raise ValueError(f"found {found}; expected one of {', '.join(forms)}")
-        return self
-
-
-class SetupKeys(_Keys):
-    """One standing of the gauge."""
-
-    leg: Name
-    direction: str
-    section: SectionKeys
-    postures: Annotated[list[Name], Field(min_length=1)] | None = None
-    """In a plan: the postures it is to be read in; all by default."""
-
-
-class ControllerKeys(_Keys):
-    """What the controller already corrects."""
-
-    offsets_mm: Vector
-
-
-class SessionKeys(_Keys):
-    """A session.yaml, or a plan: the same without `readings`."""
-
-    robot: str
-    title: str = ""
-    source: str = ""
-    gauge: GaugeKeys = GaugeKeys()
-    postures: Annotated[dict[Name, PostureKeys], Field(min_length=1)]
-    controller: ControllerKeys | None = None
-    setups: Annotated[dict[Name, SetupKeys], Field(min_length=1)]
-    cycles: Annotated[int, Field(ge=1, le=1000)] = 1
-    """In a plan: how often the postures are gone through."""
-    readings: str | None = None
 
 
 def load_session(path: str | Path) -> Session:
@@ -439,8 +353,7 @@ def _build_postures(
             targets[name] = given[name][1]
             continue
         form = "joints_mm" if posture.joints_mm is not None else "joints_deg"
-        values = posture.joints_mm if posture.joints_mm is not None else posture.joints_deg
-        assert values is not None  # one of the three forms is given
+        values = posture.joints_mm or posture.joints_deg or []
         _check_count(values, robot, f"{where}.{form}")
         unit = "m" if form == "joints_mm" else "rad"
         for drive in robot.drives:

@@ -59,16 +59,11 @@ class ElementaryError:
     unit: Unit
 
 
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """A named error parameter."""
+class InUnit:
+    """Something with a `unit` that people read in another one."""
 
-    name: str
+    __slots__ = ()
     unit: Unit
-    tolerance: float
-    """One standard deviation, [unit]."""
-    terms: tuple[tuple[str, float], ...]
-    """Elementary errors it adds to, with coefficients."""
 
     @property
     def edge_unit(self) -> str:
@@ -79,6 +74,18 @@ class Parameter:
     def edge_factor(self) -> float:
         """Factor from SI to the unit in which people read it."""
         return EDGE_UNITS[self.unit][1]
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter(InUnit):
+    """A named error parameter."""
+
+    name: str
+    unit: Unit
+    tolerance: float
+    """One standard deviation, [unit]."""
+    terms: tuple[tuple[str, float], ...]
+    """Elementary errors it adds to, with coefficients."""
 
 
 class ParameterSet:

@@ -22,7 +22,7 @@ from orthocal.identification.calibration import Calibration, ResidualRow
 from orthocal.identification.uncertainty import confidence_factor
 from orthocal.measurement.session import Session
 from orthocal.robot.model import read_only
-from orthocal.robot.parameters import EDGE_UNITS, Unit
+from orthocal.robot.parameters import InUnit, Unit
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ EXCESS_CHANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FurtherChange:
+class FurtherChange(InUnit):
     """What a further fit would still change in one parameter."""
 
     name: str
@@ -45,16 +45,6 @@ class FurtherChange:
     """Standard deviation of the change by the new session's own fit, [unit]."""
     significant: bool
     """Whether it is outside the 95 % interval around 0."""
-
-    @property
-    def edge_unit(self) -> str:
-        """Unit in which people read it."""
-        return EDGE_UNITS[self.unit][0]
-
-    @property
-    def edge_factor(self) -> float:
-        """Factor to the unit in which people read it."""
-        return EDGE_UNITS[self.unit][1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

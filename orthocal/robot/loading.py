@@ -1,0 +1,328 @@
+"""Loading robots: URDF and YAML, checked against each other, with the loops closed."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from orthocal.documents import is_folder
+from orthocal.errors import ClosureError, ParameterError, RobotError
+from orthocal.robot.description import RobotKeys, load_description
+from orthocal.robot.model import (
+    Closure,
+    Drive,
+    Leg,
+    Robot,
+    Tcp,
+    build_constraints,
+    find_frame,
+    joint_axis,
+    read_only,
+)
+from orthocal.robot.parameters import (
+    AXES,
+    ElementaryError,
+    Kind,
+    ParameterSet,
+    Unit,
+    build_parameters,
+    split_unit,
+)
+from orthocal.robot.urdf import load_urdf
+
+Array = NDArray[np.float64]
+
+
+def packaged_robots() -> dict[str, Path]:
+    """Name to folder of the robots that come with orthocal."""
+    package = Path(str(resources.files("orthocal")))
+    for folder in (package / "_robots", package.parent / "robots"):
+        if folder.is_dir():
+            return {f.name: f for f in sorted(folder.iterdir()) if any(f.glob("*.urdf"))}
+    return {}
+
+
+def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
+    """Load a robot: URDF and YAML, checked against each other, with its loops closed.
+
+    Args:
+        robot: Name of a robot that comes with orthocal, or path to a robot folder.
+        beside: Folder that a relative path counts from; the working directory by default.
+
+    Raises:
+        RobotError: Naming file and line or key, what was found and what was expected.
+    """
+    packaged = packaged_robots()
+    if str(robot) in packaged:
+        return _load_folder(packaged[str(robot)])
+    folder = Path(robot) if beside is None else beside / robot
+    if not str(robot) or not is_folder(folder):
+        raise RobotError(
+            f"'{robot}' is neither a robot of orthocal ({', '.join(packaged)}) "
+            f"nor a folder ({folder})"
+        )
+    return _load_folder(folder)
+
+
+def _load_folder(folder: Path) -> Robot:
+    yaml_path, urdf_path = _find_files(folder)
+    keys = load_description(yaml_path)
+    model = load_urdf(urdf_path)
+    where = str(yaml_path)
+    digest = hashlib.sha256(urdf_path.read_bytes() + b"\0" + yaml_path.read_bytes()).hexdigest()
+
+    drives = _build_drives(model, keys, where)
+    drive_index = [model.joints[model.getJointId(d.name)].idx_v for d in drives]
+    passive_index = [i for i in range(model.nv) if i not in drive_index]
+    closures = _build_closures(model, keys, where)
+    try:
+        parameters = _build_parameter_set(model, keys, drives, closures)
+    except ParameterError as e:
+        raise RobotError(e.problem, where=f"{where}: orthocal") from None
+    name = folder.resolve().name
+    robot = Robot(
+        name=name,
+        folder=folder,
+        urdf=urdf_path,
+        yaml=yaml_path,
+        sha256=digest,
+        model=model,
+        constraints=build_constraints(model, closures),
+        drives=drives,
+        closures=closures,
+        legs={},
+        tcp=_build_tcp(model, keys, where),
+        parameters=parameters,
+        drive_index=np.array(drive_index, dtype=np.int64),
+        passive_index=np.array(passive_index, dtype=np.int64),
+        zero=read_only(np.zeros(model.nv)),
+        drive_gain=read_only(np.ones(len(drives))),
+    )
+    start = _passive_start(robot, keys, where)
+    try:
+        passive = robot.close_with_pinocchio(robot.drive_zero, start, posture="mechanical zero")
+    except ClosureError as e:
+        raise RobotError(
+            f"{e}; set orthocal.drives.<motor>.zero_mm (or zero_deg) and "
+            "orthocal.passive_start near a posture that closes",
+            where=where,
+        ) from None
+    zero = read_only(robot.joint_coordinates(robot.drive_zero, passive))
+    robot = replace(robot, zero=zero)
+    return replace(robot, legs=_build_legs(robot, keys, where))
+
+
+def _find_files(folder: Path) -> tuple[Path, Path]:
+    """YAML and URDF of a robot folder: those named as the folder, or the only ones."""
+    found = []
+    for suffix in (".yaml", ".urdf"):
+        own = folder / f"{folder.resolve().name}{suffix}"
+        files = [own] if own.is_file() else sorted(folder.glob(f"*{suffix}"))
+        if len(files) != 1:
+            names = ", ".join(f.name for f in files) or "none"
+            raise RobotError(
+                f"expected one {suffix[1:].upper()} file, or one named {own.name}; found {names}",
+                where=str(folder),
+            )
+        found.append(files[0])
+    return found[0], found[1]
+
+
+def _build_drives(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Drive, ...]:
+    drives = []
+    for motor in keys.name_mot:
+        if not model.existJointName(motor):
+            moving = ", ".join(list(model.names)[1:]) or "none"
+            raise RobotError(
+                f"the URDF has no moving joint '{motor}'; joints: {moving}",
+                where=f"{where}: name_mot",
+            )
+        joint = model.joints[model.getJointId(motor)]
+        if joint.nv != 1:
+            raise RobotError(
+                f"'{motor}' has {joint.nv} degrees of freedom; a motor has one",
+                where=f"{where}: name_mot",
+            )
+        prismatic = not np.any(joint_axis(model, joint.id)[3:])
+        entry = keys.orthocal.drives.get(motor)
+        zero = 0.0
+        if entry is not None:
+            wrong = "zero_deg" if prismatic else "zero_mm"
+            if getattr(entry, wrong) is not None:
+                kind, right = ("prismatic", "zero_mm") if prismatic else ("revolute", "zero_deg")
+                raise RobotError(
+                    f"the drive is {kind}; expected {right}",
+                    where=f"{where}: orthocal.drives.{motor}.{wrong}",
+                )
+            zero = (entry.zero_mm or 0.0) * 1e-3 if prismatic else np.deg2rad(entry.zero_deg or 0.0)
+        bounded = joint.nq == 1
+        lower = float(model.lowerPositionLimit[joint.idx_q]) if bounded else -np.inf
+        upper = float(model.upperPositionLimit[joint.idx_q]) if bounded else np.inf
+        if entry is not None and not lower <= zero <= upper:
+            factor, unit = (1e3, "mm") if prismatic else (180.0 / np.pi, "deg")
+            raise RobotError(
+                f"the zero, {zero * factor:g} {unit}, is outside the joint's limits "
+                f"{lower * factor:g} ... {upper * factor:g} {unit}",
+                where=f"{where}: orthocal.drives.{motor}",
+            )
+        drives.append(Drive(motor, "m" if prismatic else "rad", float(zero), lower, upper))
+    return tuple(drives)
+
+
+def _build_closures(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Closure, ...]:
+    named = keys.orthocal.closures
+    names = (
+        list(named) if named is not None else [f"closure_{i + 1}" for i in range(len(keys.type))]
+    )
+    rows_of = {r: i for i, r in enumerate(AXES)}
+    closures = []
+    for i, (name, pair, kind) in enumerate(zip(names, keys.closed_loop, keys.type, strict=True)):
+        for frame in pair:
+            find_frame(model, frame, where=f"{where}: closed_loop[{i}]")
+        if pair[0] == pair[1]:
+            raise RobotError(
+                f"closes the frame '{pair[0]}' on itself", where=f"{where}: closed_loop[{i}]"
+            )
+        rows = named[name].rows if named is not None else None
+        count = 3 if kind == "3d" else 6
+        indices = tuple(range(count)) if rows is None else tuple(sorted(rows_of[r] for r in rows))
+        closures.append(Closure(name, pair[0], pair[1], kind, indices))
+    return tuple(closures)
+
+
+def _build_tcp(model: pin.Model, keys: RobotKeys, where: str) -> Tcp | None:
+    tcp = keys.orthocal.tcp
+    if tcp is None:
+        return None
+    find_frame(model, tcp.frame, where=f"{where}: orthocal.tcp.frame")
+    return Tcp(tcp.frame, tuple(sorted("xyz".index(c) for c in set(tcp.coordinates))))
+
+
+def _build_parameter_set(
+    model: pin.Model, keys: RobotKeys, drives: Sequence[Drive], closures: Sequence[Closure]
+) -> ParameterSet:
+    """All elementary errors: drives, then joints, then the frames that are used.
+
+    The component of a motor's placement along or about its own axis is left out: the offset is the
+    same error.
+    """
+    elementary: list[ElementaryError] = []
+    units: tuple[Unit, ...] = ("m", "m", "m", "rad", "rad", "rad")
+
+    def add_twist(owner: str, prefix: str, *, of_frame: bool, leave_out: int | None) -> None:
+        for axis, letter in enumerate(AXES):
+            if axis != leave_out:
+                kind: Kind = "translation" if axis < 3 else "rotation"
+                elementary.append(
+                    ElementaryError(
+                        f"{prefix}{owner}.{letter}", kind, owner, of_frame, axis, units[axis]
+                    )
+                )
+
+    for drive in drives:
+        elementary.append(
+            ElementaryError(f"{drive.name}.offset", "offset", drive.name, False, -1, drive.unit)
+        )
+    for drive in drives:
+        elementary.append(
+            ElementaryError(f"{drive.name}.scale", "scale", drive.name, False, -1, "1")
+        )
+    motors = {d.name for d in drives}
+    for i in range(1, model.njoints):
+        own = int(np.abs(joint_axis(model, i)).argmax()) if model.names[i] in motors else None
+        add_twist(model.names[i], "", of_frame=False, leave_out=own)
+    extra = keys.orthocal
+    frames = [f for c in closures for f in (c.frame_a, c.frame_b)]
+    frames += [f for leg in extra.legs.values() for f in (leg.root, leg.tip)]
+    frames += [extra.tcp.frame] if extra.tcp else []
+    for frame in dict.fromkeys(frames):
+        add_twist(frame, "frame.", of_frame=True, leave_out=None)
+
+    t = extra.tolerances
+    models = dict(extra.models)
+    models.setdefault("offsets", ["*.offset"])
+    models.setdefault(
+        "full",
+        [
+            "*",
+            "!*.scale",
+            *(["!frame.*"] if frames else []),
+            *(f"!{name}" for name in extra.parameters),
+        ],
+    )
+    return build_parameters(
+        elementary,
+        sums=extra.parameters,
+        tolerances={
+            "offset:m": t.offset_mm * 1e-3,
+            "offset:rad": t.offset_mrad * 1e-3,
+            "translation": t.translation_mm * 1e-3,
+            "rotation": t.rotation_mrad * 1e-3,
+            "scale": t.scale_ppm * 1e-6,
+        },
+        overrides=t.overrides,
+        models=models,
+    )
+
+
+def _passive_start(robot: Robot, keys: RobotKeys, where: str) -> Array:
+    start = np.zeros(robot.model.nv)
+    for key, value in keys.orthocal.passive_start.items():
+        here = f"{where}: orthocal.passive_start.{key}"
+        try:
+            name, unit, factor = split_unit(key)
+        except ParameterError as e:
+            raise RobotError(e.problem, where=here) from None
+        model = robot.model
+        if not model.existJointName(name) or name in keys.name_mot:
+            raise RobotError(f"'{name}' is not a passive joint of the URDF", where=here)
+        joint = model.joints[model.getJointId(name)]
+        expected: Unit = "rad" if np.any(joint_axis(model, joint.id)[3:]) else "m"
+        if unit != expected:
+            raise RobotError(f"has the wrong unit; the joint is in {expected}", where=here)
+        start[joint.idx_v] = value * factor
+    return np.asarray(start[robot.passive_index])
+
+
+def _without_rounding(unit_vector: Array) -> Array:
+    """A unit vector whose components within rounding of 0 or ±1 are exactly that."""
+    nearest = np.round(unit_vector)
+    return np.where(np.abs(unit_vector - nearest) < 1e-12, nearest, unit_vector)
+
+
+def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
+    model, legs = robot.model, {}
+    data = model.createData()
+    q = robot.configuration(robot.zero)
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    for name, entry in keys.orthocal.legs.items():
+        here = f"{where}: orthocal.legs.{name}"
+        ids = [find_frame(model, f, where=f"{here}") for f in (entry.root, entry.tip)]
+        root, tip = (np.array(data.oMf[i].translation) for i in ids)
+        length = float(np.linalg.norm(tip - root))
+        if length < 1e-6:
+            raise RobotError(
+                f"root '{entry.root}' and tip '{entry.tip}' are at the same place", where=here
+            )
+        jacobian = pin.getFrameJacobian(
+            model, data, ids[0], pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        )[:3]
+        moved = np.abs(jacobian[:, robot.passive_index]).max(initial=0.0)
+        legs[name] = Leg(
+            name=name,
+            root=entry.root,
+            tip=entry.tip,
+            length=length,
+            axis=read_only(_without_rounding((tip - root) / length)),
+            zero_root=read_only(root),
+            root_driven=bool(moved < 1e-9),
+        )
+    return legs
