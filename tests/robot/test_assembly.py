@@ -85,17 +85,23 @@ def test_a_robot_with_redundant_closure_rows_closes(fivebar):
     for d, p in zip(motors, passive, strict=True):
         residual, _ = fivebar.evaluate_constraints(d, p)
         assert np.abs(residual).max() < CLOSED
-    elbow = np.array([-0.15, 0.08])
-    turned = -0.1 + 0.0j + (elbow[0] + 0.1 + 1j * elbow[1]) * np.exp(1j * 0.2)
-    other = 0.1 + (0.05 + 0.08j) * np.exp(-0.1j)
-    rod = abs(0.15 + 0.07j)
-    middle = (turned + other) / 2
-    half = abs(other - turned) / 2
-    apex = middle + 1j * (other - turned) / abs(other - turned) * np.sqrt(rod**2 - half**2)
+
+
+@pytest.mark.parametrize(
+    "motors", [(0.2, -0.1), (0.174, 1.74), (-0.434, 1.561), (1.253, 1.651), (-1.091, 0.493)]
+)
+def test_large_motions_keep_the_elbows_where_they_were(fivebar, motors):
+    """The apex stays on its side of the elbows; plain Newton from zero turns all but the first."""
     import pinocchio as pin
 
+    first = -0.1 + (-0.05 + 0.08j) * np.exp(1j * motors[0])
+    second = 0.1 + (0.05 + 0.08j) * np.exp(1j * motors[1])
+    between = second - first
+    height = np.sqrt(abs(0.15 + 0.07j) ** 2 - abs(between) ** 2 / 4)
+    apex = (first + second) / 2 + 1j * between / abs(between) * height
+    passive = nominal_assembly(fivebar).close(motors)
     data = fivebar.model.createData()
-    q = fivebar.configuration(fivebar.joint_coordinates(motors[1], passive[1]))
+    q = fivebar.configuration(fivebar.joint_coordinates(motors, passive))
     pin.framesForwardKinematics(fivebar.model, data, q)
     reached = data.oMf[fivebar.frame_id("end_a")].translation
     assert np.abs(reached - [apex.real, apex.imag, 0.0]).max() < CLOSED_FORM
