@@ -27,7 +27,7 @@ from orthocal.documents import (
 )
 from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.measurement.gauge import locate_contacts
-from orthocal.measurement.schema import SessionKeys, SetupKeys
+from orthocal.measurement.schema import SectionKeys, SessionKeys, SetupKeys
 from orthocal.measurement.session import (
     DIRECTIONS,
     Gauge,
@@ -305,18 +305,22 @@ def _build_setup(name: str, keys: SetupKeys, robot: Robot, where: str) -> Setup:
             f"'{keys.direction}' is along leg {keys.leg}; a gauge measures across it",
             where=f"{where}.direction",
         )
-    section = keys.section
-    for form, factor in (("coordinate_mm", 1e-3), ("from_root_mm", 1e-3), ("fraction", 1.0)):
-        value = getattr(section, form)
-        if value is not None:
-            setup = Setup(name, keys.leg, keys.direction, Section(form, value * factor))  # type: ignore[arg-type]
-            if form == "fraction" and not 0.0 <= value <= 1.0:
-                raise SessionError(
-                    f"found {value:g}; expected 0 (root) to 1 (tip)",
-                    where=f"{where}.section.fraction",
-                )
+    setup = Setup(name, keys.leg, keys.direction, _build_section(keys.section))
+    if setup.section.form == "fraction" and not 0.0 <= setup.section.value <= 1.0:
+        raise SessionError(
+            f"found {setup.section.value:g}; expected 0 (root) to 1 (tip)",
+            where=f"{where}.section.fraction",
+        )
     section_plane(robot, setup, where=f"{where}.section")
     return setup
+
+
+def _build_section(keys: SectionKeys) -> Section:
+    if keys.coordinate_mm is not None:
+        return Section("coordinate_mm", keys.coordinate_mm * 1e-3)
+    if keys.from_root_mm is not None:
+        return Section("from_root_mm", keys.from_root_mm * 1e-3)
+    return Section("fraction", keys.fraction or 0.0)
 
 
 def _check_count(values: Sequence[float], robot: Robot, where: str) -> None:
