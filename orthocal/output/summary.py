@@ -81,7 +81,7 @@ def render_validation(validation: Validation, *, all_rows: bool = False) -> Rend
     )
     for name, *values in rows:
         _add(table, name, *(_mm(v) for v in values))
-    changes = _table("parameter", "change", "± σ", "unit", "beyond its 95 % interval?")
+    changes = _table("parameter", "change", "± σ", "unit", "beyond chance (95 % for all)?")
     for c in validation.changes:
         _add(
             changes,

@@ -42,9 +42,9 @@ class FurtherChange(InUnit):
     change: float
     """[unit]."""
     std: float
-    """Standard deviation of the change by the new session's own fit, [unit]."""
+    """Standard deviation of the change: both sessions know the parameter only so well, [unit]."""
     significant: bool
-    """Whether it is outside the 95 % interval around 0."""
+    """Whether it is outside the interval around 0 that holds all changes together with 95 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,17 +165,7 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         session = _with_controller(session, offsets)
     fixed = {p.name: p.value for p in calibration.parameters if not p.free}
     refit = calibrate(session, model=calibration.model, prior=calibration.prior, fixed=fixed)
-    factor = confidence_factor(refit.dof)
-    changes = tuple(
-        FurtherChange(
-            new.name,
-            new.unit,
-            new.value - old.value,
-            new.std,
-            abs(new.value - old.value) > factor * new.std,
-        )
-        for old, new in zip(calibration.free, refit.free, strict=True)
-    )
+    changes = _further_changes(calibration, refit)
     matched, correlation, cosine = _correlate(calibration.residuals, refit.residuals)
     dims = _residual_dimensions(refit, matched)
     chance = math.nan
@@ -199,6 +189,18 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         chance=chance,
         rows=refit.residuals,
     )
+
+
+def _further_changes(calibration: Calibration, refit: Calibration) -> tuple[FurtherChange, ...]:
+    """New less old estimates, against the standard error of the difference of the two."""
+    pairs = list(zip(calibration.free, refit.free, strict=True))
+    # so many chances to be wrong by chance: each gets its share of the 5 %
+    factor = confidence_factor(min(calibration.dof, refit.dof), 1.0 - CHANCE / len(pairs))
+    changes = []
+    for old, new in pairs:
+        change, std = new.value - old.value, math.hypot(old.std, new.std)
+        changes.append(FurtherChange(new.name, new.unit, change, std, abs(change) > factor * std))
+    return tuple(changes)
 
 
 def _require_offsets(calibration: Calibration, session: Session) -> None:

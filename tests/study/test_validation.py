@@ -70,15 +70,17 @@ def test_offsets_that_were_entered_with_their_sign_turned_are_found_out(plan):
 
 def test_a_right_calibration_with_noise_alone_does_not_repeat_its_residuals(plan):
     verdicts = []
-    before = calibrate(simulate_session(plan, TRUTH, seed=1).session)
-    entered = np.round([p.value * 1e3 for p in before.free], 3) * 1e-3
-    for seed in range(2, 22):
+    for seed in range(2, 42, 2):
+        before = calibrate(simulate_session(plan, TRUTH, seed=seed + 1).session)
+        entered = np.round([p.value * 1e3 for p in before.free], 3) * 1e-3
         after = simulate_session(with_offsets(plan, entered), TRUTH, seed=seed).session
         result = validate_calibration(before, after)
         assert result.offsets_stated
-        verdicts.append((result.as_expected, result.residuals_repeat))
-    assert sum(ok is False for ok, _ in verdicts) <= 4  # 5 % each by construction
-    assert sum(bool(again) for _, again in verdicts) <= 4
+        verdicts.append((result.as_expected, result.nothing_to_change, result.residuals_repeat))
+    # 1 %, 5 % and 5 % by construction: more than these of 20 have a chance below 1 %
+    assert sum(ok is False for ok, _, _ in verdicts) <= 2
+    assert sum(not nothing for _, nothing, _ in verdicts) <= 4
+    assert sum(bool(again) for _, _, again in verdicts) <= 4
 
 
 def test_a_session_with_other_offsets_is_no_validation(table1):
