@@ -1187,8 +1187,8 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "key-unknown",
-        f"{CALIBRATION}: solver.steps: unknown key; known keys: name, status, iterations, seconds, "
-        "hessian",
+        f"{CALIBRATION}: solver.steps: unknown key; known keys: name, status, iterations, "
+        "seconds_build, seconds_solve, hessian, loss, loss_width",
         swap(FILE, '"iterations"', '"steps"'),
     ),
     calibration(
@@ -1279,12 +1279,20 @@ CALIBRATION_CASES = [
         command=VALIDATE,
     ),
     calibration(
-        "model-unknown",
-        f"{CALIBRATION}: model: 'ofsets' is not a model of this robot; models: offsets, lengths, "
-        "full",
-        NO_CONTROLLER,
-        put(FILE, "model", "ofsets"),
-        command=VALIDATE,
+        "unmodelled-unknown",
+        f"{CALIBRATION}: unmodelled.names[1]: 'x_slid.y' is not an error parameter; did you mean "
+        "x_slide.z, x_slide.y, z_slide.y?",
+        put(FILE, "unmodelled.names.1", "x_slid.y"),
+    ),
+    calibration(
+        "unmodelled-too-few",
+        f"{CALIBRATION}: unmodelled.tolerances: has 1 numbers; expected 123, as names",
+        put(FILE, "unmodelled.tolerances", [1e-4]),
+    ),
+    calibration(
+        "leakage-too-small",
+        f"{CALIBRATION}: unmodelled.leakage: expected 3 × 123 numbers, free parameters by names",
+        put(FILE, "unmodelled.leakage", [[0.0]]),
     ),
     calibration(
         "degrees-of-freedom-negative",

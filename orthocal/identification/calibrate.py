@@ -1,17 +1,30 @@
-"""From a session to a calibration: linearised start, noise, exact solution, uncertainty."""
+"""From a session to a calibration: the one call that most users need."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal import __version__
-from orthocal.identification.calibration import (
-    Calibration,
+from orthocal.errors import ClosureError, NotIdentifiableError, ParameterError
+from orthocal.identification.calibration import Calibration
+from orthocal.identification.diagnostics import Diagnostics, diagnose_readings
+from orthocal.identification.fit import Fit, first_sigma, fit_problem
+from orthocal.identification.identifiability import (
+    Identifiability,
+    analyse_identifiability,
+    find_base_parameters,
+)
+from orthocal.identification.linear import linearise_at_reference
+from orthocal.identification.loss import Loss
+from orthocal.identification.nlp import SolverOptions
+from orthocal.identification.problem import CalibrationProblem, build_problem
+from orthocal.identification.profile import profile_interval
+from orthocal.identification.records import (
     NoiseRecord,
     ParameterEstimate,
     PostureRecord,
@@ -21,18 +34,9 @@ from orthocal.identification.calibration import (
     SetupRecord,
     SolverRecord,
 )
-from orthocal.identification.linear import solve_linearised
-from orthocal.identification.nlp import NonlinearProgram, Solution, SolverOptions
-from orthocal.identification.problem import CalibrationProblem, build_problem
-from orthocal.identification.uncertainty import (
-    Information,
-    Noise,
-    decompose,
-    estimate_noise,
-    estimate_repeatability,
-    project_out_zeros,
-    require_identifiable,
-)
+from orthocal.identification.selection import Known, Selection
+from orthocal.identification.uncertainty import estimate_repeatability, project_out_zeros
+from orthocal.identification.unmodelled import measure_unmodelled
 from orthocal.measurement.session import Session
 from orthocal.measurement.session_file import load_session
 from orthocal.robot.loading import packaged_robots
@@ -40,24 +44,18 @@ from orthocal.robot.model import read_only
 
 Array = NDArray[np.float64]
 
-SIGMA_WITHOUT_WORD = 10e-6
-"""Standard deviation of a reading assumed at first where nothing tells it, [m]."""
-
-SMALLEST_SIGMA = 1e-9
-"""Standard deviation of a reading below which readings count as perfect, [m]."""
-
-SIGMA_SETTLED = 0.01
-"""Relative change of sigma below which it needs no further solution."""
-
-MAX_SIGMA_ROUNDS = 8
-
 
 def calibrate(
     session: Session | str | Path,
     *,
-    model: str = "offsets",
+    model: str | None = None,
+    free: Sequence[str] = (),
     prior: bool | None = None,
-    fixed: Mapping[str, float] | None = None,
+    known: Mapping[str, Known] | None = None,
+    tolerances: Mapping[str, float] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    base: bool = False,
+    profile: Sequence[str] = (),
     options: SolverOptions | None = None,
     start: ArrayLike | None = None,
 ) -> Calibration:
@@ -65,11 +63,19 @@ def calibrate(
 
     Args:
         session: The session, or the path to one.
-        model: A model of the robot's YAML: `offsets`, `lengths`, `full` or one's own.
-        prior: Whether tolerances act as a prior; by default not for `offsets`, else yes.
-        fixed: Known values of parameters, which are then not free, [SI].
-        options: How Ipopt is run.
-        start: Free parameters to start from, shape (n_free,), [SI].
+        model: A model of the robot's YAML: `offsets` (the default), `lengths`, `full` or one's own.
+        free: Names or globs that are free too, or instead where no model is named; '!' takes out.
+        prior: Whether tolerances act as a prior; by default not where only offsets are free.
+        known: Name to a known value, which is then held, or to a value and its standard
+            deviation, which then act as prior, [SI].
+        tolerances: Name or glob to another standard deviation than the robot's, [SI].
+        bounds: Name or glob to lowest and highest value, ±inf for open, [SI].
+        base: Identify base parameters instead, without any prior: of what the readings cannot
+            tell apart one parameter stays, and stands for the whole combination.
+        profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
+        options: How Ipopt is run, and what a residual costs.
+        start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
+            solution.
 
     Raises:
         NotIdentifiableError: If the readings leave a parameter open and there is no prior.
@@ -79,130 +85,93 @@ def calibrate(
     """
     if not isinstance(session, Session):
         session = load_session(session)
-    problem = build_problem(session, model=model, prior=prior, fixed=fixed)
-    _, reference_jacobian = problem.linearise(problem.reference)
-    at_reference = decompose(reference_jacobian, problem.observations)
-    if not problem.prior:
-        where = session.readings_path or session.path
-        require_identifiable(
-            at_reference, problem.free, where=None if where is None else str(where)
-        )
-
-    repeatability = estimate_repeatability(problem.values, problem.observations)
-    sigma = _first_sigma(session, repeatability)
-    program = NonlinearProgram(problem, options=options)
-    solution, noise, information = _solve_with_noise(
-        program, sigma=sigma, repeatability=repeatability, start=start
-    )
-    weight = max(noise.sigma, SMALLEST_SIGMA) if math.isfinite(noise.sigma) else sigma
-    linear = solve_linearised(problem, sigma=weight)
-    return _assemble_result(problem, program, solution, noise, information, linear, model)
-
-
-def _first_sigma(session: Session, repeatability: tuple[float, int]) -> float:
-    cycles_sigma, cycles_dof = repeatability
-    if cycles_dof > 0:
-        return max(cycles_sigma, SMALLEST_SIGMA)
-    return session.gauge.sigma or SIGMA_WITHOUT_WORD
-
-
-def _solve_with_noise(
-    program: NonlinearProgram,
-    *,
-    sigma: float,
-    repeatability: tuple[float, int],
-    start: ArrayLike | None,
-) -> tuple[Solution, Noise, Information]:
-    """Solve; beside a prior, again until sigma is what the residuals say it is.
-
-    Without a prior sigma does not matter to the estimate, and one solution is enough.
-    """
-    problem = program.problem
-    passive: Array | None = None
-    for _ in range(MAX_SIGMA_ROUNDS):
-        solution = program.solve(sigma=sigma, start=start, start_passive=passive)
-        prediction, jacobian = problem.linearise(solution.theta, solution.passive)
-        information = decompose(jacobian, problem.observations)
-        residual = project_out_zeros(problem.values - prediction, problem.observations)
-        used = information.effective_parameters(sigma=sigma, prior=problem.prior)
-        noise = estimate_noise(
-            repeatability=repeatability,
-            residual_square=float(residual @ residual),
-            residual_dof=problem.observations.size - problem.observations.n_zeros - used,
-            gauge_sigma=problem.session.gauge.sigma,
-        )
-        found = max(noise.sigma, SMALLEST_SIGMA)
-        settled = not math.isfinite(found) or abs(found / sigma - 1.0) < SIGMA_SETTLED
-        if settled or not problem.prior:
-            break
-        sigma, start, passive = found, solution.theta, solution.passive
-    return solution, noise, information
-
-
-def _assemble_result(
-    problem: CalibrationProblem,
-    program: NonlinearProgram,
-    solution: Solution,
-    noise: Noise,
-    information: Information,
-    linear: Array,
-    model: str,
-) -> Calibration:
-    session, robot = problem.session, problem.robot
-    scale = problem.theta_scale
-    if math.isfinite(noise.sigma) and noise.sigma > 0.0:
-        covariance = information.covariance(sigma=noise.sigma, prior=problem.prior)
-        covariance = covariance * np.outer(scale, scale)
-    elif noise.sigma == 0.0:  # readings without any scatter
-        covariance = np.zeros((problem.n_free, problem.n_free))
-    else:
-        covariance = np.full((problem.n_free, problem.n_free), np.nan)
-    std = np.sqrt(np.diag(covariance))
-    determined = information.determined(sigma=noise.sigma)
-    estimates = [
-        ParameterEstimate(
-            name=p.name,
-            unit=p.unit,
-            value=float(solution.theta[i]),
-            linear=float(linear[i]),
-            std=float(std[i]),
-            tolerance=p.tolerance,
-            free=True,
-            identifiable=bool(determined[i]),
-        )
-        for i, p in enumerate(problem.parameters)
-    ]
-    for name, value in problem.fixed.items():
-        p = robot.parameters[name]
-        estimates.append(
-            ParameterEstimate(name, p.unit, value, value, 0.0, p.tolerance, False, False)
-        )
-    only_differences = session.only_differences
-    packaged = packaged_robots().get(session.robot_reference)
-    folder = None if packaged is not None else str(robot.folder.resolve())
-    offsets = session.controller_offsets
-    return Calibration(
-        robot_record=RobotRecord(robot.name, session.robot_reference, folder, robot.sha256),
-        session=SessionRecord(
-            path=None if session.path is None else str(session.path),
-            title=session.title,
-            source=session.source,
-            sha256=session.sha256,
-            gauge_sigma=session.gauge.sigma,
-            gauge_resolution=session.gauge.resolution,
-            controller_offsets=None if offsets is None else tuple(offsets.tolist()),
-        ),
+    problem = build_problem(
+        session,
         model=model,
+        free=free,
+        prior=prior,
+        known=known,
+        tolerances=tolerances,
+        bounds=bounds,
+    )
+    whole = None
+    if base:
+        own = [n for n, v in (known or {}).items() if isinstance(v, tuple)]
+        if prior or own:
+            raise ParameterError(
+                "base parameters are identified without any prior"
+                + (f"; give {', '.join(own)} as known without ±" if own else "")
+            )
+        whole, problem = problem, _reduce_to_base(problem)
+    profiled = _match_profiled(problem, profile)
+    fit = fit_problem(problem, options=options, start=start)
+    intervals = {name: profile_interval(fit, name) for name in profiled}
+    return assemble_calibration(fit, whole=whole, intervals=intervals)
+
+
+def repeat_calibration(calibration: Calibration, session: Session) -> Calibration:
+    """The same parameters, with the same priors and bounds, identified from another session.
+
+    Raises:
+        NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
+    """
+    free = calibration.free
+    parameters = session.robot.parameters
+    selection = Selection(
+        label=calibration.model,
+        parameters=tuple(replace(parameters[p.name], tolerance=p.tolerance) for p in free),
+        prior=np.array([p.prior for p in free]),
+        mean=read_only([p.mean for p in free]),
+        lower=read_only([-np.inf if p.lower is None else p.lower for p in free]),
+        upper=read_only([np.inf if p.upper is None else p.upper for p in free]),
+        fixed={p.name: p.value for p in calibration.parameters if not p.free},
+    )
+    solver = calibration.solver
+    options = SolverOptions(loss=Loss(solver.loss, solver.loss_width))
+    return assemble_calibration(
+        fit_problem(CalibrationProblem(session, selection), options=options)
+    )
+
+
+def assemble_calibration(
+    fit: Fit,
+    *,
+    whole: CalibrationProblem | None = None,
+    intervals: Mapping[str, tuple[float, float]] | None = None,
+) -> Calibration:
+    """The record of a solved problem.
+
+    Args:
+        fit: The solved problem.
+        whole: The problem with all parameters, where those that were solved for are its base
+            parameters.
+        intervals: Profile-likelihood intervals by name, [SI].
+    """
+    problem, noise, loss = fit.problem, fit.noise, fit.loss
+    session = problem.session
+    diagnostics = diagnose_readings(fit)
+    covariance = fit.covariance()
+    factor = np.sqrt(2.0) if session.only_differences else 1.0
+    return Calibration(
+        robot_record=_robot_record(session),
+        session=_session_record(session),
+        model=problem.selection.label,
         prior=problem.prior,
         solver=SolverRecord(
             name="ipopt",
-            status=solution.status,
-            iterations=solution.iterations,
-            seconds=solution.seconds_build + solution.seconds_solve,
-            hessian=program.options.hessian,
+            status=fit.solution.status,
+            iterations=fit.solution.iterations,
+            seconds_build=fit.solution.seconds_build,
+            seconds_solve=fit.solution.seconds_solve,
+            hessian=fit.program.options.hessian,
+            loss=loss.kind,
+            loss_width=loss.width,
         ),
-        parameters=tuple(estimates),
+        parameters=_estimates(fit, covariance, intervals or {}),
         covariance=read_only(covariance),
+        unmodelled=measure_unmodelled(fit),
+        identifiability=_identifiability(fit, whole),
+        base=whole is not None,
         noise=NoiseRecord(
             reading_sigma=noise.sigma,
             source=noise.source,
@@ -211,46 +180,175 @@ def _assemble_result(
             residual_sigma=noise.residual_sigma,
             residual_dof=noise.residual_dof,
         ),
-        sigma=noise.sigma * (math.sqrt(2.0) if only_differences else 1.0),
+        sigma=noise.sigma * float(factor),
         dof=noise.dof,
-        rows_are_differences=only_differences,
-        residuals=_residual_rows(problem, solution, linear),
+        rows_are_differences=session.only_differences,
+        residuals=_residual_rows(fit, diagnostics),
+        critical=diagnostics.critical,
         postures=tuple(
-            PostureRecord(name, tuple(p.drives.tolist()), tuple(solution.passive[i].tolist()))
+            PostureRecord(name, tuple(p.drives.tolist()), tuple(fit.solution.passive[i].tolist()))
             for i, (name, p) in enumerate(session.postures.items())
         ),
-        setups=_setup_records(problem, solution),
+        setups=_setup_records(fit),
         version=__version__,
     )
 
 
-def _residual_rows(
-    problem: CalibrationProblem, solution: Solution, linear: Array
-) -> tuple[ResidualRow, ...]:
-    """Readings beside what three machines would show, each with its best gauge zeros."""
-    o, measured = problem.observations, problem.values
+def _reduce_to_base(problem: CalibrationProblem) -> CalibrationProblem:
+    """The problem in base parameters: what cannot be told apart is told as one."""
+    information = linearise_at_reference(problem).information
+    repeatability = estimate_repeatability(problem.values, problem.observations)
+    sigma = first_sigma(problem.session, repeatability)
+    found = find_base_parameters(information.factor, problem.parameters, threshold=sigma)
+    if not found:
+        raise NotIdentifiableError(
+            "the readings tell none of the free parameters", parameters=problem.free
+        )
+    leads = [c.terms[0][0] for c in found]
+    return CalibrationProblem(problem.session, problem.selection.keep(leads))
 
-    def fitted(prediction: Array) -> Array:
-        residual = project_out_zeros(measured - prediction, o)
-        return problem.session.values - o.rows(residual)
 
-    nominal = fitted(problem.predict(problem.reference))
-    by_linear = fitted(problem.predict(linear))
-    predicted = fitted(problem.predict(solution.theta, solution.passive))
-    return tuple(
-        ResidualRow(r.setup, r.posture, r.minus, r.cycle, r.value, float(a), float(b), float(c))
-        for r, a, b, c in zip(problem.session.readings, nominal, by_linear, predicted, strict=True)
+def _match_profiled(problem: CalibrationProblem, patterns: Sequence[str]) -> list[str]:
+    if not patterns:
+        return []
+    found = [n for n in problem.robot.parameters.select(patterns) if n in problem.free]
+    if not found:
+        raise ParameterError(
+            f"{', '.join(patterns)}: no free parameter to find the interval of",
+        )
+    return found
+
+
+def _identifiability(fit: Fit, whole: CalibrationProblem | None) -> Identifiability:
+    """Of the free parameters; of base parameters, together with what they stand for."""
+    if whole is None:
+        information, parameters = fit.information, fit.problem.parameters
+    else:
+        information, parameters = linearise_at_reference(whole).information, whole.parameters
+    return analyse_identifiability(
+        information, parameters, sigma=fit.noise.sigma, n_postures=fit.problem.n_postures
     )
 
 
-def _setup_records(problem: CalibrationProblem, solution: Solution) -> tuple[SetupRecord, ...]:
-    o = problem.observations
+def _estimates(
+    fit: Fit, covariance: Array, intervals: Mapping[str, tuple[float, float]]
+) -> tuple[ParameterEstimate, ...]:
+    problem, solution = fit.problem, fit.solution
+    selection = problem.selection
+    std = np.sqrt(np.diag(covariance))
+    determined = fit.information.determined(sigma=fit.noise.sigma)
+    words = {-1: "lower", 0: None, 1: "upper"}
+    estimates = [
+        ParameterEstimate(
+            name=p.name,
+            unit=p.unit,
+            value=float(solution.theta[i]),
+            linear=float(fit.linear[i]),
+            std=float(std[i]),
+            tolerance=p.tolerance,
+            free=True,
+            identifiable=bool(determined[i]),
+            start=float(problem.reference[i]),
+            prior=bool(selection.prior[i]),
+            mean=float(problem.prior_mean[i]),
+            lower=_bound(selection.lower[i]),
+            upper=_bound(selection.upper[i]),
+            at_bound=words[int(solution.at_bound[i])],  # type: ignore[arg-type]
+            interval=intervals.get(p.name),
+        )
+        for i, p in enumerate(problem.parameters)
+    ]
+    for name, value in problem.fixed.items():
+        p = problem.robot.parameters[name]
+        estimates.append(
+            ParameterEstimate(
+                name=name,
+                unit=p.unit,
+                value=value,
+                linear=value,
+                std=0.0,
+                tolerance=p.tolerance,
+                free=False,
+                identifiable=False,
+                start=value,
+                prior=False,
+                mean=0.0,
+                lower=None,
+                upper=None,
+                at_bound=None,
+                interval=None,
+            )
+        )
+    return tuple(estimates)
+
+
+def _bound(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _robot_record(session: Session) -> RobotRecord:
+    robot = session.robot
+    packaged = packaged_robots().get(session.robot_reference)
+    folder = None if packaged is not None else str(robot.folder.resolve())
+    return RobotRecord(robot.name, session.robot_reference, folder, robot.sha256)
+
+
+def _session_record(session: Session) -> SessionRecord:
+    offsets = session.controller_offsets
+    return SessionRecord(
+        path=None if session.path is None else str(session.path),
+        readings_path=None if session.readings_path is None else str(session.readings_path),
+        title=session.title,
+        source=session.source,
+        sha256=session.sha256,
+        gauge_sigma=session.gauge.sigma,
+        gauge_resolution=session.gauge.resolution,
+        controller_offsets=None if offsets is None else tuple(offsets.tolist()),
+    )
+
+
+def _residual_rows(fit: Fit, diagnostics: Diagnostics) -> tuple[ResidualRow, ...]:
+    """Readings beside what three machines would show, each with its best gauge zeros."""
+    problem, o = fit.problem, fit.problem.observations
+    measured, session = problem.values, problem.session
+
+    def fitted(prediction: Array) -> Array:
+        residual = project_out_zeros(measured - prediction, o)
+        return session.values - o.rows(residual)
+
+    nominal = fitted(problem.predict(problem.reference))
+    try:
+        by_linear = fitted(problem.predict(fit.linear))
+    except ClosureError:  # the linearised machine cannot be assembled
+        by_linear = np.full(len(session.readings), np.nan)
+    predicted = fitted(fit.prediction)
+    return tuple(
+        ResidualRow(
+            setup=r.setup,
+            posture=r.posture,
+            minus=r.minus,
+            cycle=r.cycle,
+            measured=r.value,
+            nominal=float(nominal[i]),
+            linear=float(by_linear[i]),
+            predicted=float(predicted[i]),
+            line=r.line,
+            studentised=float(diagnostics.studentised[i]),
+            influence=float(diagnostics.influence[i]),
+            influenced=problem.free[diagnostics.influenced[i]],
+        )
+        for i, r in enumerate(session.readings)
+    )
+
+
+def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
+    o = fit.problem.observations
     zeros = {
-        name: float(solution.zeros[i])
+        name: float(fit.solution.zeros[i])
         for i, (name, real) in enumerate(zip(o.zero_setup, o.zero_real, strict=True))
         if real
     }
     return tuple(
         SetupRecord(s.name, s.leg, s.direction, s.section.form, s.section.value, zeros.get(s.name))
-        for s in problem.session.setups.values()
+        for s in fit.problem.session.setups.values()
     )

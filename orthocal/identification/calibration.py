@@ -17,162 +17,27 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.documents import write_text
 from orthocal.errors import CalibrationFileError, ParameterError, RobotError
-from orthocal.identification.uncertainty import NoiseSource, confidence_factor
+from orthocal.identification.identifiability import Combination, Identifiability
+from orthocal.identification.records import (
+    ControllerEntry,
+    NoiseRecord,
+    ParameterEstimate,
+    PostureRecord,
+    ResidualRow,
+    RobotRecord,
+    SessionRecord,
+    SetupRecord,
+    SolverRecord,
+)
+from orthocal.identification.uncertainty import confidence_factor
+from orthocal.identification.unmodelled import Unmodelled
 from orthocal.robot.assembly import Assembly
 from orthocal.robot.loading import load_robot, packaged_robots
 from orthocal.robot.model import Robot
-from orthocal.robot.parameters import InUnit, Unit
 
 Array = NDArray[np.float64]
 
 SCHEMA = "orthocal/calibration/1"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RobotRecord:
-    """The robot that was calibrated."""
-
-    name: str
-    reference: str
-    """As the session names it: a packaged name or a path."""
-    folder: str | None
-    """Folder of a robot that does not come with orthocal."""
-    sha256: str
-    """Of its URDF and YAML."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SessionRecord:
-    """The session that it was calibrated from."""
-
-    path: str | None
-    title: str
-    source: str
-    sha256: str
-    gauge_sigma: float | None
-    """[m]."""
-    gauge_resolution: float | None
-    """[m]."""
-    controller_offsets: tuple[float, ...] | None
-    """Offsets active in the controller, [m, rad]; None where not stated."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SolverRecord:
-    """How the exact solution was found."""
-
-    name: str
-    status: str
-    iterations: int
-    seconds: float
-    """Building and solving."""
-    hessian: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ParameterEstimate(InUnit):
-    """One error parameter."""
-
-    name: str
-    unit: Unit
-    value: float
-    """Exact estimate, [unit]."""
-    linear: float
-    """Linearised estimate, [unit]."""
-    std: float
-    """Standard deviation, [unit]; NaN if nothing tells."""
-    tolerance: float
-    """One standard deviation before the calibration, [unit]."""
-    free: bool
-    identifiable: bool
-    """Whether the readings alone tell it better than its tolerance."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NoiseRecord:
-    """Standard deviation of one reading of the indicator; see `uncertainty.Noise`."""
-
-    reading_sigma: float
-    """[m]; a difference of two readings has √2 of it."""
-    source: NoiseSource
-    cycles_sigma: float
-    cycles_dof: int
-    residual_sigma: float
-    residual_dof: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ResidualRow:
-    """One row of the session's readings; measured = nominal + deviation = predicted + residual."""
-
-    setup: str
-    posture: str
-    minus: str | None
-    cycle: int
-    measured: float
-    """[m]."""
-    nominal: float
-    """What the machine would show as the controller knows it, with the best gauge zero, [m]."""
-    linear: float
-    """The same for the linearised estimate, [m]."""
-    predicted: float
-    """The same for the calibrated machine, [m]."""
-
-    @property
-    def deviation(self) -> float:
-        """Measured less nominal, [m]: the residual before calibration."""
-        return self.measured - self.nominal
-
-    @property
-    def residual(self) -> float:
-        """Measured less predicted, [m]: the residual after calibration."""
-        return self.measured - self.predicted
-
-    @property
-    def label(self) -> str:
-        """Setup and postures in words."""
-        return f"{self.setup} {self.posture}" + (f" − {self.minus}" if self.minus else "")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PostureRecord:
-    """A posture of the session."""
-
-    name: str
-    drives: tuple[float, ...]
-    """Commanded drive coordinates, controller offsets taken off, [m, rad]."""
-    passive: tuple[float, ...]
-    """Passive coordinates of the calibrated machine, [m, rad]."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SetupRecord:
-    """A setup of the session."""
-
-    name: str
-    leg: str
-    direction: str
-    section_form: str
-    section_value: float
-    """[m], or 1 for a fraction."""
-    zero: float | None
-    """Estimated zero of the gauge, [m]; None where only differences were given."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ControllerEntry:
-    """What to enter into the controller for one drive."""
-
-    drive: str
-    unit: Unit
-    active: float | None
-    """Offset now in the controller, [unit]; None where the session does not say."""
-    enter: float
-    """Offset to enter, [unit]; what to add to the present one where that is not known."""
-    change: float
-    """enter − active, [unit]."""
-    std: float
-    """[unit]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,6 +54,12 @@ class Calibration:
     """Free parameters, then those held at a known value."""
     covariance: Array
     """Of the free parameters, shape (n_free, n_free), [SI]."""
+    unmodelled: Unmodelled
+    """What errors that were not free do to the estimate."""
+    identifiability: Identifiability
+    """What the readings tell, and what they cannot tell apart."""
+    base: bool
+    """Whether free parameters are base parameters: each the value of a whole combination."""
     noise: NoiseRecord
     sigma: float
     """Standard deviation of one row of the readings, [m]: of a difference where all are."""
@@ -196,6 +67,8 @@ class Calibration:
     """Degrees of freedom of sigma."""
     rows_are_differences: bool
     residuals: tuple[ResidualRow, ...]
+    critical: float
+    """Studentised residuals beyond this are suspicious; infinite if nothing tells the noise."""
     postures: tuple[PostureRecord, ...]
     setups: tuple[SetupRecord, ...]
     version: str
@@ -219,6 +92,40 @@ class Calibration:
     def errors(self) -> dict[str, float]:
         """Parameter name to exact estimate, [SI]."""
         return {p.name: p.value for p in self.parameters}
+
+    @property
+    def standard_deviations(self) -> Array:
+        """Of the free parameters, shape (n_free,), [SI]."""
+        return np.array([p.std for p in self.free])
+
+    @property
+    def correlation(self) -> Array:
+        """Correlation of the free parameters, shape (n_free, n_free); NaN at a bound."""
+        std = self.standard_deviations
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(self.covariance / np.outer(std, std))
+
+    def correlated(self, *, above: float = 0.5) -> tuple[tuple[str, str, float], ...]:
+        """Pairs of free parameters with a correlation above a size, strongest first."""
+        names = [p.name for p in self.free]
+        matrix = np.nan_to_num(self.correlation)
+        pairs = [
+            (names[i], names[j], float(matrix[i, j]))
+            for i, j in zip(*np.nonzero(np.triu(np.abs(matrix) > above, 1)), strict=True)
+        ]
+        return tuple(sorted(pairs, key=lambda p: -abs(p[2])))
+
+    @property
+    def suspicious(self) -> tuple[ResidualRow, ...]:
+        """Rows that all the others contradict, the worst first."""
+        rows = [r for r in self.residuals if abs(r.studentised) > self.critical]
+        return tuple(sorted(rows, key=lambda r: -abs(r.studentised)))
+
+    def where(self, row: ResidualRow) -> str:
+        """File and line of a row, for messages."""
+        if self.session.readings_path is None or row.line is None:
+            return f"reading {row.label}"
+        return f"{self.session.readings_path}:{row.line}"
 
     @property
     def rms_before(self) -> float:
@@ -322,12 +229,21 @@ class Calibration:
             "covariance": [[_number(v) for v in row] for row in self.covariance.tolist()],
             "sigma": _number(self.sigma),
             "dof": _number(self.dof),
+            "unmodelled": {
+                "names": list(self.unmodelled.names),
+                "tolerances": self.unmodelled.tolerances.tolist(),
+                "leakage": self.unmodelled.leakage.tolist(),
+                "residual_rms": self.unmodelled.residual_rms,
+            },
+            "identifiability": _identifiability_document(self.identifiability),
+            "base": self.base,
             "noise": _plain(self.noise),
             "rows_are_differences": self.rows_are_differences,
             "rms_before": self.rms_before,
             "rms_after": self.rms_after,
             "largest_before": self.largest_before,
             "largest_after": self.largest_after,
+            "critical": _number(self.critical),
             "residuals": [{**_plain(r), "residual": r.residual} for r in self.residuals],
             "postures": [_plain(p) for p in self.postures],
             "setups": [_plain(s) for s in self.setups],
@@ -382,12 +298,6 @@ class Calibration:
     def _check_against(self, robot: Robot) -> None:
         """Refuse names and numbers that do not fit the robot: a file can be edited."""
         prefix = "" if self.path is None else f"{self.path}: "
-        if self.model not in robot.parameters.models:
-            raise CalibrationFileError(
-                f"'{self.model}' is not a model of this robot; "
-                f"models: {', '.join(robot.parameters.models)}",
-                where=f"{prefix}model",
-            )
         for i, p in enumerate(self.parameters):
             where = f"{prefix}parameters[{i}]"
             try:
@@ -398,6 +308,13 @@ class Calibration:
                 raise CalibrationFileError(
                     f"found '{p.unit}'; {p.name} is in {known.unit}", where=f"{where}.unit"
                 )
+        for i, name in enumerate(self.unmodelled.names):
+            try:
+                robot.parameters[name]
+            except ParameterError as e:
+                raise CalibrationFileError(
+                    e.problem, where=f"{prefix}unmodelled.names[{i}]"
+                ) from None
         offsets = self.session.controller_offsets
         if offsets is not None and len(offsets) != len(robot.drives):
             raise CalibrationFileError(
@@ -405,6 +322,25 @@ class Calibration:
                 f"{', '.join(d.name for d in robot.drives)}",
                 where=f"{prefix}session.controller_offsets",
             )
+
+
+def _identifiability_document(found: Identifiability) -> dict[str, Any]:
+    def combination(c: Combination) -> list[list[Any]]:
+        return [[name, coefficient] for name, coefficient in c.terms]
+
+    return {
+        "singular_values": found.singular_values.tolist(),
+        "threshold": found.threshold,
+        "rank": found.rank,
+        "structural_rank": found.structural_rank,
+        "condition": _number(found.condition),
+        "observability": found.observability,
+        "n_postures": found.n_postures,
+        "unseen": list(found.unseen),
+        "told": list(found.told),
+        "alike": [combination(c) for c in found.alike],
+        "base": [combination(c) for c in found.base],
+    }
 
 
 def _rms(values: list[float]) -> float:

@@ -10,11 +10,11 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from orthocal.documents import Number, exists, is_folder, read_json, validate
+from orthocal.documents import Number, PositiveNumber, exists, is_folder, read_json, validate
 from orthocal.errors import CalibrationFileError
-from orthocal.identification.calibration import (
-    SCHEMA,
-    Calibration,
+from orthocal.identification.calibration import SCHEMA, Calibration
+from orthocal.identification.identifiability import Combination, Identifiability
+from orthocal.identification.records import (
     NoiseRecord,
     ParameterEstimate,
     PostureRecord,
@@ -24,11 +24,15 @@ from orthocal.identification.calibration import (
     SetupRecord,
     SolverRecord,
 )
+from orthocal.identification.unmodelled import Unmodelled
 from orthocal.robot.model import read_only
 
 
 class _Keys(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+Terms = Annotated[list[tuple[str, Number]], Field(min_length=1)]
 
 
 class _RobotKeys(_Keys):
@@ -40,6 +44,7 @@ class _RobotKeys(_Keys):
 
 class _SessionKeys(_Keys):
     path: str | None
+    readings_path: str | None
     title: str
     source: str
     sha256: str
@@ -52,8 +57,11 @@ class _SolverKeys(_Keys):
     name: str
     status: str
     iterations: int
-    seconds: Number
+    seconds_build: Number
+    seconds_solve: Number
     hessian: str
+    loss: Literal["squares", "huber"]
+    loss_width: PositiveNumber
 
 
 class _ParameterKeys(_Keys):
@@ -65,6 +73,13 @@ class _ParameterKeys(_Keys):
     tolerance: Number
     free: bool
     identifiable: bool
+    start: Number
+    prior: bool
+    mean: Number
+    lower: Number | None
+    upper: Number | None
+    at_bound: Literal["lower", "upper"] | None
+    interval: tuple[Number, Number] | None
 
 
 class _NoiseKeys(_Keys):
@@ -83,8 +98,12 @@ class _ResidualKeys(_Keys):
     cycle: int
     measured: Number
     nominal: Number
-    linear: Number
+    linear: Number | None
     predicted: Number
+    line: int | None
+    studentised: Number | None
+    influence: Number
+    influenced: str
     residual: Number
 
 
@@ -103,6 +122,35 @@ class _SetupKeys(_Keys):
     zero: Number | None
 
 
+class _UnmodelledKeys(_Keys):
+    names: list[str]
+    tolerances: list[PositiveNumber]
+    leakage: list[list[Number]]
+    residual_rms: Number
+
+
+class _ObservabilityKeys(_Keys):
+    O1: Number
+    O2: Number
+    O3: Number
+    O4: Number
+    O5: Number
+
+
+class _IdentifiabilityKeys(_Keys):
+    singular_values: Annotated[list[Number], Field(min_length=1)]
+    threshold: Number
+    rank: Annotated[int, Field(ge=0)]
+    structural_rank: Annotated[int, Field(ge=0)]
+    condition: Number | None
+    observability: _ObservabilityKeys
+    n_postures: Annotated[int, Field(ge=1)]
+    unseen: list[str]
+    told: list[str]
+    alike: list[Terms]
+    base: list[Terms]
+
+
 class _CalibrationKeys(_Keys):
     schema_: Annotated[Literal["orthocal/calibration/1"], Field(alias="schema")]
     orthocal: str
@@ -113,6 +161,9 @@ class _CalibrationKeys(_Keys):
     solver: _SolverKeys
     parameters: Annotated[list[_ParameterKeys], Field(min_length=1)]
     covariance: list[list[Number | None]]
+    unmodelled: _UnmodelledKeys
+    identifiability: _IdentifiabilityKeys
+    base: bool
     sigma: Number | None
     dof: Number | None
     noise: _NoiseKeys
@@ -121,6 +172,7 @@ class _CalibrationKeys(_Keys):
     rms_after: Number
     largest_before: Number
     largest_after: Number
+    critical: Number | None
     residuals: list[_ResidualKeys]
     postures: list[_PostureKeys]
     setups: list[_SetupKeys]
@@ -155,6 +207,7 @@ def load_calibration(path: str | Path) -> Calibration:
             f"expected {len(free)} × {len(free)} numbers, as free parameters",
             where=f"{file}: covariance",
         )
+    _check_unmodelled(keys.unmodelled, len(free), file)
     names = [p.name for p in keys.parameters]
     for i, name in enumerate(names):
         if name in names[:i]:
@@ -191,10 +244,16 @@ def load_calibration(path: str | Path) -> Calibration:
         sigma=_float(keys.sigma),
         dof=math.inf if keys.dof is None else keys.dof,
         rows_are_differences=keys.rows_are_differences,
-        residuals=tuple(
-            ResidualRow(**{k: v for k, v in r.model_dump().items() if k != "residual"})
-            for r in keys.residuals
+        unmodelled=Unmodelled(
+            names=tuple(keys.unmodelled.names),
+            tolerances=read_only(keys.unmodelled.tolerances),
+            leakage=read_only(np.array(keys.unmodelled.leakage).reshape(len(free), -1)),
+            residual_rms=keys.unmodelled.residual_rms,
         ),
+        identifiability=_identifiability(keys.identifiability),
+        base=keys.base,
+        residuals=tuple(_residual(r) for r in keys.residuals),
+        critical=math.inf if keys.critical is None else keys.critical,
         postures=tuple(
             PostureRecord(p.name, tuple(p.drives), tuple(p.passive)) for p in keys.postures
         ),
@@ -202,6 +261,41 @@ def load_calibration(path: str | Path) -> Calibration:
         version=keys.orthocal,
         path=file,
     )
+
+
+def _check_unmodelled(keys: _UnmodelledKeys, n_free: int, file: Path) -> None:
+    count = len(keys.names)
+    if len(keys.tolerances) != count:
+        raise CalibrationFileError(
+            f"has {len(keys.tolerances)} numbers; expected {count}, as names",
+            where=f"{file}: unmodelled.tolerances",
+        )
+    if len(keys.leakage) != n_free or any(len(row) != count for row in keys.leakage):
+        raise CalibrationFileError(
+            f"expected {n_free} × {count} numbers, free parameters by names",
+            where=f"{file}: unmodelled.leakage",
+        )
+
+
+def _identifiability(keys: _IdentifiabilityKeys) -> Identifiability:
+    return Identifiability(
+        singular_values=read_only(keys.singular_values),
+        threshold=keys.threshold,
+        rank=min(keys.rank, len(keys.singular_values)),
+        structural_rank=keys.structural_rank,
+        n_postures=keys.n_postures,
+        unseen=tuple(keys.unseen),
+        told=tuple(keys.told),
+        alike=tuple(Combination(tuple(terms)) for terms in keys.alike),
+        base=tuple(Combination(tuple(terms)) for terms in keys.base),
+    )
+
+
+def _residual(keys: _ResidualKeys) -> ResidualRow:
+    values = keys.model_dump(exclude={"residual"})
+    for name in ("linear", "studentised"):
+        values[name] = _float(values[name])
+    return ResidualRow(**values)
 
 
 def _float(value: float | None) -> float:

@@ -10,7 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import NotIdentifiableError
 from orthocal.identification.problem import CalibrationProblem
-from orthocal.identification.uncertainty import RANK_THRESHOLD, project_out_zeros
+from orthocal.identification.uncertainty import (
+    RANK_THRESHOLD,
+    Information,
+    decompose,
+    project_out_zeros,
+)
 from orthocal.robot.orthoglide import displacement_angle
 
 Array = NDArray[np.float64]
@@ -145,10 +150,68 @@ def solve_equation_8(
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearisation:
+    """A problem to first order about what the controller already corrects."""
+
+    problem: CalibrationProblem
+    residual: Array
+    """y − h there, less the mean of those with the same gauge zero, shape (n_entries,), [m]."""
+    slopes: Array
+    """dh/dθ̂ there, zeros eliminated likewise, shape (n_entries, n_free), [m per tolerance]."""
+    information: Information
+
+    def solve(self, *, sigma: float, use: NDArray[np.bool_] | None = None) -> Array:
+        """First-order solution: generalised least squares with the problem's prior and bounds.
+
+        Args:
+            sigma: Standard deviation of one reading, [m]; matters only beside a prior.
+            use: Which entries to use, shape (n_entries,): whole groups with a common zero.
+
+        Returns:
+            Free parameters, shape (n_free,), [SI].
+        """
+        problem = self.problem
+        chosen = slice(None) if use is None else use
+        slopes, residual = self.slopes[chosen], self.residual[chosen]
+        if len(slopes) > 2 * problem.n_free:  # the same normal equations from far fewer rows
+            stacked = np.asarray(np.linalg.qr(np.column_stack([slopes, residual]), mode="r"))
+            slopes, residual = stacked[:, :-1], stacked[:, -1]
+        reference = problem.reference / problem.theta_scale
+        weight = np.sqrt(problem.prior_precision)
+        if problem.prior:
+            expected = problem.prior_mean / problem.theta_scale
+            slopes = np.vstack([slopes / sigma, np.diag(weight)])
+            residual = np.concatenate([residual / sigma, weight * (expected - reference)])
+        selection = problem.selection
+        lower, upper = selection.lower, selection.upper
+        if np.isfinite(lower).any() or np.isfinite(upper).any():
+            from scipy.optimize import lsq_linear
+
+            limits = [b / problem.theta_scale - reference for b in (lower, upper)]
+            step = lsq_linear(slopes, residual, bounds=limits, method="bvls").x
+        else:
+            step = np.linalg.lstsq(slopes, residual, rcond=RANK_THRESHOLD)[0]
+        return np.asarray((reference + step) * problem.theta_scale)
+
+
+def linearise_at_reference(problem: CalibrationProblem) -> Linearisation:
+    """A problem to first order about what the controller already corrects.
+
+    Raises:
+        ClosureError: If the reference machine cannot reach a posture.
+    """
+    prediction, jacobian = problem.linearise(problem.reference)
+    return Linearisation(
+        problem,
+        project_out_zeros(problem.values - prediction, problem.observations),
+        project_out_zeros(jacobian, problem.observations),
+        decompose(jacobian, problem.observations),
+    )
+
+
 def solve_linearised(problem: CalibrationProblem, *, sigma: float) -> Array:
     """First-order solution of a problem about what the controller already corrects.
-
-    Generalised least squares, gauge zeros eliminated, with the problem's prior.
 
     Args:
         problem: The problem.
@@ -160,12 +223,4 @@ def solve_linearised(problem: CalibrationProblem, *, sigma: float) -> Array:
     Raises:
         ClosureError: If the reference machine cannot reach a posture.
     """
-    prediction, jacobian = problem.linearise(problem.reference)
-    residual = project_out_zeros(problem.values - prediction, problem.observations)
-    slopes = project_out_zeros(jacobian, problem.observations)
-    reference = problem.reference / problem.theta_scale
-    if problem.prior:
-        slopes = np.vstack([slopes / sigma, np.eye(problem.n_free)])
-        residual = np.concatenate([residual / sigma, -reference])
-    step = np.linalg.lstsq(slopes, residual, rcond=RANK_THRESHOLD)[0]
-    return np.asarray((reference + step) * problem.theta_scale)
+    return linearise_at_reference(problem).solve(sigma=sigma)

@@ -9,6 +9,7 @@ gradient, Jacobian and Hessian of the whole by index: building does not grow wit
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import SolverError
+from orthocal.identification.loss import SQUARES, Loss
 from orthocal.identification.problem import LENGTH_SCALE, CalibrationProblem, ReadingPiece
 
 Array = NDArray[np.float64]
@@ -26,6 +28,9 @@ Hessian = Literal["gauss-newton", "exact"]
 FINEST_WEIGHT = 5e-6
 """Readings are weighted as if they had at least this standard deviation, [m], and the prior is
 scaled down with them: the same optimum, with rounding errors that stay below the tolerance."""
+
+LEFT_OUT = 1e-9
+"""Weight of readings that are left out: next to nothing, and their gauge zeros stay determined."""
 
 CONVERGED = frozenset({"Solve_Succeeded"})
 """Ipopt's words for a solution; anything else is an error."""
@@ -46,6 +51,8 @@ class SolverOptions:
     max_iterations: int = 200
     print_level: int = 0
     """Ipopt's own printing, 0 (none) to 12."""
+    loss: Loss = SQUARES
+    """What a residual costs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +66,7 @@ class Solution:
     passive: Array
     """Passive coordinates, shape (n_postures, n_passive), [m, rad]."""
     objective: float
-    """½ Σ ((y − h − z)/σ)², and the prior's share."""
+    """Σ ρ((y − h − z)/σ), and the prior's share."""
     status: str
     """Ipopt's own word."""
     iterations: int
@@ -67,6 +74,8 @@ class Solution:
     seconds_solve: float
     closure: float
     """Largest closure residual that is left, rotations times characteristic length, [m]."""
+    at_bound: NDArray[np.int8]
+    """-1 where a parameter is held by its lower bound, 1 by its upper one, else 0, (n_free,)."""
 
 
 class _Gather:
@@ -140,6 +149,8 @@ class NonlinearProgram:
         values: ArrayLike | None = None,
         start: ArrayLike | None = None,
         start_passive: Array | None = None,
+        left_out: ArrayLike | None = None,
+        held: Mapping[int, float] | None = None,
     ) -> Solution:
         """Solve for given readings.
 
@@ -149,13 +160,21 @@ class NonlinearProgram:
             start: Free parameters to start from, shape (n_free,), [SI]; by default what the
                 controller already corrects.
             start_passive: Passive coordinates to start closing the loops from.
+            left_out: Entries not to be used, as indices.
+            held: Index of a free parameter to the value it is held at, [SI].
 
         Raises:
             SolverError: If Ipopt does not converge.
             ClosureError: If the machine cannot reach a posture with the start values.
         """
         problem = self.problem
+        lower, upper = (self._bounds(side, held or {}) for side in ("lower", "upper"))
         theta = np.array(problem.reference if start is None else start, dtype=np.float64)
+        theta = np.clip(
+            theta,
+            lower[: self._n_theta] * problem.theta_scale,
+            upper[: self._n_theta] * problem.theta_scale,
+        )
         passive = problem.close(theta, start=start_passive)
         y = problem.values if values is None else np.asarray(values, dtype=np.float64)
         residual = y - problem.predict(theta, passive)
@@ -169,11 +188,14 @@ class NonlinearProgram:
                 (passive / problem.passive_scale).reshape(-1),
             ]
         )
-        weighted = max(sigma, FINEST_WEIGHT)
-        scale = (sigma / weighted) ** 2
         began = time.perf_counter()
         answer = self._solver(
-            x0=x0, p=np.concatenate([y, [weighted, scale * problem.prior]]), lbg=0.0, ubg=0.0
+            x0=x0,
+            p=self.pack(sigma=sigma, values=y, left_out=left_out),
+            lbx=lower,
+            ubx=upper,
+            lbg=0.0,
+            ubg=0.0,
         )
         seconds = time.perf_counter() - began
         stats = self._solver.stats()
@@ -187,22 +209,51 @@ class NonlinearProgram:
             )
         x = np.asarray(answer["x"].full()).reshape(-1)
         closures = np.abs(np.asarray(answer["g"].full())).max(initial=0.0)
+        pull = np.asarray(answer["lam_x"].full()).reshape(-1)[: self._n_theta]
         return Solution(
             theta=x[: self._n_theta] * problem.theta_scale,
             zeros=x[self._n_theta : self._n_theta + self._n_zeros] * LENGTH_SCALE,
             passive=x[self._n_theta + self._n_zeros :].reshape(-1, self._n_passive)
             * problem.passive_scale,
-            objective=float(answer["f"]) / scale,
+            objective=float(answer["f"]) / _weighting(sigma)[1],
             status=status,
             iterations=iterations,
             seconds_build=self.seconds_build,
             seconds_solve=seconds,
             closure=float(closures) * LENGTH_SCALE,
+            at_bound=_at_bound(x[: self._n_theta], pull, lower, upper, held or {}),
         )
+
+    def pack(
+        self, *, sigma: float, values: Array | None = None, left_out: ArrayLike | None = None
+    ) -> Array:
+        """The program's parameters p: readings, their weights, σ, the prior's scale, the width.
+
+        Args:
+            sigma: Standard deviation of one reading, [m].
+            values: Readings as single ones, shape (n_entries,), [m]; the session's by default.
+            left_out: Entries not to be used, as indices.
+        """
+        y = self.problem.values if values is None else values
+        weights = np.ones(y.size)
+        if left_out is not None:
+            weights[np.asarray(left_out, dtype=np.int64)] = LEFT_OUT
+        weighted, scale = _weighting(sigma)
+        width = self.options.loss.width * sigma / weighted
+        return np.concatenate([y, weights, [weighted, scale, width]])
 
     def functions(self) -> dict[str, ca.Function]:
         """The program's functions of (x, p[, lam_f, lam_g]), for checks of their derivatives."""
         return dict(self._functions)
+
+    def _bounds(self, side: Literal["lower", "upper"], held: Mapping[int, float]) -> Array:
+        """Bounds of all variables, scaled: only parameters have any."""
+        problem = self.problem
+        k = problem.n_postures * self._n_passive + self._n_zeros
+        own = getattr(problem.selection, side) / problem.theta_scale
+        for i, value in held.items():
+            own[i] = value / problem.theta_scale[i]
+        return np.concatenate([own, np.full(k, -np.inf if side == "lower" else np.inf)])
 
     def _build(self) -> None:
         problem = self.problem
@@ -211,18 +262,19 @@ class NonlinearProgram:
         n = n_fixed + k * self._n_passive
         x = ca.MX.sym("x", n)
         entries = problem.observations.size
-        p = ca.MX.sym("p", entries + 2)
+        p = ca.MX.sym("p", 2 * entries + 3)
         lam_f = ca.MX.sym("lam_f")
         lam_g = ca.MX.sym("lam_g", k * problem.robot.closure_rows)
         theta = x[: self._n_theta]
-        prior = p[entries + 1]
+        prior = p[2 * entries + 1] * ca.DM(problem.prior_precision)
+        from_mean = theta - ca.DM(problem.prior_mean / problem.theta_scale)
 
         shared = list(self._shared_call(theta))
-        objective = 0.5 * prior * ca.dot(theta, theta)
+        objective = 0.5 * ca.dot(prior * from_mean, from_mean)
         gradient, hessian = _Gather(n, 1), _Gather(n, n)
         diagonal = np.arange(self._n_theta)
-        gradient.add(diagonal, np.zeros_like(diagonal), prior * theta)
-        hessian.add(diagonal, diagonal, lam_f * ca.repmat(prior, self._n_theta, 1))
+        gradient.add(diagonal, np.zeros_like(diagonal), prior * from_mean)
+        hessian.add(diagonal, diagonal, lam_f * prior)
         for piece in problem.reading_pieces:
             objective += self._add_readings(piece, x, p, shared, lam_f, gradient, hessian)
         constraints, jacobian = self._add_closures(x, lam_g, shared, hessian)
@@ -305,10 +357,11 @@ class NonlinearProgram:
             x[local[:, 0].tolist()].T,
             ca.reshape(x[local[:, 1:].reshape(-1).tolist()], -1, count),
             p[piece.entries.tolist()].T,
+            p[(o.size + piece.entries).tolist()].T,
             ca.MX(ca.DM(problem.drives[postures].T)),
             ca.MX(ca.DM(problem.setup_columns[o.setup[piece.entries]].T)),
         ]
-        common = [p[problem.observations.size], *shared]
+        common = [p[2 * o.size], p[2 * o.size + 2], *shared]
         arguments = [*own, *common]
         masks = [*(False for _ in own), *(True for _ in common)]
         functions = self._reading_functions(piece)
@@ -328,16 +381,22 @@ class NonlinearProgram:
 
     def _reading_functions(self, piece: ReadingPiece) -> dict[str, ca.Function]:
         """Objective, gradient (by θ̂; by ẑ and q̂) and Hessian (θ̂ with θ̂; the rest) of one."""
-        zero, y, sigma = ca.SX.sym("zero"), ca.SX.sym("y"), ca.SX.sym("sigma")
+        zero, y, weight = ca.SX.sym("zero"), ca.SX.sym("y"), ca.SX.sym("weight")
+        sigma, width, loss = ca.SX.sym("sigma"), ca.SX.sym("width"), self.options.loss
         n_t = piece.theta_index.size
         residual = (y - piece.reading - zero * LENGTH_SCALE) / sigma
         slope = -ca.horzcat(piece.by_theta, LENGTH_SCALE, piece.by_passive) / sigma
         slope = ca.densify(slope)
-        gradient = (residual * slope).T
-        second = slope.T @ slope
-        if self.options.hessian == "exact":
-            second += residual * self._reading_curvature(piece) / -sigma
-        inputs = [zero, piece.passive, y, piece.drives, piece.setup, sigma]
+        pull = weight * loss.slope(residual, width)
+        gradient = (pull * slope).T
+        exact = self.options.hessian == "exact"
+        # Gauss-Newton takes the secant ρ'/r, which is never below ρ'': far out, where ρ is nearly
+        # straight, a step by ρ'' goes much too far
+        bend = loss.curvature(residual, width) if exact else loss.secant(residual, width)
+        second = weight * bend * (slope.T @ slope)
+        if exact:
+            second += pull * self._reading_curvature(piece) / -sigma
+        inputs = [zero, piece.passive, y, weight, piece.drives, piece.setup, sigma, width]
         inputs += self.problem.shared.symbols
 
         def pick(rows: Indices, columns: Indices) -> ca.SX:
@@ -345,7 +404,7 @@ class NonlinearProgram:
 
         triangle = _triangle(n_t), _rest_of_triangle(slope.numel(), n_t)
         outputs = {
-            "objective": [0.5 * residual**2],
+            "objective": [weight * loss.cost(residual, width)],
             "gradient": [gradient[:n_t], gradient[n_t:]],
             "hessian": [pick(*triangle[0]), pick(*triangle[1])],
         }
@@ -427,6 +486,23 @@ class NonlinearProgram:
         hessian.add(rows[summed_part], columns[summed_part], summed)
         rest = variables[:, rows[~summed_part]], variables[:, columns[~summed_part]]
         hessian.add(*rest, ca.vec(local))
+
+
+def _weighting(sigma: float) -> tuple[float, float]:
+    """Standard deviation that readings are weighted by, and the scale of the whole objective."""
+    weighted = max(sigma, FINEST_WEIGHT)
+    return weighted, (sigma / weighted) ** 2
+
+
+def _at_bound(
+    theta: Array, pull: Array, lower: Array, upper: Array, held: Mapping[int, float]
+) -> NDArray[np.int8]:
+    """Which parameters their bounds hold: the multiplier outweighs what is left of the way."""
+    result = np.zeros(theta.size, dtype=np.int8)
+    result[-pull > np.abs(theta - lower[: theta.size])] = -1
+    result[pull > np.abs(theta - upper[: theta.size])] = 1
+    result[list(held)] = 0
+    return result
 
 
 def _triangle(n: int) -> tuple[Indices, Indices]:

@@ -1,6 +1,6 @@
 """The calibration problem: which errors are free, and the scaled pieces its solvers are made of.
 
-    min over θ, z, q_1..q_K   ½ Σ ((y − h(q_k, θ) − z)/σ)² + ½ Σ (θ/tolerance)²
+    min over θ, z, q_1..q_K   Σ ρ((y − h(q_k, θ) − z)/σ) + ½ Σ ((θ − mean)/tolerance)²
     s.t.                      g(q_k, θ) = 0 for every posture k
 
 A problem is made of two kinds of piece: one posture (its closures) and one reading of a leg. Both
@@ -12,14 +12,15 @@ are CasADi expressions in scaled variables of order one:
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.errors import RobotError, SessionError
+from orthocal.errors import RobotError
+from orthocal.identification.selection import Known, Selection, select_parameters
 from orthocal.measurement.gauge import (
     Observations,
     build_observations,
@@ -32,7 +33,7 @@ from orthocal.measurement.session import Session
 from orthocal.robot.assembly import Assembly
 from orthocal.robot.batch import BatchFunction
 from orthocal.robot.model import Robot
-from orthocal.robot.parameters import AXES, Parameter
+from orthocal.robot.parameters import AXES
 from orthocal.robot.slopes import SharedPlacements
 from orthocal.robot.symbolic import SymbolicRobot, closure_row_units, coordinate_units
 
@@ -41,9 +42,6 @@ Indices = NDArray[np.int64]
 
 LENGTH_SCALE = 1e-3
 """What closures, passive motions and gauge zeros are scaled by, [m]."""
-
-PRIOR_BY_DEFAULT = {"offsets": False}
-"""Models without a prior by default; all others have one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,49 +115,37 @@ class CalibrationProblem:
 
     Args:
         session: The session.
-        free: Names of the free parameters.
-        prior: Whether tolerances act as a prior with mean 0.
-        fixed: Known values of other parameters, [unit of the parameter].
-        tolerances: Other tolerances than the robot's, by name, [unit of the parameter].
+        selection: What is free, and what is known of it beforehand.
 
     Raises:
-        SessionError: If there is nothing to identify.
-        ParameterError: If a name is unknown.
+        RobotError: If closure rows of the robot depend on each other.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        *,
-        free: Sequence[str],
-        prior: bool,
-        fixed: Mapping[str, float] | None = None,
-        tolerances: Mapping[str, float] | None = None,
-    ) -> None:
-        if not free:
-            raise SessionError("no free parameters: there is nothing to identify")
+    def __init__(self, session: Session, selection: Selection) -> None:
         self.session = session
         self.robot = session.robot
-        self.free = tuple(free)
-        self.prior = prior
-        own = dict(tolerances or {})
-        self.parameters: tuple[Parameter, ...] = tuple(
-            replace(p, tolerance=own.get(p.name, p.tolerance))
-            for p in (self.robot.parameters[name] for name in self.free)
-        )
-        self.fixed = {k: v for k, v in (fixed or {}).items() if k not in self.free}
-        self.robot.parameters.expand(self.fixed)  # refuses unknown names
+        self.selection = selection
+        self.free = selection.names
+        self.parameters = selection.parameters
+        self.fixed = dict(selection.fixed)
         _require_independent_rows(self.robot)
         self.observations: Observations = build_observations(session)
         self.drives = drive_table(session)
         self.setup_columns = setup_columns(session)
-        self.theta_scale = np.array([p.tolerance for p in self.parameters])
+        self.theta_scale = selection.tolerances
+        self.prior_precision = selection.prior.astype(np.float64)
+        self.prior_mean = np.where(selection.prior, selection.mean, 0.0)
         self.passive_scale = LENGTH_SCALE / coordinate_units(self.robot)[self.robot.passive_index]
 
     @property
     def n_free(self) -> int:
         """Number of free parameters."""
         return len(self.free)
+
+    @property
+    def prior(self) -> bool:
+        """Whether any parameter has a prior."""
+        return bool(self.prior_precision.any())
 
     @property
     def n_postures(self) -> int:
@@ -180,7 +166,8 @@ class CalibrationProblem:
                 strict=True,
             )
         )
-        return np.array([active.get(name, 0.0) for name in self.free])
+        at = np.array([active.get(name, 0.0) for name in self.free])
+        return np.asarray(np.clip(at, self.selection.lower, self.selection.upper))
 
     @cached_property
     def values(self) -> Array:
@@ -468,25 +455,24 @@ class CalibrationProblem:
 def build_problem(
     session: Session,
     *,
-    model: str = "offsets",
+    model: str | None = None,
+    free: Sequence[str] = (),
     prior: bool | None = None,
-    fixed: Mapping[str, float] | None = None,
+    known: Mapping[str, Known] | None = None,
+    tolerances: Mapping[str, float] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> CalibrationProblem:
-    """The problem of a named model of the robot.
-
-    Args:
-        session: The session.
-        model: A model of the robot's YAML.
-        prior: Whether tolerances act as a prior; by default not for `offsets`, else yes.
-        fixed: Known values of parameters, which are then not free, [SI].
-
-    Raises:
-        ParameterError: If the robot has no such model.
-    """
-    known = dict(fixed or {})
-    free = [n for n in session.robot.parameters.select_model(model) if n not in known]
-    use_prior = PRIOR_BY_DEFAULT.get(model, True) if prior is None else prior
-    return CalibrationProblem(session, free=free, prior=use_prior, fixed=known)
+    """The problem of a model of the robot; arguments as for `select_parameters`."""
+    selection = select_parameters(
+        session.robot.parameters,
+        model=model,
+        free=free,
+        prior=prior,
+        known=known,
+        tolerances=tolerances,
+        bounds=bounds,
+    )
+    return CalibrationProblem(session, selection)
 
 
 def _require_independent_rows(robot: Robot) -> None:

@@ -139,8 +139,10 @@ def estimate_noise(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Information:
-    """Singular value decomposition of the identification Jacobian, zeros eliminated."""
+    """What the readings say of the parameters: the identification Jacobian, zeros eliminated."""
 
+    factor: Array
+    """A matrix with the same product FᵀF as the Jacobian, shape (n, n_free), [m per tolerance]."""
     singular_values: Array
     """Descending, shape (n_free,), padded with zeros, [m per tolerance]."""
     directions: Array
@@ -172,19 +174,51 @@ class Information:
         variance[told] = (sigma / self.singular_values[told]) ** 2
         return np.asarray(((self.directions**2).T @ variance < 1.0) & self.identifiable)
 
-    def effective_parameters(self, *, sigma: float, prior: bool) -> float:
-        """Parameters that the readings determine: the rank, or the trace of the prior's share."""
-        if not prior:
-            return float(self.rank)
-        square = self.singular_values**2
-        return float((square / (square + sigma**2)).sum())
+    def effective_parameters(self, *, sigma: float, precision: Array) -> float:
+        """Parameters that the readings determine, n − tr(P cov): the rank without a prior.
 
-    def covariance(self, *, sigma: float, prior: bool) -> Array:
-        """Covariance of θ̂, (Jᵀ J/σ² + P)⁻¹ with P = 1 or 0, shape (n_free, n_free)."""
-        precision = (self.singular_values / sigma) ** 2 + float(prior)
+        Args:
+            sigma: Standard deviation of one reading, [m].
+            precision: Diagonal of P, what the prior knows: 1 or 0, shape (n_free,).
+        """
+        if not precision.any():
+            return float(self.rank)
+        covariance = self.covariance(sigma=sigma, precision=precision)
+        return float(len(precision) - precision @ np.diag(covariance))
+
+    def covariance(
+        self,
+        *,
+        sigma: float,
+        precision: Array,
+        held: NDArray[np.bool_] | None = None,
+        loss: tuple[float, float] = (1.0, 1.0),
+    ) -> Array:
+        """Covariance of θ̂, (Jᵀ J/σ² + P)⁻¹, shape (n_free, n_free).
+
+        With a robust loss it is A⁻¹ B A⁻¹, A = a Jᵀ J/σ² + P and B = b Jᵀ J/σ² + P (Huber, Robust
+        Statistics, 1981, section 7.6, with a prior).
+
+        Args:
+            sigma: Standard deviation of one reading, [m].
+            precision: Diagonal of P: 1 or 0, shape (n_free,).
+            held: Parameters that are held where they are, by a bound: no covariance.
+            loss: a, mean of ρ'', and b, mean square of ρ', of the residuals; 1 for squares.
+        """
+        free = np.ones(len(precision), dtype=bool) if held is None else ~held
+        rows = self.factor[:, free] / sigma
+        gain, noise = loss
+        prior = np.diag(np.sqrt(precision[free]))
+        stacked = np.vstack([np.sqrt(gain) * rows, prior])
+        _, values, directions = np.linalg.svd(stacked, full_matrices=False)
         with np.errstate(divide="ignore"):
-            variance = 1.0 / precision
-        return np.asarray((self.directions.T * variance) @ self.directions)
+            inverse = (directions.T / values**2) @ directions
+        if loss != (1.0, 1.0):
+            spread = np.hstack([np.sqrt(noise) * inverse @ rows.T, inverse @ prior])
+            inverse = spread @ spread.T
+        result = np.zeros((len(free), len(free)))
+        result[np.ix_(free, free)] = 0.5 * (inverse + inverse.T)
+        return result
 
 
 def decompose(jacobian: Array, observations: Observations) -> Information:
@@ -194,29 +228,38 @@ def decompose(jacobian: Array, observations: Observations) -> Information:
         jacobian: dh/dθ̂, shape (n_entries, n_free), [m per tolerance].
         observations: Which zero each entry has.
     """
-    projected = project_out_zeros(jacobian, observations)
-    if len(projected) > 2 * projected.shape[1]:  # same singular values, far fewer rows
-        projected = np.asarray(np.linalg.qr(projected, mode="r"))
-    _, values, directions = np.linalg.svd(projected, full_matrices=True)
-    padded = np.zeros(projected.shape[1])
+    factor = project_out_zeros(jacobian, observations)
+    if len(factor) > 2 * factor.shape[1]:  # same singular values, far fewer rows
+        factor = np.asarray(np.linalg.qr(factor, mode="r"))
+    _, values, directions = np.linalg.svd(factor, full_matrices=True)
+    padded = np.zeros(factor.shape[1])
     padded[: len(values)] = values
-    return Information(padded, directions)
+    return Information(factor, padded, directions)
 
 
 def require_identifiable(
-    information: Information, names: tuple[str, ...], *, where: str | None = None
+    information: Information,
+    names: tuple[str, ...],
+    *,
+    precision: Array,
+    where: str | None = None,
 ) -> None:
-    """Refuse a problem without prior whose readings leave parameters undetermined.
+    """Refuse parameters that neither readings nor a prior determine.
 
     Args:
         information: Of the readings.
         names: Of the free parameters.
+        precision: What the prior knows of each: 1 or 0, shape (n_free,).
         where: File, for messages.
 
     Raises:
         NotIdentifiableError: Naming the parameters.
     """
-    lost = tuple(n for n, ok in zip(names, information.identifiable, strict=True) if not ok)
+    largest = max(float(information.singular_values[0]), 1e-300)
+    stacked = np.vstack([information.factor / largest, np.diag(precision)])
+    _, values, directions = np.linalg.svd(stacked, full_matrices=False)
+    null = directions[values <= RANK_THRESHOLD * values[0]]
+    lost = tuple(n for n, size in zip(names, (null**2).sum(axis=0), strict=True) if size > 1e-12)
     if lost:
         raise NotIdentifiableError(
             f"the readings do not determine {', '.join(lost)}: "

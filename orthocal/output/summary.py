@@ -13,7 +13,8 @@ from rich.table import Table
 from rich.text import Text
 from scipy import special
 
-from orthocal.identification.calibration import Calibration, ResidualRow
+from orthocal.identification.calibration import Calibration
+from orthocal.identification.records import ResidualRow
 from orthocal.study.validation import Validation
 
 MANY_ROWS = 60
@@ -294,7 +295,7 @@ def _heading(calibration: Calibration) -> RenderableType:
     lines.append(
         Text(
             f"Solved: {len(calibration.free)} parameters, {prior}; Ipopt {solver.status}, "
-            f"{solver.iterations} iterations, {solver.seconds:.2f} s"
+            f"{solver.iterations} iterations, {solver.seconds_build + solver.seconds_solve:.2f} s"
         )
     )
     return Group(*lines)

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy import special
 
 from orthocal.errors import SessionError
-from orthocal.identification.calibrate import calibrate
-from orthocal.identification.calibration import Calibration, ResidualRow
+from orthocal.identification.calibrate import repeat_calibration
+from orthocal.identification.calibration import Calibration
+from orthocal.identification.records import ResidualRow
 from orthocal.identification.uncertainty import confidence_factor
 from orthocal.measurement.session import Session
 from orthocal.robot.model import read_only
@@ -163,8 +164,7 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         by_drive = {e.drive: e.enter for e in entries}
         offsets = np.array([by_drive.get(d.name, 0.0) for d in session.robot.drives])
         session = _with_controller(session, offsets)
-    fixed = {p.name: p.value for p in calibration.parameters if not p.free}
-    refit = calibrate(session, model=calibration.model, prior=calibration.prior, fixed=fixed)
+    refit = repeat_calibration(calibration, session)
     changes = _further_changes(calibration, refit)
     matched, correlation, cosine = _correlate(calibration.residuals, refit.residuals)
     dims = _residual_dimensions(refit, matched)

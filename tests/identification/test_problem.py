@@ -8,8 +8,8 @@ from derivatives import assert_derivative
 from tolerances import KINEMATICS
 
 from orthocal import load_plan
-from orthocal.errors import ParameterError, RobotError, SessionError
-from orthocal.identification.problem import CalibrationProblem, build_problem
+from orthocal.errors import ParameterError, RobotError
+from orthocal.identification.problem import build_problem
 from orthocal.measurement.gauge import build_observations, predict_entries
 
 
@@ -35,7 +35,7 @@ def test_the_implicit_jacobian_is_the_derivative(plan, model, size):
 
 def test_frames_and_scales_can_be_freed_too(plan):
     names = plan.robot.parameters.select(["*.offset", "*.scale", "frame.*"])
-    problem = CalibrationProblem(plan, free=names, prior=True)
+    problem = build_problem(plan, free=names)
     at = np.random.default_rng(2).normal(size=len(names))
     _, jacobian = problem.linearise(at * problem.theta_scale)
     assert_derivative(
@@ -56,7 +56,7 @@ def test_predictions_are_those_of_the_observation_model(plan):
 
 def test_known_values_are_held(plan):
     fixed = {"x_leg.length": 0.3e-3, "x_slide.offset": 1e-3}
-    problem = build_problem(plan, model="lengths", fixed=fixed)
+    problem = build_problem(plan, model="lengths", known=fixed)
     assert "x_slide.offset" not in problem.free
     entries = predict_entries(plan, build_observations(plan), fixed)
     assert np.abs(problem.predict(np.zeros(problem.n_free)) - entries).max() < KINEMATICS * 10
@@ -81,8 +81,8 @@ def test_readings_depend_on_few_variables(plan):
 
 
 def test_nothing_free_is_refused(plan):
-    with pytest.raises(SessionError, match="nothing to identify"):
-        CalibrationProblem(plan, free=(), prior=False)
+    with pytest.raises(ParameterError, match="nothing to identify"):
+        build_problem(plan, free=["!*"])
 
 
 def test_an_unknown_model_is_named_with_what_there_is(plan):

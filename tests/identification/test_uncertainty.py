@@ -35,14 +35,14 @@ def test_covariance_of_a_line_solved_by_hand():
     """y = a u + zero at u = −1, 0, 2: the slope has variance σ²/Σ(u − ū)² = σ²/(14/3)."""
     o = observations([0, 0, 0], [0, 1, 2], [0, 0, 0])
     information = decompose(np.array([[-1.0], [0.0], [2.0]]), o)
-    assert information.covariance(sigma=0.3, prior=False)[0, 0] == pytest.approx(
+    assert information.covariance(sigma=0.3, precision=np.zeros(1))[0, 0] == pytest.approx(
         0.3**2 / (14 / 3), rel=KINEMATICS
     )
     # with a prior of one: precisions add
-    assert information.covariance(sigma=0.3, prior=True)[0, 0] == pytest.approx(
+    assert information.covariance(sigma=0.3, precision=np.ones(1))[0, 0] == pytest.approx(
         1.0 / (1.0 + (14 / 3) / 0.3**2), rel=KINEMATICS
     )
-    assert information.effective_parameters(sigma=0.3, prior=True) == pytest.approx(
+    assert information.effective_parameters(sigma=0.3, precision=np.ones(1)) == pytest.approx(
         (14 / 3) / (14 / 3 + 0.3**2), rel=KINEMATICS
     )
 
@@ -123,7 +123,8 @@ def test_six_equations_have_the_closed_form_covariance(experiment_2):
     _, jacobian = problem.linearise(problem.reference)
     information = decompose(jacobian, problem.observations)
     scale = np.outer(problem.theta_scale, problem.theta_scale)
-    covariance = information.covariance(sigma=1.0 / np.sqrt(2.0), prior=False) * scale
+    precision = problem.prior_precision
+    covariance = information.covariance(sigma=1.0 / np.sqrt(2.0), precision=precision) * scale
     assert np.abs(np.sqrt(np.diag(covariance)) - 1.4031).max() < 0.00006
     assert abs(covariance[0, 1] / covariance[0, 0] + 0.25) < 0.005
 
@@ -144,7 +145,7 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations(root, model
         solution = program.solve(sigma=sigma, values=values)
         _, jacobian = problem.linearise(solution.theta, solution.passive)
         covariance = decompose(jacobian, problem.observations).covariance(
-            sigma=sigma, prior=problem.prior
+            sigma=sigma, precision=problem.prior_precision
         )
         error = solution.theta / problem.theta_scale - truth
         whitened.append(np.linalg.solve(np.linalg.cholesky(covariance), error))
@@ -161,6 +162,6 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations(root, model
 
 
 def test_an_information_without_readings_has_no_rank():
-    information = Information(np.zeros(2), np.eye(2))
+    information = Information(np.zeros((0, 2)), np.zeros(2), np.eye(2))
     assert information.rank == 0
     assert not information.identifiable.any()

@@ -9,7 +9,7 @@ from derivatives import assert_derivative
 
 from orthocal import load_plan
 from orthocal.errors import RobotError
-from orthocal.identification.problem import CalibrationProblem
+from orthocal.identification.problem import build_problem
 from orthocal.identification.uncertainty import decompose, project_out_zeros
 from orthocal.robot.assembly import Assembly
 from orthocal.study.accuracy import ToolSensitivity, Workspace, cube, measure_uncertainty
@@ -108,11 +108,12 @@ def test_what_three_plans_are_worth(
 ):
     session = load_plan(plans.write(tmp_path, plan()))
     own = dict(zip(tool.free, tolerances, strict=True))
-    problem = CalibrationProblem(session, free=tool.free, prior=True, tolerances=own)
+    problem = build_problem(session, free=tool.free, tolerances=own)
     _, slopes = problem.linearise(np.zeros(problem.n_free))
     information = decompose(slopes, problem.observations)
     scale = np.outer(tolerances, tolerances)
-    posterior = information.covariance(sigma=sigma * 1e-6, prior=True) * scale
+    precision = problem.prior_precision
+    posterior = information.covariance(sigma=sigma * 1e-6, precision=precision) * scale
     found = measure_uncertainty(jacobian, posterior, workspace)
     # three digits are printed, fewer where the number is small
     slack = max(SAMPLING * full, 0.0006)

@@ -1,0 +1,192 @@
+"""One problem solved: linearised start, noise, exact solution, and what the readings say there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.errors import ClosureError
+from orthocal.identification.linear import linearise_at_reference
+from orthocal.identification.loss import Loss
+from orthocal.identification.nlp import NonlinearProgram, Solution, SolverOptions
+from orthocal.identification.problem import CalibrationProblem
+from orthocal.identification.uncertainty import (
+    Information,
+    Noise,
+    decompose,
+    estimate_noise,
+    estimate_repeatability,
+    project_out_zeros,
+    require_identifiable,
+)
+from orthocal.measurement.session import Session
+
+Array = NDArray[np.float64]
+
+SIGMA_WITHOUT_WORD = 10e-6
+"""Standard deviation of a reading assumed at first where nothing tells it, [m]."""
+
+SMALLEST_SIGMA = 1e-9
+"""Standard deviation of a reading below which readings count as perfect, [m]."""
+
+SIGMA_SETTLED = 0.01
+"""Relative change of sigma below which it needs no further solution."""
+
+MAX_SIGMA_ROUNDS = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A solved problem."""
+
+    problem: CalibrationProblem
+    program: NonlinearProgram
+    linear: Array
+    """Linearised solution, shape (n_free,), [SI]."""
+    solution: Solution
+    noise: Noise
+    prediction: Array
+    """h at the solution, gauge zeros at 0, shape (n_entries,), [m]."""
+    jacobian: Array
+    """dh/dθ̂ at the solution, shape (n_entries, n_free), [m per tolerance]."""
+    information: Information
+    """Of that Jacobian."""
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of a reading by which the solution was weighted, [m]."""
+        if math.isfinite(self.noise.sigma):
+            return max(self.noise.sigma, SMALLEST_SIGMA)
+        return first_sigma(self.problem.session, (math.nan, 0))
+
+    @property
+    def loss(self) -> Loss:
+        """What a residual cost."""
+        return self.program.options.loss
+
+    @property
+    def residual(self) -> Array:
+        """Readings less predictions, gauge zeros eliminated, shape (n_entries,), [m]."""
+        return project_out_zeros(self.problem.values - self.prediction, self.problem.observations)
+
+    @property
+    def held(self) -> NDArray[np.bool_]:
+        """Parameters that a bound holds, shape (n_free,)."""
+        return np.asarray(self.solution.at_bound != 0)
+
+    def covariance(self) -> Array:
+        """Covariance of the free parameters, shape (n_free, n_free), [SI]; NaN if unknown."""
+        scale = np.outer(self.problem.theta_scale, self.problem.theta_scale)
+        if self.noise.sigma == 0.0:  # readings without any scatter
+            return np.zeros_like(scale)
+        if not math.isfinite(self.noise.sigma):
+            return np.full_like(scale, np.nan)
+        r = self.residual / self.noise.sigma
+        factors = (self.loss.gain(r), self.loss.normal_square)
+        return scale * self.information.covariance(
+            sigma=self.noise.sigma,
+            precision=self.problem.prior_precision,
+            held=self.held,
+            loss=factors if self.loss.robust else (1.0, 1.0),
+        )
+
+
+def fit_problem(
+    problem: CalibrationProblem,
+    *,
+    options: SolverOptions | None = None,
+    start: ArrayLike | None = None,
+) -> Fit:
+    """Solve a problem exactly, with sigma from the readings where they tell it.
+
+    Args:
+        problem: The problem.
+        options: How Ipopt is run.
+        start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
+            solution.
+
+    Raises:
+        NotIdentifiableError: If neither readings nor a prior determine a parameter.
+        SolverError: If Ipopt does not converge.
+        ClosureError: If the machine cannot reach a posture.
+    """
+    linearisation = linearise_at_reference(problem)
+    require_determined(problem, linearisation.information)
+    repeatability = estimate_repeatability(problem.values, problem.observations)
+    sigma = first_sigma(problem.session, repeatability)
+    program = NonlinearProgram(problem, options=options)
+    first = linearisation.solve(sigma=sigma) if start is None else np.asarray(start)
+    passive: Array | None = None
+    for _ in range(MAX_SIGMA_ROUNDS):
+        try:
+            solution = program.solve(sigma=sigma, start=first, start_passive=passive)
+        except ClosureError:
+            if start is not None or passive is not None:
+                raise
+            solution = program.solve(sigma=sigma)  # the linearised machine cannot be assembled
+        prediction, jacobian = problem.linearise(solution.theta, solution.passive)
+        information = decompose(jacobian, problem.observations)
+        noise = _noise(program, prediction, information, sigma, repeatability)
+        found = max(noise.sigma, SMALLEST_SIGMA)
+        settled = not math.isfinite(found) or abs(found / sigma - 1.0) < SIGMA_SETTLED
+        if settled or not (problem.prior or program.options.loss.robust):
+            break  # without either, sigma does not matter to the estimate
+        sigma, first, passive = found, solution.theta, solution.passive
+    weight = max(noise.sigma, SMALLEST_SIGMA) if math.isfinite(noise.sigma) else sigma
+    return Fit(
+        problem=problem,
+        program=program,
+        linear=linearisation.solve(sigma=weight),
+        solution=solution,
+        noise=noise,
+        prediction=prediction,
+        jacobian=jacobian,
+        information=information,
+    )
+
+
+def first_sigma(session: Session, repeatability: tuple[float, int]) -> float:
+    """What a reading's standard deviation is taken to be before there is a solution, [m]."""
+    cycles_sigma, cycles_dof = repeatability
+    if cycles_dof > 0:
+        return max(cycles_sigma, SMALLEST_SIGMA)
+    return session.gauge.sigma or SIGMA_WITHOUT_WORD
+
+
+def require_determined(problem: CalibrationProblem, information: Information) -> None:
+    """Refuse parameters that neither the readings nor a prior determine.
+
+    Raises:
+        NotIdentifiableError: Naming them.
+    """
+    session = problem.session
+    where = session.readings_path or session.path
+    require_identifiable(
+        information,
+        problem.free,
+        precision=problem.prior_precision,
+        where=None if where is None else str(where),
+    )
+
+
+def _noise(
+    program: NonlinearProgram,
+    prediction: Array,
+    information: Information,
+    sigma: float,
+    repeatability: tuple[float, int],
+) -> Noise:
+    problem, loss = program.problem, program.options.loss
+    residual = project_out_zeros(problem.values - prediction, problem.observations)
+    used = information.effective_parameters(sigma=sigma, precision=problem.prior_precision)
+    dof = problem.observations.size - problem.observations.n_zeros - used
+    return estimate_noise(
+        # cycles with a wrong reading among them would say that all scatter
+        repeatability=(math.nan, 0) if loss.robust and dof > 1.0 else repeatability,
+        residual_square=loss.robust_square(residual, dof=dof, start=sigma),
+        residual_dof=dof,
+        gauge_sigma=problem.session.gauge.sigma,
+    )

@@ -1,0 +1,114 @@
+"""How residuals count: their squares, or less than that far out.
+
+A residual r, in standard deviations, costs ρ(r). Beside squares, ρ = r²/2, there is a smooth form
+of Huber's loss (Hartley and Zisserman, Multiple View Geometry, 2004, A6.8)
+
+    ρ(r) = k² (√(1 + (r/k)²) − 1)
+
+which is r²/2 for small residuals and k |r| for large ones, so that a single wrong reading cannot
+pull the estimate as far as it likes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.errors import OrthocalError
+
+Array = NDArray[np.float64]
+LossKind = Literal["squares", "huber"]
+
+HUBER_WIDTH = 1.345
+"""k at which the estimate is 95 % as precise as by squares where all residuals are normal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """What a residual costs."""
+
+    kind: LossKind = "squares"
+    width: float = HUBER_WIDTH
+    """k, [standard deviations]; of no account for squares."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("squares", "huber"):
+            raise OrthocalError(f"the loss is '{self.kind}'; expected squares or huber")
+        if not (math.isfinite(self.width) and self.width > 0.0):
+            raise OrthocalError(f"the width of the loss is {self.width:g}; expected more than 0")
+
+    @property
+    def robust(self) -> bool:
+        """Whether large residuals count less than their squares."""
+        return self.kind == "huber"
+
+    def cost(self, r: ca.SX, width: ca.SX) -> ca.SX:
+        """ρ(r)."""
+        if not self.robust:
+            return 0.5 * r**2
+        # not k² (√… − 1), which loses all digits of a small r
+        return r**2 / (1.0 + ca.sqrt(1.0 + (r / width) ** 2))
+
+    def slope(self, r: ca.SX, width: ca.SX) -> ca.SX:
+        """ρ'(r)."""
+        return r / ca.sqrt(1.0 + (r / width) ** 2) if self.robust else r
+
+    def curvature(self, r: ca.SX, width: ca.SX) -> ca.SX:
+        """ρ''(r)."""
+        return (1.0 + (r / width) ** 2) ** -1.5 if self.robust else ca.SX(1.0)
+
+    def secant(self, r: ca.SX, width: ca.SX) -> ca.SX:
+        """ρ'(r)/r: how much of a square a residual counts."""
+        return 1.0 / ca.sqrt(1.0 + (r / width) ** 2) if self.robust else ca.SX(1.0)
+
+    def influence(self, r: Array) -> Array:
+        """ρ'(r) of residuals in standard deviations, shape as r."""
+        return r / np.sqrt(1.0 + (r / self.width) ** 2) if self.robust else r
+
+    def gain(self, r: Array) -> float:
+        """Mean of ρ''(r): how steeply the estimate answers to the readings; 1 for squares."""
+        if not self.robust or not r.size:
+            return 1.0
+        return float(np.mean((1.0 + (r / self.width) ** 2) ** -1.5))
+
+    @property
+    def normal_square(self) -> float:
+        """Mean of ρ'(r)² of standard normal residuals; 1 for squares."""
+        return _normal_square(self.width) if self.robust else 1.0
+
+    def robust_square(self, residual: Array, *, dof: float, start: float) -> float:
+        """Σ r² that residuals would have without those that are far out, [unit of r²].
+
+        The scale s with Σ ρ'(r/s)² = dof E ρ'(z)² (Huber's proposal 2), times dof.
+
+        Args:
+            residual: Shape (n,).
+            dof: Degrees of freedom of the residuals.
+            start: A first scale.
+        """
+        if not self.robust or dof <= 0.0:
+            return float(residual @ residual)
+        scale = start
+        for _ in range(200):
+            found = float(np.sum(self.influence(residual / scale) ** 2)) / dof
+            new = scale * math.sqrt(found / self.normal_square)
+            if new == 0.0 or abs(new / scale - 1.0) < 1e-10:
+                return new**2 * dof
+            scale = new
+        return scale**2 * dof
+
+
+SQUARES = Loss()
+
+
+@lru_cache(maxsize=16)
+def _normal_square(width: float) -> float:
+    nodes, weights = np.polynomial.hermite_e.hermegauss(120)
+    values = nodes**2 / (1.0 + (nodes / width) ** 2)
+    return float(weights @ values / weights.sum())

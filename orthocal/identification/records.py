@@ -1,0 +1,194 @@
+"""The parts of a calibration's result: plain data, as they stand in calibration.json."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from orthocal.identification.loss import LossKind
+from orthocal.identification.uncertainty import NoiseSource
+from orthocal.robot.parameters import InUnit, Unit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotRecord:
+    """The robot that was calibrated."""
+
+    name: str
+    reference: str
+    """As the session names it: a packaged name or a path."""
+    folder: str | None
+    """Folder of a robot that does not come with orthocal."""
+    sha256: str
+    """Of its URDF and YAML."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionRecord:
+    """The session that it was calibrated from."""
+
+    path: str | None
+    readings_path: str | None
+    title: str
+    source: str
+    sha256: str
+    gauge_sigma: float | None
+    """[m]."""
+    gauge_resolution: float | None
+    """[m]."""
+    controller_offsets: tuple[float, ...] | None
+    """Offsets active in the controller, [m, rad]; None where not stated."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolverRecord:
+    """How the exact solution was found."""
+
+    name: str
+    status: str
+    iterations: int
+    seconds_build: float
+    """Building the program once, [s]."""
+    seconds_solve: float
+    """The last solution, [s]."""
+    hessian: str
+    loss: LossKind
+    """What residuals cost: their squares, or Huber's smooth loss."""
+    loss_width: float
+    """Where that turns from square to linear, [standard deviations]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ParameterEstimate(InUnit):
+    """One error parameter."""
+
+    name: str
+    unit: Unit
+    value: float
+    """Exact estimate, [unit]."""
+    linear: float
+    """Linearised estimate, [unit]."""
+    std: float
+    """Standard deviation, [unit]; NaN if nothing tells."""
+    tolerance: float
+    """One standard deviation before the calibration, [unit]."""
+    free: bool
+    identifiable: bool
+    """Whether the readings alone tell it better than its tolerance."""
+    start: float
+    """What the controller already corrects: the point of linearisation, [unit]."""
+    prior: bool
+    """Whether its tolerance acted as a prior."""
+    mean: float
+    """Mean of that prior, [unit]."""
+    lower: float | None
+    """Lower bound, [unit]."""
+    upper: float | None
+    """Upper bound, [unit]."""
+    at_bound: Literal["lower", "upper"] | None
+    """Which bound holds it: it has no standard deviation then, and others hold with it there."""
+    interval: tuple[float, float] | None
+    """Profile-likelihood interval of 95 %, [unit], where it was asked for."""
+
+    @property
+    def data_share(self) -> float:
+        """How much the readings said: 1 − posterior/prior variance; NaN without a prior."""
+        if not (self.free and self.prior) or self.at_bound:
+            return math.nan
+        return 1.0 - (self.std / self.tolerance) ** 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseRecord:
+    """Standard deviation of one reading of the indicator; see `uncertainty.Noise`."""
+
+    reading_sigma: float
+    """[m]; a difference of two readings has √2 of it."""
+    source: NoiseSource
+    cycles_sigma: float
+    cycles_dof: int
+    residual_sigma: float
+    residual_dof: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResidualRow:
+    """One row of the session's readings; measured = nominal + deviation = predicted + residual."""
+
+    setup: str
+    posture: str
+    minus: str | None
+    cycle: int
+    measured: float
+    """[m]."""
+    nominal: float
+    """What the machine would show as the controller knows it, with the best gauge zero, [m]."""
+    linear: float
+    """The same for the linearised estimate, [m]."""
+    predicted: float
+    """The same for the calibrated machine, [m]."""
+    line: int | None
+    """Line in the CSV."""
+    studentised: float
+    """Error of the row as all others see it, in its standard deviations; NaN if they do not."""
+    influence: float
+    """Largest change of a parameter without this row, in its standard deviations."""
+    influenced: str
+    """Which parameter that is."""
+
+    @property
+    def deviation(self) -> float:
+        """Measured less nominal, [m]: the residual before calibration."""
+        return self.measured - self.nominal
+
+    @property
+    def residual(self) -> float:
+        """Measured less predicted, [m]: the residual after calibration."""
+        return self.measured - self.predicted
+
+    @property
+    def label(self) -> str:
+        """Setup and postures in words."""
+        return f"{self.setup} {self.posture}" + (f" − {self.minus}" if self.minus else "")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PostureRecord:
+    """A posture of the session."""
+
+    name: str
+    drives: tuple[float, ...]
+    """Commanded drive coordinates, controller offsets taken off, [m, rad]."""
+    passive: tuple[float, ...]
+    """Passive coordinates of the calibrated machine, [m, rad]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SetupRecord:
+    """A setup of the session."""
+
+    name: str
+    leg: str
+    direction: str
+    section_form: str
+    section_value: float
+    """[m], or 1 for a fraction."""
+    zero: float | None
+    """Estimated zero of the gauge, [m]; None where only differences were given."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ControllerEntry:
+    """What to enter into the controller for one drive."""
+
+    drive: str
+    unit: Unit
+    active: float | None
+    """Offset now in the controller, [unit]; None where the session does not say."""
+    enter: float
+    """Offset to enter, [unit]; what to add to the present one where that is not known."""
+    change: float
+    """enter − active, [unit]."""
+    std: float
+    """[unit]."""

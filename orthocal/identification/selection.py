@@ -1,0 +1,260 @@
+"""What a calibration may change, and what it takes for known: models, globs, tolerances, bounds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.documents import parse_number
+from orthocal.errors import ParameterError
+from orthocal.robot.model import read_only
+from orthocal.robot.parameters import Parameter, ParameterSet, Unit, split_unit
+
+Array = NDArray[np.float64]
+Known = float | tuple[float, float]
+
+DEFAULT_MODEL = "offsets"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Selection:
+    """The free parameters of a problem, with what is known of each beforehand."""
+
+    label: str
+    """Model, and what was added to it or taken from it."""
+    parameters: tuple[Parameter, ...]
+    """The free ones, with the tolerances that hold here."""
+    prior: NDArray[np.bool_]
+    """Whether a parameter's tolerance acts as prior, shape (n_free,)."""
+    mean: Array
+    """Mean of each prior, shape (n_free,), [SI]."""
+    lower: Array
+    """Lower bounds, -inf where there are none, shape (n_free,), [SI]."""
+    upper: Array
+    """Upper bounds, shape (n_free,), [SI]."""
+    fixed: Mapping[str, float]
+    """Known values of parameters that are not free, [SI]."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def tolerances(self) -> Array:
+        """One standard deviation of each free parameter, shape (n_free,), [SI]."""
+        return np.array([p.tolerance for p in self.parameters])
+
+    def keep(self, names: Sequence[str]) -> Selection:
+        """The same with only some of the parameters free, none with a prior; the others are 0."""
+        index = [self.names.index(name) for name in names]
+        return replace(
+            self,
+            parameters=tuple(self.parameters[i] for i in index),
+            prior=np.zeros(len(index), dtype=bool),
+            mean=read_only(np.zeros(len(index))),
+            lower=read_only(self.lower[index]),
+            upper=read_only(self.upper[index]),
+        )
+
+
+def select_parameters(
+    parameters: ParameterSet,
+    *,
+    model: str | None = None,
+    free: Sequence[str] = (),
+    prior: bool | None = None,
+    known: Mapping[str, Known] | None = None,
+    tolerances: Mapping[str, float] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+) -> Selection:
+    """Choose what is free.
+
+    Args:
+        parameters: Of the robot.
+        model: A model of the robot's YAML; `offsets` where neither a model nor `free` is given.
+        free: Names or globs that are free too, after the model's; '!' takes out again.
+        prior: Whether tolerances act as a prior; by default not where only offsets are free.
+        known: Name to a known value, which is then held, or to a value and its standard
+            deviation, which then act as prior of a free parameter, [SI].
+        tolerances: Name or glob to another standard deviation than the robot's, [SI].
+        bounds: Name or glob to lowest and highest value, ±inf for open, [SI].
+
+    Raises:
+        ParameterError: If a name, glob or model is unknown, nothing is left free, two of the
+            parameters are partly the same error, or a number makes no sense.
+    """
+    base = DEFAULT_MODEL if model is None and not free else model
+    patterns: list[str] = []
+    if base is not None:
+        parameters.select_model(base)  # refuses an unknown model
+        patterns += parameters.models[base]
+    chosen = set(parameters.select([*patterns, *free]))
+    held: dict[str, float] = {}
+    own_prior: dict[str, tuple[float, float]] = {}
+    for name, entry in (known or {}).items():
+        parameters[name]  # refuses an unknown name
+        if isinstance(entry, tuple):
+            own_prior[name] = (_finite(entry[0], name), _positive(entry[1], name))
+            chosen.add(name)
+        else:
+            held[name] = _finite(entry, name)
+            chosen.discard(name)
+    names = [n for n in parameters.names if n in chosen]
+    if not names:
+        raise ParameterError("no free parameters: there is nothing to identify")
+    _refuse_overlap(parameters, [*names, *(n for n, v in held.items() if v != 0.0)])
+
+    spread = {n: parameters[n].tolerance for n in names}
+    for glob, value in (tolerances or {}).items():
+        for name in _match_free(parameters, glob, names):
+            spread[name] = _positive(value, glob)
+    spread.update({n: s for n, (_, s) in own_prior.items()})
+    lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    for glob, (low, high) in (bounds or {}).items():
+        if not low < high:
+            raise ParameterError(f"the bounds of '{glob}' leave nothing between them")
+        for name in _match_free(parameters, glob, names):
+            lower[names.index(name)], upper[names.index(name)] = low, high
+    only_offsets = all(n.endswith(".offset") for n in names)
+    everywhere = not only_offsets if prior is None else prior
+    return Selection(
+        label=_label(base, free),
+        parameters=tuple(replace(parameters[n], tolerance=spread[n]) for n in names),
+        prior=np.array([everywhere or n in own_prior for n in names]),
+        mean=read_only([own_prior.get(n, (0.0, 0.0))[0] for n in names]),
+        lower=read_only(lower),
+        upper=read_only(upper),
+        fixed=held,
+    )
+
+
+def read_known(texts: Sequence[str], parameters: ParameterSet, *, where: str) -> dict[str, Known]:
+    """Known values from texts such as x_leg.length_mm=0.12 or x_leg.length_mm=0.12±0.02.
+
+    Raises:
+        ParameterError: If a text does not fit.
+    """
+    result: dict[str, Known] = {}
+    for text in texts:
+        key, number = _split(text, "NAME=VALUE or NAME=VALUE±TOLERANCE", where)
+        value, _, spread = number.replace("+-", "±").partition("±")
+        try:
+            name, si = parameters.read_quantity(key, _number(value, where, key))
+        except ParameterError as e:
+            raise ParameterError(e.problem, where=e.where or where) from None
+        if name in result:
+            raise ParameterError(f"'{name}' is given twice", where=where)
+        factor = split_unit(key)[2]
+        result[name] = (si, _number(spread, where, key) * factor) if spread else si
+    return result
+
+
+def read_tolerances(
+    texts: Sequence[str], parameters: ParameterSet, *, where: str
+) -> dict[str, float]:
+    """Tolerances from texts such as *.offset_mm=2.
+
+    Raises:
+        ParameterError: If a text does not fit.
+    """
+    result = {}
+    for text in texts:
+        key, number = _split(text, "NAME=VALUE", where)
+        glob, factor = _read_glob(key, parameters, where)
+        result[glob] = _number(number, where, key) * factor
+    return result
+
+
+def read_bounds(
+    texts: Sequence[str], parameters: ParameterSet, *, where: str
+) -> dict[str, tuple[float, float]]:
+    """Bounds from texts such as x_slide.offset_mm=-2:2; either side may be left open.
+
+    Raises:
+        ParameterError: If a text does not fit.
+    """
+    form = "NAME=LOWEST:HIGHEST"
+    result = {}
+    for text in texts:
+        key, numbers = _split(text, form, where)
+        low, colon, high = numbers.partition(":")
+        if not colon:
+            raise ParameterError(f"found '{text}'; expected {form}", where=where)
+        glob, factor = _read_glob(key, parameters, where)
+        result[glob] = (
+            _number(low, where, key) * factor if low.strip() else -math.inf,
+            _number(high, where, key) * factor if high.strip() else math.inf,
+        )
+    return result
+
+
+def _split(text: str, form: str, where: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise ParameterError(f"found '{text}'; expected {form}", where=where)
+    return key.strip(), value
+
+
+def _number(text: str, where: str, name: str) -> float:
+    return parse_number(text.strip(), where=where, name=name, error=ParameterError)
+
+
+def _read_glob(key: str, parameters: ParameterSet, where: str) -> tuple[str, float]:
+    """Glob and factor to SI of a key with its unit; what it matches must be in that unit."""
+    try:
+        glob, unit, factor = split_unit(key)
+        for name in parameters.select([glob]):
+            if parameters[name].unit != unit:
+                raise ParameterError(
+                    f"'{key}' has the wrong unit; {name} is in {parameters[name].edge_unit}"
+                )
+    except ParameterError as e:
+        raise ParameterError(e.problem, where=where) from None
+    return glob, factor
+
+
+def _match_free(parameters: ParameterSet, glob: str, free: Sequence[str]) -> list[str]:
+    """Free parameters that a glob matches, all in one unit."""
+    found = [n for n in parameters.select([glob]) if n in free]
+    if not found:
+        raise ParameterError(f"'{glob}' matches no free parameter")
+    units: set[Unit] = {parameters[n].unit for n in found}
+    if len(units) > 1:
+        raise ParameterError(f"'{glob}' matches parameters in {' and '.join(sorted(units))}")
+    return found
+
+
+def _refuse_overlap(parameters: ParameterSet, names: Sequence[str]) -> None:
+    """Two parameters that add to the same elementary error are not two."""
+    owner: dict[str, str] = {}
+    for name in names:
+        for term, _ in parameters[name].terms:
+            if term in owner:
+                whole = max(name, owner[term], key=lambda n: len(parameters[n].terms))
+                terms = ", ".join(t for t, _ in parameters[whole].terms)
+                raise ParameterError(
+                    f"'{owner[term]}' and '{name}' are partly the same error: {whole} is made of "
+                    f"{terms}; take one of them out, such as '!{term}'"
+                )
+            owner[term] = name
+
+
+def _label(model: str | None, free: Sequence[str]) -> str:
+    return " ".join([*([] if model is None else [model]), *free])
+
+
+def _finite(value: float, name: str) -> float:
+    if not math.isfinite(value):
+        raise ParameterError(f"the known value of '{name}' is {value}; expected a finite number")
+    return float(value)
+
+
+def _positive(value: float, name: str) -> float:
+    if not (math.isfinite(value) and value > 0.0):
+        raise ParameterError(f"the tolerance of '{name}' is {value:g}; expected more than 0")
+    return float(value)
