@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import orthocal
-from orthocal.errors import OrthocalError, SessionError
+from orthocal.errors import OrthocalError, ParameterError, SessionError
 
 if TYPE_CHECKING:
     from orthocal.identification.calibration import Calibration
@@ -35,6 +35,13 @@ CalibrationPath = Annotated[
     typer.Argument(metavar="CALIBRATION", help="calibration.json, or the folder that holds it."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+Tolerances = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="GLOB=VALUE",
+        help="Another tolerance than the robot's, such as '*.offset_mm=2'.",
+    ),
+]
 AllRows = Annotated[bool, typer.Option("--all", help="List every reading, however many.")]
 
 
@@ -81,13 +88,60 @@ def _version(
 def calibrate(
     session: SessionPath,
     model: Annotated[
-        str, typer.Option(help="Which errors are free: offsets, lengths, or one of the robot's.")
-    ] = "offsets",
+        str | None,
+        typer.Option(
+            help="Which errors are free: offsets (the default), lengths, full, or one of the "
+            "robot's own.",
+        ),
+    ] = None,
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="GLOBS",
+            help="Names or globs, with commas, that are free too, or instead where no --model is "
+            "given; '!' takes out: --model full --free '!*_fork.*'.",
+        ),
+    ] = None,
     prior: Annotated[
         bool | None,
         typer.Option(
             "--prior/--no-prior",
             help="Whether tolerances act as a prior; by default not for offsets, else yes.",
+        ),
+    ] = None,
+    known: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE[±TOL]",
+            help="A value known from elsewhere: held, or with a tolerance a prior, such as "
+            "x_leg.length_mm=0.12±0.02 (or +-).",
+        ),
+    ] = None,
+    tolerance: Tolerances = None,
+    bound: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="GLOB=LOW:HIGH", help="Bounds, such as 'x_slide.offset_mm=-2:2'; open: '=-2:'."
+        ),
+    ] = None,
+    base: Annotated[
+        bool,
+        typer.Option(
+            "--base",
+            help="Base parameters, without any prior: of what cannot be told apart one stays.",
+        ),
+    ] = False,
+    loss: Annotated[
+        str,
+        typer.Option(
+            metavar="squares|huber",
+            help="What residuals cost; with huber single wrong readings pull less.",
+        ),
+    ] = "squares",
+    profile: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="GLOBS", help="Profile-likelihood intervals of these parameters, slowly."
         ),
     ] = None,
     out: Annotated[
@@ -99,11 +153,27 @@ def calibrate(
     """Identify the errors of a machine from a session of readings."""
     from orthocal.documents import require_writable
     from orthocal.identification.calibrate import calibrate as run
+    from orthocal.identification.loss import Loss
+    from orthocal.identification.nlp import SolverOptions
+    from orthocal.identification.selection import read_bounds, read_known, read_tolerances
     from orthocal.measurement.session_file import load_session
 
     if out is not None:
         require_writable(out)
-    result = run(load_session(session), model=model, prior=prior)
+    loaded = load_session(session)
+    parameters = loaded.robot.parameters
+    result = run(
+        loaded,
+        model=model,
+        free=_globs(free),
+        prior=prior,
+        known=read_known(known or [], parameters, where="--known"),
+        tolerances=read_tolerances(tolerance or [], parameters, where="--tolerance"),
+        bounds=read_bounds(bound or [], parameters, where="--bound"),
+        base=base,
+        profile=_globs(profile),
+        options=SolverOptions(loss=Loss(loss)),  # type: ignore[arg-type] # checked there
+    )
     if json:
         _out(result.to_json().rstrip("\n"))
     else:
@@ -211,6 +281,7 @@ def simulate(
             help="Draw errors from the tolerances: a model, or names and globs with commas.",
         ),
     ] = None,
+    tolerance: Tolerances = None,
     seed: Annotated[int, typer.Option(min=0, help="Of noise, gauge zeros and drawn errors.")] = 0,
     exact: Annotated[
         bool, typer.Option("--exact", help="No noise, no gauge zeros, no rounding.")
@@ -221,6 +292,7 @@ def simulate(
 ) -> None:
     """Make a session of simulated readings of a machine whose errors are known."""
     from orthocal.documents import exists, require_writable
+    from orthocal.identification.selection import read_tolerances
     from orthocal.measurement.session_file import load_plan, write_session
     from orthocal.measurement.synthetic import (
         collect_errors,
@@ -233,14 +305,27 @@ def simulate(
         if exists(out / name) and not force:
             raise SessionError("is there already; --force writes over it", where=str(out / name))
     planned = load_plan(plan)
+    tolerances = read_tolerances(tolerance or [], planned.robot.parameters, where="--tolerance")
+    if tolerances and draw is None:
+        raise ParameterError("is of no use without --draw", where="--tolerance")
     true_errors = collect_errors(
-        planned.robot, file=errors, single=error or [], draw=draw, seed=seed
+        planned.robot,
+        file=errors,
+        single=error or [],
+        draw=draw,
+        tolerances=tolerances,
+        seed=seed,
     )
     simulated = simulate_session(planned, true_errors, seed=seed, exact=exact)
     truth = {"truth.yaml": truth_document(simulated)}
     comment = "Simulated readings, not measured. The truth behind them is in truth.yaml."
     path = write_session(simulated.session, out, comment=comment, extra=truth)
     _note(f"Wrote {path}, {len(simulated.session.readings)} simulated readings, and truth.yaml")
+
+
+def _globs(texts: list[str] | None) -> list[str]:
+    """Globs of repeated options, each with commas between."""
+    return [glob.strip() for text in texts or [] for glob in text.split(",") if glob.strip()]
 
 
 def _show(result: Calibration | Validation, *, all_rows: bool) -> None:

@@ -1281,7 +1281,7 @@ CALIBRATION_CASES = [
     calibration(
         "unmodelled-unknown",
         f"{CALIBRATION}: unmodelled.names[1]: 'x_slid.y' is not an error parameter; did you mean "
-        "x_slide.z, x_slide.y, z_slide.y?",
+        "x_slide.y, x_slide.ry, z_slide.y?",
         put(FILE, "unmodelled.names.1", "x_slid.y"),
     ),
     calibration(

@@ -49,16 +49,17 @@ def draw_errors(
         robot: The robot.
         patterns: Names or globs of the parameters to draw; '!' takes out.
         seed: Of the random numbers.
-        tolerances: Other standard deviations, by name, [SI].
+        tolerances: Name or glob to another standard deviation than the robot's, [SI].
 
     Raises:
         ParameterError: If a pattern matches nothing.
     """
     rng = np.random.default_rng(seed)
-    own = tolerances or {}
+    parameters = robot.parameters
+    own = {n: value for g, value in (tolerances or {}).items() for n in parameters.select([g])}
     return {
-        name: float(rng.normal() * own.get(name, robot.parameters[name].tolerance))
-        for name in robot.parameters.select(patterns)
+        name: float(rng.normal() * own.get(name, parameters[name].tolerance))
+        for name in parameters.select(patterns)
     }
 
 
@@ -153,6 +154,7 @@ def collect_errors(
     file: Path | None = None,
     single: Sequence[str] = (),
     draw: str | None = None,
+    tolerances: Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> dict[str, float]:
     """Errors drawn, then from a file, then given singly; later ones win.
@@ -162,6 +164,7 @@ def collect_errors(
         file: As for `load_errors`.
         single: Texts such as x_slide.offset_mm=1.2.
         draw: Model of the robot, or names and globs with commas between, to draw.
+        tolerances: For drawing, as for `draw_errors`.
         seed: Of the random numbers.
 
     Raises:
@@ -172,7 +175,7 @@ def collect_errors(
         models = robot.parameters.models
         patterns = models[draw] if draw in models else tuple(draw.split(","))
         try:
-            errors.update(draw_errors(robot, patterns, seed=seed))
+            errors.update(draw_errors(robot, patterns, seed=seed, tolerances=tolerances))
         except ParameterError:
             raise ParameterError(
                 f"'{draw}' is neither a model ({', '.join(models)}) nor the name of an error "

@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import RobotError
-from orthocal.robot.assembly import Assembly
+from orthocal.identification.calibration import Calibration
+from orthocal.robot.assembly import Assembly, nominal_assembly
 from orthocal.robot.batch import BatchFunction
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Robot, read_only
 from orthocal.robot.slopes import SharedPlacements
 
 Array = NDArray[np.float64]
@@ -31,7 +32,10 @@ HALF_SIDE = 0.06
 """Half the side of the cube around the mechanical zero that is looked at by default, [m]."""
 
 POINTS_A_SIDE = 7
-DRAWS = 2000
+NOTABLE = 0.1
+"""Tolerances by which a parameter must be off to be named in a combination."""
+
+DRAWS = 500
 """Errors drawn to find how large 95 % of the position errors are at most."""
 
 
@@ -40,11 +44,11 @@ class ErrorSize:
     """Size of position errors over a workspace, [m]."""
 
     rms: float
-    """Root mean square over points and over what is not known."""
+    """Root mean square over the points, and over what is not known."""
     percentile_95: float
     """What 95 % of the errors, at any point, stay below."""
     largest: float
-    """Root mean square at the worst point."""
+    """At the worst point; of what is not known, root mean square there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +64,55 @@ class ToolUncertainty:
     absolute: ErrorSize
     relative: ErrorSize
     """With the common shift taken out."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Workspace:
+    """Points that stand for a region, with weights that make their mean the region's."""
+
+    points: Array
+    """Tool positions in the coordinates that the drives control, shape (K, n_coordinates), [m]."""
+    weights: Array
+    """Shape (K,), sum 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToolAccuracy:
+    """Where the tool is and how well that is known, before and after a calibration."""
+
+    workspace: Workspace
+    names: tuple[str, ...]
+    """Free, then unmodelled parameters."""
+    jacobian: Array
+    """∂p/∂θ at every point, shape (K, 3, n), [m per parameter unit]."""
+    deviation: Array
+    """Where the calibrated machine's tool is now, less where it is commanded, (K, 3), [m]."""
+    left: Array
+    """The same once the identified offsets are in a controller that is nominal otherwise."""
+    before: ToolUncertainty
+    """With all errors within their tolerances and nothing known."""
+    after: ToolUncertainty | None
+    """With the machine as calibrated; None where nothing tells the noise."""
+
+    @property
+    def relative_deviation(self) -> Array:
+        """The deviation with the common shift taken out, shape (K, 3), [m]."""
+        return np.asarray(self.deviation - self.workspace.weights @ self.deviation)
+
+    @property
+    def relative_left(self) -> Array:
+        """What is left, with the common shift taken out, shape (K, 3), [m]."""
+        return np.asarray(self.left - self.workspace.weights @ self.left)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RemainingError:
+    """A combination of parameters that is not well known, and what it does at the tool."""
+
+    rms: float
+    """Over the workspace, the common shift taken out, [m]."""
+    parts: tuple[tuple[str, float], ...]
+    """Parameters and by how many tolerances each is off, the largest first."""
 
 
 class ToolSensitivity:
@@ -128,16 +181,6 @@ class ToolSensitivity:
         return np.asarray(p_theta - p_q @ slopes)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Workspace:
-    """Points that stand for a region, with weights that make their mean the region's."""
-
-    points: Array
-    """Tool positions in the coordinates that the drives control, shape (K, n_coordinates), [m]."""
-    weights: Array
-    """Shape (K,), sum 1."""
-
-
 def cube(
     robot: Robot, *, half_side: float = HALF_SIDE, points_a_side: int = POINTS_A_SIDE
 ) -> Workspace:
@@ -168,31 +211,140 @@ def measure_uncertainty(
         covariance: Of θ, shape (n, n), [SI].
         workspace: The points, and the weights of their mean.
     """
-    weights = workspace.weights
-    relative = jacobian - np.tensordot(weights, jacobian, axes=1)
-    root = _square_root(covariance)
-    sizes, covariances = [], []
-    for j in (jacobian, relative):
-        spread = j @ root
-        covariances.append(spread @ spread.transpose(0, 2, 1))
-        sizes.append(_error_size(spread, weights))
+    relative = jacobian - np.tensordot(workspace.weights, jacobian, axes=1)
+    covariances = [j @ covariance @ j.transpose(0, 2, 1) for j in (jacobian, relative)]
+    sizes = [_spread_size(c, workspace.weights) for c in covariances]
     return ToolUncertainty(workspace.points, covariances[0], covariances[1], sizes[0], sizes[1])
 
 
-def _error_size(spread: Array, weights: Array) -> ErrorSize:
-    """Sizes of errors spread @ ε with ε standard normal, spread of shape (K, 3, n)."""
-    at_point = (spread**2).sum(axis=(1, 2))
-    rng = np.random.default_rng(0)
-    draws = rng.normal(size=(spread.shape[2], DRAWS))
-    lengths = np.linalg.norm(spread @ draws, axis=1)
-    order = np.argsort(lengths, axis=None)
-    share = np.cumsum(np.broadcast_to(weights[:, None] / DRAWS, lengths.shape).reshape(-1)[order])
-    percentile = lengths.reshape(-1)[order][int(np.searchsorted(share, 0.95))]
+def measure_deviations(deviations: Array, weights: Array) -> ErrorSize:
+    """Size of known position errors.
+
+    Args:
+        deviations: Shape (K, 3), [m].
+        weights: Of the points in the mean, shape (K,), sum 1.
+    """
+    lengths = np.linalg.norm(deviations, axis=1)
     return ErrorSize(
-        rms=float(np.sqrt(weights @ at_point)),
-        percentile_95=float(percentile),
-        largest=float(np.sqrt(at_point.max())),
+        rms=float(np.sqrt(weights @ lengths**2)),
+        percentile_95=_weighted_percentile(lengths, weights),
+        largest=float(lengths.max()),
     )
+
+
+def assess_tool(calibration: Calibration, workspace: Workspace | None = None) -> ToolAccuracy:
+    """Where the tool is and how well that is known, before and after a calibration.
+
+    Errors that were not free are taken at their tolerances, together with what the estimate has
+    taken on of them: a calibration of offsets alone is only as good as legs and axes are.
+
+    Args:
+        calibration: The calibration.
+        workspace: Tool positions that are commanded; the cube of ±60 mm by default.
+
+    Raises:
+        RobotError: If the robot has no tool centre point.
+        ClosureError: If the machine cannot reach a point.
+    """
+    robot, values = calibration.robot, calibration.errors
+    space = cube(robot) if workspace is None else workspace
+    unmodelled = calibration.unmodelled
+    free = [p.name for p in calibration.free]
+    tool = ToolSensitivity(robot, free=[*free, *unmodelled.names], values=values)
+    nominal = nominal_assembly(robot)
+    names = [f"point {i + 1}" for i in range(len(space.points))]
+    target = nominal.inverse(space.points, names=names)
+    active = calibration.session.controller_offsets
+    commanded = target - (np.zeros(len(robot.drives)) if active is None else np.array(active))
+    offsets = np.array([values.get(f"{d.name}.offset", 0.0) for d in robot.drives])
+    where = nominal.forward(target)
+    jacobian = tool(commanded)
+    tolerances = np.r_[[p.tolerance for p in calibration.free], unmodelled.tolerances]
+    after = None
+    if np.isfinite(calibration.covariance).all():
+        after = measure_uncertainty(jacobian, error_covariance(calibration), space)
+    return ToolAccuracy(
+        workspace=space,
+        names=tool.free,
+        jacobian=read_only(jacobian),
+        deviation=read_only(tool.assembly.forward(commanded) - where),
+        left=read_only(tool.assembly.forward(target - offsets) - where),
+        before=measure_uncertainty(jacobian, np.diag(tolerances**2), space),
+        after=after,
+    )
+
+
+def error_covariance(calibration: Calibration) -> Array:
+    """Covariance of what the estimate has wrong, free and unmodelled parameters in turn, [SI].
+
+    With e = θ − θ̂ it is −L θᵤ and the estimate's own scatter for the free ones, θᵤ for the others.
+    """
+    unmodelled = calibration.unmodelled
+    variance = unmodelled.tolerances**2
+    taken_on = unmodelled.leakage * variance
+    return np.block(
+        [
+            [calibration.covariance + unmodelled.bias_covariance, -taken_on],
+            [-taken_on.T, np.diag(variance)],
+        ]
+    )
+
+
+def find_remaining_errors(
+    calibration: Calibration, accuracy: ToolAccuracy, *, count: int = 3
+) -> tuple[RemainingError, ...]:
+    """The combinations of errors that matter most at the tool after a calibration.
+
+    Principal directions of what is not known of the parameters, weighed by the mean square that it
+    makes at the tool with the common shift taken out; the largest first.
+    """
+    weights = accuracy.workspace.weights
+    relative = accuracy.jacobian - np.tensordot(weights, accuracy.jacobian, axes=1)
+    root = _square_root(error_covariance(calibration))
+    effect = relative @ root
+    _, directions = np.linalg.eigh(np.einsum("k,kin,kim->nm", weights, effect, effect))
+    tolerances = np.r_[[p.tolerance for p in calibration.free], calibration.unmodelled.tolerances]
+    found = []
+    for direction in directions.T[::-1][:count]:
+        change = root @ direction
+        moved = relative @ change
+        in_tolerances = change / tolerances
+        order = np.argsort(-np.abs(in_tolerances))
+        lead = np.sign(in_tolerances[order[0]]) or 1.0
+        found.append(
+            RemainingError(
+                rms=float(np.sqrt(weights @ (moved**2).sum(axis=1))),
+                parts=tuple(
+                    (accuracy.names[i], float(lead * in_tolerances[i]))
+                    for i in order
+                    if abs(in_tolerances[i]) > NOTABLE
+                ),
+            )
+        )
+    return tuple(found)
+
+
+def _spread_size(covariances: Array, weights: Array) -> ErrorSize:
+    """Sizes of normal errors with given covariances, shape (K, 3, 3), at the points."""
+    mean_square = np.trace(covariances, axis1=1, axis2=2)
+    values, vectors = np.linalg.eigh(covariances)
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    rng = np.random.default_rng(0)
+    draws = rng.normal(size=(3, DRAWS))
+    lengths = np.linalg.norm(roots @ draws, axis=1)
+    shares = np.broadcast_to(weights[:, None] / DRAWS, lengths.shape)
+    return ErrorSize(
+        rms=float(np.sqrt(weights @ mean_square)),
+        percentile_95=_weighted_percentile(lengths.reshape(-1), shares.reshape(-1)),
+        largest=float(np.sqrt(mean_square.max())),
+    )
+
+
+def _weighted_percentile(lengths: Array, weights: Array) -> float:
+    """What 95 % of the weight stays below."""
+    order = np.argsort(lengths)
+    share = np.cumsum(weights[order])
+    return float(lengths[order][min(int(np.searchsorted(share, 0.95)), lengths.size - 1)])
 
 
 def _square_root(covariance: Array) -> Array:
