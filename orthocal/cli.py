@@ -8,16 +8,12 @@ from __future__ import annotations
 import io
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 import orthocal
 from orthocal.errors import OrthocalError, ParameterError, SessionError
-
-if TYPE_CHECKING:
-    from orthocal.identification.calibration import Calibration
-    from orthocal.study.validation import Validation
 
 app = typer.Typer(
     add_completion=False,
@@ -48,10 +44,13 @@ AllRows = Annotated[bool, typer.Option("--all", help="List every reading, howeve
 def main() -> None:
     """Run the command line; no traceback ever reaches a user.
 
-    Exit codes: 0 done, 1 a solve did not converge, 2 bad input, 70 a bug of ours.
+    Exit codes: 0 done, 1 a solve did not converge, 2 bad input, 70 a bug of ours; `compare` has
+    more.
     """
     import os
 
+    # small matrices only: more threads would but get in each other's way
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):  # a terminal without ± prints a question mark
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -157,6 +156,7 @@ def calibrate(
     from orthocal.identification.nlp import SolverOptions
     from orthocal.identification.selection import read_bounds, read_known, read_tolerances
     from orthocal.measurement.session_file import load_session
+    from orthocal.output.summary import print_summary
 
     if out is not None:
         require_writable(out)
@@ -177,9 +177,88 @@ def calibrate(
     if json:
         _out(result.to_json().rstrip("\n"))
     else:
-        _show(result, all_rows=all_rows)
+        print_summary(result, all_rows=all_rows)
     if out is not None:
         _note(f"Wrote {result.save(out / 'calibration.json')}")
+
+
+@app.command()
+def compare(
+    session: SessionPath,
+    models: Annotated[
+        str | None,
+        typer.Option(metavar="MODELS", help="With commas between; all of the robot's by default."),
+    ] = None,
+    repeat: Annotated[
+        Path | None,
+        typer.Option(metavar="SESSION", help="Another session: does what remains repeat?"),
+    ] = None,
+    tolerance: Tolerances = None,
+    json: Json = False,
+    all_rows: AllRows = False,
+) -> None:
+    """Which model do the readings support: offsets, lengths, full, linearised and exact?
+
+    Exit code 0: one is supported, and what it leaves is noise. 3: one is supported, but what it
+    leaves is error of the model. 4: none is supported.
+    """
+    from orthocal.identification.selection import read_tolerances
+    from orthocal.measurement.session_file import load_session
+    from orthocal.output.summary import print_summary
+    from orthocal.study.comparison import compare_models
+
+    loaded = load_session(session)
+    result = compare_models(
+        loaded,
+        models=_globs([models] if models else None),
+        tolerances=read_tolerances(tolerance or [], loaded.robot.parameters, where="--tolerance"),
+        repeat=None if repeat is None else load_session(repeat),
+    )
+    if json:
+        _out(result.to_json().rstrip("\n"))
+    else:
+        print_summary(result, all_rows=all_rows)
+    raise typer.Exit(result.verdict.exit_code)
+
+
+@app.command()
+def accuracy(
+    calibration: CalibrationPath,
+    points: Annotated[
+        Path | None,
+        typer.Argument(metavar="[TARGETS.csv]", help="Columns of the tool: x_mm, y_mm, z_mm."),
+    ] = None,
+    half_side_mm: Annotated[
+        float, typer.Option(min=0.001, max=1e5, help="Half the side of the cube, without points.")
+    ] = 60.0,
+    json: Json = False,
+) -> None:
+    """Where the tool really is, and how well that is known: over a cube, or at points.
+
+    With points CSV on stdout: by how much the tool is off each, and one standard deviation of that.
+    """
+    from orthocal.identification.calibration_file import load_calibration
+    from orthocal.measurement.table import closures_named_by_row, read_points
+    from orthocal.output.accuracy import accuracy_json, format_points, print_accuracy
+    from orthocal.study.accuracy import Workspace, assess_tool, cube
+
+    result = load_calibration(calibration)
+    names = None
+    if points is None:
+        workspace = cube(result.robot, half_side=half_side_mm * 1e-3)
+        region = f"a cube of ±{half_side_mm:g} mm around the zero"
+    else:
+        names, given = read_points(points, result.robot)
+        workspace = Workspace.even(given)
+        region = f"the {len(given)} points of {points}"
+    with closures_named_by_row():
+        found = assess_tool(result, workspace, names=names)
+    if json:
+        _out(accuracy_json(result, found).rstrip("\n"))
+    elif points is None:
+        print_accuracy(result, found, region=region)
+    else:
+        _out(format_points(found))
 
 
 @app.command()
@@ -197,13 +276,14 @@ def validate(
     """Hold a new session against a calibration: is it confirmed?"""
     from orthocal.identification.calibration_file import load_calibration
     from orthocal.measurement.session_file import load_session
+    from orthocal.output.summary import print_summary
     from orthocal.study.validation import validate_calibration
 
     result = validate_calibration(load_calibration(calibration), load_session(session))
     if json:
         _out(result.to_json().rstrip("\n"))
     else:
-        _show(result, all_rows=all_rows)
+        print_summary(result, all_rows=all_rows)
 
 
 @app.command()
@@ -326,16 +406,6 @@ def simulate(
 def _globs(texts: list[str] | None) -> list[str]:
     """Globs of repeated options, each with commas between."""
     return [glob.strip() for text in texts or [] for glob in text.split(",") if glob.strip()]
-
-
-def _show(result: Calibration | Validation, *, all_rows: bool) -> None:
-    """Print a summary: in colour and as wide as the terminal, or plain where there is none."""
-    from orthocal.output.summary import print_summary, summarize
-
-    if sys.stdout.isatty():
-        print_summary(result, all_rows=all_rows)
-    else:
-        sys.stdout.write(summarize(result, all_rows=all_rows))
 
 
 def _out(text: str) -> None:

@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
+
+# as the command line does it: threads of small matrices get in each other's way
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from orthocal import load_robot, load_session
 from orthocal.measurement.session import Session

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +45,10 @@ class Fit:
 
     problem: CalibrationProblem
     program: NonlinearProgram
+    seconds_build: float
+    """Building all functions and the program, once, [s]."""
+    seconds_solve: float
+    """All solutions until sigma had settled, [s]."""
     linear: Array
     """Linearised solution, shape (n_free,), [SI]."""
     solution: Solution
@@ -113,11 +118,14 @@ def fit_problem(
         SolverError: If Ipopt does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
+    began = time.perf_counter()
     linearisation = linearise_at_reference(problem)
     require_determined(problem, linearisation.information)
     repeatability = estimate_repeatability(problem.values, problem.observations)
     sigma = first_sigma(problem.session, repeatability)
     program = NonlinearProgram(problem, options=options)
+    built = time.perf_counter()
+    seconds = 0.0
     first = linearisation.solve(sigma=sigma) if start is None else np.asarray(start)
     passive: Array | None = None
     for _ in range(MAX_SIGMA_ROUNDS):
@@ -127,6 +135,7 @@ def fit_problem(
             if start is not None or passive is not None:
                 raise
             solution = program.solve(sigma=sigma)  # the linearised machine cannot be assembled
+        seconds += solution.seconds_solve
         prediction, jacobian = problem.linearise(solution.theta, solution.passive)
         information = decompose(jacobian, problem.observations)
         noise = _noise(program, prediction, information, sigma, repeatability)
@@ -139,6 +148,8 @@ def fit_problem(
     return Fit(
         problem=problem,
         program=program,
+        seconds_build=built - began,
+        seconds_solve=seconds,
         linear=linearisation.solve(sigma=weight),
         solution=solution,
         noise=noise,

@@ -41,15 +41,15 @@ class Combination:
         """As a sum: x_slide.offset + x_swivel.x − 0.31 x_slide.ry."""
         text = self.terms[0][0]
         for name, coefficient in self.terms[1:]:
-            size = abs(coefficient)
-            factor = "" if abs(size - 1.0) < 5e-4 else f"{size:.3g} "
+            size = f"{abs(coefficient):.3g}"
+            factor = "" if size == "1" else f"{size} "
             text += f" {'+' if coefficient > 0 else '−'} {factor}{name}"
         return text
 
     @property
     def words(self) -> str:
         """In words: a and b: only their sum."""
-        if len(self.terms) == 2 and abs(abs(self.terms[1][1]) - 1.0) < 5e-4:
+        if len(self.terms) == 2 and f"{abs(self.terms[1][1]):.3g}" == "1":
             kind = "sum" if self.terms[1][1] > 0 else "difference"
             return f"{self.terms[0][0]} and {self.terms[1][0]}: only their {kind}"
         if len(self.terms) == 1:

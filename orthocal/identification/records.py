@@ -49,9 +49,9 @@ class SolverRecord:
     status: str
     iterations: int
     seconds_build: float
-    """Building the program once, [s]."""
+    """Building all functions and the program, once, [s]."""
     seconds_solve: float
-    """The last solution, [s]."""
+    """All solutions until sigma had settled, [s]."""
     hessian: str
     loss: LossKind
     """What residuals cost: their squares, or Huber's smooth loss."""

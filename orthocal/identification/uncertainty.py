@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
+from scipy import linalg, special
 
 from orthocal.errors import NotIdentifiableError
 from orthocal.measurement.gauge import Observations
@@ -210,15 +210,25 @@ class Information:
         gain, noise = loss
         prior = np.diag(np.sqrt(precision[free]))
         stacked = np.vstack([np.sqrt(gain) * rows, prior])
-        _, values, directions = np.linalg.svd(stacked, full_matrices=False)
-        with np.errstate(divide="ignore"):
-            inverse = (directions.T / values**2) @ directions
+        inverse = _inverse_square(stacked)
         if loss != (1.0, 1.0):
             spread = np.hstack([np.sqrt(noise) * inverse @ rows.T, inverse @ prior])
             inverse = spread @ spread.T
         result = np.zeros((len(free), len(free)))
         result[np.ix_(free, free)] = 0.5 * (inverse + inverse.T)
         return result
+
+
+def _inverse_square(matrix: Array) -> Array:
+    """(MᵀM)⁻¹ without forming MᵀM; infinite where M has not full rank."""
+    r = np.linalg.qr(matrix, mode="r")
+    diagonal = np.abs(np.diag(r))
+    if not diagonal.size:
+        return np.zeros((0, 0))
+    if diagonal.min() <= np.finfo(np.float64).eps * diagonal.max():
+        return np.full((len(r), len(r)), np.inf)
+    half = linalg.solve_triangular(r, np.eye(len(r)))
+    return np.asarray(half @ half.T)
 
 
 def decompose(jacobian: Array, observations: Observations) -> Information:
@@ -255,6 +265,8 @@ def require_identifiable(
     Raises:
         NotIdentifiableError: Naming the parameters.
     """
+    if precision.all():
+        return
     largest = max(float(information.singular_values[0]), 1e-300)
     stacked = np.vstack([information.factor / largest, np.diag(precision)])
     _, values, directions = np.linalg.svd(stacked, full_matrices=False)

@@ -2,27 +2,42 @@
 
 from __future__ import annotations
 
-import io
 import math
-from collections.abc import Iterable
 
-from rich import box
-from rich.console import Console, Group, RenderableType
-from rich.padding import Padding
-from rich.table import Table
+from rich.console import Group, RenderableType
 from rich.text import Text
-from scipy import special
 
 from orthocal.identification.calibration import Calibration
-from orthocal.identification.records import ResidualRow
+from orthocal.identification.records import ParameterEstimate, ResidualRow
+from orthocal.output.accuracy import render_tool
+from orthocal.output.comparison import render_comparison
+from orthocal.output.explanation import explain_fit
+from orthocal.output.layout import (
+    add_row,
+    bullets,
+    choose_rows,
+    mm,
+    plain,
+    print_rich,
+    section,
+    signed,
+    table_of,
+    to_text,
+)
+from orthocal.output.validation import render_validation
+from orthocal.study.comparison import Comparison
 from orthocal.study.validation import Validation
 
-MANY_ROWS = 60
-"""Readings above which only the worst are listed, unless all are asked for."""
+Result = Calibration | Validation | Comparison
 
-WORST_ROWS = 20
+MANY_PARAMETERS = 12
+"""Parameters above which only those that the readings tell are listed."""
 
-WIDTH = 100
+TOLD = 0.5
+"""Share of its variance that the readings must take from a parameter to be listed then."""
+
+MOST_PAIRS = 8
+"""Correlated pairs that are listed."""
 
 _SOURCES = {
     "cycles": "from repeated cycles",
@@ -32,27 +47,26 @@ _SOURCES = {
 }
 
 
-def summarize(result: Calibration | Validation, *, all_rows: bool = False) -> str:
-    """A calibration or a validation as plain text.
+def summarize(result: Result, *, all_rows: bool = False) -> str:
+    """A calibration, validation or comparison as plain text.
 
     Args:
         result: What to summarise.
-        all_rows: List every reading, however many there are.
+        all_rows: List every reading and parameter, however many there are.
     """
-    stream = io.StringIO()
-    console = Console(file=stream, width=WIDTH, no_color=True, highlight=False)
-    console.print(_render(result, all_rows))
-    return "\n".join(line.rstrip() for line in stream.getvalue().splitlines()) + "\n"
+    return to_text(_render(result, all_rows))
 
 
-def print_summary(result: Calibration | Validation, *, all_rows: bool = False) -> None:
-    """Print a calibration or a validation on the terminal, in colour."""
-    Console(highlight=False).print(_render(result, all_rows))
+def print_summary(result: Result, *, all_rows: bool = False) -> None:
+    """Print a calibration, validation or comparison: in colour where there is a terminal."""
+    print_rich(_render(result, all_rows))
 
 
-def _render(result: Calibration | Validation, all_rows: bool) -> RenderableType:
+def _render(result: Result, all_rows: bool) -> RenderableType:
     if isinstance(result, Calibration):
         return render_calibration(result, all_rows=all_rows)
+    if isinstance(result, Comparison):
+        return render_comparison(result, all_rows=all_rows)
     return render_validation(result, all_rows=all_rows)
 
 
@@ -60,213 +74,14 @@ def render_calibration(calibration: Calibration, *, all_rows: bool = False) -> R
     """A calibration as rich renderables."""
     return Group(
         _heading(calibration),
-        _section("What was identified", _parameter_table(calibration)),
-        _section("Readings before and after", _residual_table(calibration, all_rows)),
-        _section("How well it fits", _fit_table(calibration)),
-        _section("What it means", _sentences(explain_fit(calibration))),
-        _section("What to enter into the controller", _controller_table(calibration)),
+        section("What was identified", _parameter_table(calibration, all_rows)),
+        section("What the readings tell", _identifiability(calibration, all_rows)),
+        section("Readings before and after", _residual_table(calibration, all_rows)),
+        section("How well it fits", _fit_table(calibration)),
+        section("At the tool", render_tool(calibration)),
+        section("What it means", bullets(explain_fit(calibration))),
+        section("What to enter into the controller", _controller_table(calibration)),
     )
-
-
-def render_validation(validation: Validation, *, all_rows: bool = False) -> RenderableType:
-    """A validation as rich renderables."""
-    table = _table("", "expected", "achieved", "further fit")
-    rows = (
-        ("r.m.s. [mm]", validation.expected_rms, validation.achieved_rms, validation.refit_rms),
-        (
-            "largest [mm]",
-            validation.expected_largest,
-            validation.achieved_largest,
-            validation.refit_largest,
-        ),
-    )
-    for name, *values in rows:
-        _add(table, name, *(_mm(v) for v in values))
-    changes = _table("parameter", "change", "± σ", "unit", "beyond chance (95 % for all)?")
-    for c in validation.changes:
-        _add(
-            changes,
-            c.name,
-            _signed(c.change * c.edge_factor),
-            _plain(c.std * c.edge_factor),
-            c.edge_unit,
-            "yes" if c.significant else "no",
-        )
-    return Group(
-        Text("Validation of a calibration", style="bold"),
-        Text(validation.title),
-        _section("Deviations with the identified offsets in the controller", table),
-        _section("What a further fit would still change", changes),
-        _section("Readings of the new session", _validation_rows(validation, all_rows)),
-        _section("What it means", _sentences(explain_validation(validation))),
-    )
-
-
-def explain_fit(calibration: Calibration) -> list[str]:
-    """Sentences on what remains, what linearisation costs, and what can be believed."""
-    sentences = []
-    noise, factor = calibration.noise, calibration.row_factor
-    row = "a difference" if calibration.rows_are_differences else "a reading"
-    gauge = calibration.session.gauge_sigma
-    if noise.source == "unknown":
-        sentences.append(
-            "As many parameters as readings and no word on the gauge: nothing tells how far the "
-            "numbers can be trusted."
-        )
-    elif noise.source == "gauge":
-        sentences.append(
-            "There are no readings to spare: standard deviations rest on the σ given for the "
-            "gauge alone, and a wrong model would not show."
-        )
-    if noise.source == "residuals" and noise.cycles_dof > 0:
-        ratio = noise.residual_sigma / noise.cycles_sigma
-        sentences.append(
-            f"What remains is {ratio:.1f} times what repeated cycles scatter by "
-            f"({_mm(noise.cycles_sigma)} mm a reading): it is error of the model, not noise. "
-            "Standard deviations are taken from the residuals."
-        )
-    elif noise.source == "residuals" and gauge is not None:
-        ratio = noise.residual_sigma / gauge
-        low, high = _ratio_interval(noise.residual_dof)
-        if ratio > high:
-            sentences.append(
-                f"What remains, σ = {_mm(calibration.sigma)} mm of {row}, is {ratio:.0f} times "
-                f"what the gauge itself would leave ({_mm(gauge * factor)} mm): it is error of the "
-                f"model (legs, axes, mounting), or a wrong sign, direction or setup; not noise of "
-                f"the gauge. With the model '{calibration.model}' it will stay."
-            )
-        elif ratio < low:
-            sentences.append(
-                f"What remains is only {ratio:.2g} of what the gauge's own σ would leave: the σ "
-                "given for the gauge is too large, or readings were smoothed."
-            )
-        else:
-            sentences.append(
-                "What remains is what the gauge's own σ would leave: the model is good enough "
-                "for these readings."
-            )
-    elif noise.source == "cycles":
-        sentences.append("What remains is what repeated cycles scatter by: the model fits.")
-    sentences += _explain_cycles(calibration)
-    sentences += _explain_linearisation(calibration)
-    sentences += _explain_trust(calibration)
-    return sentences
-
-
-def explain_validation(validation: Validation) -> list[str]:
-    """The verdict of a validation and its reasons."""
-    sentences = []
-    achieved, expected = _mm(validation.achieved_rms), _mm(validation.expected_rms)
-    if validation.as_expected is None:
-        sentences.append(
-            "Whether this is as expected cannot be told: the calibration had no readings to spare "
-            "that would say what to expect."
-        )
-    elif validation.as_expected and validation.nothing_to_change:
-        sentences.append(
-            f"The calibration is confirmed: r.m.s. {achieved} mm was achieved where {expected} mm "
-            "was expected, and a further fit would change no parameter beyond its standard error."
-        )
-    elif not validation.as_expected:
-        sentences.append(
-            f"The calibration is not confirmed: r.m.s. {achieved} mm was achieved where {expected} "
-            "mm was expected, more than chance explains. "
-            + (
-                "No parameter would change, so the offsets are not to blame: the readings scatter "
-                "more than before, or something has moved."
-                if validation.nothing_to_change
-                else "Check the signs of the offsets in the controller first."
-            )
-        )
-    else:
-        names = ", ".join(c.name for c in validation.changes if c.significant)
-        sentences.append(
-            f"The deviations are as expected, but a further fit would change {names} beyond the "
-            "standard error: calibrate again from this session."
-        )
-    repeat = validation.residuals_repeat
-    if repeat is None:
-        sentences.append("Whether what remains repeats cannot be told: too few rows are shared.")
-    elif repeat:
-        sentences.append(
-            f"What remains repeats (correlation {validation.correlation:.3f} over "
-            f"{validation.matched} rows; chance {validation.chance:.1%}): it is error of the "
-            "model, which more readings of the same kind will not remove."
-        )
-    else:
-        sentences.append(
-            f"What remains does not repeat (correlation {validation.correlation:.3f} over "
-            f"{validation.matched} rows): it looks like noise."
-        )
-    if not validation.offsets_stated:
-        sentences.append(
-            "The session does not state which offsets were active; the identified ones are taken."
-        )
-    return sentences
-
-
-def _explain_linearisation(calibration: Calibration) -> list[str]:
-    shifts = [(abs(p.value - p.linear), p) for p in calibration.free]
-    largest, parameter = max(shifts, key=lambda s: s[0] / max(s[1].std, 1e-300))
-    if math.isnan(parameter.std) or parameter.std <= 0.0:
-        return []
-    return [
-        f"Linearising costs at most {_plain(largest * parameter.edge_factor)} "
-        f"{parameter.edge_unit} ({parameter.name}), {largest / parameter.std:.2g} of its σ."
-    ]
-
-
-def _explain_trust(calibration: Calibration) -> list[str]:
-    k = calibration.confidence_factor
-    if math.isinf(k) or math.isnan(calibration.sigma) or calibration.noise.source == "gauge":
-        return []
-    told = {p.name for p in calibration.free if p.identifiable}
-    entries = [e for e in calibration.controller_entries() if f"{e.drive}.offset" in told]
-    vague = [e.drive for e in entries if abs(e.change) <= k * e.std]
-    clear = [e.drive for e in entries if abs(e.change) > k * e.std]
-    sentences = []
-    if clear:
-        sentences.append(f"Offsets that the readings prove (95 %): {', '.join(clear)}.")
-    if vague:
-        sentences.append(
-            f"Offsets whose 95 % interval holds no change at all: {', '.join(vague)}. They are "
-            "still the best estimate, but do not expect much of them."
-        )
-    if len(calibration.free) == len(calibration.controller_entries()):
-        sentences.append(
-            "± σ is what the scatter leaves open if legs and axes are perfect; where they are "
-            "not, these are the offsets that make up for it best in the postures measured."
-        )
-    return sentences
-
-
-def _explain_cycles(calibration: Calibration) -> list[str]:
-    """Whether repeated readings scatter more than the gauge's σ allows, and where most."""
-    noise, gauge = calibration.noise, calibration.session.gauge_sigma
-    if noise.cycles_dof == 0 or gauge is None:
-        return []
-    if noise.cycles_sigma / gauge <= _ratio_interval(noise.cycles_dof)[1]:
-        return []
-    groups: dict[tuple[str, str], list[ResidualRow]] = {}
-    for row in calibration.residuals:
-        groups.setdefault((row.setup, row.label), []).append(row)
-
-    def spread(rows: list[ResidualRow]) -> float:
-        return max(r.measured for r in rows) - min(r.measured for r in rows)
-
-    worst = max(groups.values(), key=spread)
-    shown = ", ".join(f"{_signed(r.measured * 1e3)} in cycle {r.cycle}" for r in worst[:6])
-    return [
-        f"Repeated readings scatter by {_mm(noise.cycles_sigma)} mm, more than the gauge's "
-        f"{_mm(gauge)} mm explain. They differ most at {worst[0].label}: {shown} mm. Check these "
-        "for a wrong sign or row before anything is entered."
-    ]
-
-
-def _ratio_interval(dof: float) -> tuple[float, float]:
-    """Where a standard deviation from dof degrees of freedom lies, as a ratio, 98 %."""
-    low, high = (float(special.chdtri(dof, p)) for p in (0.99, 0.01))
-    return math.sqrt(low / dof), math.sqrt(high / dof)
 
 
 def _heading(calibration: Calibration) -> RenderableType:
@@ -291,49 +106,142 @@ def _heading(calibration: Calibration) -> RenderableType:
             f"{len(calibration.setups)} setups on legs {legs}"
         )
     )
-    prior = "tolerances as prior" if calibration.prior else "no prior"
+    with_prior = sum(p.prior for p in calibration.free)
+    prior = "tolerances as prior" if with_prior else "no prior"
+    if 0 < with_prior < len(calibration.free):
+        prior = f"{with_prior} with a prior"
+    kind = "base parameters" if calibration.base else "parameters"
+    loss = ", Huber's loss" if solver.loss == "huber" else ""
     lines.append(
         Text(
-            f"Solved: {len(calibration.free)} parameters, {prior}; Ipopt {solver.status}, "
-            f"{solver.iterations} iterations, {solver.seconds_build + solver.seconds_solve:.2f} s"
+            f"Solved: {len(calibration.free)} {kind}, {prior}{loss}; Ipopt {solver.status}, "
+            f"{solver.iterations} iterations, {solver.seconds_build:.2f} + "
+            f"{solver.seconds_solve:.2f} s"
         )
     )
     return Group(*lines)
 
 
-def _parameter_table(calibration: Calibration) -> RenderableType:
-    table = _table(
-        "parameter", "linear", "exact", "± σ", "95 % interval", "exact − linear", "in σ", "unit"
+def _parameter_table(calibration: Calibration, all_rows: bool) -> RenderableType:
+    c, told = calibration, calibration.prior
+    profiled = any(p.interval for p in c.free)
+    table = table_of(
+        "parameter",
+        "linear",
+        "exact",
+        "± σ",
+        *(["told"] if told else []),
+        "95 % interval",
+        *(["profile interval"] if profiled else []),
+        *([] if told or profiled else ["exact − linear"]),
+        *([] if told and profiled else ["in σ"]),
+        "unit",
     )
-    k = calibration.confidence_factor
-    for p in calibration.free:
+    listed = [p for p in c.free if all_rows or len(c.free) <= MANY_PARAMETERS or _worth_listing(p)]
+    for p in listed:
         f = p.edge_factor
-        half = k * p.std * f
-        interval = f"{_signed(p.value * f - half)} … {_signed(p.value * f + half)}"
-        _add(
+        half = c.confidence_factor * p.std
+        add_row(
             table,
             p.name + ("" if p.identifiable else " *"),
-            _signed(p.linear * f),
-            _signed(p.value * f),
-            _plain(p.std * f),
-            interval if math.isfinite(half) else "unknown",
-            _signed((p.value - p.linear) * f, 4),
-            f"{(p.value - p.linear) / p.std:+.3f}" if p.std > 0.0 else "",
+            signed(p.linear * f),
+            signed(p.value * f),
+            f"at its {p.at_bound} bound" if p.at_bound else plain(p.std * f),
+            *([f"{p.data_share:.0%}" if p.prior and not p.at_bound else ""] if told else []),
+            "" if p.at_bound else _interval(p.value - half, p.value + half, f),
+            *([_interval(*p.interval, f) if p.interval else ""] if profiled else []),
+            *([] if told or profiled else [signed((p.value - p.linear) * f, 4)]),
+            *([] if told and profiled else [_ratio(p.value - p.linear, p.std)]),
             p.edge_unit,
         )
-    held = [p for p in calibration.parameters if not p.free]
     notes: list[RenderableType] = [table]
+    if len(listed) < len(c.free):
+        notes.append(
+            Text(
+                f"{len(c.free) - len(listed)} more of which the readings tell less than half; "
+                "--all lists every parameter."
+            )
+        )
+    held = [p for p in c.parameters if not p.free]
     if held:
         values = ", ".join(f"{p.name} = {p.value * p.edge_factor:g} {p.edge_unit}" for p in held)
         notes.append(Text(f"Held at known values: {values}"))
-    if any(not p.identifiable for p in calibration.free):
+    if any(p.at_bound for p in c.free):
         notes.append(
             Text(
-                "* the readings alone do not tell it better than its tolerance, "
-                "which acts as a prior"
+                "A parameter at its bound has no ± of its own, and the others' ± holds with it "
+                "there: the readings want it beyond."
             )
         )
+    if any(not p.identifiable for p in listed):
+        notes.append(
+            Text(
+                "* the readings alone do not tell it better than its tolerance: not at all, or only "
+                "together with others"
+            )
+        )
+    if told:
+        notes.append(
+            Text("told: how much of what the tolerance left open the readings took away (variance)")
+        )
+    pairs = c.correlated(above=0.5)
+    if pairs:
+        words = ", ".join(f"{a} with {b} {r:+.2f}" for a, b, r in pairs[:MOST_PAIRS])
+        more = f", and {len(pairs) - MOST_PAIRS} more" if len(pairs) > MOST_PAIRS else ""
+        notes.append(Text(f"Correlations above 0.5: {words}{more}"))
     return Group(*notes)
+
+
+def _worth_listing(p: ParameterEstimate) -> bool:
+    return (
+        p.name.endswith(".offset")
+        or p.at_bound is not None
+        or p.interval is not None
+        or not p.prior
+        or p.data_share >= TOLD
+    )
+
+
+def _ratio(value: float, std: float) -> str:
+    return f"{value / std:+.3f}" if std > 0.0 else ""
+
+
+def _interval(low: float, high: float, factor: float) -> str:
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return "unknown"
+    return f"{signed(low * factor)} … {signed(high * factor)}"
+
+
+def _identifiability(calibration: Calibration, all_rows: bool) -> RenderableType:
+    found = calibration.identifiability
+    count = found.singular_values.size
+    o = found.observability
+    lines = [
+        f"{found.rank} of {count} combinations of parameters better than their tolerances "
+        f"(singular values above {found.threshold * 1e6:.3g} µm a tolerance); perfect readings "
+        f"would tell {found.structural_rank}.",
+    ]
+    if found.rank:
+        lines.append(
+            f"Condition number {found.condition:.3g}; observability O1 {o['O1'] * 1e3:.3g} mm, "
+            f"O2 {o['O2']:.3g}, O3 {o['O3'] * 1e3:.3g} mm, O4 {o['O4'] * 1e3:.3g} mm, "
+            f"O5 {o['O5'] * 1e3:.3g} mm a tolerance."
+        )
+    shown = found.alike if all_rows else found.alike[:6]
+    lines += [f"Not told apart: {c.words}." for c in shown]
+    if len(shown) < len(found.alike):
+        lines.append(f"{len(found.alike) - len(shown)} more such groups; --all lists them.")
+    if found.unseen:
+        names = (
+            ", ".join(found.unseen) if all_rows or len(found.unseen) <= 6 else "--all lists them"
+        )
+        lines.append(f"Not seen at all: {len(found.unseen)} parameters ({names}).")
+    sums = [c for c in found.base if len(c.terms) > 1]
+    if calibration.base:
+        lines += [f"{c.terms[0][0]} stands for {c.formula}" for c in sums]
+    elif all_rows:
+        lines += [f"Told as one: {c.formula}" for c in sums]
+    return Group(*(Text(line) for line in lines))
 
 
 def _residual_table(calibration: Calibration, all_rows: bool) -> RenderableType:
@@ -342,87 +250,65 @@ def _residual_table(calibration: Calibration, all_rows: bool) -> RenderableType:
     def spread(row: ResidualRow) -> float:
         return noise * (math.sqrt(2.0) if row.minus else 1.0)
 
-    rows, note = _choose_rows(calibration.residuals, all_rows)
+    rows, note = choose_rows(calibration.residuals, all_rows)
     cycles = any(r.cycle != 1 for r in calibration.residuals)
     raw = not calibration.rows_are_differences
     columns = ["setup", "posture", *(["cycle"] if cycles else []), "measured [mm]"]
-    table = _table(*columns, "before [mm]", "after [mm]", "after in σ", left=2)
+    table = table_of(
+        *columns, "before [mm]", "after [mm]", "in σ", "studentised", "moves by", left=2
+    )
     for r in rows:
         where = f"{r.posture} − {r.minus}" if r.minus else r.posture
-        _add(
+        add_row(
             table,
             r.setup,
             where,
             *([str(r.cycle)] if cycles else []),
-            _signed(r.measured * 1e3),
-            _signed(r.deviation * 1e3),
-            _signed(r.residual * 1e3),
+            signed(r.measured * 1e3),
+            signed(r.deviation * 1e3),
+            signed(r.residual * 1e3),
             f"{r.residual / spread(r):+.1f}" if spread(r) > 0.0 else "",
+            f"{r.studentised:+.1f}" if math.isfinite(r.studentised) else "",
+            f"{r.influence:.1f}",
         )
     parts: list[RenderableType] = [table]
     if raw:
         parts.append(Text("Before and after: measured less model, each with its best gauge zeros."))
+    parts.append(
+        Text(
+            "studentised: as all other readings see it, in its σ; moves by: the σ by which a "
+            "parameter would change without it, at most"
+        )
+    )
     if note:
         parts.append(Text(note))
     return Group(*parts)
 
 
-def _validation_rows(validation: Validation, all_rows: bool) -> RenderableType:
-    rows, note = _choose_rows(validation.rows, all_rows)
-    cycles = any(r.cycle != 1 for r in validation.rows)
-    table = _table(
-        "setup",
-        "posture",
-        *(["cycle"] if cycles else []),
-        "deviation [mm]",
-        "after a further fit [mm]",
-        left=2,
-    )
-    for r in rows:
-        _add(
-            table,
-            r.setup,
-            f"{r.posture} − {r.minus}" if r.minus else r.posture,
-            *([str(r.cycle)] if cycles else []),
-            _signed(r.deviation * 1e3),
-            _signed(r.residual * 1e3),
-        )
-    return Group(table, Text(note)) if note else table
-
-
-def _choose_rows(
-    rows: tuple[ResidualRow, ...], all_rows: bool
-) -> tuple[Iterable[ResidualRow], str]:
-    if all_rows or len(rows) <= MANY_ROWS:
-        return rows, ""
-    worst = sorted(rows, key=lambda r: -abs(r.residual))[:WORST_ROWS]
-    return worst, f"The {WORST_ROWS} largest of {len(rows)}; --all lists every reading."
-
-
 def _fit_table(calibration: Calibration) -> RenderableType:
     c, noise = calibration, calibration.noise
-    table = _table("", "before", "after", "")
+    table = table_of("", "before", "after", "")
     change = c.rms_after / c.rms_before - 1.0 if c.rms_before > 0.0 else 0.0
-    _add(table, "r.m.s. [mm]", _mm(c.rms_before), _mm(c.rms_after), f"{change:+.0%}")
+    add_row(table, "r.m.s. [mm]", mm(c.rms_before), mm(c.rms_after), f"{change:+.0%}")
     change = c.largest_after / c.largest_before - 1.0 if c.largest_before > 0.0 else 0.0
-    _add(table, "largest [mm]", _mm(c.largest_before), _mm(c.largest_after), f"{change:+.0%}")
+    add_row(table, "largest [mm]", mm(c.largest_before), mm(c.largest_after), f"{change:+.0%}")
     row = "a difference" if c.rows_are_differences else "a reading"
     dof = "" if math.isinf(c.dof) else f", {c.dof:.3g} degrees of freedom"
-    text = f"σ of {row}: {_mm(c.sigma)} mm, {_SOURCES[noise.source]}{dof}"
+    text = f"σ of {row}: {mm(c.sigma)} mm, {_SOURCES[noise.source]}{dof}"
     if c.rows_are_differences and math.isfinite(noise.reading_sigma):
-        text += f" (of one reading {_mm(noise.reading_sigma)} mm)"
+        text += f" (of one reading {mm(noise.reading_sigma)} mm)"
     lines: list[RenderableType] = [table, Text(text)]
     if noise.cycles_dof > 0 and noise.source != "cycles":
         lines.append(
             Text(
-                f"σ of a reading from repeated cycles: {_mm(noise.cycles_sigma)} mm, "
+                f"σ of a reading from repeated cycles: {mm(noise.cycles_sigma)} mm, "
                 f"{noise.cycles_dof} degrees of freedom"
             )
         )
     if c.session.gauge_sigma is not None:
-        text = f"σ given for the gauge: {_mm(c.session.gauge_sigma)} mm a reading"
+        text = f"σ given for the gauge: {mm(c.session.gauge_sigma)} mm a reading"
         if c.rows_are_differences:
-            text += f", {_mm(c.session.gauge_sigma * math.sqrt(2.0))} mm a difference"
+            text += f", {mm(c.session.gauge_sigma * math.sqrt(2.0))} mm a difference"
         lines.append(Text(text))
     return Group(*lines)
 
@@ -433,13 +319,13 @@ def _controller_table(calibration: Calibration) -> RenderableType:
         return Text("Nothing: no offset was identified.")
     stated = entries[0].active is not None
     if stated:
-        table = _table("drive", "active now", "enter", "± σ", "unit")
+        table = table_of("drive", "active now", "enter", "± σ", "unit")
     else:
-        table = _table("drive", "add to the present offset", "± σ", "unit")
+        table = table_of("drive", "add to the present offset", "± σ", "unit")
     for e in entries:
         factor, unit = (1e3, "mm") if e.unit == "m" else (1e3, "mrad")
-        now = [] if e.active is None else [_signed(e.active * factor)]
-        _add(table, e.drive, *now, _signed(e.enter * factor), _plain(e.std * factor), unit)
+        now = [] if e.active is None else [signed(e.active * factor)]
+        add_row(table, e.drive, *now, signed(e.enter * factor), plain(e.std * factor), unit)
     notes = [
         Text("An offset is what to add to the encoder's coordinate to get the slider's true one."),
     ]
@@ -457,35 +343,3 @@ def _controller_table(calibration: Calibration) -> RenderableType:
             )
         )
     return Group(table, *notes)
-
-
-def _section(title: str, body: RenderableType) -> RenderableType:
-    return Group(Text(), Text(title, style="bold cyan"), Padding(body, (0, 0, 0, 2)))
-
-
-def _sentences(sentences: list[str]) -> RenderableType:
-    return Group(*(Text(f"• {s}") for s in sentences))
-
-
-def _table(*columns: str, left: int = 1) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    for i, column in enumerate(columns):
-        table.add_column(Text(column), justify="left" if i < left or column == "unit" else "right")
-    return table
-
-
-def _add(table: Table, *cells: str) -> None:
-    """Add a row of plain text: names come from files, and are not markup."""
-    table.add_row(*(Text(cell) for cell in cells))
-
-
-def _mm(value: float) -> str:
-    return _plain(value * 1e3)
-
-
-def _plain(value: float, decimals: int = 3) -> str:
-    return f"{value:.{decimals}f}" if math.isfinite(value) else "unknown"
-
-
-def _signed(value: float, decimals: int = 3) -> str:
-    return f"{value:+.{decimals}f}" if math.isfinite(value) else "unknown"

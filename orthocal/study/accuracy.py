@@ -75,12 +75,20 @@ class Workspace:
     weights: Array
     """Shape (K,), sum 1."""
 
+    @classmethod
+    def even(cls, points: ArrayLike) -> Workspace:
+        """Points that all count alike, shape (K, n_coordinates), [m]."""
+        p = read_only(np.atleast_2d(np.asarray(points, dtype=np.float64)))
+        return cls(p, read_only(np.full(len(p), 1.0 / len(p))))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolAccuracy:
     """Where the tool is and how well that is known, before and after a calibration."""
 
     workspace: Workspace
+    targets: Array
+    """Commanded tool positions, shape (K, 3), [m]."""
     names: tuple[str, ...]
     """Free, then unmodelled parameters."""
     jacobian: Array
@@ -159,11 +167,12 @@ class ToolSensitivity:
         self._function = BatchFunction(function, shared=["theta", "placements", "slopes"])
         self._shared = [np.asarray(v.full()).reshape(-1) for v in shared.function(self.theta)]
 
-    def __call__(self, drives: ArrayLike) -> Array:
+    def __call__(self, drives: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
         """∂p/∂θ at commanded drive coordinates.
 
         Args:
             drives: Shape (K, n_drives), [m, rad].
+            names: What to call the postures in messages.
 
         Returns:
             Shape (K, 3, n_free), [m per parameter unit].
@@ -172,7 +181,7 @@ class ToolSensitivity:
             ClosureError: If a posture cannot be reached.
         """
         d = np.atleast_2d(np.asarray(drives, dtype=np.float64))
-        passive = self.assembly.close(d)
+        passive = self.assembly.close(d, names=names)
         p_q, p_theta, g_q, g_theta = self._function(d, passive, self.theta, *self._shared)
         if g_q.shape[1] == g_q.shape[2]:
             slopes = np.linalg.solve(g_q, g_theta)
@@ -232,7 +241,12 @@ def measure_deviations(deviations: Array, weights: Array) -> ErrorSize:
     )
 
 
-def assess_tool(calibration: Calibration, workspace: Workspace | None = None) -> ToolAccuracy:
+def assess_tool(
+    calibration: Calibration,
+    workspace: Workspace | None = None,
+    *,
+    names: Sequence[str] | None = None,
+) -> ToolAccuracy:
     """Where the tool is and how well that is known, before and after a calibration.
 
     Errors that were not free are taken at their tolerances, together with what the estimate has
@@ -241,6 +255,7 @@ def assess_tool(calibration: Calibration, workspace: Workspace | None = None) ->
     Args:
         calibration: The calibration.
         workspace: Tool positions that are commanded; the cube of ±60 mm by default.
+        names: What to call the points in messages.
 
     Raises:
         RobotError: If the robot has no tool centre point.
@@ -252,39 +267,44 @@ def assess_tool(calibration: Calibration, workspace: Workspace | None = None) ->
     free = [p.name for p in calibration.free]
     tool = ToolSensitivity(robot, free=[*free, *unmodelled.names], values=values)
     nominal = nominal_assembly(robot)
-    names = [f"point {i + 1}" for i in range(len(space.points))]
+    names = names or [f"point {i + 1}" for i in range(len(space.points))]
     target = nominal.inverse(space.points, names=names)
     active = calibration.session.controller_offsets
     commanded = target - (np.zeros(len(robot.drives)) if active is None else np.array(active))
     offsets = np.array([values.get(f"{d.name}.offset", 0.0) for d in robot.drives])
-    where = nominal.forward(target)
-    jacobian = tool(commanded)
+    where = nominal.forward(target, names=names)
+    jacobian = tool(commanded, names=names)
     tolerances = np.r_[[p.tolerance for p in calibration.free], unmodelled.tolerances]
     after = None
     if np.isfinite(calibration.covariance).all():
         after = measure_uncertainty(jacobian, error_covariance(calibration), space)
     return ToolAccuracy(
         workspace=space,
+        targets=read_only(where),
         names=tool.free,
         jacobian=read_only(jacobian),
-        deviation=read_only(tool.assembly.forward(commanded) - where),
-        left=read_only(tool.assembly.forward(target - offsets) - where),
+        deviation=read_only(tool.assembly.forward(commanded, names=names) - where),
+        left=read_only(tool.assembly.forward(target - offsets, names=names) - where),
         before=measure_uncertainty(jacobian, np.diag(tolerances**2), space),
         after=after,
     )
 
 
-def error_covariance(calibration: Calibration) -> Array:
+def error_covariance(calibration: Calibration, *, excess: float = 1.0) -> Array:
     """Covariance of what the estimate has wrong, free and unmodelled parameters in turn, [SI].
 
     With e = θ − θ̂ it is −L θᵤ and the estimate's own scatter for the free ones, θᵤ for the others.
+
+    Args:
+        calibration: The calibration.
+        excess: How many times their tolerances the unmodelled errors are taken to be.
     """
     unmodelled = calibration.unmodelled
-    variance = unmodelled.tolerances**2
+    variance = (excess * unmodelled.tolerances) ** 2
     taken_on = unmodelled.leakage * variance
     return np.block(
         [
-            [calibration.covariance + unmodelled.bias_covariance, -taken_on],
+            [calibration.covariance + taken_on @ unmodelled.leakage.T, -taken_on],
             [-taken_on.T, np.diag(variance)],
         ]
     )

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections import defaultdict
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,11 +23,12 @@ from orthocal.identification.uncertainty import confidence_factor
 from orthocal.measurement.session import Session
 from orthocal.robot.model import read_only
 from orthocal.robot.parameters import InUnit, Unit
+from orthocal.study.repetition import Repetition, measure_repetition
 
 Array = NDArray[np.float64]
 
-CHANCE = 0.05
-"""Probability below which a repetition of residuals is not put down to chance."""
+CHANGE_CHANCE = 0.05
+"""Probability that any parameter of a calibration that is right is said to change."""
 
 EXCESS_CHANCE = 0.01
 """Probability below which larger deviations than expected are not put down to chance."""
@@ -68,12 +68,8 @@ class Validation:
     """Probability that the achieved sum of squares would be as large by chance (F test); NaN if
     the calibration had no readings to spare."""
     changes: tuple[FurtherChange, ...]
-    matched: int
-    """Rows that both sessions have."""
-    correlation: float
-    """Of the residuals of both fits over those rows; NaN below three."""
-    chance: float
-    """Probability of such a correlation between residuals that are noise; NaN if unknown."""
+    repetition: Repetition
+    """Whether what both fits leave is the same."""
     rows: tuple[ResidualRow, ...]
     """Rows of the new session: nominal is the machine as the controller knows it."""
 
@@ -121,19 +117,9 @@ class Validation:
                 }
                 for c in self.changes
             ],
-            "matched": self.matched,
-            "correlation": number(self.correlation),
-            "chance": number(self.chance),
-            "residuals_repeat": self.residuals_repeat,
+            **self.repetition.to_document(),
         }
         return json.dumps(document, indent=1, allow_nan=False) + "\n"
-
-    @property
-    def residuals_repeat(self) -> bool | None:
-        """Whether what is left is the same again: model error, not noise. None if unknown."""
-        if math.isnan(self.chance):
-            return None
-        return self.chance < CHANCE and self.correlation > 0.0
 
 
 def validate_calibration(calibration: Calibration, session: Session) -> Validation:
@@ -166,13 +152,7 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         session = _with_controller(session, offsets)
     refit = repeat_calibration(calibration, session)
     changes = _further_changes(calibration, refit)
-    matched, correlation, cosine = _correlate(calibration.residuals, refit.residuals)
-    dims = _residual_dimensions(refit, matched)
-    chance = math.nan
-    if matched >= 3 and dims > 1.0 and not math.isnan(correlation):
-        # directions of noise are spread evenly over the space that the fit leaves to residuals
-        tail = 0.5 * (1.0 - float(special.betainc(0.5, 0.5 * (dims - 1.0), cosine**2)))
-        chance = tail if cosine > 0.0 else 1.0 - tail
+    repetition = measure_repetition(calibration, refit)
     return Validation(
         title=session.title,
         offsets_stated=stated,
@@ -184,9 +164,7 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         refit_largest=refit.largest_after,
         excess_probability=_excess_probability(calibration, refit),
         changes=changes,
-        matched=matched,
-        correlation=correlation,
-        chance=chance,
+        repetition=repetition,
         rows=refit.residuals,
     )
 
@@ -195,7 +173,7 @@ def _further_changes(calibration: Calibration, refit: Calibration) -> tuple[Furt
     """New less old estimates, against the standard error of the difference of the two."""
     pairs = list(zip(calibration.free, refit.free, strict=True))
     # so many chances to be wrong by chance: each gets its share of the 5 %
-    factor = confidence_factor(min(calibration.dof, refit.dof), 1.0 - CHANCE / len(pairs))
+    factor = confidence_factor(min(calibration.dof, refit.dof), 1.0 - CHANGE_CHANCE / len(pairs))
     changes = []
     for old, new in pairs:
         change, std = new.value - old.value, math.hypot(old.std, new.std)
@@ -237,29 +215,3 @@ def _excess_probability(calibration: Calibration, refit: Calibration) -> float:
     # what the calibration did not know of its parameters adds to what the new readings show
     mean = expected**2 * (1.0 + (count - refit.noise.residual_dof) / count)
     return float(special.fdtrc(count, dof, achieved / count / mean))
-
-
-def _residual_dimensions(refit: Calibration, matched: int) -> float:
-    """Dimensions that a fit leaves to the residuals of matched rows, cycles averaged."""
-    rows = refit.residuals
-    zeros = len({r.setup for r in rows if r.minus is None})
-    used = len(rows) - zeros - refit.noise.residual_dof
-    return matched - zeros - used
-
-
-def _correlate(
-    first: tuple[ResidualRow, ...], second: tuple[ResidualRow, ...]
-) -> tuple[int, float, float]:
-    """Rows that two sessions share, cycles averaged; correlation and cosine of their residuals."""
-    means = []
-    for rows in (first, second):
-        collected: dict[tuple[str, str, str | None], list[float]] = defaultdict(list)
-        for r in rows:
-            collected[r.setup, r.posture, r.minus].append(r.residual)
-        means.append({key: sum(v) / len(v) for key, v in collected.items()})
-    common = [key for key in means[0] if key in means[1]]
-    a, b = (np.array([m[key] for key in common]) for m in means)
-    if len(common) < 3 or not np.any(a) or not np.any(b):
-        return len(common), math.nan, math.nan
-    cosine = float(a @ b / np.sqrt((a @ a) * (b @ b)))
-    return len(common), float(np.corrcoef(a, b)[0, 1]), cosine

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from orthocal import calibrate, load_session, summarize
-from orthocal.output.summary import explain_fit
+from orthocal.output.explanation import explain_fit
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +36,8 @@ def test_every_reading_is_listed_before_and_after(table1):
         "-1.140",
         "-0.130",
         "-0.5",
+        "-0.6",
+        "0.6",
     ]
     assert line(text, "r.m.s.").split()[-3:] == ["0.622", "0.195", "-69%"]
     assert line(text, "largest").split()[-3:] == ["1.140", "0.278", "-76%"]
@@ -105,8 +107,8 @@ def test_many_readings_are_cut_unless_all_are_asked_for(raw_cycles):
 
 
 def test_names_from_files_are_not_markup(table1):
-    rows = (replace(table1.residuals[0], setup="[red]yx[/red]"), *table1.residuals[1:])
+    rows = (replace(table1.residuals[0], setup="[red]y"), *table1.residuals[1:])
     titled = replace(table1.session, title="[bold]x[/nonsense]")
     text = summarize(replace(table1, residuals=rows, session=titled))
-    assert "[red]yx[/red]" in text
+    assert "[red]y " in text
     assert "[bold]x[/nonsense]" in text

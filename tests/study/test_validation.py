@@ -48,8 +48,8 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(table1):
     assert np.abs(changes - [0.0667, 0.1411, 0.0025]).max() < 0.005
     assert result.as_expected
     assert result.nothing_to_change
-    assert result.residuals_repeat is True
-    assert result.chance < 0.01
+    assert result.repetition.repeats is True
+    assert result.repetition.chance < 0.01
     assert not result.offsets_stated
     text = summarize(result)
     assert "The calibration is confirmed" in text
@@ -76,7 +76,7 @@ def test_a_right_calibration_with_noise_alone_does_not_repeat_its_residuals(plan
         after = simulate_session(with_offsets(plan, entered), TRUTH, seed=seed).session
         result = validate_calibration(before, after)
         assert result.offsets_stated
-        verdicts.append((result.as_expected, result.nothing_to_change, result.residuals_repeat))
+        verdicts.append((result.as_expected, result.nothing_to_change, result.repetition.repeats))
     # 1 %, 5 % and 5 % by construction: more than these of 20 have a chance below 1 %
     assert sum(ok is False for ok, _, _ in verdicts) <= 2
     assert sum(not nothing for _, nothing, _ in verdicts) <= 4

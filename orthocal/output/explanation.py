@@ -1,0 +1,173 @@
+"""What a calibration means, in sentences."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy import special
+
+from orthocal.identification.calibration import Calibration
+from orthocal.identification.records import ResidualRow
+from orthocal.output.layout import mm, plain, signed
+
+WORST_SUSPICIOUS = 5
+"""Suspicious readings that are named."""
+
+STANDSTILL = 1e-6
+"""Part of a tolerance by which a parameter must move to have moved."""
+
+
+def explain_fit(calibration: Calibration) -> list[str]:
+    """Sentences on what remains, what linearisation costs, and what can be believed."""
+    sentences = []
+    noise, factor = calibration.noise, calibration.row_factor
+    row = "a difference" if calibration.rows_are_differences else "a reading"
+    gauge = calibration.session.gauge_sigma
+    if noise.source == "unknown":
+        sentences.append(
+            "As many parameters as readings and no word on the gauge: nothing tells how far the "
+            "numbers can be trusted."
+        )
+    elif noise.source == "gauge":
+        sentences.append(
+            "There are no readings to spare: standard deviations rest on the σ given for the "
+            "gauge alone, and a wrong model would not show."
+        )
+    if noise.source == "residuals" and noise.cycles_dof > 0:
+        ratio = noise.residual_sigma / noise.cycles_sigma
+        sentences.append(
+            f"What remains is {ratio:.1f} times what repeated cycles scatter by "
+            f"({mm(noise.cycles_sigma)} mm a reading): it is error of the model, not noise. "
+            "Standard deviations are taken from the residuals."
+        )
+    elif noise.source == "residuals" and gauge is not None:
+        ratio = noise.residual_sigma / gauge
+        low, high = _ratio_interval(noise.residual_dof)
+        if ratio > high:
+            sentences.append(
+                f"What remains, σ = {mm(calibration.sigma)} mm of {row}, is {ratio:.0f} times "
+                f"what the gauge itself would leave ({mm(gauge * factor)} mm): it is error of the "
+                f"model (legs, axes, mounting), or a wrong sign, direction or setup; not noise of "
+                f"the gauge. With the model '{calibration.model}' it will stay."
+            )
+        elif ratio < low:
+            sentences.append(
+                f"What remains is only {ratio:.2g} of what the gauge's own σ would leave: the σ "
+                "given for the gauge is too large, or readings were smoothed."
+            )
+        else:
+            sentences.append(
+                "What remains is what the gauge's own σ would leave: the model is good enough "
+                "for these readings."
+            )
+    elif noise.source == "cycles":
+        sentences.append("What remains is what repeated cycles scatter by: the model fits.")
+    sentences += _explain_cycles(calibration)
+    sentences += _explain_suspicious(calibration)
+    sentences += _explain_linearisation(calibration)
+    sentences += _explain_trust(calibration)
+    sentences += _explain_standstill(calibration)
+    return sentences
+
+
+def _explain_suspicious(calibration: Calibration) -> list[str]:
+    """Rows that all the others contradict, by file and line."""
+    rows = calibration.suspicious
+    if not rows:
+        return []
+    words = [
+        f"{calibration.where(r)}: {r.label}{f', cycle {r.cycle}' if r.cycle > 1 else ''}, reads "
+        f"{signed(r.measured * 1e3)} mm, {r.studentised:+.1f} of its σ from what all others say; "
+        f"without it {r.influenced} would change by {r.influence:.1f} of its σ"
+        for r in rows[:WORST_SUSPICIOUS]
+    ]
+    more = len(rows) - len(words)
+    return [
+        "Suspicious readings, to be looked at and read again (none was left out): "
+        + "; ".join(words)
+        + (f"; and {more} more." if more else ".")
+    ]
+
+
+def _explain_standstill(calibration: Calibration) -> list[str]:
+    """Why nothing moved, if nothing did."""
+    if any(abs(p.value - p.start) > STANDSTILL * p.tolerance for p in calibration.free):
+        return []
+    unseen = calibration.identifiability.unseen
+    if len(unseen) == len(calibration.free):
+        return [
+            "Nothing moved: no reading depends on any free parameter, so all stay at their start."
+        ]
+    return [
+        "Nothing moved: the readings show no deviation that these parameters would explain "
+        f"(r.m.s. {mm(calibration.rms_before)} mm before). What the controller has is right, or "
+        "the readings are those of a machine without errors."
+    ]
+
+
+def _explain_linearisation(calibration: Calibration) -> list[str]:
+    shifts = [(abs(p.value - p.linear), p) for p in calibration.free]
+    largest, parameter = max(shifts, key=lambda s: s[0] / max(s[1].std, 1e-300))
+    if math.isnan(parameter.std) or parameter.std <= 0.0:
+        return []
+    return [
+        f"Linearising costs at most {plain(largest * parameter.edge_factor)} "
+        f"{parameter.edge_unit} ({parameter.name}), {largest / parameter.std:.2g} of its σ."
+    ]
+
+
+def _explain_trust(calibration: Calibration) -> list[str]:
+    k = calibration.confidence_factor
+    if math.isinf(k) or math.isnan(calibration.sigma) or calibration.noise.source == "gauge":
+        return []
+    told = {p.name for p in calibration.free if p.identifiable}
+    entries = [e for e in calibration.controller_entries() if f"{e.drive}.offset" in told]
+    vague = [e.drive for e in entries if abs(e.change) <= k * e.std]
+    clear = [e.drive for e in entries if abs(e.change) > k * e.std]
+    sentences = []
+    if clear:
+        sentences.append(f"Offsets that the readings prove (95 %): {', '.join(clear)}.")
+    if vague:
+        sentences.append(
+            f"Offsets whose 95 % interval holds no change at all: {', '.join(vague)}. They are "
+            "still the best estimate, but do not expect much of them."
+        )
+    if len(calibration.free) == len(calibration.controller_entries()):
+        bias = np.sqrt(np.diag(calibration.unmodelled.bias_covariance))
+        size = f", which would move them by ±{mm(float(bias.max()))} mm," if bias.size else ""
+        sentences.append(
+            f"± σ is what the scatter leaves open. Errors of legs and axes within their tolerances"
+            f"{size} come on top: these are the offsets that make up for them best in the postures "
+            "measured. What is left of that at the tool is in the table above."
+        )
+    return sentences
+
+
+def _explain_cycles(calibration: Calibration) -> list[str]:
+    """Whether repeated readings scatter more than the gauge's σ allows, and where most."""
+    noise, gauge = calibration.noise, calibration.session.gauge_sigma
+    if noise.cycles_dof == 0 or gauge is None:
+        return []
+    if noise.cycles_sigma / gauge <= _ratio_interval(noise.cycles_dof)[1]:
+        return []
+    groups: dict[tuple[str, str], list[ResidualRow]] = {}
+    for row in calibration.residuals:
+        groups.setdefault((row.setup, row.label), []).append(row)
+
+    def spread(rows: list[ResidualRow]) -> float:
+        return max(r.measured for r in rows) - min(r.measured for r in rows)
+
+    worst = max(groups.values(), key=spread)
+    shown = ", ".join(f"{signed(r.measured * 1e3)} in cycle {r.cycle}" for r in worst[:6])
+    return [
+        f"Repeated readings scatter by {mm(noise.cycles_sigma)} mm, more than the gauge's "
+        f"{mm(gauge)} mm explain. They differ most at {worst[0].label}: {shown} mm. Check these "
+        "for a wrong sign or row before anything is entered."
+    ]
+
+
+def _ratio_interval(dof: float) -> tuple[float, float]:
+    """Where a standard deviation from dof degrees of freedom lies, as a ratio, 98 %."""
+    low, high = (float(special.chdtri(dof, p)) for p in (0.99, 0.01))
+    return math.sqrt(low / dof), math.sqrt(high / dof)
