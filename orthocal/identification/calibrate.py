@@ -160,7 +160,7 @@ def assemble_calibration(
         solver=SolverRecord(
             name="ipopt",
             status=fit.solution.status,
-            iterations=fit.solution.iterations,
+            iterations=fit.iterations,
             seconds_build=fit.seconds_build,
             seconds_solve=fit.seconds_solve,
             hessian=fit.program.options.hessian,

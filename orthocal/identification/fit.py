@@ -49,6 +49,8 @@ class Fit:
     """Building all functions and the program, once, [s]."""
     seconds_solve: float
     """All solutions until sigma had settled, [s]."""
+    iterations: int
+    """Of Ipopt, in all of them."""
     linear: Array
     """Linearised solution, shape (n_free,), [SI]."""
     solution: Solution
@@ -125,7 +127,7 @@ def fit_problem(
     sigma = first_sigma(problem.session, repeatability)
     program = NonlinearProgram(problem, options=options)
     built = time.perf_counter()
-    seconds = 0.0
+    seconds, iterations = 0.0, 0
     first = linearisation.solve(sigma=sigma) if start is None else np.asarray(start)
     passive: Array | None = None
     for _ in range(MAX_SIGMA_ROUNDS):
@@ -135,7 +137,7 @@ def fit_problem(
             if start is not None or passive is not None:
                 raise
             solution = program.solve(sigma=sigma)  # the linearised machine cannot be assembled
-        seconds += solution.seconds_solve
+        seconds, iterations = seconds + solution.seconds_solve, iterations + solution.iterations
         prediction, jacobian = problem.linearise(solution.theta, solution.passive)
         information = decompose(jacobian, problem.observations)
         noise = _noise(program, prediction, information, sigma, repeatability)
@@ -150,6 +152,7 @@ def fit_problem(
         program=program,
         seconds_build=built - began,
         seconds_solve=seconds,
+        iterations=iterations,
         linear=linearisation.solve(sigma=weight),
         solution=solution,
         noise=noise,

@@ -48,6 +48,7 @@ class SolverRecord:
     name: str
     status: str
     iterations: int
+    """In all solutions until sigma had settled."""
     seconds_build: float
     """Building all functions and the program, once, [s]."""
     seconds_solve: float

@@ -120,7 +120,7 @@ def select_parameters(
             raise ParameterError(f"the bounds of '{glob}' leave nothing between them")
         for name in _match_free(parameters, glob, names):
             lower[names.index(name)], upper[names.index(name)] = low, high
-    only_offsets = all(n.endswith(".offset") for n in names)
+    only_offsets = all(n.endswith(".offset") for n in names if n not in own_prior)
     everywhere = not only_offsets if prior is None else prior
     return Selection(
         label=_label(base, free),
@@ -142,7 +142,7 @@ def read_known(texts: Sequence[str], parameters: ParameterSet, *, where: str) ->
     result: dict[str, Known] = {}
     for text in texts:
         key, number = _split(text, "NAME=VALUE or NAME=VALUE±TOLERANCE", where)
-        value, _, spread = number.replace("+-", "±").partition("±")
+        value, sign, spread = number.replace("+-", "±").partition("±")
         try:
             name, si = parameters.read_quantity(key, _number(value, where, key))
         except ParameterError as e:
@@ -150,7 +150,7 @@ def read_known(texts: Sequence[str], parameters: ParameterSet, *, where: str) ->
         if name in result:
             raise ParameterError(f"'{name}' is given twice", where=where)
         factor = split_unit(key)[2]
-        result[name] = (si, _number(spread, where, key) * factor) if spread else si
+        result[name] = (si, _number(spread, where, key) * factor) if sign else si
     return result
 
 

@@ -143,7 +143,7 @@ def _parameter_table(calibration: Calibration, all_rows: bool) -> RenderableType
         half = c.confidence_factor * p.std
         add_row(
             table,
-            p.name + ("" if p.identifiable else " *"),
+            p.name,
             signed(p.linear * f),
             signed(p.value * f),
             f"at its {p.at_bound} bound" if p.at_bound else plain(p.std * f),
@@ -171,13 +171,6 @@ def _parameter_table(calibration: Calibration, all_rows: bool) -> RenderableType
             Text(
                 "A parameter at its bound has no ± of its own, and the others' ± holds with it "
                 "there: the readings want it beyond."
-            )
-        )
-    if any(not p.identifiable for p in listed):
-        notes.append(
-            Text(
-                "* the readings alone do not tell it better than its tolerance: not at all, or only "
-                "together with others"
             )
         )
     if told:
