@@ -91,13 +91,16 @@ class Fit:
             return np.zeros_like(scale)
         if not math.isfinite(self.noise.sigma):
             return np.full_like(scale, np.nan)
-        r = self.residual / self.noise.sigma
-        factors = (self.loss.gain(r), self.loss.normal_square)
+        factors = (1.0, 1.0)
+        if self.loss.robust:
+            used = self.problem.observations.size - self.noise.residual_dof
+            gain = self.loss.gain(self.residual / self.noise.sigma, used=used)
+            factors = (gain, self.loss.normal_square)
         return scale * self.information.covariance(
             sigma=self.noise.sigma,
             precision=self.problem.prior_precision,
             held=self.held,
-            loss=factors if self.loss.robust else (1.0, 1.0),
+            loss=factors,
         )
 
 

@@ -71,11 +71,21 @@ class Loss:
         """ρ'(r) of residuals in standard deviations, shape as r."""
         return r / np.sqrt(1.0 + (r / self.width) ** 2) if self.robust else r
 
-    def gain(self, r: Array) -> float:
-        """Mean of ρ''(r): how steeply the estimate answers to the readings; 1 for squares."""
+    def gain(self, r: Array, *, used: float) -> float:
+        """Mean of ρ''(r): how steeply the estimate answers to the readings; 1 for squares.
+
+        Divided by Huber's correction for few residuals, 1 + (p/n) var ρ''/(mean ρ'')² (Robust
+        Statistics, 1981, section 7.6).
+
+        Args:
+            r: Residuals, [standard deviations], shape (n,).
+            used: p, parameters and zeros that the residuals were fitted with.
+        """
         if not self.robust or not r.size:
             return 1.0
-        return float(np.mean((1.0 + (r / self.width) ** 2) ** -1.5))
+        curvature = (1.0 + (r / self.width) ** 2) ** -1.5
+        mean = float(np.mean(curvature))
+        return mean / (1.0 + used / r.size * float(np.var(curvature)) / mean**2)
 
     @property
     def normal_square(self) -> float:

@@ -29,6 +29,9 @@ FINEST_WEIGHT = 5e-6
 """Readings are weighted as if they had at least this standard deviation, [m], and the prior is
 scaled down with them: the same optimum, with rounding errors that stay below the tolerance."""
 
+EXACT_READINGS = 20_000
+"""Readings up to which the tolerance is kept; with more it grows as their sum's rounding errors."""
+
 LEFT_OUT = 1e-9
 """Weight of readings that are left out: next to nothing, and their gauge zeros stay determined."""
 
@@ -295,7 +298,7 @@ class NonlinearProgram:
         }
         self._functions = functions
         ipopt: dict[str, Any] = {
-            "tol": self.options.tolerance,
+            "tol": self.options.tolerance * max(1.0, entries / EXACT_READINGS),
             "constr_viol_tol": self.options.closure_tolerance,
             "acceptable_iter": 0,
             "max_iter": self.options.max_iterations,

@@ -278,14 +278,16 @@ def _build_plan(file: Path, keys: SessionKeys) -> Session:
 def _check_planned_postures(file: Path, keys: SessionKeys) -> None:
     for name, setup in keys.setups.items():
         where = f"{file}: setups.{name}.postures"
+        seen: set[str] = set()
         for posture in setup.postures or ():
             if posture not in keys.postures:
                 raise SessionError(
                     f"'{posture}' is not a posture; postures: {', '.join(keys.postures)}",
                     where=where,
                 )
-            if (setup.postures or []).count(posture) > 1:
+            if posture in seen:
                 raise SessionError(f"'{posture}' stands twice", where=where)
+            seen.add(posture)
 
 
 def _build_setup(name: str, keys: SetupKeys, robot: Robot, where: str) -> Setup:

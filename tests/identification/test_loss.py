@@ -43,7 +43,10 @@ def test_slope_and_curvature_are_its_derivatives(loss):
         evaluate(loss.slope, R[R != 0]) / R[R != 0]
     )
     assert loss.influence(R) == pytest.approx(evaluate(loss.slope, R))
-    assert loss.gain(R) == pytest.approx(evaluate(loss.curvature, R).mean())
+    curvature = evaluate(loss.curvature, R)
+    assert loss.gain(R, used=0.0) == pytest.approx(curvature.mean())
+    correction = 1.0 + 2.0 / R.size * curvature.var() / curvature.mean() ** 2
+    assert loss.gain(R, used=2.0) == pytest.approx(curvature.mean() / correction)
 
 
 def test_its_precision_on_normal_residuals_is_95_percent_of_squares():

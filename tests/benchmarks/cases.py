@@ -1,0 +1,195 @@
+"""Sessions of every size, and what it takes to identify a machine from them."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal import load_plan, simulate_session
+from orthocal.identification.nlp import NonlinearProgram, Solution
+from orthocal.identification.problem import build_problem
+from orthocal.measurement.session import Session
+from orthocal.measurement.synthetic import draw_errors
+
+sys.path.append(str(Path(__file__).parents[1] / "study"))
+
+import plans
+
+Array = NDArray[np.float64]
+
+MODEL = "full"
+SIGMA = 5e-6
+"""Standard deviation of a reading, [m]."""
+
+OFFSET_SIGMA = 2e-3
+"""Offsets are drawn with this standard deviation, [m]; all other errors with their tolerance."""
+
+SWEEP = 27
+"""Postures of `plans.sweep`; sessions of other sizes are made by `spread_plan`."""
+
+SECTIONS = [0.36, 0.425, 0.5, 0.575, 0.64]
+"""Fractions of a leg that the gauge touches between -100 and 60 mm: 0.323 are left at the root
+and 0.193 at the tip, and a lateral displacement shortens the leg's shadow."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Timing:
+    """What one identification took."""
+
+    postures: int
+    readings: int
+    seconds_build: float
+    """Until the program can be solved."""
+    seconds_solve: float
+    """For the first solution, with all that is only built when it is first needed."""
+    seconds_again: float
+    """For the solution of other readings with the same program."""
+    iterations: int
+    """Of the first solution."""
+    iterations_again: int
+    peak_before: float
+    """Most memory that the process held before it built anything, [MB]."""
+    peak: float
+    """Most memory until the first solution, [MB]."""
+
+    @property
+    def seconds(self) -> float:
+        """From a session to its solution."""
+        return self.seconds_build + self.seconds_solve
+
+    @property
+    def microseconds_a_reading(self) -> float:
+        """From a session to its solution."""
+        return 1e6 * self.seconds / self.readings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identification:
+    """A program, its first two solutions and what they took."""
+
+    program: NonlinearProgram
+    first: Solution
+    again: Solution
+    timing: Timing
+
+
+def spread_plan(n_postures: int, *, seed: int = 0) -> dict:
+    """A plan of any size: each leg read in ten setups, in postures of its own.
+
+    Args:
+        n_postures: A multiple of 3; a third for each leg, anywhere from -100 to 60 mm along its
+            axis and within ±20 mm across it.
+        seed: Of the postures.
+    """
+    rng = np.random.default_rng(seed)
+    postures, read = {}, {a: [] for a in plans.AXES}
+    for k, axis in enumerate(plans.AXES):
+        for i in range(n_postures // 3):
+            point = rng.uniform(-20.0, 20.0, 3)
+            point[k] = rng.uniform(-100.0, 60.0)
+            postures[f"{axis}{i}"] = {"tcp_mm": point.tolist()}
+            read[axis].append(f"{axis}{i}")
+    return {"robot": "orthoglide", "postures": postures, "setups": plans.setups(read, SECTIONS)}
+
+
+def simulate(n_postures: int, *, seed: int = 1) -> Session:
+    """Readings of a machine with all errors of the model: 6 a posture in the sweep, else 10.
+
+    Args:
+        n_postures: SWEEP, or a multiple of 3.
+        seed: Of errors, noise and gauge zeros.
+    """
+    plan = plans.sweep() if n_postures == SWEEP else spread_plan(n_postures)
+    with tempfile.TemporaryDirectory() as folder:
+        session = load_plan(plans.write(Path(folder), plan))
+    return resimulate(session, seed=seed)
+
+
+def resimulate(session: Session, *, seed: int) -> Session:
+    """The same readings of another machine.
+
+    Args:
+        session: What is read.
+        seed: Of errors, noise and gauge zeros.
+    """
+    parameters = session.robot.parameters
+    errors = draw_errors(
+        session.robot,
+        parameters.models[MODEL],
+        seed=seed,
+        tolerances={f"{axis}_slide.offset": OFFSET_SIGMA for axis in plans.AXES},
+    )
+    return simulate_session(session, errors, seed=seed, sigma=SIGMA).session
+
+
+def identify(session: Session, other: Session) -> Identification:
+    """Build a program for a session, solve it, and solve it again for other readings.
+
+    Args:
+        session: The session.
+        other: The same readings of another machine.
+    """
+    before = peak_memory()
+    began = time.perf_counter()
+    problem = build_problem(session, model=MODEL)
+    program = NonlinearProgram(problem)
+    built = time.perf_counter()
+    first = program.solve(sigma=SIGMA)
+    solved = time.perf_counter()
+    peak = peak_memory()
+    values = problem.observations.values(other.values)
+    restarted = time.perf_counter()
+    again = program.solve(sigma=SIGMA, values=values)
+    ended = time.perf_counter()
+    timing = Timing(
+        postures=problem.n_postures,
+        readings=len(session.readings),
+        seconds_build=built - began,
+        seconds_solve=solved - built,
+        seconds_again=ended - restarted,
+        iterations=first.iterations,
+        iterations_again=again.iterations,
+        peak_before=before,
+        peak=peak,
+    )
+    return Identification(program, first, again, timing)
+
+
+def measure(n_postures: int) -> Timing:
+    """Time one identification.
+
+    Args:
+        n_postures: As for `simulate`.
+    """
+    session = simulate(n_postures)
+    return identify(session, resimulate(session, seed=2)).timing
+
+
+def measure_apart(n_postures: int) -> Timing:
+    """Time one identification in a fresh process, whose peak of memory is its own."""
+    with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(measure, n_postures).result()
+
+
+def peak_memory() -> float:
+    """Most memory that this process held so far, [MB].
+
+    Not from getrusage where Linux tells it: there `ru_maxrss` of a child begins with the peak of
+    the process that started it.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024.0
+    unit = 1.0 if sys.platform == "darwin" else 1024.0
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1024.0**2

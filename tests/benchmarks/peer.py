@@ -1,0 +1,210 @@
+"""The same estimate without orthocal's program: `scipy.optimize.least_squares` on Pinocchio.
+
+This is what one would write instead: residuals of the error parameters alone, the loops of every
+posture closed inside, derivatives by finite differences. It is given every advantage that needs no
+symbolic derivatives: loops start from where they were last closed, Pinocchio's buffers are kept,
+gauge zeros are eliminated by their means, variables are scaled by their tolerances, and only what
+a reading needs is evaluated. Nothing here evaluates CasADi, so it is a second way to the optimum.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+
+from orthocal.measurement.session import DIRECTIONS, Session, section_plane
+from orthocal.robot.model import CLOSED, Robot
+
+Array = NDArray[np.float64]
+
+STOP = 1e-8
+"""[1] SciPy's own `ftol` and `xtol`: the last step changes objective and errors by less."""
+
+MAX_NEWTON_STEPS = 60
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PeerSolution:
+    """What the peer found."""
+
+    errors: Array
+    """Error parameters, shape (n_free,), [m, rad]."""
+    objective: float
+    """½ Σ ((y − h − z)/σ)² + ½ Σ (θ/tolerance)², as orthocal's."""
+    seconds: float
+    evaluations: int
+    """How often all loops were closed."""
+
+
+class LoopCloser:
+    """Closes the loops of a machine by Newton's method on Pinocchio's constraint models.
+
+    The same as `Robot.close_with_pinocchio`, several times faster: buffers are kept, and the
+    constraint Jacobians are used as they come. They are exact where the loops are closed, so
+    convergence stays quadratic.
+
+    Args:
+        machine: With its errors in its placements, and without unbounded revolute joints.
+    """
+
+    def __init__(self, machine: Robot) -> None:
+        self.machine = machine
+        self.data = machine.model.createData()
+        self._constraints = [
+            (constraint, constraint.createData(), list(closure.rows))
+            for closure, constraint in zip(machine.closures, machine.constraints, strict=True)
+        ]
+
+    def close(self, drives: Array, start: Array) -> Array:
+        """Passive coordinates that close the loops; `data` then holds this posture.
+
+        Args:
+            drives: Commanded drive coordinates, shape (n_drives,), [m].
+            start: Passive coordinates to start from, shape (n_passive,), [m, rad].
+
+        Returns:
+            Shape (n_passive,), [m, rad].
+
+        Raises:
+            RuntimeError: If Newton's method does not converge.
+        """
+        model, data, index = self.machine.model, self.data, self.machine.passive_index
+        coordinates = self.machine.joint_coordinates(drives, start)
+        for _ in range(MAX_NEWTON_STEPS):
+            pin.computeJointJacobians(model, data, coordinates)
+            residuals = []
+            for constraint, buffer, rows in self._constraints:
+                constraint.calc(model, data, buffer)
+                residuals.append(buffer.constraint_position_error[rows])
+            residual = np.concatenate(residuals)
+            if np.abs(residual).max() < CLOSED:
+                return coordinates[index]
+            jacobian = np.concatenate(
+                [c.jacobian(model, data, buffer)[rows] for c, buffer, rows in self._constraints]
+            )
+            coordinates[index] -= np.linalg.solve(jacobian[:, index], residual)
+        raise RuntimeError(f"loops stay open by {np.abs(residual).max():.3g} m")
+
+
+class PeerProblem:
+    """Residuals of a session's readings and of the prior, as functions of the errors alone.
+
+    Args:
+        session: Readings as shown, not differences.
+        names: Free error parameters.
+        sigma: Standard deviation of one reading, [m].
+    """
+
+    def __init__(self, session: Session, *, names: Sequence[str], sigma: float) -> None:
+        robot = session.robot
+        self.robot = robot
+        self.names = tuple(names)
+        self.sigma = sigma
+        self.tolerances = np.array([robot.parameters[n].tolerance for n in names])
+        self.evaluations = 0
+        self._readings = session.values
+        self._zero_drives = session.zero_drives
+
+        postures = {name: k for k, name in enumerate(session.postures)}
+        setups = {name: k for k, name in enumerate(session.setups)}
+        legs = {name: k for k, name in enumerate(robot.legs)}
+        self._posture = np.array([postures[r.posture] for r in session.readings])
+        self._setup = np.array([setups[r.setup] for r in session.readings])
+        self._leg = np.array([legs[s.leg] for s in session.setups.values()])[self._setup]
+        self._direction = np.array([DIRECTIONS[s.direction] for s in session.setups.values()])
+        planes = [section_plane(robot, s) for s in session.setups.values()]
+        self._plane = np.array([plane for plane, _ in planes])
+        self._from_root = np.array([from_root for _, from_root in planes])
+        self._axis = np.array([leg.axis for leg in robot.legs.values()])
+        self._ends = [
+            (robot.frame_id(leg.root), robot.frame_id(leg.tip)) for leg in robot.legs.values()
+        ]
+        self._drives = np.array([p.drives for p in session.postures.values()])
+        self._legs_read = [np.unique(self._leg[self._posture == k]) for k in postures.values()]
+        self._passive = np.tile(robot.zero[robot.passive_index], (len(postures), 1))
+
+    def predict(self, errors: ArrayLike) -> Array:
+        """Readings with gauge zeros at 0, shape (n_readings,), [m].
+
+        Args:
+            errors: Shape (n_free,), [m, rad].
+        """
+        machine = self.robot.with_errors(dict(zip(self.names, np.asarray(errors), strict=True)))
+        closer = LoopCloser(machine)
+        ends = np.zeros((len(self._drives), len(self._ends), 2, 3))
+        for k, (drives, legs) in enumerate(zip(self._drives, self._legs_read, strict=True)):
+            self._passive[k] = closer.close(drives, self._passive[k])
+            for leg in legs:
+                for end, frame in enumerate(self._ends[leg]):
+                    place = pin.updateFramePlacement(machine.model, closer.data, frame)
+                    ends[k, leg, end] = place.translation
+        root, tip = ends[self._posture, self._leg].transpose(1, 0, 2)
+        axis = self._axis[self._leg]
+        plane = (self._plane + self._section_starts(machine, closer.data))[self._setup]
+        along = (plane - _dots(axis, root)) / _dots(axis, tip - root)
+        return _dots(self._direction[self._setup], root + along[:, None] * (tip - root))
+
+    def residuals(self, errors: Array) -> Array:
+        """What the sum of squares is made of: readings over σ, then errors over tolerances.
+
+        The best zero of a setup is the mean of what its readings leave, whatever the errors.
+
+        Args:
+            errors: Shape (n_free,), [m, rad].
+
+        Returns:
+            Shape (n_readings + n_free,), [1].
+        """
+        self.evaluations += 1
+        left = self._readings - self.predict(errors)
+        means = np.bincount(self._setup, left) / np.bincount(self._setup)
+        return np.concatenate([(left - means[self._setup]) / self.sigma, errors / self.tolerances])
+
+    def solve(self) -> PeerSolution:
+        """Estimate the errors, from 0.
+
+        Levenberg-Marquardt needs the fewest evaluations of SciPy's methods here. The variables stay
+        in SI units: the difference step of 1.5e-8 m and rad is far above the CLOSED of the loops,
+        where a step of 1.5e-8 tolerances would be lost in it.
+        """
+        began = time.perf_counter()
+        found = least_squares(
+            self.residuals,
+            np.zeros(len(self.names)),
+            method="lm",
+            x_scale=self.tolerances,
+            ftol=STOP,
+            xtol=STOP,
+        )
+        seconds = time.perf_counter() - began
+        if not found.success:
+            raise RuntimeError(found.message)
+        return PeerSolution(found.x, float(found.cost), seconds, self.evaluations)
+
+    def _section_starts(self, machine: Robot, data: pin.Data) -> Array:
+        """Where the sections of each setup count from: 0, or the root in the zero posture, [m].
+
+        The root needs its drive alone, so no loops are closed.
+        """
+        passive = self.robot.zero[self.robot.passive_index]
+        pin.forwardKinematics(
+            machine.model, data, machine.joint_coordinates(self._zero_drives, passive)
+        )
+        roots = [
+            axis @ pin.updateFramePlacement(machine.model, data, root).translation
+            for axis, (root, _) in zip(self._axis, self._ends, strict=True)
+        ]
+        legs = np.zeros(len(self._plane), dtype=np.int64)
+        legs[self._setup] = self._leg
+        return np.where(self._from_root, np.array(roots)[legs], 0.0)
+
+
+def _dots(a: Array, b: Array) -> Array:
+    """Scalar products of rows, shape (n,) of (n, 3)."""
+    return np.einsum("ni,ni->n", a, b)
