@@ -14,11 +14,14 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Calibration": "orthocal.identification.calibration",
+    "Loss": "orthocal.identification.loss",
     "OrthocalError": "orthocal.errors",
     "Robot": "orthocal.robot.model",
     "Session": "orthocal.measurement.session",
     "SolverOptions": "orthocal.identification.nlp",
+    "assess_tool": "orthocal.study.accuracy",
     "calibrate": "orthocal.identification.calibrate",
+    "compare_models": "orthocal.study.comparison",
     "draw_errors": "orthocal.measurement.synthetic",
     "load_calibration": "orthocal.identification.calibration_file",
     "load_plan": "orthocal.measurement.session_file",
@@ -32,11 +35,14 @@ _HOMES = {
 
 __all__ = [
     "Calibration",
+    "Loss",
     "OrthocalError",
     "Robot",
     "Session",
     "SolverOptions",
+    "assess_tool",
     "calibrate",
+    "compare_models",
     "draw_errors",
     "load_calibration",
     "load_plan",
@@ -53,6 +59,7 @@ if TYPE_CHECKING:
     from orthocal.identification.calibrate import calibrate
     from orthocal.identification.calibration import Calibration
     from orthocal.identification.calibration_file import load_calibration
+    from orthocal.identification.loss import Loss
     from orthocal.identification.nlp import SolverOptions
     from orthocal.measurement.session import Session
     from orthocal.measurement.session_file import load_plan, load_session, write_session
@@ -60,6 +67,8 @@ if TYPE_CHECKING:
     from orthocal.output.summary import summarize
     from orthocal.robot.loading import load_robot
     from orthocal.robot.model import Robot
+    from orthocal.study.accuracy import assess_tool
+    from orthocal.study.comparison import compare_models
     from orthocal.study.validation import validate_calibration
 
 

@@ -578,6 +578,137 @@ SESSION_SENSE_CASES = [
     ),
 ]
 
+
+def option(name: str, options: str, message: str, command: str = CALIBRATE) -> Case:
+    return Case(f"option-{name}", message, command=f"{command} {options}")
+
+
+OPTION_CASES = [
+    option("free-unknown", "--free w_*", "free: 'w_*' matches no error parameter"),
+    option("free-nothing", "--free !*", "no free parameters: there is nothing to identify"),
+    option(
+        "free-twice-the-same",
+        "--free x_leg.length,x_coupler.x",
+        "'x_coupler.x' and 'x_leg.length' are partly the same error: x_leg.length is made of "
+        "x_coupler.x, frame.x_rod_b_tip.x; take one of them out, such as '!x_coupler.x'",
+    ),
+    option(
+        "free-more-than-told",
+        "--free *.offset,*_leg.length,*_fork.x --no-prior",
+        "{tmp}/readings.csv: the readings do not determine x_slide.offset, y_slide.offset, "
+        "z_slide.offset, x_fork.x, y_fork.x, z_fork.x and 3 more: 5 of 9 free parameters can be "
+        "told from them. Read the legs that are missing, in postures along their own axes; or use "
+        "tolerances as a prior, or identify base parameters",
+    ),
+    option(
+        "known-without-value",
+        "--known x_leg.length",
+        "--known: found 'x_leg.length'; expected NAME=VALUE or NAME=VALUE±TOLERANCE",
+    ),
+    option(
+        "known-without-unit",
+        "--known x_leg.length=1",
+        "--known: 'x_leg.length' carries no unit; expected one of the suffixes _mm, _um, _mrad, "
+        "_deg, _ppm",
+    ),
+    option(
+        "known-half-a-tolerance",
+        "--known x_leg.length_mm=1±",
+        "--known: x_leg.length_mm is ''; expected a number",
+    ),
+    option(
+        "known-negative-tolerance",
+        "--known x_leg.length_mm=1+--0.5",
+        "known: the tolerance of 'x_leg.length' is -0.5 mm; expected at least 1e-06 mm",
+    ),
+    option(
+        "known-nan",
+        "--known x_leg.length_mm=nan",
+        "--known: x_leg.length_mm is 'nan'; expected a finite number",
+    ),
+    option(
+        "known-twice",
+        "--known x_leg.length_mm=1 --known x_leg.length_mm=2",
+        "--known: 'x_leg.length' is given twice",
+    ),
+    option(
+        "known-everything",
+        "--known x_slide.offset_mm=1 --known y_slide.offset_mm=1 --known z_slide.offset_mm=1",
+        "no free parameters: there is nothing to identify",
+    ),
+    option(
+        "tolerance-tiny",
+        "--tolerance *.offset_mm=1e-9",
+        "tolerances: the tolerance of 'x_slide.offset' is 1e-09 mm; expected at least 1e-06 mm",
+    ),
+    option(
+        "tolerance-of-what-is-not-free",
+        "--tolerance x_leg.length_mm=1",
+        "tolerances: 'x_leg.length' matches no free parameter",
+    ),
+    option(
+        "tolerance-of-other-unit",
+        "--tolerance *.offset_mrad=1",
+        "--tolerance: '*.offset_mrad' has the wrong unit; x_slide.offset is in mm",
+    ),
+    option(
+        "bound-upside-down",
+        "--bound x_slide.offset_mm=2:-2",
+        "bounds: those of 'x_slide.offset' leave nothing between them",
+    ),
+    option(
+        "bound-half",
+        "--bound x_slide.offset_mm=1",
+        "--bound: found 'x_slide.offset_mm=1'; expected NAME=LOWEST:HIGHEST",
+    ),
+    option("loss-unknown", "--loss cubes", "the loss is 'cubes'; expected squares or huber"),
+    option(
+        "profile-of-what-is-not-free",
+        "--profile x_leg.length",
+        "x_leg.length: no free parameter to find the interval of",
+    ),
+    option(
+        "base-beside-a-prior",
+        "--base --prior",
+        "base parameters are identified without any prior",
+    ),
+    option(
+        "compare-unknown-model",
+        "--models offsets,all",
+        "'all' is not a model of this robot; models: offsets, lengths, full",
+        command="compare {tmp}",
+    ),
+    option(
+        "compare-with-nothing",
+        "--repeat {tmp}/again",
+        "{tmp}/again: there is no such file",
+        command="compare {tmp}",
+    ),
+    option(
+        "simulate-tolerance-of-no-use",
+        "--error x_slide.offset_mm=1 --tolerance *.offset_mm=2",
+        "--tolerance: is of no use without --draw",
+        command="simulate {tmp}/session.yaml --out {tmp}/out",
+    ),
+    Case(
+        "accuracy-beyond-reach",
+        "{tmp}/points.csv:2: cannot be reached: the loops stay open by # mm, #% of the way from "
+        "the mechanical zero",
+        (write("points.csv", "x_mm,y_mm,z_mm\n0,0,900\n"),),
+        command="accuracy {tmp}/calibration.json {tmp}/points.csv",
+        base="machine",
+        calibrated=True,
+    ),
+    Case(
+        "accuracy-cube-too-large",
+        "point 2: cannot be reached: the loops stay open by # mm, #% of the way from the "
+        "mechanical zero",
+        command="accuracy {tmp}/calibration.json --half-side-mm 500",
+        base="machine",
+        calibrated=True,
+    ),
+]
+
 HEADER = "setup,posture,minus,reading_mm"
 COLUMNS = "expected setup, posture, reading_mm and optionally minus, cycle"
 
@@ -715,7 +846,8 @@ READINGS_CASES = [
         "readings-too-few",
         "{tmp}/readings.csv: the readings do not determine x_slide.offset, y_slide.offset, "
         "z_slide.offset: 1 of 3 free parameters can be told from them. Read the legs that are "
-        "missing, in postures along their own axes, or use tolerances as a prior",
+        "missing, in postures along their own axes; or use tolerances as a prior, or identify base "
+        "parameters",
         (write("readings.csv", f"{HEADER}\nxy,y_max,y_min,-0.43\n"),),
     ),
 ]
@@ -1496,6 +1628,7 @@ CASES = [
     *SESSION_TYPE_CASES,
     *SESSION_FILE_CASES,
     *SESSION_SENSE_CASES,
+    *OPTION_CASES,
     *READINGS_CASES,
     *ROBOT_CASES,
     *URDF_CASES,

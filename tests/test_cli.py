@@ -76,6 +76,70 @@ def test_forward_and_inverse_undo_each_other(orthocal, experiment, tmp_path):
     assert np.abs(back - [[310.25] * 3, [330, 290, 300.5]]).max() < 2e-5
 
 
+def test_compare_gives_its_verdict_as_exit_code(orthocal, experiment, root):
+    repeat = experiment.parent / "experiment-3"
+    code, out, err = orthocal("compare", experiment, "--repeat", repeat)
+    assert (code, err) == (3, "")
+    assert "Six independent readings support offsets only." in out
+    code, out, _ = orthocal(
+        "compare", root / "examples/raw-cycles", "--models", "offsets,lengths", "--json"
+    )
+    assert code == 0
+    document = json.loads(out)
+    assert [m["model"] for m in document["models"]] == ["offsets", "lengths"]
+    assert document["verdict"]["supported"] == "offsets"
+
+
+def test_accuracy_over_a_cube_and_at_points(orthocal, experiment, tmp_path):
+    orthocal("calibrate", experiment, "--out", tmp_path)
+    code, out, _ = orthocal("accuracy", tmp_path, "--half-side-mm", 40)
+    assert code == 0
+    assert "Over a cube of ±40 mm around the zero" in out
+    points = tmp_path / "points.csv"
+    points.write_text("x_mm,y_mm,z_mm\n0,0,0\n10,20,-30.5\n")
+    code, out, _ = orthocal("accuracy", tmp_path, points)
+    assert code == 0
+    rows = list(csv.DictReader(io.StringIO(out)))
+    assert [r["z_mm"] for r in rows] == ["0", "-30.5"]
+    # at the zero an offset moves the tool by itself
+    assert float(rows[0]["deviation_z_um"]) == pytest.approx(-1760, abs=5)
+    assert float(rows[0]["sigma_x_um"]) > 387
+    code, out, _ = orthocal("accuracy", tmp_path, points, "--json")
+    assert json.loads(out)["points"] == 2
+
+
+def test_what_is_free_known_and_bounded_by_option(orthocal, experiment, root):
+    code, out, _ = orthocal(
+        "calibrate", root / "examples/sweep", "--json",
+        "--model", "lengths", "--free", "x_coupler.rz,!z_leg.length",
+        "--known", "y_leg.length_mm=0.05±0.01", "--known", "z_slide.offset_mm=0.2",
+        "--tolerance", "*.offset_mm=2", "--bound", "x_slide.offset_mm=-1:0.5",
+        "--profile", "y_leg.length",
+    )  # fmt: skip
+    assert code == 0
+    found = {p["name"]: p for p in json.loads(out)["parameters"]}
+    assert list(found) == [
+        "x_slide.offset", "y_slide.offset", "x_coupler.rz", "x_leg.length", "y_leg.length",
+        "z_slide.offset",
+    ]  # fmt: skip
+    assert found["x_slide.offset"]["at_bound"] == "upper"
+    assert found["y_slide.offset"]["tolerance"] == 2e-3
+    assert (found["y_leg.length"]["mean"], found["y_leg.length"]["tolerance"]) == (5e-5, 1e-5)
+    assert found["y_leg.length"]["interval"][0] < found["y_leg.length"]["value"]
+    assert found["z_slide.offset"]["free"] is False
+    assert found["z_slide.offset"]["value"] == 0.2e-3
+
+
+def test_base_parameters_and_hubers_loss_by_option(orthocal, root):
+    code, out, _ = orthocal(
+        "calibrate", root / "examples/raw-cycles", "--free", "*.offset,x_swivel.x", "--base",
+        "--loss", "huber",
+    )  # fmt: skip
+    assert code == 0
+    assert "3 base parameters, no prior, Huber's loss" in out
+    assert "stands for" in out
+
+
 def test_validate_holds_experiment_3_against_2(orthocal, experiment, tmp_path):
     orthocal("calibrate", experiment, "--out", tmp_path)
     new = experiment.parent / "experiment-3"
@@ -154,7 +218,8 @@ def test_a_bug_is_said_to_be_one(orthocal, experiment, monkeypatch):
 
 def test_version_and_help(orthocal):
     assert orthocal("--version")[1].strip() == cli.orthocal.__version__
-    for command in ("calibrate", "validate", "forward", "inverse", "simulate"):
+    commands = ("calibrate", "compare", "accuracy", "validate", "forward", "inverse", "simulate")
+    for command in commands:
         code, out, _ = orthocal(command, "--help")
         assert code == 0
         assert out.startswith("Usage: ")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,9 @@ Array = NDArray[np.float64]
 Known = float | tuple[float, float]
 
 DEFAULT_MODEL = "offsets"
+
+SMALLEST_TOLERANCE = 1e-9
+"""[m, rad or 1]. Parameters are scaled by their tolerances: with less they would hardly move."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,17 +97,19 @@ def select_parameters(
     if base is not None:
         parameters.select_model(base)  # refuses an unknown model
         patterns += parameters.models[base]
-    chosen = set(parameters.select([*patterns, *free]))
+    with _named("free"):
+        chosen = set(parameters.select([*patterns, *free]))
     held: dict[str, float] = {}
     own_prior: dict[str, tuple[float, float]] = {}
     for name, entry in (known or {}).items():
-        parameters[name]  # refuses an unknown name
-        if isinstance(entry, tuple):
-            own_prior[name] = (_finite(entry[0], name), _positive(entry[1], name))
-            chosen.add(name)
-        else:
-            held[name] = _finite(entry, name)
-            chosen.discard(name)
+        with _named("known"):
+            parameter = parameters[name]
+            if isinstance(entry, tuple):
+                own_prior[name] = (_finite(entry[0], name), _tolerance(entry[1], parameter))
+                chosen.add(name)
+            else:
+                held[name] = _finite(entry, name)
+                chosen.discard(name)
     names = [n for n in parameters.names if n in chosen]
     if not names:
         raise ParameterError("no free parameters: there is nothing to identify")
@@ -111,15 +117,17 @@ def select_parameters(
 
     spread = {n: parameters[n].tolerance for n in names}
     for glob, value in (tolerances or {}).items():
-        for name in _match_free(parameters, glob, names):
-            spread[name] = _positive(value, glob)
+        with _named("tolerances"):
+            for name in _match_free(parameters, glob, names):
+                spread[name] = _tolerance(value, parameters[name])
     spread.update({n: s for n, (_, s) in own_prior.items()})
     lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     for glob, (low, high) in (bounds or {}).items():
-        if not low < high:
-            raise ParameterError(f"the bounds of '{glob}' leave nothing between them")
-        for name in _match_free(parameters, glob, names):
-            lower[names.index(name)], upper[names.index(name)] = low, high
+        with _named("bounds"):
+            if not low < high:
+                raise ParameterError(f"those of '{glob}' leave nothing between them")
+            for name in _match_free(parameters, glob, names):
+                lower[names.index(name)], upper[names.index(name)] = low, high
     only_offsets = all(n.endswith(".offset") for n in names if n not in own_prior)
     everywhere = not only_offsets if prior is None else prior
     return Selection(
@@ -186,6 +194,8 @@ def read_bounds(
         if not colon:
             raise ParameterError(f"found '{text}'; expected {form}", where=where)
         glob, factor = _read_glob(key, parameters, where)
+        if not (low.strip() or high.strip()):
+            raise ParameterError(f"found '{text}'; expected {form}", where=where)
         result[glob] = (
             _number(low, where, key) * factor if low.strip() else -math.inf,
             _number(high, where, key) * factor if high.strip() else math.inf,
@@ -254,7 +264,20 @@ def _finite(value: float, name: str) -> float:
     return float(value)
 
 
-def _positive(value: float, name: str) -> float:
-    if not (math.isfinite(value) and value > 0.0):
-        raise ParameterError(f"the tolerance of '{name}' is {value:g}; expected more than 0")
+def _tolerance(value: float, parameter: Parameter) -> float:
+    if not (math.isfinite(value) and value >= SMALLEST_TOLERANCE):
+        unit, factor = parameter.edge_unit, parameter.edge_factor
+        raise ParameterError(
+            f"the tolerance of '{parameter.name}' is {value * factor:g} {unit}; expected at least "
+            f"{SMALLEST_TOLERANCE * factor:g} {unit}"
+        )
     return float(value)
+
+
+@contextmanager
+def _named(choice: str) -> Iterator[None]:
+    """Say which of the choices an error is about."""
+    try:
+        yield
+    except ParameterError as e:
+        raise ParameterError(e.problem, where=choice) from None

@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 RANK_THRESHOLD = 1e-10
 """Singular values below this part of the largest count as zero."""
 
+MOST_NAMED = 6
+"""Parameters that a message names one by one."""
+
 MISFIT_LEVEL = 0.01
 """Probability below which residuals are too large for repeated cycles to explain (F test)."""
 
@@ -273,10 +276,12 @@ def require_identifiable(
     null = directions[values <= RANK_THRESHOLD * values[0]]
     lost = tuple(n for n, size in zip(names, (null**2).sum(axis=0), strict=True) if size > 1e-12)
     if lost:
+        named = ", ".join(lost[:MOST_NAMED])
+        more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
         raise NotIdentifiableError(
-            f"the readings do not determine {', '.join(lost)}: "
-            f"{information.rank} of {len(names)} free parameters can be told from them. Read the "
-            "legs that are missing, in postures along their own axes, or use tolerances as a prior",
+            f"the readings do not determine {named}{more}: {information.rank} of {len(names)} free "
+            "parameters can be told from them. Read the legs that are missing, in postures along "
+            "their own axes; or use tolerances as a prior, or identify base parameters",
             parameters=lost,
             where=where,
         )

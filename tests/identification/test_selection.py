@@ -76,12 +76,15 @@ def test_bounds_are_open_where_none_is_given(parameters):
         ({"free": ["w_*"]}, r"'w_\*' matches no error parameter"),
         ({"model": "all"}, "'all' is not a model"),
         ({"tolerances": {"x_leg.length": 1e-4}}, "matches no free parameter"),
-        ({"tolerances": {"*.offset": 0.0}}, "expected more than 0"),
+        ({"tolerances": {"*.offset": 1e-12}}, "is 1e-09 mm; expected at least 1e-06 mm"),
         ({"model": "full", "tolerances": {"x_*": 1e-3}}, "matches parameters in m and rad"),
-        ({"bounds": {"*.offset": (1e-3, -1e-3)}}, "leave nothing between them"),
+        ({"bounds": {"*.offset": (1e-3, -1e-3)}}, "bounds: those of"),
         ({"known": {"x_slid.offset": 0.0}}, "did you mean x_slide.offset"),
         ({"known": {"x_slide.offset": float("nan")}}, "expected a finite number"),
-        ({"known": {"x_slide.offset": (0.0, 0.0)}}, "expected more than 0"),
+        (
+            {"known": {"x_slide.offset": (0.0, 0.0)}},
+            "known: the tolerance of 'x_slide.offset' is 0",
+        ),
     ],
 )
 def test_choices_that_make_no_sense_are_refused(parameters, choice, message):
@@ -118,6 +121,7 @@ def test_texts_carry_their_units(parameters):
         (read_known, "x_slide.offset_mrad=1", "has the wrong unit"),
         (read_tolerances, "*.offset_mrad=1", "has the wrong unit; x_slide.offset is in mm"),
         (read_tolerances, "w.offset_mm=1", "matches no error parameter"),
+        (read_bounds, "x_slide.offset_mm=:", "expected NAME=LOWEST:HIGHEST"),
         (read_bounds, "x_slide.offset_mm=1", "expected NAME=LOWEST:HIGHEST"),
         (read_bounds, "x_slide.offset_mm=a:b", "expected a number"),
     ],

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from derivatives import central_differences
+from machines import reading_by_pinocchio
 from tolerances import KINEMATICS, PRINTED, THREE_DECIMALS_MM
 
 from orthocal import load_plan, load_session
 from orthocal.measurement.gauge import build_observations, locate_contacts, predict_entries
-from orthocal.measurement.session import DIRECTIONS, Section, section_plane
+from orthocal.measurement.session import Section
 
 OFFSETS = ("x_slide.offset", "y_slide.offset", "z_slide.offset")
 
@@ -20,25 +20,6 @@ OFFSETS = ("x_slide.offset", "y_slide.offset", "z_slide.offset")
 def differences(session, offsets):
     o = build_observations(session)
     return o.rows(predict_entries(session, o, dict(zip(OFFSETS, offsets, strict=True))))
-
-
-def reading_by_pinocchio(session, machine, setup, posture):
-    """The gauge's reading from placements of a calibrated Pinocchio model, in plain NumPy."""
-    leg = machine.legs[setup.leg]
-
-    def places(drives):
-        passive = machine.close_with_pinocchio(drives, machine.zero[machine.passive_index])
-        data = machine.model.createData()
-        q = machine.configuration(machine.joint_coordinates(drives, passive))
-        pin.framesForwardKinematics(machine.model, data, q)
-        return (np.array(data.oMf[machine.frame_id(f)].translation) for f in (leg.root, leg.tip))
-
-    root, tip = places(posture.drives)
-    plane, from_root = section_plane(machine, setup)
-    if from_root:
-        plane = plane + leg.axis @ next(iter(places(session.zero_drives)))
-    along = (plane - leg.axis @ root) / (leg.axis @ (tip - root))
-    return float(np.dot(DIRECTIONS[setup.direction], root + along * (tip - root)))
 
 
 def test_readings_equal_those_of_a_pinocchio_machine_with_all_errors(root):

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import plans
 import pytest
 from derivatives import assert_derivative
+from machines import place
 
-from orthocal import load_plan
+from orthocal import calibrate, load_plan, load_robot
 from orthocal.errors import RobotError
 from orthocal.identification.problem import build_problem
 from orthocal.identification.uncertainty import decompose, project_out_zeros
-from orthocal.robot.assembly import Assembly
-from orthocal.study.accuracy import ToolSensitivity, Workspace, cube, measure_uncertainty
+from orthocal.measurement.synthetic import load_errors
+from orthocal.robot.assembly import Assembly, nominal_assembly
+from orthocal.robot.orthoglide import inverse
+from orthocal.study.accuracy import (
+    ToolSensitivity,
+    Workspace,
+    assess_tool,
+    cube,
+    find_remaining_errors,
+    measure_uncertainty,
+)
 
 OFFSET_SIGMA = 2e-3
 
@@ -135,3 +148,70 @@ def test_what_three_plans_are_worth(
 def test_a_robot_without_a_tool_is_refused(fivebar):
     with pytest.raises(RobotError, match="no tool centre point"):
         ToolSensitivity(fivebar, free=["motor_a.offset"])
+
+
+@pytest.fixture(scope="module")
+def calibrated(root):
+    return calibrate(root / "examples/sweep", model="lengths", tolerances={"*.offset": 2e-3})
+
+
+def test_where_the_tool_is_now_by_pinocchio(calibrated):
+    """The calibrated pin.Model, its loops closed by Pinocchio, at the commanded drives."""
+    machine = calibrated.robot.with_errors(calibrated.errors)
+    points = np.array([[0.0, 0.0, 0.0], [0.04, -0.05, 0.03]])
+    found = assess_tool(calibrated, Workspace.even(points))
+    drives = np.array([inverse(p, length=0.31025) for p in points])
+    for i, d in enumerate(drives):
+        tool = place(machine, d, "tcp", start=nominal_assembly(machine).close(d))
+        assert found.deviation[i] == pytest.approx(tool - points[i], abs=1e-9)
+
+
+def test_active_offsets_are_part_of_where_the_tool_is(root, calibrated):
+    """With the identified offsets in the controller the deviation is what is left."""
+    offsets = [p.value for p in calibrated.free if p.name.endswith(".offset")]
+    entered = replace(
+        calibrated, session=replace(calibrated.session, controller_offsets=tuple(offsets))
+    )
+    points = Workspace.even([[0.03, 0.0, -0.05]])
+    before, after = (assess_tool(c, points) for c in (calibrated, entered))
+    assert after.deviation == pytest.approx(before.left, abs=1e-12)
+    assert np.linalg.norm(before.deviation) > 20 * np.linalg.norm(before.left)
+
+
+def test_offsets_alone_are_as_good_as_the_machines_are(root):
+    """What the summary promises of offsets: 0.102 mm of an independent model, whatever scatters."""
+    found = assess_tool(calibrate(root / "examples/sweep", tolerances={"*.offset": 2e-3}))
+    assert found.after.relative.rms * 1e3 == pytest.approx(0.102, rel=SAMPLING)
+    full = calibrate(root / "examples/sweep", model="full", tolerances={"*.offset": 2e-3})
+    assert assess_tool(full).after.relative.rms * 1e3 == pytest.approx(0.062, rel=0.06)
+
+
+def test_the_truth_behind_the_examples_is_where_it_should_be(root):
+    """Sweep and lines are of one machine: its tool against what each calibration says."""
+    robot = load_robot("orthoglide")
+    truth = load_errors(root / "examples/lines/truth.yaml", robot)
+    space = cube(robot)
+    drives = Assembly(robot).inverse(space.points)
+    real = Assembly(robot, fixed=truth).forward(drives)
+    for name, model, largest in (("sweep", "offsets", 2.0), ("lines", "full", 1.5)):
+        result = calibrate(root / f"examples/{name}", model=model, tolerances={"*.offset": 2e-3})
+        error = result.forward(drives) - real
+        error -= space.weights @ error
+        found = np.sqrt(space.weights @ (error**2).sum(axis=1))
+        assert found < largest * assess_tool(result, space).after.relative.rms
+
+
+def test_remaining_errors_add_up_to_what_is_not_known(root):
+    result = calibrate(root / "examples/sweep", model="full", tolerances={"*.offset": 2e-3})
+    found = assess_tool(result)
+    parts = find_remaining_errors(result, found, count=126)
+    assert np.sqrt(sum(p.rms**2 for p in parts)) == pytest.approx(found.after.relative.rms)
+    assert all(a.rms >= b.rms for a, b in itertools.pairwise(parts[:20]))
+    named = {name for p in parts[:3] for name, _ in p.parts[:4]}
+    assert named <= {f"{leg}_slide.{a}" for leg in "xyz" for a in ("ry", "rz")}
+
+
+def test_without_noise_nothing_is_said_of_what_is_not_known(experiment_2):
+    rows = tuple(experiment_2.readings[i] for i in (2, 0, 4))
+    session = replace(experiment_2, readings=rows, gauge=replace(experiment_2.gauge, sigma=None))
+    assert assess_tool(calibrate(session)).after is None

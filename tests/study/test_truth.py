@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from machines import place, reading_by_pinocchio
 
-from orthocal import draw_errors, load_plan
+from orthocal import calibrate, draw_errors, load_plan, load_session
 from orthocal.identification.calibrate import assemble_calibration
 from orthocal.identification.fit import fit_problem
 from orthocal.identification.nlp import NonlinearProgram
@@ -101,6 +102,21 @@ def test_perfect_readings_give_the_tool_where_they_determine_it(machines):
     else:  # what the sweep leaves open is everywhere but near the axes
         assert 0 < determined.sum() < 0.1 * determined.size
         assert np.abs(error)[~determined].max() > 10e-6
+
+
+def test_the_calibrated_machine_in_pinocchio_shows_what_the_calibration_predicts(root):
+    """All 126 errors in the placements of a pin.Model: its readings and its tool, to 1e-9 m."""
+    session = load_session(root / "examples/sweep")
+    result = calibrate(session, model="full", tolerances=OFFSETS)
+    machine = session.robot.with_errors(result.errors)
+    zeros = {s.name: s.zero for s in result.setups}
+    for row in result.residuals[::6]:
+        setup, posture = session.setups[row.setup], session.postures[row.posture]
+        shown = reading_by_pinocchio(session, machine, setup, posture) + zeros[row.setup]
+        assert shown == pytest.approx(row.predicted, abs=1e-9)
+    for p in list(session.postures.values())[::5]:
+        tool = place(machine, p.drives, "tcp")
+        assert np.abs(result.forward(p.drives) - tool).max() < 1e-9
 
 
 @pytest.mark.slow

@@ -1,0 +1,29 @@
+"""Calibrated machines as Pinocchio alone sees them: errors in placements, loops closed by it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from orthocal.measurement.session import DIRECTIONS, section_plane
+
+
+def place(machine, drives, frame, *, start=None):
+    """Position of a frame, loops closed by Pinocchio's constraint models, shape (3,), [m]."""
+    start = machine.zero[machine.passive_index] if start is None else start
+    passive = machine.close_with_pinocchio(drives, start)
+    data = machine.model.createData()
+    q = machine.configuration(machine.joint_coordinates(drives, passive))
+    pin.framesForwardKinematics(machine.model, data, q)
+    return np.array(data.oMf[machine.frame_id(frame)].translation)
+
+
+def reading_by_pinocchio(session, machine, setup, posture):
+    """The gauge's reading from placements of a calibrated Pinocchio model, in plain NumPy."""
+    leg = machine.legs[setup.leg]
+    root, tip = (place(machine, posture.drives, f) for f in (leg.root, leg.tip))
+    plane, from_root = section_plane(machine, setup)
+    if from_root:
+        plane = plane + leg.axis @ place(machine, session.zero_drives, leg.root)
+    along = (plane - leg.axis @ root) / (leg.axis @ (tip - root))
+    return float(np.dot(DIRECTIONS[setup.direction], root + along * (tip - root)))
