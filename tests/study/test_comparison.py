@@ -46,6 +46,14 @@ def test_six_readings_support_offsets_only(table1):
     assert any(s.startswith("lengths: no") for s in verdict.reasons)
 
 
+def test_tolerances_that_shrink_offsets_do_not_make_lengths_supported(experiment_2):
+    """Beside a narrow prior lengths use up less than three parameters, which AICc rewards."""
+    found = compare_models(experiment_2, models=["offsets", "lengths"], tolerances=OFFSETS)
+    assert found["lengths"].exact.aicc < found["offsets"].exact.aicc - 2.0
+    assert found.verdict.supported == "offsets"
+    assert any(s.startswith("lengths: no more than offsets") for s in found.verdict.reasons)
+
+
 def test_what_remains_of_table_1_is_model_error_not_noise(table1):
     text = " ".join(table1.verdict.reasons)
     assert table1.verdict.model_error is True
