@@ -19,7 +19,7 @@ from orthocal.output.layout import (
     table_of,
     um,
 )
-from orthocal.study.comparison import Comparison, Score
+from orthocal.study.comparison import Comparison
 
 
 def render_comparison(comparison: Comparison, *, all_rows: bool = False) -> RenderableType:
@@ -29,11 +29,13 @@ def render_comparison(comparison: Comparison, *, all_rows: bool = False) -> Rend
         "cycles": "as repeated cycles scatter",
         "gauge": "as given for the gauge",
         "unknown": "nothing tells it",
-    }[c.noise_source]
+    }[c.noise.source]
     parts = [
         Text("Which model do the readings support?", style="bold"),
         Text(c.title),
-        Text(f"{c.independent} independent readings; noise of one {mm(c.noise)} mm, {source}"),
+        Text(
+            f"{c.independent} independent readings; noise of one {mm(c.noise.sigma)} mm, {source}"
+        ),
         section("Models side by side", _scores(c)),
         section("Estimates", _estimates(c, all_rows)),
         section("What each leaves of the readings", _residuals(c, all_rows)),
@@ -108,13 +110,12 @@ def _residuals(comparison: Comparison, all_rows: bool) -> RenderableType:
     if not results:
         return Text("Nothing was fitted.")
     table = table_of("reading", *(f"{r.model} [mm]" for r in results))
-    last: Score = results[-1].exact
     order = range(len(comparison.labels))
     note = ""
     if len(comparison.labels) > MANY_ROWS and not all_rows:
         largest = [max(abs(r.exact.residuals[i]) for r in results) for i in order]
         order = sorted(order, key=lambda i: -largest[i])[:WORST_ROWS]  # type: ignore[assignment]
-        note = f"The {WORST_ROWS} largest of {len(last.residuals)}; --all lists every reading."
+        note = f"The {WORST_ROWS} largest of {len(comparison.labels)}; --all lists every reading."
     for i in order:
         add_row(table, comparison.labels[i], *(signed(r.exact.residuals[i] * 1e3) for r in results))
     return Group(table, Text(note)) if note else table

@@ -118,7 +118,7 @@ def test_repeated_readings_are_not_counted_as_new_ones(cycles):
     """Six setups in three postures, three times over: twelve differences, whatever the cycles."""
     assert cycles.independent == 12
     assert cycles["full"].spare == 0
-    assert cycles.noise_source == "cycles"
+    assert cycles.noise.source == "cycles"
     assert cycles.verdict.supported == "offsets"
     assert cycles.verdict.model_error is False
     assert cycles.verdict.exit_code == 0

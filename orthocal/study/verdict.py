@@ -1,0 +1,236 @@
+"""Which of several models to believe, and why.
+
+A model is judged by what the readings can check of it, not by how small its residuals are. With as
+many parameters as independent readings they are zero whatever the machine is like. So a model must
+leave readings to spare, tell more than a smaller one, describe the readings better by more than its
+extra parameters buy (AICc; Hurvich and Tsai, 1989), and predict setups that it has not seen better.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from scipy import special
+
+from orthocal.measurement.session import Session
+from orthocal.study.accuracy import error_covariance, measure_uncertainty
+from orthocal.study.repetition import Repetition
+from orthocal.study.scores import ModelResult, Undetermined
+
+NoiseKind = Literal["cycles", "gauge", "unknown"]
+
+EXCESS_CHANCE = 0.01
+"""Probability below which residuals larger than the noise are not put down to chance."""
+
+TELLING = 0.5
+"""Effective parameters by which a larger model must exceed a smaller one to say anything new."""
+
+WORTHWHILE = 2.0
+"""Least drop of AICc for which a larger model is preferred (Burnham and Anderson, 2002, 2.6)."""
+
+BEYOND = 1.5
+"""Residuals by which errors must exceed their tolerances for the machine to be called worse."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownNoise:
+    """Noise of a reading that no model has a part in."""
+
+    sigma: float
+    """[m]; NaN if nothing tells it."""
+    source: NoiseKind
+    dof: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """Which model to believe, and why."""
+
+    supported: str | None
+    """The largest model that the readings support; None if they support none."""
+    model_error: bool | None
+    """Whether what it leaves is error of the model, not noise; None if nothing tells."""
+    reasons: tuple[str, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """0: supported, and noise remains. 3: supported, but model error remains. 4: none is."""
+        if self.supported is None:
+            return 4
+        return 3 if self.model_error else 0
+
+
+def give_verdict(
+    results: Sequence[ModelResult],
+    undetermined: Sequence[Undetermined],
+    *,
+    noise: KnownNoise,
+    repetition: tuple[Repetition, Session] | None = None,
+) -> Verdict:
+    """Which model to believe, and why.
+
+    Args:
+        results: Models that the readings determine, the smallest first.
+        undetermined: Models that they do not.
+        noise: What residuals are held against.
+        repetition: Residuals of the supported model held against those of another session.
+    """
+    best, reasons = choose_model(results, undetermined)
+    if best is None:
+        return Verdict(None, None, ("These readings support none of the models.", *reasons))
+    model_error, excess, words = _explain_remainder(best, noise)
+    reasons += words
+    if repetition is not None:
+        words, model_error = _explain_repetition(*repetition, model_error)
+        reasons += words
+    reasons += _explain_tool(best, excess)
+    return Verdict(best.model, model_error, (_headline(best, results, undetermined), *reasons))
+
+
+def choose_model(
+    results: Sequence[ModelResult], undetermined: Sequence[Undetermined]
+) -> tuple[ModelResult | None, list[str]]:
+    """The largest model that earns its parameters, and why the others do not."""
+    best: ModelResult | None = None
+    reasons = [f"{u.model}: not determined. {u.reason}." for u in undetermined]
+    for result in results:
+        total = result.rank + result.spare
+        if result.spare < 1:
+            reasons.append(
+                f"{result.model}: not supported. Its {result.n_free} parameters take up all "
+                f"{total} independent readings: what remains is decided by the tolerances, "
+                "and no reading is left to check it."
+            )
+            continue
+        if best is None:
+            best = result
+            reasons.append(
+                f"{result.model}: supported. The readings tell {_count(result.rank)} parameters "
+                f"and leave {_count(result.spare)} readings to check them."
+            )
+            continue
+        if result.effective < best.effective + TELLING:
+            reasons.append(
+                f"{result.model}: no more than {best.model}. Beside the tolerances the readings "
+                f"tell {result.effective:.1f} of its {result.n_free} parameters, as many as of "
+                f"{best.model}: what it adds stays where the tolerances put it."
+            )
+            continue
+        gain = best.exact.aicc - result.exact.aicc
+        old, new = best.exact.unseen_rms, result.exact.unseen_rms
+        predicts = not new >= old  # unknown counts for the model
+        words = f"unseen setups are predicted to {new * 1e3:.4f} mm instead of {old * 1e3:.4f} mm"
+        if gain > WORTHWHILE and predicts:
+            reasons.append(
+                f"{result.model}: supported. It describes the readings better than {best.model} "
+                f"by more than its parameters buy (AICc lower by {gain:.0f}), and {words}."
+            )
+            best = result
+        elif gain > WORTHWHILE:
+            reasons.append(
+                f"{result.model}: not supported. It describes these readings better than "
+                f"{best.model}, but {words}: it learns what does not carry over."
+            )
+        else:
+            reasons.append(
+                f"{result.model}: no better than {best.model}. AICc is "
+                f"{'higher' if gain < 0 else 'lower'} by {abs(gain):.1f}, and {words}."
+            )
+    return best, reasons
+
+
+def _headline(
+    best: ModelResult, results: Sequence[ModelResult], undetermined: Sequence[Undetermined]
+) -> str:
+    count = _count(best.rank + best.spare).capitalize()
+    others = [*(r.n_free for r in results), *(u.n_free for u in undetermined)]
+    only = " only" if best.n_free == min(others) < max(others) else ""
+    return f"{count} independent readings support {best.model}{only}."
+
+
+def _explain_remainder(
+    best: ModelResult, noise: KnownNoise
+) -> tuple[bool | None, float, list[str]]:
+    """Whether what the supported model leaves is noise, and by how much it is beyond tolerances."""
+    calibration = best.calibration
+    dof, chi_square = best.exact.dof, best.exact.chi_square
+    found = calibration.noise.residual_sigma
+    if not math.isfinite(noise.sigma) or dof < 0.5:
+        words = [
+            "Whether what remains is noise cannot be told: nothing says what the noise is. Repeat "
+            "readings in cycles, or give gauge.sigma_mm."
+        ]
+        return None, 1.0, words
+    if math.isinf(noise.dof):
+        chance = float(special.chdtrc(dof, chi_square))
+    else:
+        chance = float(special.fdtrc(dof, noise.dof, chi_square / dof))
+    factor = calibration.row_factor
+    row = "a difference" if calibration.rows_are_differences else "a reading"
+    where = {"cycles": "repeated cycles scatter", "gauge": "the gauge's own σ"}[noise.source]
+    sizes = f"σ {found * factor * 1e3:.3g} mm of {row} against {noise.sigma * factor * 1e3:.2g} mm"
+    if chance >= EXCESS_CHANCE:
+        return False, 1.0, [f"What {best.model} leaves is noise: {sizes} ({where})."]
+    words = [
+        f"What {best.model} leaves is error of the model rather than noise: {sizes} ({where}), "
+        f"{found / noise.sigma:.0f} times as much."
+    ]
+    tolerated, scale = calibration.unmodelled.residual_rms, 1.0
+    if tolerated > 0.0:
+        rms = best.exact.rms
+        scale = rms / tolerated
+        words.append(
+            f"Errors that {best.model} leaves out, at their tolerances, would leave "
+            f"{tolerated * 1e3:.3f} mm r.m.s.; found are {rms * 1e3:.3f} mm"
+            + (
+                f": this machine is worse than its tolerances, by about {scale:.1f} times."
+                if scale > BEYOND
+                else ": they explain it."
+            )
+        )
+    return True, scale if scale > BEYOND else 1.0, words
+
+
+def _explain_repetition(
+    repetition: Repetition, repeat: Session, model_error: bool | None
+) -> tuple[list[str], bool | None]:
+    sizes = f"correlation {repetition.correlation:.3f} over {repetition.matched} rows"
+    if repetition.repeats is None:
+        return ["Whether what remains repeats cannot be told: too few rows are shared."], (
+            model_error
+        )
+    if repetition.repeats:
+        return [
+            f"What remains repeats in '{repeat.title}' ({sizes}; by chance {repetition.chance:.2g})"
+            ": it is error of the model, which no repetition removes."
+        ], True
+    return [f"What remains does not repeat in '{repeat.title}' ({sizes})."], model_error
+
+
+def _explain_tool(best: ModelResult, excess: float) -> list[str]:
+    """What the supported model is good for at the tool, with errors beyond their tolerances."""
+    if best.tool is None or best.tool.after is None:
+        return []
+    after, cost = best.tool.after.relative, best.linearisation_cost
+    words = [
+        f"At the tool {best.model} is good for {after.rms * 1e6:.0f} µm r.m.s. over the workspace, "
+        "common shift taken out, if the tolerances hold."
+    ]
+    if excess > 1.0:
+        covariance = error_covariance(best.calibration, excess=excess)
+        size = measure_uncertainty(best.tool.jacobian, covariance, best.tool.workspace).relative
+        words[0] = (
+            f"At the tool {best.model} is good for about {size.rms * 1e6:.0f} µm r.m.s. over the "
+            f"workspace, common shift taken out, with errors {excess:.1f} times their tolerances."
+        )
+    if cost is not None:
+        words.append(f"Linearising it costs {cost.rms * 1e6:.1f} µm r.m.s. there.")
+    return words
+
+
+def _count(value: int) -> str:
+    words = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
+    return words[value] if 0 <= value < len(words) else str(value)
