@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError
-from orthocal.identification.linear import linearise_at_reference
+from orthocal.identification.linear import Linearisation, linearise_at_reference
 from orthocal.identification.loss import Loss
 from orthocal.identification.nlp import NonlinearProgram, Solution, SolverOptions
 from orthocal.identification.problem import CalibrationProblem
@@ -33,8 +33,9 @@ SIGMA_WITHOUT_WORD = 10e-6
 SMALLEST_SIGMA = 1e-9
 """Standard deviation of a reading below which readings count as perfect, [m]."""
 
-SIGMA_SETTLED = 0.01
-"""Relative change of sigma below which it needs no further solution."""
+SIGMA_SETTLED = 0.03
+"""Relative change of sigma below which it needs no further solution: beside a prior it moves no
+parameter by more than a twentieth of its standard deviation."""
 
 MAX_SIGMA_ROUNDS = 8
 
@@ -127,10 +128,10 @@ def fit_problem(
     linearisation = linearise_at_reference(problem)
     require_determined(problem, linearisation.information)
     repeatability = estimate_repeatability(problem.values, problem.observations)
-    sigma = first_sigma(problem.session, repeatability)
     program = NonlinearProgram(problem, options=options)
     built = time.perf_counter()
     seconds, iterations = 0.0, 0
+    sigma = _linearised_sigma(program, linearisation, repeatability)
     first = linearisation.solve(sigma=sigma) if start is None else np.asarray(start)
     passive: Array | None = None
     for _ in range(MAX_SIGMA_ROUNDS):
@@ -143,11 +144,11 @@ def fit_problem(
         seconds, iterations = seconds + solution.seconds_solve, iterations + solution.iterations
         prediction, jacobian = problem.linearise(solution.theta, solution.passive)
         information = decompose(jacobian, problem.observations)
-        noise = _noise(program, prediction, information, sigma, repeatability)
+        residual = project_out_zeros(problem.values - prediction, problem.observations)
+        noise = _noise(program, residual, information, sigma, repeatability)
         found = max(noise.sigma, SMALLEST_SIGMA)
-        settled = not math.isfinite(found) or abs(found / sigma - 1.0) < SIGMA_SETTLED
-        if settled or not (problem.prior or program.options.loss.robust):
-            break  # without either, sigma does not matter to the estimate
+        if not _matters(program) or _settled(found, sigma):
+            break
         sigma, first, passive = found, solution.theta, solution.passive
     weight = max(noise.sigma, SMALLEST_SIGMA) if math.isfinite(noise.sigma) else sigma
     return Fit(
@@ -163,6 +164,32 @@ def fit_problem(
         jacobian=jacobian,
         information=information,
     )
+
+
+def _matters(program: NonlinearProgram) -> bool:
+    """Whether sigma matters to the estimate: beside a prior, or with a robust loss."""
+    return program.problem.prior or program.options.loss.robust
+
+
+def _settled(found: float, sigma: float) -> bool:
+    return not math.isfinite(found) or abs(found / sigma - 1.0) < SIGMA_SETTLED
+
+
+def _linearised_sigma(
+    program: NonlinearProgram, linearisation: Linearisation, repeatability: tuple[float, int]
+) -> float:
+    """Sigma as the linearised problem has it, [m]: mostly near enough for one exact solution."""
+    problem = program.problem
+    sigma = first_sigma(problem.session, repeatability)
+    for _ in range(MAX_SIGMA_ROUNDS if _matters(program) else 0):
+        change = (linearisation.solve(sigma=sigma) - problem.reference) / problem.theta_scale
+        residual = linearisation.residual - linearisation.slopes @ change
+        noise = _noise(program, residual, linearisation.information, sigma, repeatability)
+        found = max(noise.sigma, SMALLEST_SIGMA)
+        if _settled(found, sigma):
+            break
+        sigma = found
+    return sigma
 
 
 def first_sigma(session: Session, repeatability: tuple[float, int]) -> float:
@@ -191,13 +218,13 @@ def require_determined(problem: CalibrationProblem, information: Information) ->
 
 def _noise(
     program: NonlinearProgram,
-    prediction: Array,
+    residual: Array,
     information: Information,
     sigma: float,
     repeatability: tuple[float, int],
 ) -> Noise:
+    """Noise from residuals with zeros eliminated, shape (n_entries,), [m]."""
     problem, loss = program.problem, program.options.loss
-    residual = project_out_zeros(problem.values - prediction, problem.observations)
     used = information.effective_parameters(sigma=sigma, precision=problem.prior_precision)
     dof = problem.observations.size - problem.observations.n_zeros - used
     return estimate_noise(

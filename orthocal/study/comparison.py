@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from orthocal.errors import NotIdentifiableError
+from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.identification.calibrate import repeat_calibration
 from orthocal.identification.nlp import SolverOptions
 from orthocal.identification.problem import build_problem
@@ -86,9 +86,16 @@ def compare_models(
 
     Raises:
         ParameterError: If a model or name is unknown.
+        SessionError: If the other session is of another robot.
         SolverError: If Ipopt does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
+    if repeat is not None and repeat.robot.sha256 != session.robot.sha256:
+        raise SessionError(
+            f"is of robot '{repeat.robot.name}'; the other session is of '{session.robot.name}', "
+            "or of another version of it",
+            where=None if repeat.path is None else str(repeat.path),
+        )
     noise = find_known_noise(session)
     parameters = session.robot.parameters
     results, undetermined = [], []

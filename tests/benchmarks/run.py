@@ -7,6 +7,10 @@ python tests/benchmarks/run.py --large    up to 100 050 readings; takes 3 GB and
 from __future__ import annotations
 
 import argparse
+import os
+
+# as the command line does it, for the peer too: threads of small matrices get in each other's way
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from cases import MODEL, SIGMA, SWEEP, Timing, measure_apart, simulate
 from peer import PeerProblem
