@@ -313,7 +313,7 @@ def _residual_rows(fit: Fit, diagnostics: Diagnostics) -> tuple[ResidualRow, ...
     measured, session = problem.values, problem.session
 
     def fitted(prediction: Array) -> Array:
-        residual = project_out_zeros(measured - prediction, o)
+        residual = project_out_zeros(measured - prediction, o, weights=fit.weights)
         return session.values - o.rows(residual)
 
     nominal = fitted(problem.predict(problem.reference))
@@ -321,7 +321,7 @@ def _residual_rows(fit: Fit, diagnostics: Diagnostics) -> tuple[ResidualRow, ...
         by_linear = fitted(problem.predict(fit.linear))
     except ClosureError:  # the linearised machine cannot be assembled
         by_linear = np.full(len(session.readings), np.nan)
-    predicted = fitted(fit.prediction)
+    predicted = session.values - o.rows(fit.residual)
     return tuple(
         ResidualRow(
             setup=r.setup,

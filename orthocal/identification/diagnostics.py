@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.identification.fit import Fit
-from orthocal.identification.uncertainty import confidence_factor
+from orthocal.identification.uncertainty import Information, confidence_factor, project_out_zeros
 from orthocal.measurement.gauge import Observations
 
 Array = NDArray[np.float64]
@@ -62,28 +62,32 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
     if not (np.isfinite(sigma) and sigma > 0.0):
         nothing, zeros = np.full(count, np.nan), np.zeros(count)
         return Diagnostics(nothing, nothing, zeros, zeros.astype(np.int64), np.inf)
-    inverse = fit.information.covariance(
+    inverse = _weighted_information(fit).covariance(
         sigma=sigma, precision=problem.prior_precision, held=fit.held
     )
-    slopes, residual = o.rows(fit.jacobian), o.rows(fit.residual)
+    slopes, residual, weights = o.rows(fit.jacobian), o.rows(fit.residual), fit.weights[o.plus]
     sensitivity, projected, own = np.empty_like(slopes), np.empty(count), np.empty(count)
     for zero in range(o.n_zeros):
         group = np.flatnonzero(o.zero[o.plus] == zero)
-        weights = _inverse_covariance(o, group)
-        if weights is None:
-            sensitivity[group] = slopes[group] - slopes[group].mean(axis=0)
-            projected[group], own[group] = residual[group], 1.0 - 1.0 / group.size
+        precision = _inverse_covariance(o, group)
+        if precision is None:
+            w = weights[group]
+            mean = (w @ slopes[group]) / w.sum()
+            sensitivity[group] = slopes[group] - mean
+            # in its own weight: what a robust loss has taken from a reading is not held against it
+            projected[group], own[group] = residual[group], 1.0 - w / w.sum()
         else:
-            sensitivity[group] = weights @ slopes[group]
-            projected[group], own[group] = weights @ residual[group], np.diag(weights)
+            sensitivity[group] = precision @ slopes[group]
+            projected[group], own[group] = precision @ residual[group], np.diag(precision)
+            weights[group] = 1.0
     moved = sensitivity @ inverse / sigma**2
-    left = own - (moved * sensitivity).sum(axis=1)
+    left = own - weights * (moved * sensitivity).sum(axis=1)
     left[left < BLIND * own] = np.nan
     deleted = projected / left
     spread, dof = _spread_without(fit, projected**2 / left)
     std = np.sqrt(np.diag(inverse))
     with np.errstate(divide="ignore", invalid="ignore"):
-        shifts = np.abs(moved * deleted[:, None]) / np.where(std > 0.0, std, np.inf)
+        shifts = np.abs(moved * (weights * deleted)[:, None]) / np.where(std > 0.0, std, np.inf)
     influenced = np.nan_to_num(shifts).argmax(axis=1)
     return Diagnostics(
         studentised=deleted * np.sqrt(left) / spread,
@@ -91,6 +95,19 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
         influence=np.nan_to_num(shifts[np.arange(count), influenced]),
         influenced=influenced,
         critical=confidence_factor(dof, 1.0 - SUSPICION / count),
+    )
+
+
+def _weighted_information(fit: Fit) -> Information:
+    """What the readings say in the weights that a robust loss has left them."""
+    if not fit.loss.robust:
+        return fit.information
+    o, weights = fit.problem.observations, fit.weights
+    centred = project_out_zeros(fit.jacobian, o, weights=weights)
+    return Information(
+        np.sqrt(weights)[:, None] * centred,
+        fit.information.singular_values,
+        fit.information.directions,
     )
 
 

@@ -77,8 +77,13 @@ class Fit:
 
     @property
     def residual(self) -> Array:
-        """Readings less predictions, gauge zeros eliminated, shape (n_entries,), [m]."""
-        return project_out_zeros(self.problem.values - self.prediction, self.problem.observations)
+        """Readings less predictions and gauge zeros, shape (n_entries,), [m]."""
+        return _residual(self.program, self.solution, self.prediction)
+
+    @property
+    def weights(self) -> Array:
+        """How much of a square each entry counted, shape (n_entries,): 1 without a robust loss."""
+        return self.loss.weight(self.residual / self.sigma)
 
     @property
     def held(self) -> NDArray[np.bool_]:
@@ -144,7 +149,7 @@ def fit_problem(
         seconds, iterations = seconds + solution.seconds_solve, iterations + solution.iterations
         prediction, jacobian = problem.linearise(solution.theta, solution.passive)
         information = decompose(jacobian, problem.observations)
-        residual = project_out_zeros(problem.values - prediction, problem.observations)
+        residual = _residual(program, solution, prediction)
         noise = _noise(program, residual, information, sigma, repeatability)
         found = max(noise.sigma, SMALLEST_SIGMA)
         if not _matters(program) or _settled(found, sigma):
@@ -214,6 +219,15 @@ def require_determined(problem: CalibrationProblem, information: Information) ->
         precision=problem.prior_precision,
         where=None if where is None else str(where),
     )
+
+
+def _residual(program: NonlinearProgram, solution: Solution, prediction: Array) -> Array:
+    """Residuals with the zeros that the loss gives: their mean for squares."""
+    problem, o = program.problem, program.problem.observations
+    left = problem.values - prediction
+    if program.options.loss.robust:
+        return np.asarray(left - solution.zeros[o.zero])
+    return project_out_zeros(left, o)
 
 
 def _noise(

@@ -71,6 +71,10 @@ class Loss:
         """ρ'(r) of residuals in standard deviations, shape as r."""
         return r / np.sqrt(1.0 + (r / self.width) ** 2) if self.robust else r
 
+    def weight(self, r: Array) -> Array:
+        """ρ'(r)/r: how much of a square a residual counts, 1 at 0, shape as r."""
+        return 1.0 / np.sqrt(1.0 + (r / self.width) ** 2) if self.robust else np.ones_like(r)
+
     def gain(self, r: Array, *, used: float) -> float:
         """Mean of ρ''(r): how steeply the estimate answers to the readings; 1 for squares.
 

@@ -412,7 +412,7 @@ class CalibrationProblem:
             [piece.passive, piece.drives, *self.shared.symbols],
             [piece.by_passive, piece.by_theta],
         )
-        return BatchFunction(function, shared=function.name_in()[2:])
+        return BatchFunction(function, shared=function.name_in()[2:], matrices=function.name_out())
 
     @cached_property
     def _reading_functions(self) -> tuple[BatchFunction, ...]:

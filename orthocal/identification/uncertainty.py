@@ -53,13 +53,22 @@ class Noise:
         return self.source == "residuals" and self.cycles_dof > 0
 
 
-def project_out_zeros(values: Array, observations: Observations) -> Array:
-    """Values less the mean of those that share their gauge zero, shape (n_entries, ...)."""
+def project_out_zeros(
+    values: Array, observations: Observations, *, weights: Array | None = None
+) -> Array:
+    """Values less the mean of those that share their gauge zero, shape (n_entries, ...).
+
+    Args:
+        values: Shape (n_entries, ...).
+        observations: Which zero each entry has.
+        weights: Of the entries in the means, shape (n_entries,); 1 by default.
+    """
     flat = values.reshape(len(values), -1)
+    own = np.ones(len(values)) if weights is None else weights
     totals = np.zeros((observations.n_zeros, flat.shape[1]))
-    np.add.at(totals, observations.zero, flat)
-    counts = np.bincount(observations.zero, minlength=observations.n_zeros)
-    means = totals / np.maximum(counts, 1)[:, None]
+    np.add.at(totals, observations.zero, flat * own[:, None])
+    counts = np.bincount(observations.zero, own, minlength=observations.n_zeros)
+    means = totals / np.where(counts > 0.0, counts, 1.0)[:, None]
     return np.asarray((flat - means[observations.zero]).reshape(values.shape))
 
 

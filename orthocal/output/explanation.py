@@ -107,6 +107,8 @@ def _explain_standstill(calibration: Calibration) -> list[str]:
 
 
 def _explain_linearisation(calibration: Calibration) -> list[str]:
+    if calibration.solver.loss == "huber":  # the linearised estimate is by squares
+        return []
     shifts = [(abs(p.value - p.linear), p) for p in calibration.free]
     largest, parameter = max(shifts, key=lambda s: s[0] / max(s[1].std, 1e-300))
     if math.isnan(parameter.std) or parameter.std <= 0.0:

@@ -22,9 +22,12 @@ class BatchFunction:
     Args:
         function: Inputs are column vectors; outputs are taken dense.
         shared: Names of the inputs that are the same at every point.
+        matrices: Names of the outputs that are matrices, though they may have one column.
     """
 
-    def __init__(self, function: ca.Function, *, shared: Sequence[str] = ()) -> None:
+    def __init__(
+        self, function: ca.Function, *, shared: Sequence[str] = (), matrices: Sequence[str] = ()
+    ) -> None:
         symbols = [function.sx_in(i) for i in range(function.n_in())]
         outputs = (
             [ca.densify(y) for y in function(*symbols)]
@@ -36,6 +39,7 @@ class BatchFunction:
         )
         self._shared = [function.index_in(name) for name in shared]
         self._shapes = [function.size_out(i) for i in range(function.n_out())]
+        self._matrices = [function.index_out(name) for name in matrices]
         self._maps: dict[int, ca.Function] = {}
 
     def __call__(self, *inputs: ArrayLike) -> tuple[Array, ...]:
@@ -45,7 +49,8 @@ class BatchFunction:
             inputs: Shape (K, n) each, or (n,) for the shared ones.
 
         Returns:
-            Each output with shape (K, rows, columns), or (K, rows) for a column vector.
+            Each output with shape (K, rows, columns), or (K, rows) for a column vector; `matrices`
+            keep their one column.
         """
         arrays = [np.ascontiguousarray(a, dtype=np.float64) for a in inputs]
         count = next(len(a) for i, a in enumerate(arrays) if i not in self._shared)
@@ -65,8 +70,10 @@ class BatchFunction:
                 buffer.set_res(i, memoryview(result[part].reshape(-1)))  # type: ignore[call-arg,arg-type]
             trigger()
         return tuple(
-            np.asarray(y[:, 0, :] if shape[1] == 1 else y.transpose(0, 2, 1))
-            for y, shape in zip(results, self._shapes, strict=True)
+            np.asarray(
+                y[:, 0, :] if shape[1] == 1 and i not in self._matrices else y.transpose(0, 2, 1)
+            )
+            for i, (y, shape) in enumerate(zip(results, self._shapes, strict=True))
         )
 
     def _map(self, size: int) -> ca.Function:

@@ -164,7 +164,9 @@ class ToolSensitivity:
             ["drives", "passive", "theta", "placements", "slopes"],
             ["p_q", "p_theta", "g_q", "g_theta"],
         )
-        self._function = BatchFunction(function, shared=["theta", "placements", "slopes"])
+        self._function = BatchFunction(
+            function, shared=["theta", "placements", "slopes"], matrices=function.name_out()
+        )
         self._shared = [np.asarray(v.full()).reshape(-1) for v in shared.function(self.theta)]
 
     def __call__(self, drives: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
