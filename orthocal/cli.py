@@ -38,7 +38,9 @@ Tolerances = Annotated[
         help="Another tolerance than the robot's, such as '*.offset_mm=2'.",
     ),
 ]
-AllRows = Annotated[bool, typer.Option("--all", help="List every reading, however many.")]
+AllRows = Annotated[
+    bool, typer.Option("--all", help="List every reading, parameter and group, however many.")
+]
 
 
 def main() -> None:
@@ -273,7 +275,10 @@ def validate(
     json: Json = False,
     all_rows: AllRows = False,
 ) -> None:
-    """Hold a new session against a calibration: is it confirmed?"""
+    """Hold a new session against a calibration: is it confirmed?
+
+    Exit code 0: it is. 3: it is not, or a further fit would change something.
+    """
     from orthocal.identification.calibration_file import load_calibration
     from orthocal.measurement.session_file import load_session
     from orthocal.output.summary import print_summary
@@ -284,6 +289,8 @@ def validate(
         _out(result.to_json().rstrip("\n"))
     else:
         print_summary(result, all_rows=all_rows)
+    if result.confirmed is False:
+        raise typer.Exit(3)
 
 
 @app.command()

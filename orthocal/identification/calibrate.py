@@ -112,6 +112,8 @@ def calibrate(
 def repeat_calibration(calibration: Calibration, session: Session) -> Calibration:
     """The same parameters, with the same priors and bounds, identified from another session.
 
+    Its rows' nominal values are those of the machine as it was calibrated before.
+
     Raises:
         NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
     """
@@ -129,7 +131,8 @@ def repeat_calibration(calibration: Calibration, session: Session) -> Calibratio
     solver = calibration.solver
     options = SolverOptions(loss=Loss(solver.loss, solver.loss_width))
     return assemble_calibration(
-        fit_problem(CalibrationProblem(session, selection), options=options)
+        fit_problem(CalibrationProblem(session, selection), options=options),
+        nominal=np.array([p.value for p in free]),
     )
 
 
@@ -138,6 +141,7 @@ def assemble_calibration(
     *,
     whole: CalibrationProblem | None = None,
     intervals: Mapping[str, tuple[float, float]] | None = None,
+    nominal: Array | None = None,
 ) -> Calibration:
     """The record of a solved problem.
 
@@ -146,6 +150,8 @@ def assemble_calibration(
         whole: The problem with all parameters, where those that were solved for are its base
             parameters.
         intervals: Profile-likelihood intervals by name, [SI].
+        nominal: Free parameters of the machine that readings are held against, shape (n_free,),
+            [SI]; what the controller already corrects by default.
     """
     problem, noise, loss = fit.problem, fit.noise, fit.loss
     session = problem.session
@@ -183,7 +189,7 @@ def assemble_calibration(
         sigma=noise.sigma * float(factor),
         dof=noise.dof,
         rows_are_differences=session.only_differences,
-        residuals=_residual_rows(fit, diagnostics),
+        residuals=_residual_rows(fit, diagnostics, nominal),
         critical=diagnostics.critical,
         postures=tuple(
             PostureRecord(name, tuple(p.drives.tolist()), tuple(fit.solution.passive[i].tolist()))
@@ -222,11 +228,15 @@ def _match_profiled(problem: CalibrationProblem, patterns: Sequence[str]) -> lis
 def _identifiability(fit: Fit, whole: CalibrationProblem | None) -> Identifiability:
     """Of the free parameters; of base parameters, together with what they stand for."""
     if whole is None:
-        information, parameters = fit.information, fit.problem.parameters
+        information, parameters = fit.linearisation.information, fit.problem.parameters
     else:
         information, parameters = linearise_at_reference(whole).information, whole.parameters
     return analyse_identifiability(
-        information, parameters, sigma=fit.noise.sigma, n_postures=fit.problem.n_postures
+        information,
+        parameters,
+        sigma=fit.noise.sigma,
+        n_postures=fit.problem.n_postures,
+        n_readings=fit.independent_readings,
     )
 
 
@@ -307,7 +317,9 @@ def _session_record(session: Session) -> SessionRecord:
     )
 
 
-def _residual_rows(fit: Fit, diagnostics: Diagnostics) -> tuple[ResidualRow, ...]:
+def _residual_rows(
+    fit: Fit, diagnostics: Diagnostics, nominal_theta: Array | None
+) -> tuple[ResidualRow, ...]:
     """Readings beside what three machines would show, each with its best gauge zeros."""
     problem, o = fit.problem, fit.problem.observations
     measured, session = problem.values, problem.session
@@ -316,7 +328,8 @@ def _residual_rows(fit: Fit, diagnostics: Diagnostics) -> tuple[ResidualRow, ...
         residual = project_out_zeros(measured - prediction, o, weights=fit.weights)
         return session.values - o.rows(residual)
 
-    nominal = fitted(problem.predict(problem.reference))
+    reference = problem.reference if nominal_theta is None else nominal_theta
+    nominal = fitted(problem.predict(reference))
     try:
         by_linear = fitted(problem.predict(fit.linear))
     except ClosureError:  # the linearised machine cannot be assembled

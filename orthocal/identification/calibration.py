@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -157,6 +157,20 @@ class Calibration:
         """Standard deviations on either side of an estimate in its 95 % interval."""
         return confidence_factor(self.dof)
 
+    def interval(self, parameter: ParameterEstimate) -> tuple[float, float]:
+        """95 % interval of a free parameter, [unit]; infinite where nothing tells the noise.
+
+        Student's factor counts for the share that the readings told: what only the prior tells has
+        no part in the degrees of freedom of their scatter.
+        """
+        share = 1.0 if math.isnan(parameter.data_share) else max(parameter.data_share, 0.0)
+        student, normal = self.confidence_factor, confidence_factor(math.inf)
+        factor = normal
+        if share > 0.0:
+            factor = math.sqrt(share * student**2 + (1.0 - share) * normal**2)
+        half = factor * parameter.std
+        return parameter.value - half, parameter.value + half
+
     @property
     def robot(self) -> Robot:
         """The nominal robot.
@@ -173,14 +187,30 @@ class Calibration:
         """What to enter into the controller; empty where no offset was identified."""
         active = self.session.controller_offsets
         entries = []
+        free = [p.name for p in self.free]
+        bias = np.sqrt(np.diag(self.unmodelled.bias_covariance))
         for i, drive in enumerate(self.robot.drives):
             estimate = next((p for p in self.parameters if p.name == f"{drive.name}.offset"), None)
             if estimate is None:
                 continue
             now = None if active is None else active[i]
             change = estimate.value - (now or 0.0)
+            held: Literal["known", "lower bound", "upper bound"] | None = None
+            if not estimate.free:
+                held = "known"
+            elif estimate.at_bound is not None:
+                held = "lower bound" if estimate.at_bound == "lower" else "upper bound"
             entries.append(
-                ControllerEntry(drive.name, drive.unit, now, estimate.value, change, estimate.std)
+                ControllerEntry(
+                    drive=drive.name,
+                    unit=drive.unit,
+                    active=now,
+                    enter=estimate.value,
+                    change=change,
+                    std=estimate.std,
+                    bias_std=0.0 if held else float(bias[free.index(estimate.name)]),
+                    held=held,
+                )
             )
         return tuple(entries)
 
@@ -336,6 +366,7 @@ def _identifiability_document(found: Identifiability) -> dict[str, Any]:
         "condition": _number(found.condition),
         "observability": found.observability,
         "n_postures": found.n_postures,
+        "n_readings": found.n_readings,
         "unseen": list(found.unseen),
         "told": list(found.told),
         "alike": [combination(c) for c in found.alike],

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from orthocal.documents import Number, PositiveNumber, exists, is_folder, read_json, validate
@@ -26,6 +27,8 @@ from orthocal.identification.records import (
 )
 from orthocal.identification.unmodelled import Unmodelled
 from orthocal.robot.model import read_only
+
+Array = NDArray[np.float64]
 
 
 class _Keys(BaseModel):
@@ -69,8 +72,8 @@ class _ParameterKeys(_Keys):
     unit: Literal["m", "rad", "1"]
     value: Number
     linear: Number
-    std: Number | None
-    tolerance: Number
+    std: Annotated[Number, Field(ge=0.0)] | None
+    tolerance: PositiveNumber
     free: bool
     identifiable: bool
     start: Number
@@ -83,7 +86,7 @@ class _ParameterKeys(_Keys):
 
 
 class _NoiseKeys(_Keys):
-    reading_sigma: Number | None
+    reading_sigma: Annotated[Number, Field(ge=0.0)] | None
     source: Literal["cycles", "residuals", "gauge", "unknown"]
     cycles_sigma: Number | None
     cycles_dof: int
@@ -145,6 +148,7 @@ class _IdentifiabilityKeys(_Keys):
     condition: Number | None
     observability: _ObservabilityKeys
     n_postures: Annotated[int, Field(ge=1)]
+    n_readings: Annotated[int, Field(ge=0)]
     unseen: list[str]
     told: list[str]
     alike: list[Terms]
@@ -164,8 +168,8 @@ class _CalibrationKeys(_Keys):
     unmodelled: _UnmodelledKeys
     identifiability: _IdentifiabilityKeys
     base: bool
-    sigma: Number | None
-    dof: Number | None
+    sigma: Annotated[Number, Field(ge=0.0)] | None
+    dof: Annotated[Number, Field(ge=0.0)] | None
     noise: _NoiseKeys
     rows_are_differences: bool
     rms_before: Number
@@ -207,6 +211,7 @@ def load_calibration(path: str | Path) -> Calibration:
             f"expected {len(free)} × {len(free)} numbers, as free parameters",
             where=f"{file}: covariance",
         )
+    _check_covariance(np.array(covariance, dtype=np.float64), file)
     _check_unmodelled(keys.unmodelled, len(free), file)
     names = [p.name for p in keys.parameters]
     for i, name in enumerate(names):
@@ -263,6 +268,21 @@ def load_calibration(path: str | Path) -> Calibration:
     )
 
 
+def _check_covariance(covariance: Array, file: Path) -> None:
+    """Refuse what cannot be a covariance: a file can be edited."""
+    if not np.isfinite(covariance).all():
+        return
+    scale = float(np.abs(covariance).max())
+    std = np.sqrt(np.abs(np.diag(covariance)))
+    unit = covariance / np.outer(*(np.where(std > 0.0, std, 1.0),) * 2)
+    symmetric = np.abs(covariance - covariance.T).max() <= 1e-9 * scale
+    if not symmetric or np.linalg.eigvalsh(unit).min() < -1e-6:
+        raise CalibrationFileError(
+            "is not a covariance: expected symmetric numbers without negative variances",
+            where=f"{file}: covariance",
+        )
+
+
 def _check_unmodelled(keys: _UnmodelledKeys, n_free: int, file: Path) -> None:
     count = len(keys.names)
     if len(keys.tolerances) != count:
@@ -284,6 +304,7 @@ def _identifiability(keys: _IdentifiabilityKeys) -> Identifiability:
         rank=min(keys.rank, len(keys.singular_values)),
         structural_rank=keys.structural_rank,
         n_postures=keys.n_postures,
+        n_readings=keys.n_readings,
         unseen=tuple(keys.unseen),
         told=tuple(keys.told),
         alike=tuple(Combination(tuple(terms)) for terms in keys.alike),

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.identification.fit import Fit
+from orthocal.identification.fit import SMALLEST_SIGMA, Fit
 from orthocal.identification.uncertainty import Information, confidence_factor, project_out_zeros
 from orthocal.measurement.gauge import Observations
 
@@ -59,7 +59,7 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
     """Hold every reading against all the others, to first order about the solution."""
     problem, o = fit.problem, fit.problem.observations
     count, sigma = o.plus.size, fit.noise.sigma
-    if not (np.isfinite(sigma) and sigma > 0.0):
+    if not (np.isfinite(sigma) and sigma >= SMALLEST_SIGMA):
         nothing, zeros = np.full(count, np.nan), np.zeros(count)
         return Diagnostics(nothing, nothing, zeros, zeros.astype(np.int64), np.inf)
     inverse = _weighted_information(fit).covariance(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.errors import ClosureError
+from orthocal.errors import ClosureError, SolverError
 from orthocal.identification.linear import Linearisation, linearise_at_reference
 from orthocal.identification.loss import Loss
 from orthocal.identification.nlp import NonlinearProgram, Solution, SolverOptions
@@ -52,6 +52,8 @@ class Fit:
     """All solutions until sigma had settled, [s]."""
     iterations: int
     """Of Ipopt, in all of them."""
+    linearisation: Linearisation
+    """About what the controller already corrects."""
     linear: Array
     """Linearised solution, shape (n_free,), [SI]."""
     solution: Solution
@@ -86,6 +88,13 @@ class Fit:
         return self.loss.weight(self.residual / self.sigma)
 
     @property
+    def independent_readings(self) -> int:
+        """Independent readings: repeated ones once, less gauge zeros."""
+        o = self.problem.observations
+        _, repeated = estimate_repeatability(self.problem.values, o)
+        return o.size - o.n_zeros - repeated
+
+    @property
     def held(self) -> NDArray[np.bool_]:
         """Parameters that a bound holds, shape (n_free,)."""
         return np.asarray(self.solution.at_bound != 0)
@@ -93,17 +102,15 @@ class Fit:
     def covariance(self) -> Array:
         """Covariance of the free parameters, shape (n_free, n_free), [SI]; NaN if unknown."""
         scale = np.outer(self.problem.theta_scale, self.problem.theta_scale)
-        if self.noise.sigma == 0.0:  # readings without any scatter
-            return np.zeros_like(scale)
         if not math.isfinite(self.noise.sigma):
             return np.full_like(scale, np.nan)
         factors = (1.0, 1.0)
         if self.loss.robust:
             used = self.problem.observations.size - self.noise.residual_dof
-            gain = self.loss.gain(self.residual / self.noise.sigma, used=used)
+            gain = self.loss.gain(self.residual / self.sigma, used=used)
             factors = (gain, self.loss.normal_square)
         return scale * self.information.covariance(
-            sigma=self.noise.sigma,
+            sigma=self.sigma,  # some, also for readings without any scatter
             precision=self.problem.prior_precision,
             held=self.held,
             loss=factors,
@@ -155,6 +162,7 @@ def fit_problem(
         if not _matters(program) or _settled(found, sigma):
             break
         sigma, first, passive = found, solution.theta, solution.passive
+    _require_assembly(problem, solution, robust=program.options.loss.robust)
     weight = max(noise.sigma, SMALLEST_SIGMA) if math.isfinite(noise.sigma) else sigma
     return Fit(
         problem=problem,
@@ -162,6 +170,7 @@ def fit_problem(
         seconds_build=built - began,
         seconds_solve=seconds,
         iterations=iterations,
+        linearisation=linearisation,
         linear=linearisation.solve(sigma=weight),
         solution=solution,
         noise=noise,
@@ -169,6 +178,24 @@ def fit_problem(
         jacobian=jacobian,
         information=information,
     )
+
+
+def _require_assembly(problem: CalibrationProblem, solution: Solution, *, robust: bool) -> None:
+    """Refuse a solution that is no machine: absurd readings can be met by absurd errors.
+
+    Raises:
+        SolverError: Naming the posture that the machine found cannot reach.
+    """
+    try:
+        problem.close(solution.theta, start=solution.passive)
+    except ClosureError as e:
+        hint = "" if robust else "; with the loss 'huber' it may be named"
+        raise SolverError(
+            f"the errors that fit these readings best make no machine: {e}. Look for a reading "
+            f"with a wrong sign or in a wrong row{hint}",
+            status=solution.status,
+            iterations=solution.iterations,
+        ) from None
 
 
 def _matters(program: NonlinearProgram) -> bool:
@@ -247,4 +274,5 @@ def _noise(
         residual_square=loss.robust_square(residual, dof=dof, start=sigma),
         residual_dof=dof,
         gauge_sigma=problem.session.gauge.sigma,
+        resolution=problem.session.gauge.resolution,
     )

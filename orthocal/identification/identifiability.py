@@ -39,12 +39,18 @@ class Combination:
     @property
     def formula(self) -> str:
         """As a sum: x_slide.offset + x_swivel.x − 0.31 x_slide.ry."""
+        return self.shorten(None)
+
+    def shorten(self, most: int | None) -> str:
+        """The sum with no more than so many terms, the largest coefficients first."""
+        rest = sorted(self.terms[1:], key=lambda t: -abs(t[1])) if most else self.terms[1:]
         text = self.terms[0][0]
-        for name, coefficient in self.terms[1:]:
+        for name, coefficient in rest if most is None else rest[: most - 1]:
             size = f"{abs(coefficient):.3g}"
             factor = "" if size == "1" else f"{size} "
             text += f" {'+' if coefficient > 0 else '−'} {factor}{name}"
-        return text
+        left_out = 0 if most is None else len(self.terms) - most
+        return f"{text} and {left_out} more" if left_out > 0 else text
 
     @property
     def words(self) -> str:
@@ -70,6 +76,8 @@ class Identifiability:
     structural_rank: int
     """Number above RANK_THRESHOLD of the largest: what perfect readings would tell."""
     n_postures: int
+    n_readings: int
+    """Independent readings: repeated ones once, less gauge zeros."""
     unseen: tuple[str, ...]
     """Parameters that move no reading by more than the threshold."""
     told: tuple[str, ...]
@@ -78,6 +86,11 @@ class Identifiability:
     """Parameters that move the readings alike, two or more: only their sum is told."""
     base: tuple[Combination, ...]
     """Base parameters by QR decomposition with pivoting: what the readings tell, one each."""
+
+    @property
+    def spare_readings(self) -> int:
+        """Independent readings that the parameters leave to check the model."""
+        return self.n_readings - self.structural_rank
 
     @property
     def condition(self) -> float:
@@ -111,6 +124,7 @@ def analyse_identifiability(
     *,
     sigma: float,
     n_postures: int,
+    n_readings: int,
 ) -> Identifiability:
     """Analyse an identification Jacobian.
 
@@ -120,6 +134,7 @@ def analyse_identifiability(
         sigma: Standard deviation of a reading, which is the threshold, [m]; 0 or NaN for what
             perfect readings would tell.
         n_postures: Postures of the session.
+        n_readings: Independent readings of the session.
     """
     factor, s = information.factor, information.singular_values
     smallest = RANK_THRESHOLD * float(s[0])
@@ -133,6 +148,7 @@ def analyse_identifiability(
         rank=int((s > threshold).sum()),
         structural_rank=information.rank,
         n_postures=n_postures,
+        n_readings=n_readings,
         unseen=tuple(n for n, size in zip(names, sizes, strict=True) if size <= threshold),
         told=tuple(n for n, ok in zip(names, told, strict=True) if ok),
         alike=_find_alike(factor, parameters, threshold),

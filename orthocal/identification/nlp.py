@@ -206,7 +206,8 @@ class NonlinearProgram:
         if status not in CONVERGED:
             raise SolverError(
                 f"Ipopt did not converge: {status} after {iterations} iterations; there is no "
-                "result. Look for a reading with a wrong sign or in a wrong row first",
+                "result. Look for a reading with a wrong sign or in a wrong row first"
+                + ("" if self.options.loss.robust else "; with the loss 'huber' it may be named"),
                 status=status,
                 iterations=iterations,
             )

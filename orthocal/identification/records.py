@@ -192,4 +192,13 @@ class ControllerEntry:
     change: float
     """enter − active, [unit]."""
     std: float
-    """[unit]."""
+    """What the scatter leaves open, [unit]."""
+    bias_std: float
+    """What errors that were not identified, at their tolerances, add to it, [unit]."""
+    held: Literal["known", "lower bound", "upper bound"] | None
+    """What holds it instead of the readings."""
+
+    @property
+    def std_in_all(self) -> float:
+        """Standard deviation from both, [unit]."""
+        return math.hypot(self.std, self.bias_std)

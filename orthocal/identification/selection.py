@@ -20,6 +20,9 @@ Known = float | tuple[float, float]
 
 DEFAULT_MODEL = "offsets"
 
+LARGEST_KNOWN = 100.0
+"""Tolerances beyond which a known value is taken for a length or an angle instead of an error."""
+
 SMALLEST_TOLERANCE = 1e-9
 """[m, rad or 1]. Parameters are scaled by their tolerances: with less they would hardly move."""
 
@@ -104,6 +107,7 @@ def select_parameters(
     for name, entry in (known or {}).items():
         with _named("known"):
             parameter = parameters[name]
+            _refuse_length(entry[0] if isinstance(entry, tuple) else entry, parameter)
             if isinstance(entry, tuple):
                 own_prior[name] = (_finite(entry[0], name), _tolerance(entry[1], parameter))
                 chosen.add(name)
@@ -150,7 +154,7 @@ def read_known(texts: Sequence[str], parameters: ParameterSet, *, where: str) ->
     result: dict[str, Known] = {}
     for text in texts:
         key, number = _split(text, "NAME=VALUE or NAME=VALUE±TOLERANCE", where)
-        value, sign, spread = number.replace("+-", "±").partition("±")
+        value, sign, spread = number.replace("+/-", "±").replace("+-", "±").partition("±")
         try:
             name, si = parameters.read_quantity(key, _number(value, where, key))
         except ParameterError as e:
@@ -256,6 +260,15 @@ def _refuse_overlap(parameters: ParameterSet, names: Sequence[str]) -> None:
 
 def _label(model: str | None, free: Sequence[str]) -> str:
     return " ".join([*([] if model is None else [model]), *free])
+
+
+def _refuse_length(value: float, parameter: Parameter) -> None:
+    if abs(value) > LARGEST_KNOWN * parameter.tolerance:
+        factor, unit = parameter.edge_factor, parameter.edge_unit
+        raise ParameterError(
+            f"'{parameter.name}' is {value * factor:g} {unit}; expected the deviation from nominal "
+            f"(its tolerance is {parameter.tolerance * factor:g} {unit}), not the whole length"
+        )
 
 
 def _finite(value: float, name: str) -> float:

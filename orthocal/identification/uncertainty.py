@@ -7,6 +7,7 @@ deviation from the mean of their zero.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -109,6 +110,7 @@ def estimate_noise(
     residual_square: float,
     residual_dof: float,
     gauge_sigma: float | None,
+    resolution: float | None = None,
 ) -> Noise:
     """Standard deviation of a reading: from repeated cycles, else from residuals, else the gauge's.
 
@@ -120,10 +122,17 @@ def estimate_noise(
         residual_square: Σ r² of single readings, zeros eliminated, [m²].
         residual_dof: Readings less zeros less (effective) parameters.
         gauge_sigma: The session's `sigma_mm`, [m].
+        resolution: Of the gauge, [m]: readings rounded to it scatter by at least 1/√12 of it, also
+            where they happen to be equal.
     """
     cycles_sigma, cycles_dof = repeatability
+    finest = 0.0 if resolution is None else resolution / math.sqrt(12.0)
+    if cycles_dof > 0:
+        cycles_sigma = max(cycles_sigma, finest)
     enough = residual_dof > 0.5
-    residual_sigma = float(np.sqrt(residual_square / residual_dof)) if enough else float("nan")
+    residual_sigma = float("nan")
+    if enough:
+        residual_sigma = max(float(np.sqrt(residual_square / residual_dof)), finest)
     if cycles_dof > 0:
         misfit = False
         if enough and cycles_sigma > 0.0:

@@ -118,6 +118,7 @@ def simulate_session(
                 )
     session = replace(
         plan.with_values(rows),
+        gauge=replace(plan.gauge, resolution=None) if exact else plan.gauge,
         title=plan.title if plan.title.startswith("Simulated") else f"Simulated: {plan.title}",
         source=f"Simulated by orthocal, not measured (seed {seed})",
         path=None,

@@ -18,7 +18,9 @@ from orthocal.study.accuracy import (
     HALF_SIDE,
     ErrorSize,
     ToolAccuracy,
+    assess_excess,
     assess_tool,
+    find_excess,
     find_remaining_errors,
     measure_deviations,
 )
@@ -66,7 +68,7 @@ def render_accuracy(
         region: What the points are, in words.
     """
     weights = accuracy.workspace.weights
-    sizes = ("r.m.s. [µm]", "95 %", "largest")
+    sizes = ("r.m.s. [µm]", "95 %", "worst point")
     table = table_of("", *sizes, *sizes)
     rows: list[tuple[str, ErrorSize, ErrorSize]] = [
         (
@@ -78,14 +80,18 @@ def render_accuracy(
     if len(calibration.free) > len(calibration.controller_entries()):
         rows.append(
             (
-                "off with the offsets entered",
+                "with the offsets entered",
                 measure_deviations(accuracy.left, weights),
                 measure_deviations(accuracy.relative_left, weights),
             )
         )
     rows.append(("not known before", accuracy.before.absolute, accuracy.before.relative))
+    excess = find_excess(calibration)
     if accuracy.after is not None:
         rows.append(("not known after", accuracy.after.absolute, accuracy.after.relative))
+        if excess > 1.0:
+            worse = assess_excess(calibration, accuracy, excess)
+            rows.append((f"  at {excess:.1f} × tolerances", worse.absolute, worse.relative))
     for name, absolute, relative in rows:
         add_row(table, name, *(um(v) for size in (absolute, relative) for v in _parts(size)))
     lines: list[RenderableType] = [
@@ -97,10 +103,18 @@ def render_accuracy(
     else:
         lines.append(
             Text(
-                "Not known: one standard deviation in space, with all errors of the machine that "
+                "Not known: one standard deviation in space (95 %: 95 of 100 errors are smaller; "
+                "worst point: one standard deviation there), with all errors of the machine that "
                 "were not identified at their tolerances."
             )
         )
+        if excess > 1.0:
+            lines.append(
+                Text(
+                    f"What remains of the readings is {excess:.1f} times what such errors would "
+                    "leave: this machine seems to be as much worse than its tolerances."
+                )
+            )
         lines += [Text(line) for line in describe_remaining(calibration, accuracy)]
     return Group(*lines)
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from scipy import special
 
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.records import ResidualRow
+from orthocal.identification.uncertainty import confidence_factor
 from orthocal.output.layout import mm, plain, signed
 
 WORST_SUSPICIOUS = 5
 """Suspicious readings that are named."""
+
+MANY_SUSPICIOUS = 0.2
+"""Part of the readings above which it is not the readings that are wrong."""
 
 STANDSTILL = 1e-6
 """Part of a tolerance by which a parameter must move to have moved."""
@@ -38,7 +41,8 @@ def explain_fit(calibration: Calibration) -> list[str]:
         ratio = noise.residual_sigma / noise.cycles_sigma
         sentences.append(
             f"What remains is {ratio:.1f} times what repeated cycles scatter by "
-            f"({mm(noise.cycles_sigma)} mm a reading): it is error of the model, not noise. "
+            f"({mm(noise.cycles_sigma)} mm a reading): it is error of the model (legs, axes, "
+            "mounting), or a wrong sign, direction or setup; not noise. "
             "Standard deviations are taken from the residuals."
         )
     elif noise.source == "residuals" and gauge is not None:
@@ -46,7 +50,7 @@ def explain_fit(calibration: Calibration) -> list[str]:
         low, high = _ratio_interval(noise.residual_dof)
         if ratio > high:
             sentences.append(
-                f"What remains, σ = {mm(calibration.sigma)} mm of {row}, is {ratio:.0f} times "
+                f"What remains, σ = {mm(calibration.sigma)} mm of {row}, is {_times(ratio)} "
                 f"what the gauge itself would leave ({mm(gauge * factor)} mm): it is error of the "
                 f"model (legs, axes, mounting), or a wrong sign, direction or setup; not noise of "
                 f"the gauge. With the model '{calibration.model}' it will stay."
@@ -62,8 +66,14 @@ def explain_fit(calibration: Calibration) -> list[str]:
                 "for these readings."
             )
     elif noise.source == "cycles":
-        sentences.append("What remains is what repeated cycles scatter by: the model fits.")
+        fits = (
+            "the model fits."
+            if gauge is None or noise.cycles_sigma <= gauge * _ratio_interval(noise.cycles_dof)[1]
+            else "but see how they scatter."
+        )
+        sentences.append(f"What remains is what repeated cycles scatter by: {fits}")
     sentences += _explain_cycles(calibration)
+    sentences += _explain_check(calibration)
     sentences += _explain_suspicious(calibration)
     sentences += _explain_linearisation(calibration)
     sentences += _explain_trust(calibration)
@@ -71,11 +81,28 @@ def explain_fit(calibration: Calibration) -> list[str]:
     return sentences
 
 
+def _explain_check(calibration: Calibration) -> list[str]:
+    """Whether any reading is left to check the model."""
+    found = calibration.identifiability
+    if found.spare_readings > 0:
+        return []
+    return [
+        f"The parameters can take up all {found.n_readings} independent readings, and none is left "
+        "to check the model: `orthocal compare` says what the readings support."
+    ]
+
+
 def _explain_suspicious(calibration: Calibration) -> list[str]:
     """Rows that all the others contradict, by file and line."""
     rows = calibration.suspicious
     if not rows:
         return []
+    if len(rows) > MANY_SUSPICIOUS * len(calibration.residuals):
+        return [
+            f"{len(rows)} of {len(calibration.residuals)} readings contradict all others by what "
+            "this model and its tolerances allow: it is the model or the tolerances, not single "
+            "readings."
+        ]
     words = [
         f"{calibration.where(r)}: {r.label}{f', cycle {r.cycle}' if r.cycle > 1 else ''}, reads "
         f"{signed(r.measured * 1e3)} mm, {r.studentised:+.1f} of its σ from what all others say; "
@@ -120,28 +147,35 @@ def _explain_linearisation(calibration: Calibration) -> list[str]:
 
 
 def _explain_trust(calibration: Calibration) -> list[str]:
+    """Which offsets are proved, errors that were not identified taken at their tolerances."""
+    entries = [e for e in calibration.controller_entries() if e.held is None]
+    sentences = []
+    worst = max((e.bias_std for e in entries), default=0.0)
+    if worst > 0.0:
+        sentences.append(
+            f"± σ is what the scatter leaves open. Errors of legs and axes within their tolerances "
+            f"would move the offsets by ±{mm(worst)} mm more: these are the offsets that make up "
+            "for them best in the postures measured. What is left of that at the tool is in the "
+            "table above."
+        )
     k = calibration.confidence_factor
     if math.isinf(k) or math.isnan(calibration.sigma) or calibration.noise.source == "gauge":
-        return []
-    told = {p.name for p in calibration.free if p.identifiable}
-    entries = [e for e in calibration.controller_entries() if f"{e.drive}.offset" in told]
-    vague = [e.drive for e in entries if abs(e.change) <= k * e.std]
-    clear = [e.drive for e in entries if abs(e.change) > k * e.std]
-    sentences = []
+        return sentences
+    normal = confidence_factor(math.inf)
+    clear: list[str] = []
+    vague: list[str] = []
+    for e in entries:
+        proved = abs(e.change) > math.hypot(k * e.std, normal * e.bias_std)
+        (clear if proved else vague).append(e.drive)
     if clear:
-        sentences.append(f"Offsets that the readings prove (95 %): {', '.join(clear)}.")
+        sentences.append(
+            f"Offsets that must change (95 %, with all that is not known): {', '.join(clear)}."
+        )
     if vague:
         sentences.append(
-            f"Offsets whose 95 % interval holds no change at all: {', '.join(vague)}. They are "
-            "still the best estimate, but do not expect much of them."
-        )
-    if len(calibration.free) == len(calibration.controller_entries()):
-        bias = np.sqrt(np.diag(calibration.unmodelled.bias_covariance))
-        size = f", which would move them by ±{mm(float(bias.max()))} mm," if bias.size else ""
-        sentences.append(
-            f"± σ is what the scatter leaves open. Errors of legs and axes within their tolerances"
-            f"{size} come on top: these are the offsets that make up for them best in the postures "
-            "measured. What is left of that at the tool is in the table above."
+            f"Offsets that might as well stay as they are (their 95 % interval, with all that is "
+            f"not known, includes no change): {', '.join(vague)}. The values are still the best "
+            "estimate."
         )
     return sentences
 
@@ -167,6 +201,10 @@ def _explain_cycles(calibration: Calibration) -> list[str]:
         f"{mm(gauge)} mm explain. They differ most at {worst[0].label}: {shown} mm. Check these "
         "for a wrong sign or row before anything is entered."
     ]
+
+
+def _times(ratio: float) -> str:
+    return f"{ratio:.1f} times" if ratio < 3.0 else f"{ratio:.0f} times"
 
 
 def _ratio_interval(dof: float) -> tuple[float, float]:

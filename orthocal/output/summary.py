@@ -33,8 +33,14 @@ Result = Calibration | Validation | Comparison
 MANY_PARAMETERS = 12
 """Parameters above which only those that the readings tell are listed."""
 
+NOTHING = 1e-8
+"""Deviations below this are none, [m]."""
+
 TOLD = 0.5
 """Share of its variance that the readings must take from a parameter to be listed then."""
+
+MOST_TERMS = 5
+"""Terms of a combination that are printed."""
 
 MOST_PAIRS = 8
 """Correlated pairs that are listed."""
@@ -140,15 +146,14 @@ def _parameter_table(calibration: Calibration, all_rows: bool) -> RenderableType
     listed = [p for p in c.free if all_rows or len(c.free) <= MANY_PARAMETERS or _worth_listing(p)]
     for p in listed:
         f = p.edge_factor
-        half = c.confidence_factor * p.std
         add_row(
             table,
             p.name,
             signed(p.linear * f),
             signed(p.value * f),
-            f"at its {p.at_bound} bound" if p.at_bound else plain(p.std * f),
+            "at bound" if p.at_bound else plain(p.std * f),
             *([f"{p.data_share:.0%}" if p.prior and not p.at_bound else ""] if told else []),
-            "" if p.at_bound else _interval(p.value - half, p.value + half, f),
+            "" if p.at_bound else _interval(*c.interval(p), f),
             *([_interval(*p.interval, f) if p.interval else ""] if profiled else []),
             *([] if told or profiled else [signed((p.value - p.linear) * f, 4)]),
             *([] if told and profiled else [_ratio(p.value - p.linear, p.std)]),
@@ -166,11 +171,12 @@ def _parameter_table(calibration: Calibration, all_rows: bool) -> RenderableType
     if held:
         values = ", ".join(f"{p.name} = {p.value * p.edge_factor:g} {p.edge_unit}" for p in held)
         notes.append(Text(f"Held at known values: {values}"))
-    if any(p.at_bound for p in c.free):
+    bound = [f"{p.name} at its {p.at_bound} one" for p in c.free if p.at_bound]
+    if bound:
         notes.append(
             Text(
-                "A parameter at its bound has no ± of its own, and the others' ± holds with it "
-                "there: the readings want it beyond."
+                f"Held by a bound: {', '.join(bound)}. The readings want it beyond; it has no ± of "
+                "its own, and the others' ± holds with it there."
             )
         )
     if told:
@@ -210,9 +216,11 @@ def _identifiability(calibration: Calibration, all_rows: bool) -> RenderableType
     count = found.singular_values.size
     o = found.observability
     lines = [
-        f"{found.rank} of {count} combinations of parameters better than their tolerances "
-        f"(singular values above {found.threshold * 1e6:.3g} µm a tolerance); perfect readings "
-        f"would tell {found.structural_rank}.",
+        f"{found.rank} of {count} combinations of parameters, each better than its tolerance "
+        f"(singular values above the noise, {found.threshold * 1e6:.3g} µm a tolerance); perfect "
+        f"readings of this kind would tell {found.structural_rank}.",
+        f"There are {found.n_readings} independent readings: {found.spare_readings} are left to "
+        "check the model.",
     ]
     if found.rank:
         lines.append(
@@ -228,10 +236,14 @@ def _identifiability(calibration: Calibration, all_rows: bool) -> RenderableType
         names = (
             ", ".join(found.unseen) if all_rows or len(found.unseen) <= 6 else "--all lists them"
         )
-        lines.append(f"Not seen at all: {len(found.unseen)} parameters ({names}).")
+        lines.append(
+            f"Below the noise: {len(found.unseen)} parameters, one tolerance of which moves all "
+            f"readings together by less ({names})."
+        )
     sums = [c for c in found.base if len(c.terms) > 1]
     if calibration.base:
-        lines += [f"{c.terms[0][0]} stands for {c.formula}" for c in sums]
+        most = None if all_rows else MOST_TERMS
+        lines += [f"{c.terms[0][0]} stands for {c.shorten(most)}" for c in sums]
     elif all_rows:
         lines += [f"Told as one: {c.formula}" for c in sums]
     return Group(*(Text(line) for line in lines))
@@ -281,10 +293,12 @@ def _residual_table(calibration: Calibration, all_rows: bool) -> RenderableType:
 def _fit_table(calibration: Calibration) -> RenderableType:
     c, noise = calibration, calibration.noise
     table = table_of("", "before", "after", "")
-    change = c.rms_after / c.rms_before - 1.0 if c.rms_before > 0.0 else 0.0
-    add_row(table, "r.m.s. [mm]", mm(c.rms_before), mm(c.rms_after), f"{change:+.0%}")
-    change = c.largest_after / c.largest_before - 1.0 if c.largest_before > 0.0 else 0.0
-    add_row(table, "largest [mm]", mm(c.largest_before), mm(c.largest_after), f"{change:+.0%}")
+    for name, before, after in (
+        ("r.m.s. [mm]", c.rms_before, c.rms_after),
+        ("largest [mm]", c.largest_before, c.largest_after),
+    ):
+        change = f"{after / before - 1.0:+.0%}" if before > NOTHING else ""
+        add_row(table, name, mm(before), mm(after), change)
     row = "a difference" if c.rows_are_differences else "a reading"
     dof = "" if math.isinf(c.dof) else f", {c.dof:.3g} degrees of freedom"
     text = f"σ of {row}: {mm(c.sigma)} mm, {_SOURCES[noise.source]}{dof}"
@@ -311,17 +325,26 @@ def _controller_table(calibration: Calibration) -> RenderableType:
     if not entries:
         return Text("Nothing: no offset was identified.")
     stated = entries[0].active is not None
-    if stated:
-        table = table_of("drive", "active now", "enter", "± σ", "unit")
-    else:
-        table = table_of("drive", "add to the present offset", "± σ", "unit")
+    biased = any(e.bias_std > 0.0 for e in entries)
+    enter = ("active now", "enter") if stated else ("add to the present offset",)
+    table = table_of("drive", *enter, "± σ", *(["± σ in all"] if biased else []), "unit")
     for e in entries:
         factor, unit = (1e3, "mm") if e.unit == "m" else (1e3, "mrad")
         now = [] if e.active is None else [signed(e.active * factor)]
-        add_row(table, e.drive, *now, signed(e.enter * factor), plain(e.std * factor), unit)
+        spread = [plain(e.std * factor), *([plain(e.std_in_all * factor)] if biased else [])]
+        if e.held:
+            spread = [e.held, *([""] if biased else [])]
+        add_row(table, e.drive, *now, signed(e.enter * factor), *spread, unit)
     notes = [
         Text("An offset is what to add to the encoder's coordinate to get the slider's true one."),
     ]
+    if biased:
+        notes.append(
+            Text(
+                "± σ: what the scatter leaves open. In all: with what errors that were not "
+                "identified, at their tolerances, add to it."
+            )
+        )
     if not stated:
         notes.append(
             Text(
@@ -331,8 +354,8 @@ def _controller_table(calibration: Calibration) -> RenderableType:
     if len(calibration.free) > len(entries):
         notes.append(
             Text(
-                "The other parameters need a controller with a model of the machine; offsets alone "
-                "are best taken from the model 'offsets'."
+                "The other parameters need a controller with a model of the machine. What offsets "
+                "alone leave stands above, as 'with the offsets entered'."
             )
         )
     return Group(table, *notes)

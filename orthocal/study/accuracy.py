@@ -35,6 +35,9 @@ POINTS_A_SIDE = 7
 NOTABLE = 0.1
 """Tolerances by which a parameter must be off to be named in a combination."""
 
+EXCESS = 1.5
+"""Residuals by which errors must exceed their tolerances for the machine to be called worse."""
+
 DRAWS = 500
 """Errors drawn to find how large 95 % of the position errors are at most."""
 
@@ -310,6 +313,25 @@ def error_covariance(calibration: Calibration, *, excess: float = 1.0) -> Array:
             [-taken_on.T, np.diag(variance)],
         ]
     )
+
+
+def find_excess(calibration: Calibration) -> float:
+    """How many times what unmodelled errors at their tolerances would leave of readings is left.
+
+    1 where that is no more than EXCESS, or no errors were left out: the machine may be as good as
+    its tolerances.
+    """
+    foretold = calibration.unmodelled.residual_rms
+    ratio = calibration.rms_after / foretold if foretold > 0.0 else 1.0
+    return ratio if ratio > EXCESS else 1.0
+
+
+def assess_excess(
+    calibration: Calibration, accuracy: ToolAccuracy, excess: float
+) -> ToolUncertainty:
+    """Uncertainty after a calibration with unmodelled errors beyond their tolerances."""
+    covariance = error_covariance(calibration, excess=excess)
+    return measure_uncertainty(accuracy.jacobian, covariance, accuracy.workspace)
 
 
 def find_remaining_errors(

@@ -86,7 +86,7 @@ def compare_models(
 
     Raises:
         ParameterError: If a model or name is unknown.
-        SessionError: If the other session is of another robot.
+        SessionError: If the other session is of another robot, or the same one.
         SolverError: If Ipopt does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
@@ -96,7 +96,13 @@ def compare_models(
             "or of another version of it",
             where=None if repeat.path is None else str(repeat.path),
         )
+    if repeat is not None and repeat.sha256 and repeat.sha256 == session.sha256:
+        raise SessionError(
+            "is the same session: what remains repeats by itself",
+            where=None if repeat.path is None else str(repeat.path),
+        )
     noise = find_known_noise(session)
+    cycles = len({r.cycle for r in session.readings}) > 1
     parameters = session.robot.parameters
     results, undetermined = [], []
     for model in dict.fromkeys(models or parameters.models):
@@ -115,7 +121,7 @@ def compare_models(
         repetition = measure_repetition(best.calibration, again)
     return Comparison(
         title=session.title,
-        labels=tuple(r.label for r in session.readings),
+        labels=tuple(r.label + (f", cycle {r.cycle}" if cycles else "") for r in session.readings),
         noise=noise,
         independent=results[0].spare + results[0].rank if results else 0,
         results=tuple(results),

@@ -13,15 +13,11 @@ from numpy.typing import NDArray
 from orthocal.errors import ClosureError, NotIdentifiableError, SolverError
 from orthocal.identification.calibrate import assemble_calibration
 from orthocal.identification.calibration import Calibration
-from orthocal.identification.fit import Fit, fit_problem, require_determined
-from orthocal.identification.linear import Linearisation, linearise_at_reference
+from orthocal.identification.fit import SMALLEST_SIGMA, Fit, fit_problem, require_determined
+from orthocal.identification.linear import Linearisation
 from orthocal.identification.nlp import SolverOptions
 from orthocal.identification.problem import CalibrationProblem
-from orthocal.identification.uncertainty import (
-    decompose,
-    estimate_repeatability,
-    project_out_zeros,
-)
+from orthocal.identification.uncertainty import decompose, project_out_zeros
 from orthocal.study.accuracy import ErrorSize, ToolAccuracy, assess_tool, measure_deviations
 
 Array = NDArray[np.float64]
@@ -105,9 +101,7 @@ def score_model(
         ClosureError: If the machine cannot reach a posture.
     """
     fit = fit_problem(problem, options=options)
-    linearisation = linearise_at_reference(problem)
-    o = problem.observations
-    _, repeated = estimate_repeatability(problem.values, o)
+    linearisation = fit.linearisation
     rank = linearisation.information.rank
     calibration = assemble_calibration(fit)
     tool = _assess(calibration)
@@ -115,7 +109,7 @@ def score_model(
         model=problem.selection.label,
         n_free=problem.n_free,
         rank=rank,
-        spare=o.size - o.n_zeros - repeated - rank,
+        spare=fit.independent_readings - rank,
         effective=_effective(fit),
         linearised=_score(fit, linearisation, "linearised", noise),
         exact=_score(fit, linearisation, "exact", noise),
@@ -152,7 +146,9 @@ def _score(fit: Fit, linearisation: Linearisation, method: Method, noise: float)
     rows = o.rows(residual)
     k = effective + 1.0  # and the noise
     room = count - k - 1.0
-    misfit = math.nan if math.isnan(square) else count * math.log(max(square, 1e-300) / count)
+    # readings without any scatter fit all models alike
+    mean_square = max(square / count, SMALLEST_SIGMA**2)
+    misfit = math.nan if math.isnan(square) else count * math.log(mean_square)
     return Score(
         model=problem.selection.label,
         method=method,

@@ -84,6 +84,13 @@ class Validation:
         return self.excess_probability >= EXCESS_CHANCE
 
     @property
+    def confirmed(self) -> bool | None:
+        """Whether the calibration is confirmed; None if it expected nothing."""
+        if self.as_expected is None:
+            return None
+        return self.as_expected and self.nothing_to_change
+
+    @property
     def nothing_to_change(self) -> bool:
         """Whether no parameter would change beyond its standard error."""
         return not any(c.significant for c in self.changes)

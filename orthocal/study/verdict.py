@@ -16,7 +16,7 @@ from typing import Literal
 from scipy import special
 
 from orthocal.measurement.session import Session
-from orthocal.study.accuracy import error_covariance, measure_uncertainty
+from orthocal.study.accuracy import assess_excess, find_excess
 from orthocal.study.repetition import Repetition
 from orthocal.study.scores import ModelResult, Undetermined
 
@@ -30,9 +30,6 @@ TELLING = 0.5
 
 WORTHWHILE = 2.0
 """Least drop of AICc for which a larger model is preferred (Burnham and Anderson, 2002, 2.6)."""
-
-BEYOND = 1.5
-"""Residuals by which errors must exceed their tolerances for the machine to be called worse."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,18 +95,20 @@ def choose_model(
     reasons = [f"{u.model}: not determined. {u.reason}." for u in undetermined]
     for result in results:
         total = result.rank + result.spare
+        prior = result.calibration.prior
         if result.spare < 1:
             reasons.append(
-                f"{result.model}: not supported. Its {result.n_free} parameters take up all "
-                f"{total} independent readings: what remains is decided by the tolerances, "
-                "and no reading is left to check it."
+                f"{result.model}: not supported. Its {result.n_free} parameters can take up all "
+                f"{total} independent readings: "
+                + ("what remains is decided by the tolerances, and " if prior else "")
+                + "no reading is left to check it."
             )
             continue
         if best is None:
             best = result
             reasons.append(
-                f"{result.model}: supported. The readings tell {_count(result.rank)} parameters "
-                f"and leave {_count(result.spare)} readings to check them."
+                f"{result.model}: supported. It leaves {_count(result.spare)} of "
+                f"{_count(total)} independent readings to check it."
             )
             continue
         if result.effective < best.effective + TELLING:
@@ -176,22 +175,21 @@ def _explain_remainder(
         return False, 1.0, [f"What {best.model} leaves is noise: {sizes} ({where})."]
     words = [
         f"What {best.model} leaves is error of the model rather than noise: {sizes} ({where}), "
-        f"{found / noise.sigma:.0f} times as much."
+        f"{_times(found / noise.sigma)} as much."
     ]
-    tolerated, scale = calibration.unmodelled.residual_rms, 1.0
+    tolerated, scale = calibration.unmodelled.residual_rms, find_excess(calibration)
     if tolerated > 0.0:
-        rms = best.exact.rms
-        scale = rms / tolerated
+        rms = calibration.rms_after
         words.append(
             f"Errors that {best.model} leaves out, at their tolerances, would leave "
             f"{tolerated * 1e3:.3f} mm r.m.s.; found are {rms * 1e3:.3f} mm"
             + (
                 f": this machine is worse than its tolerances, by about {scale:.1f} times."
-                if scale > BEYOND
+                if scale > 1.0
                 else ": they explain it."
             )
         )
-    return True, scale if scale > BEYOND else 1.0, words
+    return True, scale, words
 
 
 def _explain_repetition(
@@ -220,8 +218,7 @@ def _explain_tool(best: ModelResult, excess: float) -> list[str]:
         "common shift taken out, if the tolerances hold."
     ]
     if excess > 1.0:
-        covariance = error_covariance(best.calibration, excess=excess)
-        size = measure_uncertainty(best.tool.jacobian, covariance, best.tool.workspace).relative
+        size = assess_excess(best.calibration, best.tool, excess).relative
         words[0] = (
             f"At the tool {best.model} is good for about {size.rms * 1e6:.0f} µm r.m.s. over the "
             f"workspace, common shift taken out, with errors {excess:.1f} times their tolerances."
@@ -229,6 +226,10 @@ def _explain_tool(best: ModelResult, excess: float) -> list[str]:
     if cost is not None:
         words.append(f"Linearising it costs {cost.rms * 1e6:.1f} µm r.m.s. there.")
     return words
+
+
+def _times(ratio: float) -> str:
+    return f"{ratio:.1f} times" if ratio < 3.0 else f"{ratio:.0f} times"
 
 
 def _count(value: int) -> str:

@@ -42,6 +42,7 @@ def analyse(columns, names, *, sigma=0.1, tolerances=None):
         parameters(*names, tolerances=tolerances),
         sigma=sigma,
         n_postures=4,
+        n_readings=4,
     )
 
 
@@ -156,6 +157,7 @@ def test_what_the_sweep_takes_for_one_the_lines_tell_apart(jacobians):
             problem.parameters,
             sigma=5e-6,
             n_postures=problem.n_postures,
+            n_readings=jacobian.shape[0],
         )
         alike[name] = found
     assert alike["lines"].rank > 1.5 * alike["sweep"].rank

@@ -55,8 +55,10 @@ def test_sigma_is_held_against_the_gauges_own(table1):
 def test_it_says_what_to_type_and_what_to_believe(table1):
     text = summarize(table1)
     entered = text[text.index("What to enter into the controller") :]
-    assert line(entered, "z_slide").split() == ["z_slide", "+0.000", "-1.761", "0.388", "mm"]
-    assert "Offsets that the readings prove (95 %): z_slide." in text
+    assert line(entered, "z_slide").split() == [
+        *("z_slide", "+0.000", "-1.761", "0.388", "0.498", "mm")
+    ]
+    assert "Offsets that must change (95 %, with all that is not known): z_slide." in text
 
 
 def test_an_unstated_controller_is_said_to_be_so(root):
