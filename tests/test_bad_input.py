@@ -685,6 +685,18 @@ OPTION_CASES = [
         command="compare {tmp}",
     ),
     option(
+        "compare-with-itself",
+        "--repeat {tmp}/session.yaml",
+        "{tmp}/session.yaml: is the same session: what remains repeats by itself",
+        command="compare {tmp}",
+    ),
+    option(
+        "known-a-whole-length",
+        "--known x_leg.length_mm=310.25±0.02",
+        "known: 'x_leg.length' is 310.25 mm; expected the deviation from nominal (its tolerance is "
+        "0.1 mm), not the whole length",
+    ),
+    option(
         "simulate-tolerance-of-no-use",
         "--error x_slide.offset_mm=1 --tolerance *.offset_mm=2",
         "--tolerance: is of no use without --draw",
@@ -1409,6 +1421,33 @@ CALIBRATION_CASES = [
         NO_CONTROLLER,
         put(FILE, "session.controller_offsets", []),
         command=VALIDATE,
+    ),
+    calibration(
+        "deviation-negative",
+        f"{CALIBRATION}: parameters[0].std: found '-1.0'; expected greater than or equal to 0",
+        put(FILE, "parameters.0.std", -1.0),
+    ),
+    calibration(
+        "tolerance-zero",
+        f"{CALIBRATION}: parameters[0].tolerance: found '0.0'; expected greater than 0",
+        put(FILE, "parameters.0.tolerance", 0.0),
+    ),
+    calibration(
+        "sigma-negative",
+        f"{CALIBRATION}: sigma: found '-1.0'; expected greater than or equal to 0",
+        put(FILE, "sigma", -1.0),
+    ),
+    calibration(
+        "covariance-asymmetric",
+        f"{CALIBRATION}: covariance: is not a covariance: expected symmetric numbers without "
+        "negative variances",
+        put(FILE, "covariance.0.1", 1e-9),
+    ),
+    calibration(
+        "covariance-negative",
+        f"{CALIBRATION}: covariance: is not a covariance: expected symmetric numbers without "
+        "negative variances",
+        put(FILE, "covariance.0.0", -1e-9),
     ),
     calibration(
         "unmodelled-unknown",

@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 BLIND = 1e-9
 """Part of a row's own weight below which no other row says anything of it."""
 
+LEAST_REST = 1e-6
+"""Part of the sum of squares that is left at least when a row is taken out."""
+
 SUSPICION = 0.01
 """Probability that any of the readings of a session that is sound is called suspicious."""
 
@@ -134,5 +137,6 @@ def _spread_without(fit: Fit, share: Array) -> tuple[Array, float]:
     dof = noise.dof - 1.0
     if dof <= 0.0:
         return np.full(share.size, np.nan), 0.0
-    rest = np.maximum(noise.sigma**2 * noise.dof - share, 0.0)
-    return np.sqrt(rest / dof), dof
+    # to first order a reading that is far out can take more than there is
+    total = noise.sigma**2 * noise.dof
+    return np.sqrt(np.maximum(total - share, LEAST_REST * total) / dof), dof

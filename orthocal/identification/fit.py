@@ -162,7 +162,7 @@ def fit_problem(
         if not _matters(program) or _settled(found, sigma):
             break
         sigma, first, passive = found, solution.theta, solution.passive
-    _require_assembly(problem, solution, robust=program.options.loss.robust)
+    require_assembly(problem, solution, robust=program.options.loss.robust)
     weight = max(noise.sigma, SMALLEST_SIGMA) if math.isfinite(noise.sigma) else sigma
     return Fit(
         problem=problem,
@@ -180,8 +180,13 @@ def fit_problem(
     )
 
 
-def _require_assembly(problem: CalibrationProblem, solution: Solution, *, robust: bool) -> None:
+def require_assembly(problem: CalibrationProblem, solution: Solution, *, robust: bool) -> None:
     """Refuse a solution that is no machine: absurd readings can be met by absurd errors.
+
+    Args:
+        problem: The problem.
+        solution: Its solution.
+        robust: Whether the loss was a robust one already.
 
     Raises:
         SolverError: Naming the posture that the machine found cannot reach.

@@ -114,6 +114,11 @@ def _explain_suspicious(calibration: Calibration) -> list[str]:
         "Suspicious readings, to be looked at and read again (none was left out): "
         + "; ".join(words)
         + (f"; and {more} more." if more else ".")
+        + (
+            f" All are of setup {rows[0].setup}: look at its sign, direction and section first."
+            if len(rows) > 2 and len({r.setup for r in rows}) == 1
+            else ""
+        )
     ]
 
 

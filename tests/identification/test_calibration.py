@@ -10,8 +10,16 @@ import numpy as np
 import pytest
 from tolerances import CLOSED_FORM, KINEMATICS
 
-from orthocal import calibrate, load_calibration, load_plan, load_session, simulate_session
+from orthocal import (
+    calibrate,
+    load_calibration,
+    load_plan,
+    load_session,
+    simulate_session,
+    summarize,
+)
 from orthocal.errors import CalibrationFileError
+from orthocal.output.explanation import explain_fit
 from orthocal.robot import orthoglide as closed_form
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
@@ -158,3 +166,65 @@ def test_a_robot_that_changed_is_noticed(root, tmp_path, result):
 def test_an_unknown_parameter_is_a_key_error(result):
     with pytest.raises(KeyError):
         result["w_slide.offset"]
+
+
+def test_every_doubt_of_an_offset_is_in_what_is_entered(root):
+    """Scatter and errors that were left out, at their tolerances."""
+    result = calibrate(load_session(root / "examples/sweep"))
+    bias = np.sqrt(np.diag(result.unmodelled.bias_covariance))
+    for entry, own in zip(result.controller_entries(), bias, strict=True):
+        assert entry.std_in_all == pytest.approx(np.hypot(entry.std, own))
+        assert entry.std_in_all > 10.0 * entry.std
+        assert entry.held is None
+    assert (
+        calibrate(load_session(root / "examples/sweep"), model="full")
+        .controller_entries()[0]
+        .bias_std
+        == 0.0
+    )
+
+
+def test_what_a_bound_or_a_known_value_holds_is_not_proved(experiment_2):
+    bounded = calibrate(
+        experiment_2,
+        bounds={"x_slide.offset": (-0.2e-3, 2e-3)},
+        known={"y_slide.offset": 0.5e-3},
+    )
+    held = {e.drive: e.held for e in bounded.controller_entries()}
+    assert held == {"x_slide": "lower bound", "y_slide": "known", "z_slide": None}
+    text = summarize(bounded)
+    entered = text[text.index("What to enter into the controller") :]
+    assert "lower bound" in entered
+    assert "known" in entered
+    sentence = next(s for s in explain_fit(bounded) if s.startswith("Offsets that must change"))
+    assert "x_slide" not in sentence
+    assert "y_slide" not in sentence
+
+
+def test_students_factor_counts_for_what_the_readings_told(experiment_2):
+    """Three degrees of freedom say nothing of a length that only its prior tells."""
+    result = calibrate(experiment_2, model="lengths")
+    length, offset = result["x_leg.length"], result["x_slide.offset"]
+    low, high = result.interval(length)
+    assert (high - low) / 2 == pytest.approx(1.96 * length.std, rel=0.02)
+    low, high = result.interval(offset)
+    assert (high - low) / 2 == pytest.approx(result.confidence_factor * offset.std, rel=0.02)
+
+
+def test_cycles_that_are_all_equal_scatter_by_the_resolution(raw_cycles):
+    first = {(r.setup, r.posture): r.value for r in raw_cycles.readings if r.cycle == 1}
+    values = [first[r.setup, r.posture] for r in raw_cycles.readings]
+    for model in ("offsets", "full"):
+        result = calibrate(raw_cycles.with_values(values), model=model)
+        assert result.noise.cycles_sigma == pytest.approx(0.01e-3 / np.sqrt(12.0))
+        assert np.isfinite(result.covariance).all()
+        assert "unknown" not in summarize(result)
+    zero = calibrate(raw_cycles.with_values(np.zeros(len(values))), model="full")
+    assert zero["x_slide.offset"].std > 0.1e-3  # one with other errors, as its tolerance says
+
+
+def test_one_free_parameter_alone(experiment_2):
+    rows = experiment_2.readings[:1]
+    result = calibrate(replace(experiment_2, readings=rows), base=True)
+    assert len(result.free) == 1
+    assert np.isfinite(result.covariance).all()

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from orthocal import SolverOptions, calibrate, load_plan, load_session, simulate_session
+from orthocal.errors import SolverError
 from orthocal.identification.diagnostics import diagnose_readings
-from orthocal.identification.fit import fit_problem
+from orthocal.identification.fit import fit_problem, require_assembly
 from orthocal.identification.loss import Loss
 from orthocal.identification.nlp import NonlinearProgram
 from orthocal.identification.problem import build_problem
@@ -156,3 +157,57 @@ def test_without_word_on_the_noise_nothing_is_suspicious(experiment_2):
     result = calibrate(session)
     assert np.isinf(result.critical)
     assert all(np.isnan(r.studentised) for r in result.residuals)
+
+
+@pytest.mark.parametrize("model", ["offsets", "full"])
+def test_only_the_wrong_reading_is_suspicious(root, model):
+    """A wrong sign of 14 mm; by squares too, but it pulls ten times as far."""
+    session = load_session(root / "examples/lines")
+    row = next(i for i, r in enumerate(session.readings) if r.value > 13.5e-3)
+    values = session.values.copy()
+    values[row] *= -1.0
+    spoilt = session.with_values(values)
+    sound = calibrate(session, model=model)
+    distances = []
+    for loss in ("huber", "squares"):
+        result = calibrate(spoilt, model=model, options=SolverOptions(loss=Loss(loss)))
+        assert [r.line for r in result.suspicious] == [session.readings[row].line]
+        distances.append(result["z_slide.offset"].value - sound["z_slide.offset"].value)
+    assert abs(distances[0]) < 0.1 * abs(distances[1])
+
+
+def test_readings_of_a_wrong_setup_are_said_to_be_of_one(root):
+    session = load_session(root / "examples/lines")
+    sign = np.where([r.setup == "yx" for r in session.readings], -1.0, 1.0)
+    text = " ".join(explain_fit(calibrate(session.with_values(sign * session.values))))
+    assert "All are of setup yx: look at its sign, direction and section first." in text
+
+
+def test_errors_that_make_no_machine_are_refused(readings):
+    fit = fit_problem(build_problem(readings))
+    absurd = replace(fit.solution, theta=np.array([0.3, 0.0, 0.0]))
+    with pytest.raises(SolverError, match="make no machine: posture 'zero' cannot be reached"):
+        require_assembly(fit.problem, absurd, robust=False)
+    with pytest.raises(SolverError) as caught:
+        require_assembly(fit.problem, absurd, robust=True)
+    assert "huber" not in str(caught.value)
+
+
+@pytest.mark.parametrize("experiment", ["1-printed", "1-corrected", "2", "3"])
+def test_hubers_loss_converges_on_few_readings(root, experiment):
+    session = load_session(root / f"examples/table1/experiment-{experiment}")
+    options = SolverOptions(loss=Loss("huber"))
+    for model in ("offsets", "lengths"):
+        found = calibrate(session, model=model, options=options)
+        plain = calibrate(session, model=model)
+        gap = [a.value - b.value for a, b in zip(found.free, plain.free, strict=True)]
+        assert np.abs(gap).max() < 2.0 * plain["x_slide.offset"].std
+    assert not any("Linearising" in s for s in explain_fit(found))
+
+
+def test_when_most_readings_are_contradicted_it_is_the_model(experiment_2):
+    """Six readings and tolerances that this machine is twice as bad as."""
+    result = calibrate(experiment_2, model="full")
+    text = " ".join(explain_fit(result))
+    assert "it is the model or the tolerances, not single readings" in text
+    assert "none is left to check the model" in text

@@ -176,3 +176,10 @@ def test_the_summary_shows_all_that_was_promised(table1):
     document = json.loads(table1.to_json())
     assert document["verdict"]["supported"] == "offsets"
     assert document["models"][0]["exact"]["rms"] == pytest.approx(0.195e-3, abs=5e-7)
+
+
+def test_readings_without_any_deviation_support_offsets_only(raw_cycles):
+    still = raw_cycles.with_values(np.zeros(len(raw_cycles.readings)))
+    found = compare_models(still, models=["offsets", "lengths"])
+    assert found.verdict.supported == "offsets"
+    assert math.isfinite(found["lengths"].exact.aicc)

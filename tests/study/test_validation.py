@@ -18,6 +18,7 @@ from orthocal import (
     validate_calibration,
 )
 from orthocal.errors import SessionError
+from orthocal.measurement.synthetic import load_errors
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
@@ -106,3 +107,20 @@ def test_a_calibration_without_readings_to_spare_expects_nothing(table1):
     result = validate_calibration(calibrate(replace(table1[2], readings=few)), table1[3])
     assert result.as_expected is None
     assert "no readings to spare" in summarize(result)
+
+
+def test_a_calibration_of_all_errors_is_confirmed_with_its_offsets_entered(root):
+    """The other errors cannot be entered: the new readings are expected to show them."""
+    plan = load_plan(root / "examples/lines/plan.yaml")
+    truth = load_errors(root / "examples/lines/truth.yaml", plan.robot)
+    session = load_session(root / "examples/lines")
+    calibration = calibrate(session, model="full", tolerances={"*.offset": 2e-3})
+    offsets = np.array([e.enter for e in calibration.controller_entries()])
+    entered = with_offsets(plan, offsets)
+    again = simulate_session(entered, truth, seed=99).session
+    found = validate_calibration(calibration, again)
+    assert found.achieved_rms < 2.0 * found.expected_rms
+    assert found.confirmed
+    # a machine that has changed since is told
+    other = simulate_session(entered, {**truth, "x_coupler.x": 0.5e-3}, seed=99).session
+    assert validate_calibration(calibration, other).confirmed is False
