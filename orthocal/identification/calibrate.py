@@ -45,6 +45,9 @@ from orthocal.robot.model import read_only
 Array = NDArray[np.float64]
 
 
+MAX_BASE_ROUNDS = 8
+
+
 def calibrate(
     session: Session | str | Path,
     *,
@@ -102,9 +105,11 @@ def calibrate(
                 "base parameters are identified without any prior"
                 + (f"; give {', '.join(own)} as known without ±" if own else "")
             )
-        whole, problem = problem, _reduce_to_base(problem)
-    profiled = _match_profiled(problem, profile)
-    fit = fit_problem(problem, options=options, start=start)
+        whole = problem
+        fit = _fit_base(whole, options=options, start=start)
+    else:
+        fit = fit_problem(problem, options=options, start=start)
+    profiled = _match_profiled(fit.problem, profile)
     intervals = {name: profile_interval(fit, name) for name in profiled}
     return assemble_calibration(fit, whole=whole, intervals=intervals)
 
@@ -200,18 +205,31 @@ def assemble_calibration(
     )
 
 
-def _reduce_to_base(problem: CalibrationProblem) -> CalibrationProblem:
-    """The problem in base parameters: what cannot be told apart is told as one."""
+def _fit_base(
+    problem: CalibrationProblem, *, options: SolverOptions | None, start: ArrayLike | None
+) -> Fit:
+    """Solve a problem in base parameters: what cannot be told apart is told as one.
+
+    How many there are depends on the noise, and that on what they leave: until both agree.
+    """
     information = linearise_at_reference(problem).information
     repeatability = estimate_repeatability(problem.values, problem.observations)
     sigma = first_sigma(problem.session, repeatability)
-    found = find_base_parameters(information.factor, problem.parameters, threshold=sigma)
-    if not found:
-        raise NotIdentifiableError(
-            "the readings tell none of the free parameters", parameters=problem.free
-        )
-    leads = [c.terms[0][0] for c in found]
-    return CalibrationProblem(problem.session, problem.selection.keep(leads))
+    leads: list[str] = []
+    for _ in range(MAX_BASE_ROUNDS):
+        found = find_base_parameters(information.factor, problem.parameters, threshold=sigma)
+        if not found:
+            raise NotIdentifiableError(
+                "the readings tell none of the free parameters", parameters=problem.free
+            )
+        chosen = [c.terms[0][0] for c in found]
+        if chosen == leads:
+            break
+        leads = chosen
+        reduced = CalibrationProblem(problem.session, problem.selection.keep(leads))
+        fit = fit_problem(reduced, options=options, start=start)
+        sigma = max(fit.sigma, sigma)  # no more parameters than before
+    return fit
 
 
 def _match_profiled(problem: CalibrationProblem, patterns: Sequence[str]) -> list[str]:

@@ -116,6 +116,12 @@ class Calibration:
         return tuple(sorted(pairs, key=lambda p: -abs(p[2])))
 
     @property
+    def spare_readings(self) -> int:
+        """Independent readings that the parameters leave to check the model."""
+        found = self.identifiability
+        return found.n_readings - (len(self.free) if self.base else found.structural_rank)
+
+    @property
     def suspicious(self) -> tuple[ResidualRow, ...]:
         """Rows that all the others contradict, the worst first."""
         rows = [r for r in self.residuals if abs(r.studentised) > self.critical]

@@ -88,11 +88,6 @@ class Identifiability:
     """Base parameters by QR decomposition with pivoting: what the readings tell, one each."""
 
     @property
-    def spare_readings(self) -> int:
-        """Independent readings that the parameters leave to check the model."""
-        return self.n_readings - self.structural_rank
-
-    @property
     def condition(self) -> float:
         """Largest over smallest singular value that counts; infinite if none does."""
         seen = self.singular_values[: self.rank]

@@ -84,7 +84,7 @@ def explain_fit(calibration: Calibration) -> list[str]:
 def _explain_check(calibration: Calibration) -> list[str]:
     """Whether any reading is left to check the model."""
     found = calibration.identifiability
-    if found.spare_readings > 0:
+    if calibration.spare_readings > 0:
         return []
     return [
         f"The parameters can take up all {found.n_readings} independent readings, and none is left "

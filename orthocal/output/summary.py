@@ -219,8 +219,8 @@ def _identifiability(calibration: Calibration, all_rows: bool) -> RenderableType
         f"{found.rank} of {count} combinations of parameters, each better than its tolerance "
         f"(singular values above the noise, {found.threshold * 1e6:.3g} µm a tolerance); perfect "
         f"readings of this kind would tell {found.structural_rank}.",
-        f"There are {found.n_readings} independent readings: {found.spare_readings} are left to "
-        "check the model.",
+        f"There are {found.n_readings} independent readings: {calibration.spare_readings} are left "
+        "to check the model.",
     ]
     if found.rank:
         lines.append(

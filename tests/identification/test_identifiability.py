@@ -217,3 +217,15 @@ def test_readings_that_tell_nothing_leave_no_base(raw_cycles):
 
     with pytest.raises(NotIdentifiableError, match="tell none of the free parameters"):
         calibrate(replace(raw_cycles, readings=rows), base=True)
+
+
+def test_the_base_parameters_of_table_1_are_the_three_offsets(experiment_2):
+    """What six readings with that scatter tell of 126 errors is what the paper identifies."""
+    base = calibrate(experiment_2, model="full", base=True)
+    offsets = calibrate(experiment_2)
+    assert [p.name for p in base.free] == [p.name for p in offsets.free]
+    for a, b in zip(base.free, offsets.free, strict=True):
+        assert a.value == pytest.approx(b.value, abs=1e-9)
+        assert a.std == pytest.approx(b.std, rel=1e-6)
+    assert base.spare_readings == 3
+    assert calibrate(experiment_2, model="full").spare_readings == 0
