@@ -157,7 +157,8 @@ def fit_problem(
         prediction, jacobian = problem.linearise(solution.theta, solution.passive)
         information = decompose(jacobian, problem.observations)
         residual = _residual(program, solution, prediction)
-        noise = _noise(program, residual, information, sigma, repeatability)
+        held = solution.at_bound != 0
+        noise = _noise(program, residual, information, sigma, repeatability, held=held)
         found = max(noise.sigma, SMALLEST_SIGMA)
         if not _matters(program) or _settled(found, sigma):
             break
@@ -268,10 +269,14 @@ def _noise(
     information: Information,
     sigma: float,
     repeatability: tuple[float, int],
+    *,
+    held: NDArray[np.bool_] | None = None,
 ) -> Noise:
     """Noise from residuals with zeros eliminated, shape (n_entries,), [m]."""
     problem, loss = program.problem, program.options.loss
-    used = information.effective_parameters(sigma=sigma, precision=problem.prior_precision)
+    used = information.effective_parameters(
+        sigma=sigma, precision=problem.prior_precision, held=held
+    )
     dof = problem.observations.size - problem.observations.n_zeros - used
     return estimate_noise(
         # cycles with a wrong reading among them would say that all scatter

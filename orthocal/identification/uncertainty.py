@@ -195,17 +195,21 @@ class Information:
         variance[told] = (sigma / self.singular_values[told]) ** 2
         return np.asarray(((self.directions**2).T @ variance < 1.0) & self.identifiable)
 
-    def effective_parameters(self, *, sigma: float, precision: Array) -> float:
+    def effective_parameters(
+        self, *, sigma: float, precision: Array, held: NDArray[np.bool_] | None = None
+    ) -> float:
         """Parameters that the readings determine, n − tr(P cov): the rank without a prior.
 
         Args:
             sigma: Standard deviation of one reading, [m].
             precision: Diagonal of P, what the prior knows: 1 or 0, shape (n_free,).
+            held: Parameters that are held where they are, by a bound.
         """
+        count = 0 if held is None else int(held.sum())
         if not precision.any():
-            return float(self.rank)
-        covariance = self.covariance(sigma=sigma, precision=precision)
-        return float(len(precision) - precision @ np.diag(covariance))
+            return float(self.rank - count)
+        covariance = self.covariance(sigma=sigma, precision=precision, held=held)
+        return float(len(precision) - count - precision @ np.diag(covariance))
 
     def covariance(
         self,

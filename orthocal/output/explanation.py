@@ -35,7 +35,8 @@ def explain_fit(calibration: Calibration) -> list[str]:
     elif noise.source == "gauge":
         sentences.append(
             "There are no readings to spare: standard deviations rest on the σ given for the "
-            "gauge alone, and a wrong model would not show."
+            "gauge alone"
+            + ("." if calibration.suspicious else ", and a wrong model would not show.")
         )
     if noise.source == "residuals" and noise.cycles_dof > 0:
         ratio = noise.residual_sigma / noise.cycles_sigma
@@ -53,7 +54,12 @@ def explain_fit(calibration: Calibration) -> list[str]:
                 f"What remains, σ = {mm(calibration.sigma)} mm of {row}, is {_times(ratio)} "
                 f"what the gauge itself would leave ({mm(gauge * factor)} mm): it is error of the "
                 f"model (legs, axes, mounting), or a wrong sign, direction or setup; not noise of "
-                f"the gauge. With the model '{calibration.model}' it will stay."
+                "the gauge."
+                + (
+                    ""
+                    if calibration.suspicious
+                    else f" With the model '{calibration.model}' it will stay."
+                )
             )
         elif ratio < low:
             sentences.append(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from rich import box
 from rich.console import Console, Group, RenderableType
@@ -85,9 +85,14 @@ def um(value: float) -> str:
     return f"{size:.0f}" if abs(size) >= 20.0 else f"{size:.1f}"
 
 
-def choose_rows(rows: tuple[ResidualRow, ...], all_rows: bool) -> tuple[Iterable[ResidualRow], str]:
+def choose_rows(
+    rows: tuple[ResidualRow, ...],
+    all_rows: bool,
+    *,
+    key: Callable[[ResidualRow], float] = lambda r: abs(r.residual),
+) -> tuple[Iterable[ResidualRow], str]:
     """All rows, or the worst of many, and a note that says so."""
     if all_rows or len(rows) <= MANY_ROWS:
         return rows, ""
-    worst = sorted(rows, key=lambda r: -abs(r.residual))[:WORST_ROWS]
+    worst = sorted(rows, key=key, reverse=True)[:WORST_ROWS]
     return worst, f"The {WORST_ROWS} largest of {len(rows)}; --all lists every reading."

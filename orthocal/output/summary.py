@@ -130,6 +130,7 @@ def _heading(calibration: Calibration) -> RenderableType:
 
 def _parameter_table(calibration: Calibration, all_rows: bool) -> RenderableType:
     c, told = calibration, calibration.prior
+    robust = c.solver.loss == "huber"  # the linearised estimate is by squares
     profiled = any(p.interval for p in c.free)
     table = table_of(
         "parameter",
@@ -139,8 +140,8 @@ def _parameter_table(calibration: Calibration, all_rows: bool) -> RenderableType
         *(["told"] if told else []),
         "95 % interval",
         *(["profile interval"] if profiled else []),
-        *([] if told or profiled else ["exact − linear"]),
-        *([] if told and profiled else ["in σ"]),
+        *([] if told or profiled or robust else ["exact − linear"]),
+        *([] if (told and profiled) or robust else ["in σ"]),
         "unit",
     )
     listed = [p for p in c.free if all_rows or len(c.free) <= MANY_PARAMETERS or _worth_listing(p)]
@@ -155,8 +156,8 @@ def _parameter_table(calibration: Calibration, all_rows: bool) -> RenderableType
             *([f"{p.data_share:.0%}" if p.prior and not p.at_bound else ""] if told else []),
             "" if p.at_bound else _interval(*c.interval(p), f),
             *([_interval(*p.interval, f) if p.interval else ""] if profiled else []),
-            *([] if told or profiled else [signed((p.value - p.linear) * f, 4)]),
-            *([] if told and profiled else [_ratio(p.value - p.linear, p.std)]),
+            *([] if told or profiled or robust else [signed((p.value - p.linear) * f, 4)]),
+            *([] if (told and profiled) or robust else [_ratio(p.value - p.linear, p.std)]),
             p.edge_unit,
         )
     notes: list[RenderableType] = [table]
@@ -219,8 +220,8 @@ def _identifiability(calibration: Calibration, all_rows: bool) -> RenderableType
         f"{found.rank} of {count} combinations of parameters, each better than its tolerance "
         f"(singular values above the noise, {found.threshold * 1e6:.3g} µm a tolerance); perfect "
         f"readings of this kind would tell {found.structural_rank}.",
-        f"There are {found.n_readings} independent readings: {calibration.spare_readings} are left "
-        "to check the model.",
+        f"Of {found.n_readings} independent readings the parameters can take up "
+        f"{found.n_readings - calibration.spare_readings}; the others check the model.",
     ]
     if found.rank:
         lines.append(

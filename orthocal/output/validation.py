@@ -15,7 +15,13 @@ from orthocal.output.layout import (
     signed,
     table_of,
 )
-from orthocal.study.validation import Validation
+from orthocal.study.validation import FurtherChange, Validation
+
+REMOVED = 0.7
+"""Part of the deviations below which a further fit is said to remove them."""
+
+MANY_CHANGES = 12
+"""Parameters above which only those that change most are listed."""
 
 
 def render_validation(validation: Validation, *, all_rows: bool = False) -> RenderableType:
@@ -33,7 +39,7 @@ def render_validation(validation: Validation, *, all_rows: bool = False) -> Rend
     for name, *values in rows:
         add_row(table, name, *(mm(v) for v in values))
     changes = table_of("parameter", "change", "± σ", "unit", "beyond chance (95 % for all)?")
-    for c in validation.changes:
+    for c in _listed(validation, all_rows):
         add_row(
             changes,
             c.name,
@@ -64,18 +70,12 @@ def explain_validation(validation: Validation) -> list[str]:
     elif validation.as_expected and validation.nothing_to_change:
         sentences.append(
             f"The calibration is confirmed: r.m.s. {achieved} mm was achieved where {expected} mm "
-            "was expected, and a further fit would change no parameter beyond its standard error."
+            "was expected, and a further fit would change no parameter beyond chance."
         )
     elif not validation.as_expected:
         sentences.append(
             f"The calibration is not confirmed: r.m.s. {achieved} mm was achieved where {expected} "
-            "mm was expected, more than chance explains. "
-            + (
-                "No parameter would change, so the offsets are not to blame: the readings scatter "
-                "more than before, or something has moved."
-                if validation.nothing_to_change
-                else "Check the signs of the offsets in the controller first."
-            )
+            "mm was expected, more than chance explains. " + _explain_change(validation)
         )
     else:
         names = ", ".join(c.name for c in validation.changes if c.significant)
@@ -105,7 +105,7 @@ def explain_validation(validation: Validation) -> list[str]:
 
 
 def _validation_rows(validation: Validation, all_rows: bool) -> RenderableType:
-    rows, note = choose_rows(validation.rows, all_rows)
+    rows, note = choose_rows(validation.rows, all_rows, key=lambda r: abs(r.deviation))
     cycles = any(r.cycle != 1 for r in validation.rows)
     table = table_of(
         "setup",
@@ -125,3 +125,34 @@ def _validation_rows(validation: Validation, all_rows: bool) -> RenderableType:
             signed(r.residual * 1e3),
         )
     return Group(table, Text(note)) if note else table
+
+
+def _explain_change(validation: Validation) -> str:
+    """What may have happened where more was found than expected."""
+    if not validation.nothing_to_change:
+        return "Check the signs of the offsets in the controller first."
+    if validation.refit_rms < REMOVED * validation.achieved_rms:
+        largest = sorted(validation.changes, key=lambda c: -abs(c.change) / max(c.std, 1e-300))
+        names = ", ".join(c.name for c in largest[:3])
+        return (
+            f"A further fit would take it to {mm(validation.refit_rms)} mm: the geometry has "
+            f"changed, or the offsets were not entered as identified. No single parameter is told "
+            f"apart; most would change, in their σ: {names}."
+        )
+    return (
+        "No parameter would change, so the offsets are not to blame: the readings scatter more "
+        "than before, or something has moved."
+    )
+
+
+def _listed(validation: Validation, all_rows: bool) -> list[FurtherChange]:
+    """Changes that are listed: all of few, else offsets, what is beyond chance, and the largest."""
+    if all_rows or len(validation.changes) <= MANY_CHANGES:
+        return list(validation.changes)
+    by_size = sorted(validation.changes, key=lambda c: -abs(c.change) / max(c.std, 1e-300))
+    named = {c.name for c in by_size[:5]}
+    return [
+        c
+        for c in validation.changes
+        if c.significant or c.name in named or c.name.endswith(".offset")
+    ]

@@ -123,4 +123,11 @@ def test_a_calibration_of_all_errors_is_confirmed_with_its_offsets_entered(root)
     assert found.confirmed
     # a machine that has changed since is told
     other = simulate_session(entered, {**truth, "x_coupler.x": 0.5e-3}, seed=99).session
-    assert validate_calibration(calibration, other).confirmed is False
+    changed = validate_calibration(calibration, other)
+    assert changed.confirmed is False
+    text = " ".join(summarize(changed).split())
+    assert "the geometry has changed" in text
+    assert "x_coupler.x" in text
+    worst = max(changed.rows, key=lambda r: abs(r.deviation))
+    assert f"{worst.setup} {worst.posture}" in text  # the largest deviations are listed
+    assert "z_fork.rz" not in text  # nor is every parameter
