@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -265,7 +266,7 @@ def _estimates(
     selection = problem.selection
     std = np.sqrt(np.diag(covariance))
     determined = fit.information.determined(sigma=fit.noise.sigma)
-    words = {-1: "lower", 0: None, 1: "upper"}
+    words: dict[int, Literal["lower", "upper"] | None] = {-1: "lower", 0: None, 1: "upper"}
     estimates = [
         ParameterEstimate(
             name=p.name,
@@ -281,7 +282,7 @@ def _estimates(
             mean=float(problem.prior_mean[i]),
             lower=_bound(selection.lower[i]),
             upper=_bound(selection.upper[i]),
-            at_bound=words[int(solution.at_bound[i])],  # type: ignore[arg-type]
+            at_bound=words[int(solution.at_bound[i])],
             interval=intervals.get(p.name),
         )
         for i, p in enumerate(problem.parameters)

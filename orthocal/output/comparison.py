@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from rich.console import Group, RenderableType
 from rich.text import Text
@@ -110,11 +111,11 @@ def _residuals(comparison: Comparison, all_rows: bool) -> RenderableType:
     if not results:
         return Text("Nothing was fitted.")
     table = table_of("reading", *(f"{r.model} [mm]" for r in results))
-    order = range(len(comparison.labels))
+    order: Sequence[int] = range(len(comparison.labels))
     note = ""
     if len(comparison.labels) > MANY_ROWS and not all_rows:
         largest = [max(abs(r.exact.residuals[i]) for r in results) for i in order]
-        order = sorted(order, key=lambda i: -largest[i])[:WORST_ROWS]  # type: ignore[assignment]
+        order = sorted(order, key=lambda i: -largest[i])[:WORST_ROWS]
         note = f"The {WORST_ROWS} largest of {len(comparison.labels)}; --all lists every reading."
     for i in order:
         add_row(table, comparison.labels[i], *(signed(r.exact.residuals[i] * 1e3) for r in results))
