@@ -94,10 +94,3 @@ def _find_end(fit: Fit, index: int, factor: float, side: float) -> float:
             iterations=MAX_DOUBLINGS,
         )
     return centre + side * float(brentq(rise, inside, outside, xtol=SETTLED * std))
-
-
-def profile_intervals(
-    fit: Fit, names: tuple[str, ...], *, level: float = 0.95
-) -> dict[str, tuple[float, float]]:
-    """Profile-likelihood intervals of several parameters; see `profile_interval`."""
-    return {name: profile_interval(fit, name, level=level) for name in names}

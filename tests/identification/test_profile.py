@@ -52,7 +52,7 @@ def test_where_the_problem_bends_it_is_not_symmetric(experiment_2):
     skew = (high + low - 2 * p) / (high - low)
     assert abs(skew) > 10.0 * SETTLED / confidence_factor(fit.noise.dof, 0.999)
     half = confidence_factor(fit.noise.dof, 0.999) * np.sqrt(fit.covariance()[0, 0])
-    assert (high - low) / 2 == pytest.approx(half, rel=0.2)
+    assert (high - low) / 2 == pytest.approx(half, rel=1e-3)
 
 
 def test_a_bound_ends_an_interval(experiment_2):
