@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal import __version__
 from orthocal.errors import ClosureError, NotIdentifiableError, ParameterError
 from orthocal.identification.calibration import Calibration
+from orthocal.identification.cross_validation import predict_unseen
 from orthocal.identification.diagnostics import Diagnostics, diagnose_readings
 from orthocal.identification.fit import Fit, first_sigma, fit_problem
 from orthocal.identification.identifiability import (
@@ -354,6 +355,7 @@ def _residual_rows(
     except ClosureError:  # the linearised machine cannot be assembled
         by_linear = np.full(len(session.readings), np.nan)
     predicted = session.values - o.rows(fit.residual)
+    unseen = predict_unseen(fit)
     return tuple(
         ResidualRow(
             setup=r.setup,
@@ -368,6 +370,7 @@ def _residual_rows(
             studentised=float(diagnostics.studentised[i]),
             influence=float(diagnostics.influence[i]),
             influenced=problem.free[diagnostics.influenced[i]],
+            unseen=float(unseen[i]),
         )
         for i, r in enumerate(session.readings)
     )

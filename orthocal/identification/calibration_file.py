@@ -107,6 +107,7 @@ class _ResidualKeys(_Keys):
     studentised: Number | None
     influence: Number
     influenced: str
+    unseen: Number | None
     residual: Number
 
 
@@ -314,7 +315,7 @@ def _identifiability(keys: _IdentifiabilityKeys) -> Identifiability:
 
 def _residual(keys: _ResidualKeys) -> ResidualRow:
     values = keys.model_dump(exclude={"residual"})
-    for name in ("linear", "studentised"):
+    for name in ("linear", "studentised", "unseen"):
         values[name] = _float(values[name])
     return ResidualRow(**values)
 

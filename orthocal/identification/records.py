@@ -137,6 +137,8 @@ class ResidualRow:
     """Largest change of a parameter without this row, in its standard deviations."""
     influenced: str
     """Which parameter that is."""
+    unseen: float
+    """Error of predicting it from all other setups, [m]; NaN if they do not determine the model."""
 
     @property
     def deviation(self) -> float:
