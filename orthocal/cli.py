@@ -8,12 +8,15 @@ from __future__ import annotations
 import io
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 import orthocal
 from orthocal.errors import OrthocalError, ParameterError, SessionError
+
+if TYPE_CHECKING:
+    from orthocal.output.scene import Scene
 
 app = typer.Typer(
     add_completion=False,
@@ -348,6 +351,68 @@ def inverse(
 
 
 @app.command()
+def view(
+    subject: Annotated[
+        str,
+        typer.Argument(
+            metavar="SESSION|CALIBRATION|ROBOT",
+            help="session.yaml, calibration.json, a folder that holds one, or a robot.",
+        ),
+    ],
+    html: Annotated[
+        Path | None, typer.Option(help="Write one page that opens without network and server.")
+    ] = None,
+    png: Annotated[
+        Path | None, typer.Option(help="Write a picture, by a Chromium that is installed.")
+    ] = None,
+    size: Annotated[
+        str, typer.Option(metavar="WIDTHxHEIGHT", help="Of the picture, in pixels.")
+    ] = "1400x900",
+    posture: Annotated[
+        str | None,
+        typer.Option(help="Stand there, with what was read there; else the whole measurement."),
+    ] = None,
+    exaggerate: Annotated[
+        float | None,
+        typer.Option(
+            metavar="FACTOR",
+            help="How many times its size the machine's deviation is drawn; 1 for true scale.",
+        ),
+    ] = None,
+    show: Annotated[
+        str,
+        typer.Option(metavar="readings|tool|all", help="What of a calibration is shown at first."),
+    ] = "readings",
+    port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Where to listen; else one that is free.")
+    ] = None,
+    browse: Annotated[bool, typer.Option("--open", help="Open the browser, too.")] = False,
+) -> None:
+    """Look at a machine, its measurement and its calibration in 3-D.
+
+    Without --html and --png on a server that only this machine reaches, until Ctrl-C.
+    """
+    from orthocal.documents import require_writable_file
+    from orthocal.output.browser import find_chromium, parse_size, take_picture
+    from orthocal.output.drawing import draw_scene
+    from orthocal.output.subject import load_subject
+
+    width, height = parse_size(size)
+    for path in (html, png):
+        if path is not None:
+            require_writable_file(path)
+    if png is not None:
+        find_chromium()
+    scene = draw_scene(load_subject(subject), posture=posture, exaggeration=exaggerate, show=show)
+    if html is not None:
+        _note(f"Wrote {scene.save(html)}")
+    if png is not None:
+        _note(f"Wrote {take_picture(scene.to_html(), png, width=width, height=height)}")
+    if html is None and png is None:
+        _serve(scene, port, browse)
+
+
+@app.command()
 def simulate(
     plan: Annotated[
         Path,
@@ -413,6 +478,21 @@ def simulate(
 def _globs(texts: list[str] | None) -> list[str]:
     """Globs of repeated options, each with commas between."""
     return [glob.strip() for text in texts or [] for glob in text.split(",") if glob.strip()]
+
+
+def _serve(scene: Scene, port: int | None, browse: bool) -> None:
+    """Show a scene until Ctrl-C."""
+    from orthocal.output.live import LiveScene
+
+    with LiveScene(scene, port=port) as live:
+        _out(live.url)
+        sys.stdout.flush()
+        _note("Open this in a browser on this machine; Ctrl-C ends.")
+        if browse:
+            import webbrowser
+
+            webbrowser.open(live.url)
+        live.wait()
 
 
 def _out(text: str) -> None:

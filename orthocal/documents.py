@@ -386,17 +386,33 @@ def require_writable(folder: Path) -> None:
         raise OrthocalError(f"cannot be written: {e.strerror}", where=str(folder)) from None
 
 
-def write_text(path: Path, text: str) -> None:
+def require_writable_file(path: Path) -> None:
+    """Refuse a file to be written later that cannot be one: before the work is done.
+
+    Raises:
+        OrthocalError: If it is a folder, or its folder cannot be one.
+    """
+    if is_folder(path):
+        raise OrthocalError("is a folder; expected a file", where=str(path))
+    require_writable(path.parent)
+
+
+def write_file(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all: beside it first, then renamed.
 
     Raises:
-        OrthocalError: If the folder does not exist or cannot be written to.
+        OrthocalError: If it cannot be written.
     """
-    write_files(path.parent, {path.name: text})
+    require_writable_file(path)
+    write_files(path.parent, {path.name: content})
 
 
-def write_files(folder: Path, files: Mapping[str, str]) -> None:
+def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
     """Write several files of one folder, all or none; the folder is made if need be.
+
+    Args:
+        folder: Where to.
+        files: Name to text, which is written as UTF-8, or bytes.
 
     Raises:
         OrthocalError: If the folder cannot be made or written to.
@@ -404,11 +420,11 @@ def write_files(folder: Path, files: Mapping[str, str]) -> None:
     pending: list[tuple[str, Path]] = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, text in files.items():
+        for name, content in files.items():
             handle, temporary = tempfile.mkstemp(dir=folder, prefix=f".{name}.")
             pending.append((temporary, folder / name))
-            with os.fdopen(handle, "w", encoding="utf-8", newline="") as stream:
-                stream.write(text)
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(content.encode() if isinstance(content, str) else content)
             os.chmod(temporary, 0o644)
         for temporary, final in pending:
             os.replace(temporary, final)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.documents import write_text
+from orthocal.documents import write_file
 from orthocal.errors import CalibrationFileError, ParameterError, RobotError
 from orthocal.identification.identifiability import Combination, Identifiability
 from orthocal.identification.records import (
@@ -295,7 +295,7 @@ class Calibration:
         Raises:
             OrthocalError: If it cannot be written.
         """
-        write_text(Path(path), self.to_json())
+        write_file(Path(path), self.to_json())
         return Path(path)
 
     def _load_robot(self) -> Robot:

@@ -1,0 +1,119 @@
+"""Pictures of pages, by a Chromium where there is one."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+from orthocal.documents import write_file
+from orthocal.errors import OrthocalError
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+
+FLAGS = (
+    "--headless",
+    "--use-gl=angle",  # WebGL by software: no graphics card is needed
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--host-resolver-rules=MAP * ~NOTFOUND",  # a page may ask nobody anything
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-quic",
+    "--disable-sync",
+    "--no-first-run",
+    "--hide-scrollbars",
+)
+
+PAGE_TIME_MS = 4000
+"""Time by the page's clock until the picture is taken."""
+
+PATIENCE = 120.0
+"""Seconds until a browser that does not answer is stopped."""
+
+_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def find_chromium() -> str:
+    """Path of a Chromium: $ORTHOCAL_CHROMIUM, or the first on the PATH.
+
+    Raises:
+        OrthocalError: If there is none.
+    """
+    given = os.environ.get("ORTHOCAL_CHROMIUM")
+    found = next((p for n in ([given] if given else NAMES) if (p := shutil.which(n))), None)
+    if found is None:
+        tried = f"'{given}' ($ORTHOCAL_CHROMIUM)" if given else ", ".join(NAMES)
+        raise OrthocalError(
+            f"a picture needs Chromium, and there is none ({tried}). Install it (Debian: `apt-get "
+            "install chromium`), or write the page with --html and open it in any browser",
+            where="--png",
+        )
+    return found
+
+
+def chromium_flags() -> tuple[str, ...]:
+    """Flags of a Chromium that draws WebGL without a screen and asks no network."""
+    root = hasattr(os, "geteuid") and os.geteuid() == 0
+    return (*FLAGS, "--no-sandbox") if root else FLAGS  # its sandbox refuses root
+
+
+def take_picture(page: str, path: str | Path, *, width: int = 1400, height: int = 900) -> Path:
+    """Write a picture of a page that holds all it needs.
+
+    Args:
+        page: HTML.
+        path: A PNG file.
+        width: [px].
+        height: [px].
+
+    Raises:
+        OrthocalError: If there is no Chromium, or it takes no picture.
+    """
+    chromium = find_chromium()
+    with tempfile.TemporaryDirectory(prefix="orthocal-", ignore_cleanup_errors=True) as folder:
+        source, picture = Path(folder) / "page.html", Path(folder) / "page.png"
+        source.write_text(page, encoding="utf-8")
+        command = [
+            chromium,
+            *chromium_flags(),
+            f"--user-data-dir={folder}/profile",
+            f"--window-size={width},{height}",
+            f"--virtual-time-budget={PAGE_TIME_MS}",
+            f"--screenshot={picture}",
+            source.as_uri(),
+        ]
+        try:
+            done = subprocess.run(command, capture_output=True, timeout=PATIENCE, check=False)
+        except subprocess.TimeoutExpired:
+            raise OrthocalError(
+                f"{chromium} took no picture in {PATIENCE:g} s", where=str(path)
+            ) from None
+        except OSError as e:
+            raise OrthocalError(f"{chromium} cannot be run: {e.strerror}", where="--png") from None
+        data = picture.read_bytes() if picture.is_file() else b""
+        if not data.startswith(_SIGNATURE):
+            words = done.stderr.decode(errors="replace").strip().splitlines()
+            reason = f": {words[-1]}" if words else ""
+            raise OrthocalError(f"{chromium} took no picture{reason}", where=str(path))
+    write_file(Path(path), data)
+    return Path(path)
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height of WIDTHxHEIGHT, [px].
+
+    Raises:
+        OrthocalError: If it is not two whole numbers of 100 to 8000.
+    """
+    parts = text.lower().split("x")
+    if len(parts) == 2 and all(p.isascii() and p.isdigit() for p in parts):
+        width, height = int(parts[0]), int(parts[1])
+        if 100 <= width <= 8000 and 100 <= height <= 8000:
+            return width, height
+    raise OrthocalError(
+        f"found '{text}'; expected WIDTHxHEIGHT in pixels, such as 1400x900, each 100 to 8000",
+        where="--size",
+    )

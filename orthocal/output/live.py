@@ -1,0 +1,178 @@
+"""A scene live in a browser, from a server that only this machine reaches.
+
+The server lives in this process, so it ends with it, however that ends. It listens on 127.0.0.1
+and answers only those who ask for it by that name: a page from elsewhere cannot read along.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import signal
+import threading
+from importlib import resources
+from types import TracebackType
+from typing import Any
+
+import tornado.httpserver
+import tornado.netutil
+import tornado.web
+import tornado.websocket
+
+from orthocal.errors import OrthocalError
+from orthocal.output.scene import Scene
+
+ADDRESS = "127.0.0.1"
+FIRST_PORT = 7000
+PORTS_TRIED = 100
+
+_HOSTS = r"(localhost|127\.0\.0\.1)"  # tornado takes the port off
+
+
+class _Page(tornado.web.RequestHandler):
+    """The scene's page."""
+
+    def initialize(self, scene: Scene) -> None:
+        self.scene = scene
+
+    def get(self) -> None:
+        self.set_header("Cache-Control", "no-store")
+        self.set_header("X-Content-Type-Options", "nosniff")
+        self.finish(self.scene.to_live_html())
+
+
+class _Commands(tornado.websocket.WebSocketHandler):
+    """The scene's commands, all that there are and then those that follow."""
+
+    def initialize(self, scene: Scene, listeners: set[_Commands]) -> None:
+        self.scene, self.listeners = scene, listeners
+
+    def check_origin(self, origin: str) -> bool:
+        """Whether the page that asks came from here."""
+        return origin == f"http://{self.request.host}"
+
+    def open(self, *args: str, **kwargs: str) -> None:
+        for data in self.scene.pack():
+            self.write_message(data, binary=True)
+        self.listeners.add(self)
+
+    def on_message(self, message: str | bytes) -> None:
+        """A page has nothing to say."""
+
+    def on_close(self) -> None:
+        self.listeners.discard(self)
+
+
+class LiveScene:
+    """A scene on a server of this process; a context manager, too.
+
+    What is added to the scene after that, by `scene.visualizer`, shows at once.
+
+    Args:
+        scene: What to show.
+        port: Where to listen; by default the first free one from 7000 on.
+
+    Raises:
+        OrthocalError: If no port is free.
+    """
+
+    def __init__(self, scene: Scene, *, port: int | None = None) -> None:
+        self.scene = scene
+        self._sockets = _listen(port)
+        self.port = int(self._sockets[0].getsockname()[1])
+        self._ready = threading.Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread = threading.Thread(target=self._serve, name="orthocal-live", daemon=True)
+        self._thread.start()
+        self._ready.wait()
+
+    @property
+    def url(self) -> str:
+        """Address to open in a browser on this machine."""
+        return f"http://{ADDRESS}:{self.port}/"
+
+    def wait(self) -> None:
+        """Serve until Ctrl-C, or until the process is asked to end."""
+        ended = threading.Event()
+        previous = {
+            number: signal.signal(number, lambda *_: ended.set())
+            for number in (signal.SIGINT, signal.SIGTERM)
+        }
+        try:
+            while not ended.wait(0.2):
+                pass
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+    def close(self) -> None:
+        """End the server; the port is free again."""
+        if self._loop is not None and self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._thread.join()
+
+    def __enter__(self) -> LiveScene:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _serve(self) -> None:
+        self._loop = loop = asyncio.new_event_loop()
+        asyncio.set_event_loop(loop)
+        listeners: set[_Commands] = set()
+        server = tornado.httpserver.HTTPServer(_application(self.scene, listeners))
+        loop.call_soon(server.add_sockets, self._sockets)
+        loop.call_soon(self._ready.set)
+
+        def forward(data: bytes) -> None:
+            for listener in tuple(listeners):
+                listener.write_message(data, binary=True)
+
+        def hand_over(data: bytes) -> None:
+            loop.call_soon_threadsafe(forward, data)
+
+        self.scene.listen(hand_over)
+        try:
+            loop.run_forever()
+        finally:
+            self.scene.listen(None)
+            server.stop()
+            for listener in tuple(listeners):
+                listener.close()
+            loop.run_until_complete(server.close_all_connections())
+            loop.run_until_complete(loop.shutdown_asyncgens())
+            loop.close()
+
+
+def _application(scene: Scene, listeners: set[_Commands]) -> tornado.web.Application:
+    viewer = resources.files("meshcat") / "viewer" / "dist"
+    handlers: list[Any] = [
+        (r"/", _Page, {"scene": scene}),
+        (r"/commands", _Commands, {"scene": scene, "listeners": listeners}),
+        (r"/(main\.min\.js)", tornado.web.StaticFileHandler, {"path": str(viewer)}),
+    ]
+    application = tornado.web.Application(log_function=lambda _: None)
+    application.add_handlers(_HOSTS, handlers)
+    logging.getLogger("tornado").setLevel(logging.ERROR)
+    return application
+
+
+def _listen(port: int | None) -> list[Any]:
+    tried = [port] if port is not None else range(FIRST_PORT, FIRST_PORT + PORTS_TRIED)
+    for candidate in tried:
+        try:
+            return list(tornado.netutil.bind_sockets(candidate, address=ADDRESS))
+        except OSError as e:
+            reason = e.strerror
+    if port is not None:
+        raise OrthocalError(f"port {port} of {ADDRESS} cannot be had: {reason}", where="--port")
+    raise OrthocalError(
+        f"no port of {ADDRESS} from {FIRST_PORT} to {FIRST_PORT + PORTS_TRIED - 1} is free",
+        where="--port",
+    )

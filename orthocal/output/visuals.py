@@ -1,0 +1,168 @@
+"""What is to be seen of a robot: the visuals of its URDF, or sticks where it has none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import coal
+import meshcat.geometry as g
+import numpy as np
+import pinocchio as pin
+from lxml import etree
+from numpy.typing import NDArray
+
+from orthocal.documents import read_text
+from orthocal.errors import RobotError
+from orthocal.output.shapes import Colour, cylinder, pose_along
+from orthocal.robot.model import Robot
+
+Array = NDArray[np.float64]
+
+MESH_FORMATS = (".stl", ".obj", ".dae", ".ply")
+
+_STICK: Colour = (0.55, 0.58, 0.62)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visual:
+    """One visible part of a link."""
+
+    link: str
+    placement: Array
+    """In the link's frame, shape (4, 4), [m]."""
+    geometry: g.Geometry
+    colour: Colour
+    opacity: float
+    corners: Array
+    """Of its bounding box in the link's frame, shape (8, 3), [m]."""
+
+
+def load_visuals(robot: Robot) -> tuple[Visual, ...]:
+    """Visible parts of a robot's links, or sticks between its joints where the URDF has none.
+
+    Raises:
+        RobotError: If a mesh file is missing, outside of the robot's folder or not readable.
+    """
+    text = _with_absolute_meshes(robot)
+    try:
+        geometry = pin.buildGeomFromUrdfString(robot.model, text, pin.GeometryType.VISUAL)
+    except (ValueError, RuntimeError) as e:
+        reason = " ".join(str(e).split())
+        raise RobotError(f"its visuals cannot be loaded: {reason}", where=str(robot.urdf)) from None
+    visuals = tuple(_visual(robot, part) for part in geometry.geometryObjects)
+    return visuals or tuple(_sticks(robot))
+
+
+def _with_absolute_meshes(robot: Robot) -> str:
+    """Text of the URDF with the paths of its meshes resolved within the robot's folder."""
+    text = read_text(robot.urdf, error=RobotError)
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
+    root = etree.fromstring(text.encode(), parser=parser)
+    etree.strip_tags(root, etree.Comment)
+    folder = robot.folder.resolve()
+    for mesh in root.iter("mesh"):
+        name = mesh.get("filename") or ""
+        where = f"{robot.urdf}:{mesh.sourceline}"
+        path = (folder / _relative(name)).resolve()
+        if not path.is_relative_to(folder):
+            raise RobotError(f"the mesh '{name}' lies outside of the robot's folder", where=where)
+        if path.suffix.lower() not in MESH_FORMATS:
+            raise RobotError(f"the mesh '{name}' is none of {', '.join(MESH_FORMATS)}", where=where)
+        if not path.is_file():
+            raise RobotError(f"there is no mesh file {path}", where=where)
+        mesh.set("filename", str(path))
+    return str(etree.tostring(root, encoding="unicode"))
+
+
+def _relative(name: str) -> Path:
+    """Path of a mesh in the robot's folder: a package's name, or file://, is taken off."""
+    if name.startswith("package://"):
+        return Path(*Path(name.removeprefix("package://")).parts[1:])
+    return Path(name.removeprefix("file://"))
+
+
+def _visual(robot: Robot, part: pin.GeometryObject) -> Visual:
+    frame = robot.model.frames[part.parentFrame]
+    placement = frame.placement.inverse() * part.placement
+    shape = part.geometry
+    shape.computeLocalAABB()
+    box = shape.aabb_local
+    low, high = np.asarray(box.min_).reshape(3), np.asarray(box.max_).reshape(3)
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    inside = low + corners * (high - low)
+    colour = np.asarray(part.meshColor, dtype=np.float64).reshape(4)
+    return Visual(
+        link=frame.name,
+        placement=np.asarray(placement.homogeneous),
+        geometry=_geometry(robot, part),
+        colour=(float(colour[0]), float(colour[1]), float(colour[2])),
+        opacity=float(colour[3]),
+        corners=inside @ placement.rotation.T + placement.translation,
+    )
+
+
+def _geometry(robot: Robot, part: pin.GeometryObject) -> g.Geometry:
+    shape = part.geometry
+    if isinstance(shape, coal.Box):
+        return g.Box([float(v) for v in 2.0 * np.asarray(shape.halfSide).reshape(3)])
+    if isinstance(shape, coal.Sphere):
+        return g.Sphere(float(shape.radius))
+    if isinstance(shape, coal.Cylinder):
+        half = float(shape.halfLength)
+        return cylinder(2.0 * half, float(shape.radius), start=-half)
+    if isinstance(shape, coal.BVHModelBase):
+        faces = [shape.tri_indices(i) for i in range(shape.num_tris)]
+        triangles = np.array([[f[0], f[1], f[2]] for f in faces], dtype=np.uint32)
+        return g.TriangularMeshGeometry(np.asarray(shape.vertices()), triangles)
+    raise RobotError(
+        f"the visual '{part.name}' is a {type(shape).__name__}; expected a box, a cylinder, a "
+        "sphere or a mesh",
+        where=str(robot.urdf),
+    )
+
+
+def _sticks(robot: Robot) -> Iterator[Visual]:
+    """A ball at every link, and a stick from it to all that hangs on it."""
+    model = robot.model
+    radius = 0.012 * robot.characteristic_length
+    for i, frame in enumerate(model.frames):
+        if frame.type != pin.FrameType.BODY:
+            continue
+        yield _stick(frame.name, np.zeros(3), radius)
+        for k in range(1, model.njoints):
+            if model.parents[k] == frame.parentJoint and i == _body_of(model, frame.parentJoint):
+                end = frame.placement.inverse() * model.jointPlacements[k]
+                yield _stick(frame.name, np.asarray(end.translation), radius)
+        for other in model.frames:
+            fixed = other.type == pin.FrameType.BODY and other.name != frame.name
+            if fixed and other.parentJoint == frame.parentJoint and _hangs_on(model, other, i):
+                end = frame.placement.inverse() * other.placement
+                yield _stick(frame.name, np.asarray(end.translation), radius)
+
+
+def _body_of(model: pin.Model, joint: int) -> int:
+    """Index of the first link that a joint carries."""
+    bodies = (
+        i
+        for i, f in enumerate(model.frames)
+        if f.type == pin.FrameType.BODY and f.parentJoint == joint
+    )
+    return next(bodies, -1)
+
+
+def _hangs_on(model: pin.Model, frame: pin.Frame, body: int) -> bool:
+    """Whether a link is mounted on another by one fixed joint."""
+    mount = model.frames[frame.parentFrame]
+    return mount.type == pin.FrameType.FIXED_JOINT and int(mount.parentFrame) == body
+
+
+def _stick(link: str, end: Array, radius: float) -> Visual:
+    length = float(np.linalg.norm(end))
+    if length < 1e-9:
+        geometry, placement = g.Sphere(1.6 * radius), np.eye(4)
+    else:
+        geometry, placement = cylinder(length, radius), pose_along(np.zeros(3), end / length)
+    corners = np.array([np.full(3, -radius), np.full(3, radius)] * 4) + np.outer([0, 1] * 4, end)
+    return Visual(link, placement, geometry, _STICK, 1.0, corners)

@@ -1,0 +1,90 @@
+"""Pages in a real browser: headless Chromium without a network, driven by Playwright.
+
+Where $ORTHOCAL_BROWSER is `required`, as in continuous integration, a browser that is missing is a
+failure; elsewhere these tests are skipped, with the reason.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from orthocal.errors import OrthocalError
+from orthocal.output.browser import chromium_flags, find_chromium
+
+SIZES = ((1400, 900), (800, 600))
+
+
+@dataclass
+class Visit:
+    """A page that was opened, and all that it said and asked for."""
+
+    page: object
+    messages: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
+
+    def wait_until_drawn(self):
+        self.page.wait_for_function(
+            "Number(document.documentElement.dataset.rendered || 0) > 1", timeout=60_000
+        )
+
+    def picture(self):
+        """What is to be seen, shape (height, width, 3)."""
+        return np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB"))
+
+    def canvas(self):
+        """What the 3-D viewer draws, shape (height, width, 4)."""
+        import base64
+
+        data = self.page.evaluate("viewer.capture_image()").split(",", 1)[1]
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGBA"))
+
+
+def require_browser():
+    """Path of Chromium, or why there is none."""
+    try:
+        import playwright.sync_api  # noqa: F401
+
+        return find_chromium()
+    except (ImportError, OrthocalError) as e:
+        if os.environ.get("ORTHOCAL_BROWSER") == "required":
+            pytest.fail(f"a browser is required here: {e}")
+        pytest.skip(f"no browser to look with: {e}")
+
+
+@contextmanager
+def open_browser():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as play:
+        browser = play.chromium.launch(
+            executable_path=require_browser(), args=list(chromium_flags()), headless=True
+        )
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+@contextmanager
+def visit(browser, url, *, size=SIZES[0], online=False):
+    """Open a page without a network; online: one on this machine."""
+    context = browser.new_context(
+        viewport={"width": size[0], "height": size[1]}, offline=not online
+    )
+    try:
+        page = context.new_page()
+        found = Visit(page)
+        page.on("console", lambda m: found.messages.append(f"{m.type}: {m.text}"))
+        page.on("pageerror", lambda e: found.messages.append(f"error: {e}"))
+        page.on("request", lambda r: found.requests.append(r.url))
+        page.goto(url)
+        yield found
+    finally:
+        context.close()
