@@ -14,15 +14,18 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Calibration": "orthocal.identification.calibration",
+    "LiveScene": "orthocal.output.live",
     "Loss": "orthocal.identification.loss",
     "OrthocalError": "orthocal.errors",
     "Robot": "orthocal.robot.model",
+    "Scene": "orthocal.output.scene",
     "Session": "orthocal.measurement.session",
     "SolverOptions": "orthocal.identification.nlp",
     "assess_tool": "orthocal.study.accuracy",
     "calibrate": "orthocal.identification.calibrate",
     "compare_models": "orthocal.study.comparison",
     "draw_errors": "orthocal.measurement.synthetic",
+    "draw_scene": "orthocal.output.drawing",
     "load_calibration": "orthocal.identification.calibration_file",
     "load_plan": "orthocal.measurement.session_file",
     "load_robot": "orthocal.robot.loading",
@@ -30,20 +33,24 @@ _HOMES = {
     "simulate_session": "orthocal.measurement.synthetic",
     "summarize": "orthocal.output.summary",
     "validate_calibration": "orthocal.study.validation",
+    "write_report": "orthocal.output.report",
     "write_session": "orthocal.measurement.session_file",
 }
 
 __all__ = [
     "Calibration",
+    "LiveScene",
     "Loss",
     "OrthocalError",
     "Robot",
+    "Scene",
     "Session",
     "SolverOptions",
     "assess_tool",
     "calibrate",
     "compare_models",
     "draw_errors",
+    "draw_scene",
     "load_calibration",
     "load_plan",
     "load_robot",
@@ -51,6 +58,7 @@ __all__ = [
     "simulate_session",
     "summarize",
     "validate_calibration",
+    "write_report",
     "write_session",
 ]
 
@@ -64,6 +72,10 @@ if TYPE_CHECKING:
     from orthocal.measurement.session import Session
     from orthocal.measurement.session_file import load_plan, load_session, write_session
     from orthocal.measurement.synthetic import draw_errors, simulate_session
+    from orthocal.output.drawing import draw_scene
+    from orthocal.output.live import LiveScene
+    from orthocal.output.report import write_report
+    from orthocal.output.scene import Scene
     from orthocal.output.summary import summarize
     from orthocal.robot.loading import load_robot
     from orthocal.robot.model import Robot

@@ -149,13 +149,14 @@ def calibrate(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for calibration.json; made if need be.")
+        Path | None,
+        typer.Option(help="Folder for calibration.json and report.html; made if need be."),
     ] = None,
     json: Json = False,
     all_rows: AllRows = False,
 ) -> None:
     """Identify the errors of a machine from a session of readings."""
-    from orthocal.documents import require_writable
+    from orthocal.documents import require_writable, write_files
     from orthocal.identification.calibrate import calibrate as run
     from orthocal.identification.loss import Loss
     from orthocal.identification.nlp import SolverOptions
@@ -184,7 +185,12 @@ def calibrate(
     else:
         print_summary(result, all_rows=all_rows)
     if out is not None:
-        _note(f"Wrote {result.save(out / 'calibration.json')}")
+        from orthocal.output.report import build_report
+
+        # the report first: both are there, or none
+        files = {"report.html": build_report(result), "calibration.json": result.to_json()}
+        write_files(out, files)
+        _note(f"Wrote {out / 'calibration.json'} and {out / 'report.html'}")
 
 
 @app.command()
@@ -348,6 +354,28 @@ def inverse(
     with closures_named_by_row():
         drives = result.inverse(points, names=names)
     _out(format_table(drive_columns(result.robot), drives))
+
+
+@app.command()
+def report(
+    calibration: CalibrationPath,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="The page, or its folder; else report.html beside the calibration."),
+    ] = None,
+) -> None:
+    """Write a calibration as one page: what to enter, how far to believe it, and why."""
+    from orthocal.documents import is_folder, require_writable_file
+    from orthocal.identification.calibration_file import load_calibration
+    from orthocal.output.report import write_report
+
+    result = load_calibration(calibration)
+    folder = Path() if result.path is None else result.path.parent
+    target = folder if out is None else out
+    if is_folder(target):
+        target = target / "report.html"
+    require_writable_file(target)
+    _note(f"Wrote {write_report(result, target)}")
 
 
 @app.command()

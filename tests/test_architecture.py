@@ -11,7 +11,10 @@ from conftest import ROOT
 
 import orthocal
 
-STAGES = ["errors", "documents", "robot", "measurement", "identification", "study", "output", "cli"]
+STAGES = [
+    *("errors", "documents", "markup"),
+    *("robot", "measurement", "identification", "study", "output", "cli"),
+]
 
 MODULES = sorted((ROOT / "orthocal").rglob("*.py"))
 
@@ -81,7 +84,8 @@ def test_help_imports_nothing_heavy():
         "from orthocal.cli import app\n"
         "try: app()\n"
         "except SystemExit: pass\n"
-        "heavy = {'numpy', 'casadi', 'pinocchio', 'scipy', 'yourdfpy', 'pydantic', 'meshcat'}\n"
+        "heavy = {'numpy', 'casadi', 'pinocchio', 'scipy', 'yourdfpy', 'pydantic', 'meshcat', "
+        "'matplotlib', 'tornado', 'coal'}\n"
         "print('LOADED', sorted(heavy & set(sys.modules)))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -31,6 +31,7 @@ from orthocal.identification.records import (
 )
 from orthocal.identification.uncertainty import confidence_factor
 from orthocal.identification.unmodelled import Unmodelled
+from orthocal.markup import paragraph, table
 from orthocal.robot.assembly import Assembly
 from orthocal.robot.loading import load_robot, packaged_robots
 from orthocal.robot.model import Robot
@@ -38,6 +39,9 @@ from orthocal.robot.model import Robot
 Array = NDArray[np.float64]
 
 SCHEMA = "orthocal/calibration/1"
+
+FEW = 12
+"""Parameters up to which a notebook lists all."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -297,6 +301,36 @@ class Calibration:
         """
         write_file(Path(path), self.to_json())
         return Path(path)
+
+    def _repr_html_(self) -> str:
+        """In a notebook: what was identified, how well, and what to enter."""
+        about = (
+            f"{len(self.residuals)} {'differences' if self.rows_are_differences else 'readings'}; "
+            f"r.m.s. {self.rms_before * 1e3:.3f} mm before, {self.rms_after * 1e3:.3f} mm after"
+        )
+        offsets = {f"{e.drive}.offset": e for e in self.controller_entries()}
+        listed = [p for p in self.free if p.name in offsets or len(self.free) <= FEW]
+        rows = []
+        for p in listed:
+            entry, f = offsets.get(p.name), p.edge_factor
+            in_all = entry.std_in_all if entry and not entry.held else p.std
+            numbers = (p.linear * f, p.value * f, p.std * f, in_all * f)
+            formats = ("+.3f", "+.3f", ".3f", ".3f")
+            cells = [
+                format(n, form) if math.isfinite(n) else "unknown"
+                for n, form in zip(numbers, formats, strict=True)
+            ]
+            rows.append((p.name, *cells, p.edge_unit))
+        headers = ("parameter", "linear", "exact", "± σ", "± σ in all", "unit")
+        more = len(self.free) - len(listed)
+        return (
+            paragraph(f"Calibration of {self.robot_record.name}, model '{self.model}'")
+            + paragraph(self.session.title)
+            + table(headers, rows)
+            + (paragraph(f"and {more} more parameters") if more else "")
+            + paragraph(about)
+            + paragraph("orthocal.summarize(…) says more, orthocal.draw_scene(…) shows it.")
+        )
 
     def _load_robot(self) -> Robot:
         record = self.robot_record

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import SessionError
+from orthocal.markup import paragraph, table
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
@@ -142,6 +143,26 @@ class Session:
         if self.readings_path is None or reading.line is None:
             return f"reading {reading.label}"
         return f"{self.readings_path}:{reading.line}"
+
+    def _repr_html_(self) -> str:
+        """In a notebook: the setups and what was read in each."""
+        rows = []
+        for setup in self.setups.values():
+            values = [r.value * 1e3 for r in self.readings if r.setup == setup.name]
+            form, place = setup.section.form, setup.section.value
+            words = form.removesuffix("_mm").replace("_", " ")
+            where = f"{words} {place:g}" if form == "fraction" else f"{words} {place * 1e3:g} mm"
+            span = (f"{min(values):+.3f}", f"{max(values):+.3f}") if values else ("", "")
+            rows.append((setup.name, setup.leg, setup.direction, where, str(len(values)), *span))
+        kind = "differences" if self.only_differences else "readings"
+        about = f"{len(self.readings)} {kind} in {len(self.postures)} postures"
+        headers = ("setup", "leg", "direction", "section", kind, "least [mm]", "largest [mm]")
+        return (
+            paragraph(f"Session on {self.robot.name}: {self.title}")
+            + (paragraph(f"Source: {self.source}") if self.source else "")
+            + table(headers, rows, left=4)
+            + paragraph(about)
+        )
 
     def with_values(self, values: Sequence[float] | Array) -> Session:
         """The same session with other readings.

@@ -1,0 +1,265 @@
+"""A calibration as one page: what to enter, how far to believe it, and why.
+
+The order is that of mrcal's tour: first how well the tool is known, then whether the model fits,
+then the residuals and all the rest. Plots are drawn into the page, which asks nothing of a network.
+"""
+
+from __future__ import annotations
+
+import html
+from importlib import resources
+from pathlib import Path
+
+from orthocal.documents import write_file
+from orthocal.errors import ClosureError, OrthocalError
+from orthocal.identification.calibration import Calibration
+from orthocal.markup import heading, paragraph, table
+from orthocal.output.accuracy import render_accuracy
+from orthocal.output.drawing import draw_scene
+from orthocal.output.explanation import explain_fit
+from orthocal.output.layout import bullets, mm, plain, signed
+from orthocal.output.plots import (
+    plot_correlations,
+    plot_linearised,
+    plot_parameters,
+    plot_residuals,
+    plot_setups,
+    plot_singular_values,
+    plot_spread,
+)
+from orthocal.output.rich_markup import to_markup
+from orthocal.output.scene import frame_of
+from orthocal.output.tables import (
+    render_controller,
+    render_fit,
+    render_heading,
+    render_identifiability,
+    render_parameters,
+    render_residuals,
+)
+from orthocal.output.tool_map import Field, plot_tool_map
+from orthocal.study.accuracy import HALF_SIDE, ToolAccuracy, assess_tool
+
+FEW_ROWS = 40
+"""Readings up to which the list of all is open."""
+
+ALL_ROWS = 300
+"""Readings up to which all are listed."""
+
+_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
+)
+
+
+def build_report(calibration: Calibration) -> str:
+    """The report of a calibration as one HTML page that holds all it needs.
+
+    Raises:
+        OrthocalError: If the robot cannot be found, or is not the one that was calibrated.
+    """
+    title = f"Calibration of {calibration.robot_record.name}: {calibration.session.title}"
+    sections = [
+        ("verdict", "What to enter, and can it be believed?", _verdict(calibration)),
+        ("tool", "How well is the tool known?", _tool(calibration)),
+        ("fit", "Does the model fit?", _fit(calibration)),
+        ("residuals", "Readings before and after, the worst first", _residuals(calibration)),
+        ("parameters", "What was identified", _parameters(calibration)),
+        ("correlations", "What hangs together", _correlations(calibration)),
+        ("identifiability", "What the readings can tell", _identifiability(calibration)),
+        ("provenance", "Where this is from", _provenance(calibration)),
+        ("scene", "The machine", _scene(calibration)),
+    ]
+    links = "".join(f'<a href="#{name}">{html.escape(words)}</a>' for name, words, _ in sections)
+    body = "".join(
+        f'<section id="{name}">{heading(words)}{content}</section>'
+        for name, words, content in sections
+    )
+    style = (resources.files("orthocal.output") / "web" / "report.css").read_text(encoding="utf-8")
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
+        f'<title>{html.escape(title)}</title>\n<link rel="icon" href="data:,">\n'
+        f"<style>\n{style}</style>\n</head>\n<body>\n"
+        f"<header>{heading('Calibration report', level=1)}{to_markup(render_heading(calibration))}"
+        f"<nav>{links}</nav></header>\n<main>{body}</main>\n</body>\n</html>\n"
+    )
+
+
+def write_report(calibration: Calibration, path: str | Path) -> Path:
+    """Write the report of a calibration.
+
+    Raises:
+        OrthocalError: If it cannot be built or written.
+    """
+    write_file(Path(path), build_report(calibration))
+    return Path(path)
+
+
+def _verdict(calibration: Calibration) -> str:
+    before, after = calibration.rms_before, calibration.rms_after
+    change = f" ({after / before - 1.0:+.0%})" if before > 1e-8 else ""
+    told = (
+        f"Deviations of {mm(before)} mm (r.m.s.) become residuals of {mm(after)} mm{change}: the "
+        f"largest was {mm(calibration.largest_before)} mm and is {mm(calibration.largest_after)} "
+        "mm."
+    )
+    return (
+        paragraph(told, kind="lead")
+        + to_markup(render_controller(calibration))
+        + heading("What it means", level=3)
+        + to_markup(bullets(explain_fit(calibration)))
+    )
+
+
+def _tool(calibration: Calibration) -> str:
+    if calibration.robot.tcp is None:
+        return paragraph(
+            "This robot has no tool centre point: give orthocal.tcp in its YAML to see its errors."
+        )
+    try:
+        found = assess_tool(calibration)
+    except ClosureError as e:
+        return paragraph(f"The cube of ±{HALF_SIDE * 1e3:g} mm is out of reach: {e}.")
+    region = f"a cube of ±{HALF_SIDE * 1e3:g} mm around the zero"
+    return to_markup(render_accuracy(calibration, found, region=region)) + _maps(calibration, found)
+
+
+def _maps(calibration: Calibration, found: ToolAccuracy) -> str:
+    only_offsets = len(calibration.free) <= len(calibration.controller_entries())
+    captions: dict[Field, str] = {
+        "now": "Where the tool is, less where it is sent, with the controller as it was while "
+        "measuring.",
+        "left": "The same once the identified offsets are entered, in a controller that knows of "
+        "nothing else.",
+        "unknown": "What is not known of the tool's position after this calibration: one standard "
+        "deviation in space, errors that were not identified at their tolerances.",
+    }
+    if only_offsets:
+        del captions["left"]
+    return "".join(
+        _figure(plot_tool_map(calibration, found, which=which), words)
+        for which, words in captions.items()
+    )
+
+
+def _fit(calibration: Calibration) -> str:
+    parts = [to_markup(render_fit(calibration))]
+    if any(r.unseen == r.unseen for r in calibration.residuals):
+        text = (
+            "Predicted: every setup from all the others. A model that fits predicts what it has "
+            "not seen nearly as well as what it was fitted to."
+        )
+    else:
+        text = "No setup can be predicted from the others: they do not determine the model alone."
+    parts.append(_figure(plot_setups(calibration), text))
+    parts.append(
+        _figure(
+            plot_spread(calibration),
+            "Residuals that are noise lie on the line. A steeper or bent row is error of the "
+            "model; single readings far off are mistakes of reading.",
+        )
+    )
+    parts.append(
+        _figure(
+            plot_linearised(calibration),
+            "What the paper's linear equations would have given, against the exact solution.",
+        )
+    )
+    return "".join(parts)
+
+
+def _residuals(calibration: Calibration) -> str:
+    every = len(calibration.residuals) <= ALL_ROWS
+    listed = to_markup(render_residuals(calibration, all_rows=every))
+    words = "All readings" if every else "The largest"
+    few = len(calibration.residuals) <= FEW_ROWS
+    return _figure(plot_residuals(calibration), "") + _details(words, listed, shown=few)
+
+
+def _parameters(calibration: Calibration) -> str:
+    listed = to_markup(render_parameters(calibration, all_rows=True))
+    few = len(calibration.free) <= 12
+    return _figure(plot_parameters(calibration), "") + (
+        listed if few else _details("All parameters", listed)
+    )
+
+
+def _correlations(calibration: Calibration) -> str:
+    figure = plot_correlations(calibration)
+    if not figure:
+        return paragraph("One parameter alone has nothing to hang together with.")
+    pairs = calibration.correlated(above=0.5)
+    if not pairs:
+        return _figure(figure, "No correlation is above 0.5.")
+    rows = [(a, b, signed(r, 2)) for a, b, r in pairs[:20]]
+    more = f" The strongest 20 of {len(pairs)}." if len(pairs) > 20 else ""
+    return _figure(figure, f"Pairs above 0.5 stand below.{more}") + table(
+        ("parameter", "with", "correlation"), rows, left=2
+    )
+
+
+def _identifiability(calibration: Calibration) -> str:
+    return _figure(plot_singular_values(calibration), "") + to_markup(
+        render_identifiability(calibration, all_rows=len(calibration.free) <= 12)
+    )
+
+
+def _provenance(calibration: Calibration) -> str:
+    robot, session, solver = calibration.robot_record, calibration.session, calibration.solver
+    sigma = session.gauge_sigma
+    active = "not stated"
+    if session.controller_offsets is not None:
+        units = [(1e3, "mm") if d.unit == "m" else (1e3, "mrad") for d in calibration.robot.drives]
+        active = ", ".join(
+            f"{d.name} {signed(v * f)} {u}"
+            for d, v, (f, u) in zip(
+                calibration.robot.drives, session.controller_offsets, units, strict=True
+            )
+        )
+    rows: list[tuple[str, str]] = [
+        ("Robot", f"{robot.name} ({robot.reference})"),
+        ("its files, SHA-256", robot.sha256),
+        ("Session", session.title),
+        ("Source", session.source or "not stated"),
+        ("File", session.path or "none"),
+        ("its files, SHA-256", session.sha256 or "none"),
+        ("Gauge", "σ not stated" if sigma is None else f"σ {plain(sigma * 1e3)} mm a reading"),
+        ("Offsets active while measuring", active),
+        (
+            "Model",
+            f"{calibration.model}: {len(calibration.free)} free parameters, "
+            + ("tolerances as a prior" if calibration.prior else "no prior"),
+        ),
+        (
+            "Solver",
+            f"{solver.name}, {solver.status}, {solver.iterations} iterations, "
+            f"{solver.hessian} Hessian, loss: {solver.loss}",
+        ),
+        ("orthocal", calibration.version),
+    ]
+    return table(("", ""), rows, left=2)
+
+
+def _scene(calibration: Calibration) -> str:
+    try:
+        scene = draw_scene(calibration)
+    except OrthocalError as e:  # the numbers stand without it
+        return paragraph(f"It cannot be drawn: {e}.")
+    return (
+        paragraph(scene.headline, kind="lead")
+        + frame_of(scene.to_html(), height="640px")
+        + paragraph("Drag to turn, scroll to come nearer; play to go through the measurement.")
+    )
+
+
+def _figure(svg: str, caption: str) -> str:
+    if not svg:
+        return ""
+    words = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
+    return f"<figure>{svg}{words}</figure>"
+
+
+def _details(words: str, content: str, *, shown: bool = False) -> str:
+    opening = "<details open>" if shown else "<details>"
+    return f"{opening}<summary>{html.escape(words)}</summary>{content}</details>"

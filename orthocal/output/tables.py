@@ -1,0 +1,312 @@
+"""The parts of a calibration's summary and of its report, as tables and lines."""
+
+from __future__ import annotations
+
+import math
+
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from orthocal.identification.calibration import Calibration
+from orthocal.identification.records import ParameterEstimate, ResidualRow
+from orthocal.output.layout import add_row, choose_rows, mm, plain, signed, table_of
+
+MANY_PARAMETERS = 12
+"""Parameters above which only those that the readings tell are listed."""
+
+NOTHING = 1e-8
+"""Deviations below this are none, [m]."""
+
+TOLD = 0.5
+"""Share of its variance that the readings must take from a parameter to be listed then."""
+
+MOST_TERMS = 5
+"""Terms of a combination that are printed."""
+
+MOST_PAIRS = 8
+"""Correlated pairs that are listed."""
+
+_SOURCES = {
+    "cycles": "from repeated cycles",
+    "residuals": "from the residuals",
+    "gauge": "as given for the gauge",
+    "unknown": "unknown",
+}
+
+
+def render_heading(calibration: Calibration) -> RenderableType:
+    """What was calibrated, from what and how."""
+    session, solver = calibration.session, calibration.solver
+    kind = "differences" if calibration.rows_are_differences else "readings"
+    legs = ", ".join(sorted({s.leg for s in calibration.setups}))
+    lines = [
+        Text(
+            f"Calibration of {calibration.robot_record.name}, model '{calibration.model}'",
+            style="bold",
+        ),
+        Text(session.title),
+    ]
+    if session.source:
+        lines.append(Text(f"Source: {session.source}"))
+    used = {r.posture for r in calibration.residuals} | {
+        r.minus for r in calibration.residuals if r.minus
+    }
+    lines.append(
+        Text(
+            f"Measured: {len(calibration.residuals)} {kind} in {len(used)} postures, "
+            f"{len(calibration.setups)} setups on legs {legs}"
+        )
+    )
+    with_prior = sum(p.prior for p in calibration.free)
+    prior = "tolerances as prior" if with_prior else "no prior"
+    if 0 < with_prior < len(calibration.free):
+        prior = f"{with_prior} with a prior"
+    kind = "base parameters" if calibration.base else "parameters"
+    loss = ", Huber's loss" if solver.loss == "huber" else ""
+    lines.append(
+        Text(
+            f"Solved: {len(calibration.free)} {kind}, {prior}{loss}; Ipopt {solver.status}, "
+            f"{solver.iterations} iterations, {solver.seconds_build:.2f} + "
+            f"{solver.seconds_solve:.2f} s"
+        )
+    )
+    return Group(*lines)
+
+
+def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> RenderableType:
+    """Every parameter that the readings tell, or all: estimate, ± σ and interval."""
+    c, told = calibration, calibration.prior
+    robust = c.solver.loss == "huber"  # the linearised estimate is by squares
+    profiled = any(p.interval for p in c.free)
+    table = table_of(
+        "parameter",
+        "linear",
+        "exact",
+        "± σ",
+        *(["told"] if told else []),
+        "95 % interval",
+        *(["profile interval"] if profiled else []),
+        *([] if told or profiled or robust else ["exact − linear"]),
+        *([] if (told and profiled) or robust else ["in σ"]),
+        "unit",
+    )
+    listed = [p for p in c.free if all_rows or len(c.free) <= MANY_PARAMETERS or _worth_listing(p)]
+    for p in listed:
+        f = p.edge_factor
+        add_row(
+            table,
+            p.name,
+            signed(p.linear * f),
+            signed(p.value * f),
+            "at bound" if p.at_bound else plain(p.std * f),
+            *([f"{p.data_share:.0%}" if p.prior and not p.at_bound else ""] if told else []),
+            "" if p.at_bound else _interval(*c.interval(p), f),
+            *([_interval(*p.interval, f) if p.interval else ""] if profiled else []),
+            *([] if told or profiled or robust else [signed((p.value - p.linear) * f, 4)]),
+            *([] if (told and profiled) or robust else [_ratio(p.value - p.linear, p.std)]),
+            p.edge_unit,
+        )
+    notes: list[RenderableType] = [table]
+    if len(listed) < len(c.free):
+        notes.append(
+            Text(
+                f"{len(c.free) - len(listed)} more of which the readings tell less than half; "
+                "--all lists every parameter."
+            )
+        )
+    held = [p for p in c.parameters if not p.free]
+    if held:
+        values = ", ".join(f"{p.name} = {p.value * p.edge_factor:g} {p.edge_unit}" for p in held)
+        notes.append(Text(f"Held at known values: {values}"))
+    bound = [f"{p.name} at its {p.at_bound} one" for p in c.free if p.at_bound]
+    if bound:
+        notes.append(
+            Text(
+                f"Held by a bound: {', '.join(bound)}. The readings want it beyond; it has no ± of "
+                "its own, and the others' ± holds with it there."
+            )
+        )
+    if told:
+        notes.append(
+            Text("told: how much of what the tolerance left open the readings took away (variance)")
+        )
+    pairs = c.correlated(above=0.5)
+    if pairs:
+        words = ", ".join(f"{a} with {b} {r:+.2f}" for a, b, r in pairs[:MOST_PAIRS])
+        more = f", and {len(pairs) - MOST_PAIRS} more" if len(pairs) > MOST_PAIRS else ""
+        notes.append(Text(f"Correlations above 0.5: {words}{more}"))
+    return Group(*notes)
+
+
+def _worth_listing(p: ParameterEstimate) -> bool:
+    return (
+        p.name.endswith(".offset")
+        or p.at_bound is not None
+        or p.interval is not None
+        or not p.prior
+        or p.data_share >= TOLD
+    )
+
+
+def _ratio(value: float, std: float) -> str:
+    return f"{value / std:+.3f}" if std > 0.0 else ""
+
+
+def _interval(low: float, high: float, factor: float) -> str:
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return "unknown"
+    return f"{signed(low * factor)} … {signed(high * factor)}"
+
+
+def render_identifiability(calibration: Calibration, *, all_rows: bool = False) -> RenderableType:
+    """What the readings tell, and what they cannot tell apart."""
+    found = calibration.identifiability
+    count = found.singular_values.size
+    o = found.observability
+    lines = [
+        f"{found.rank} of {count} combinations of parameters, each better than its tolerance "
+        f"(singular values above the noise, {found.threshold * 1e6:.3g} µm a tolerance); perfect "
+        f"readings of this kind would tell {found.structural_rank}.",
+        f"Of {found.n_readings} independent readings the parameters can take up "
+        f"{found.n_readings - calibration.spare_readings}; the others check the model.",
+    ]
+    if found.rank:
+        lines.append(
+            f"Condition number {found.condition:.3g}; observability O1 {o['O1'] * 1e3:.3g} mm, "
+            f"O2 {o['O2']:.3g}, O3 {o['O3'] * 1e3:.3g} mm, O4 {o['O4'] * 1e3:.3g} mm, "
+            f"O5 {o['O5'] * 1e3:.3g} mm a tolerance."
+        )
+    shown = found.alike if all_rows else found.alike[:6]
+    lines += [f"Not told apart: {c.words}." for c in shown]
+    if len(shown) < len(found.alike):
+        lines.append(f"{len(found.alike) - len(shown)} more such groups; --all lists them.")
+    if found.unseen:
+        names = (
+            ", ".join(found.unseen) if all_rows or len(found.unseen) <= 6 else "--all lists them"
+        )
+        lines.append(
+            f"Below the noise: {len(found.unseen)} parameters, one tolerance of which moves all "
+            f"readings together by less ({names})."
+        )
+    sums = [c for c in found.base if len(c.terms) > 1]
+    if calibration.base:
+        most = None if all_rows else MOST_TERMS
+        lines += [f"{c.terms[0][0]} stands for {c.shorten(most)}" for c in sums]
+    elif all_rows:
+        lines += [f"Told as one: {c.formula}" for c in sums]
+    return Group(*(Text(line) for line in lines))
+
+
+def render_residuals(calibration: Calibration, *, all_rows: bool = False) -> RenderableType:
+    """Readings before and after, the worst of many or all."""
+    noise = calibration.noise.reading_sigma
+
+    def spread(row: ResidualRow) -> float:
+        return noise * (math.sqrt(2.0) if row.minus else 1.0)
+
+    rows, note = choose_rows(calibration.residuals, all_rows)
+    cycles = any(r.cycle != 1 for r in calibration.residuals)
+    raw = not calibration.rows_are_differences
+    columns = ["setup", "posture", *(["cycle"] if cycles else []), "measured [mm]"]
+    table = table_of(
+        *columns, "before [mm]", "after [mm]", "in σ", "studentised", "moves by", left=2
+    )
+    for r in rows:
+        where = f"{r.posture} − {r.minus}" if r.minus else r.posture
+        add_row(
+            table,
+            r.setup,
+            where,
+            *([str(r.cycle)] if cycles else []),
+            signed(r.measured * 1e3),
+            signed(r.deviation * 1e3),
+            signed(r.residual * 1e3),
+            f"{r.residual / spread(r):+.1f}" if spread(r) > 0.0 else "",
+            f"{r.studentised:+.1f}" if math.isfinite(r.studentised) else "",
+            f"{r.influence:.1f}",
+        )
+    parts: list[RenderableType] = [table]
+    if raw:
+        parts.append(Text("Before and after: measured less model, each with its best gauge zeros."))
+    parts.append(
+        Text(
+            "studentised: as all other readings see it, in its σ; moves by: the σ by which a "
+            "parameter would change without it, at most"
+        )
+    )
+    if note:
+        parts.append(Text(note))
+    return Group(*parts)
+
+
+def render_fit(calibration: Calibration) -> RenderableType:
+    """Root mean squares before and after, and the noise."""
+    c, noise = calibration, calibration.noise
+    table = table_of("", "before", "after", "")
+    for name, before, after in (
+        ("r.m.s. [mm]", c.rms_before, c.rms_after),
+        ("largest [mm]", c.largest_before, c.largest_after),
+    ):
+        change = f"{after / before - 1.0:+.0%}" if before > NOTHING else ""
+        add_row(table, name, mm(before), mm(after), change)
+    row = "a difference" if c.rows_are_differences else "a reading"
+    dof = "" if math.isinf(c.dof) else f", {c.dof:.3g} degrees of freedom"
+    text = f"σ of {row}: {mm(c.sigma)} mm, {_SOURCES[noise.source]}{dof}"
+    if c.rows_are_differences and math.isfinite(noise.reading_sigma):
+        text += f" (of one reading {mm(noise.reading_sigma)} mm)"
+    lines: list[RenderableType] = [table, Text(text)]
+    if noise.cycles_dof > 0 and noise.source != "cycles":
+        lines.append(
+            Text(
+                f"σ of a reading from repeated cycles: {mm(noise.cycles_sigma)} mm, "
+                f"{noise.cycles_dof} degrees of freedom"
+            )
+        )
+    if c.session.gauge_sigma is not None:
+        text = f"σ given for the gauge: {mm(c.session.gauge_sigma)} mm a reading"
+        if c.rows_are_differences:
+            text += f", {mm(c.session.gauge_sigma * math.sqrt(2.0))} mm a difference"
+        lines.append(Text(text))
+    return Group(*lines)
+
+
+def render_controller(calibration: Calibration) -> RenderableType:
+    """What to enter into the controller."""
+    entries = calibration.controller_entries()
+    if not entries:
+        return Text("Nothing: no offset was identified.")
+    stated = entries[0].active is not None
+    biased = any(e.bias_std > 0.0 for e in entries)
+    enter = ("active now", "enter") if stated else ("add to the present offset",)
+    table = table_of("drive", *enter, "± σ", *(["± σ in all"] if biased else []), "unit")
+    for e in entries:
+        factor, unit = (1e3, "mm") if e.unit == "m" else (1e3, "mrad")
+        now = [] if e.active is None else [signed(e.active * factor)]
+        spread = [plain(e.std * factor), *([plain(e.std_in_all * factor)] if biased else [])]
+        if e.held:
+            spread = [e.held, *([""] if biased else [])]
+        add_row(table, e.drive, *now, signed(e.enter * factor), *spread, unit)
+    notes = [
+        Text("An offset is what to add to the encoder's coordinate to get the slider's true one."),
+    ]
+    if biased:
+        notes.append(
+            Text(
+                "± σ: what the scatter leaves open. In all: with what errors that were not "
+                "identified, at their tolerances, add to it."
+            )
+        )
+    if not stated:
+        notes.append(
+            Text(
+                "The session does not state the offsets that were active: there is no `controller`."
+            )
+        )
+    if len(calibration.free) > len(entries):
+        notes.append(
+            Text(
+                "The other parameters need a controller with a model of the machine. What offsets "
+                "alone leave stands above, as 'with the offsets entered'."
+            )
+        )
+    return Group(table, *notes)
