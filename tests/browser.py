@@ -6,8 +6,10 @@ failure; elsewhere these tests are skipped, with the reason.
 
 from __future__ import annotations
 
+import base64
 import io
 import os
+import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -17,6 +19,9 @@ from PIL import Image
 
 from orthocal.errors import OrthocalError
 from orthocal.output.browser import chromium_flags, find_chromium
+
+PATIENCE = 60.0
+"""[s] Until something that must happen has happened."""
 
 SIZES = ((1400, 900), (800, 600))
 
@@ -29,9 +34,17 @@ class Visit:
     messages: list[str] = field(default_factory=list)
     requests: list[str] = field(default_factory=list)
 
-    def wait_until_drawn(self):
-        self.page.wait_for_function(
-            "Number(document.documentElement.dataset.rendered || 0) > 1", timeout=60_000
+    def wait_for(self, expression, *, frame=None):
+        """Until an expression of JavaScript is true; pages forbid the eval of Playwright's own."""
+        end = time.monotonic() + PATIENCE
+        while not (frame or self.page).evaluate(expression):
+            if time.monotonic() > end:
+                pytest.fail(f"not in {PATIENCE} s: {expression}")
+            time.sleep(0.02)
+
+    def wait_until_drawn(self, *, frame=None, times=1):
+        self.wait_for(
+            f"Number(document.documentElement.dataset.rendered || 0) > {times}", frame=frame
         )
 
     def picture(self):
@@ -40,8 +53,6 @@ class Visit:
 
     def canvas(self):
         """What the 3-D viewer draws, shape (height, width, 4)."""
-        import base64
-
         data = self.page.evaluate("viewer.capture_image()").split(",", 1)[1]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGBA"))
 

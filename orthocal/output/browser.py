@@ -18,7 +18,7 @@ FLAGS = (
     "--use-gl=angle",  # WebGL by software: no graphics card is needed
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
-    "--host-resolver-rules=MAP * ~NOTFOUND",  # a page may ask nobody anything
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",  # a page may ask nobody else
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-quic",

@@ -150,12 +150,15 @@ def worst_of_setups(rows: Sequence[Deviation]) -> tuple[Deviation, ...]:
     return tuple(worst.values())
 
 
-def plan_stops(measured: Measurement, posture: str | None) -> list[Stop]:
+def plan_stops(measured: Measurement, posture: str | None) -> tuple[list[Stop], int]:
     """Where the machine goes: an overview at the zero, then every leg through its postures.
 
     Args:
         measured: The measurement.
         posture: The only stop, instead.
+
+    Returns:
+        The stops, and how many of too many were left out.
 
     Raises:
         ParameterError: If there is no such posture.
@@ -169,7 +172,7 @@ def plan_stops(measured: Measurement, posture: str | None) -> list[Stop]:
                 where="posture",
             )
         rows = worst_of_setups([r for r in measured.rows if r.posture == posture])
-        return [Stop(posture, measured.drives[posture], rows)]
+        return [Stop(posture, measured.drives[posture], rows)], 0
     overview = Stop("overview", zero, worst_of_setups(measured.rows))
     path: list[Stop] = []
     for leg in dict.fromkeys(measured.setups[r.setup].leg for r in measured.rows):
@@ -185,7 +188,5 @@ def plan_stops(measured: Measurement, posture: str | None) -> list[Stop]:
         if not np.allclose(stops[0].drives, zero, rtol=0.0, atol=1e-9):
             path.append(Stop("zero", zero, ()))
         path += stops
-    if len(path) > MOST_STOPS:
-        chosen = np.unique(np.linspace(0, len(path) - 1, MOST_STOPS).round().astype(int))
-        path = [path[i] for i in chosen]
-    return [overview, *path, overview]
+    chosen = np.unique(np.linspace(0, len(path) - 1, min(MOST_STOPS, len(path))).round())
+    return [overview, *(path[int(i)] for i in chosen), overview], len(path) - len(chosen)

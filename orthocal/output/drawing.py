@@ -190,7 +190,7 @@ def _tour(robot: Robot) -> list[Stop]:
 def _draw_session(session: Session, posture: str | None) -> Scene:
     robot, measured = session.robot, measurement_of_session(session)
     stage = Stage(robot, session.title)
-    stops = plan_stops(measured, posture)
+    stops, left_out = plan_stops(measured, posture)
     timeline = plan_motion([s.drives + measured.offsets for s in stops])
     poses = _follow(robot, nominal_assembly(robot), timeline, stage.frames)
     stage.draw_links(MACHINE, poses)
@@ -203,9 +203,7 @@ def _draw_session(session: Session, posture: str | None) -> Scene:
     stage.move_leg_lines(film, timeline.times, poses)
     _draw_readings(stage, measured, stops, timeline, poses, film)
     scene.headline = _headline(measured)
-    _state_source(scene, session.source)
-    if len(stops) > 1:
-        scene.animate(film.animation)
+    _finish(scene, film, session.source, stops, left_out)
     return scene
 
 
@@ -219,7 +217,7 @@ def _draw_calibration(
     title = f"{calibration.session.title} · model '{calibration.model}'"
     stage = Stage(measured.robot, title)
     scene = stage.scene
-    stops = plan_stops(measured, posture)
+    stops, left_out = plan_stops(measured, posture)
     machines = _place_machines(calibration, measured, stops, stage, exaggeration)
     scene.exaggeration = machines.exaggeration
     stage.draw_links(SOLID, machines.real)
@@ -235,9 +233,7 @@ def _draw_calibration(
     _draw_readings(stage, measured, stops, machines.timeline, machines.real, film, shown=readings)
     _draw_tool_errors(stage, calibration, shown=tool)
     scene.headline = _headline(measured)
-    _state_source(scene, calibration.session.source)
-    if len(stops) > 1:
-        scene.animate(film.animation)
+    _finish(scene, film, calibration.session.source, stops, left_out)
     return scene
 
 
@@ -540,7 +536,13 @@ def _write_steps(
         scene.steps.append(Step(stop.name, caption, *timeline.interval(i)))
 
 
-def _state_source(scene: Scene, source: str) -> None:
+def _finish(scene: Scene, film: Film, source: str, stops: Sequence[Stop], left_out: int) -> None:
+    """Animate, and say what has to be said of it, and where the readings are from."""
+    if len(stops) > 1:
+        scene.animate(film.animation)
+    if left_out:
+        shown = len(stops) - 2
+        scene.facts.append(f"The animation stops at {shown} of {shown + left_out} postures.")
     if source:
         scene.facts.append(f"Source: {source}")
 

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import signal
+import socket
 import threading
 from importlib import resources
 from types import TracebackType
 from typing import Any
 
 import tornado.httpserver
-import tornado.netutil
 import tornado.web
 import tornado.websocket
 
@@ -51,10 +52,20 @@ class _Commands(tornado.websocket.WebSocketHandler):
         """Whether the page that asks came from here."""
         return origin == f"http://{self.request.host}"
 
-    def open(self, *args: str, **kwargs: str) -> None:
-        for data in self.scene.pack():
-            self.write_message(data, binary=True)
+    async def open(self, *args: str, **kwargs: str) -> None:
+        self.sent, self.lock = 0, asyncio.Lock()
         self.listeners.add(self)
+        await self.catch_up()
+
+    async def catch_up(self) -> None:
+        """Send what has not been sent yet."""
+        async with self.lock:
+            try:
+                for data in self.scene.pack(self.sent):
+                    await self.write_message(data, binary=True)
+                    self.sent += 1
+            except tornado.websocket.WebSocketClosedError:
+                self.listeners.discard(self)
 
     def on_message(self, message: str | bytes) -> None:
         """A page has nothing to say."""
@@ -78,8 +89,8 @@ class LiveScene:
 
     def __init__(self, scene: Scene, *, port: int | None = None) -> None:
         self.scene = scene
-        self._sockets = _listen(port)
-        self.port = int(self._sockets[0].getsockname()[1])
+        self._socket = _listen(port)
+        self.port = int(self._socket.getsockname()[1])
         self._ready = threading.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread = threading.Thread(target=self._serve, name="orthocal-live", daemon=True)
@@ -92,14 +103,14 @@ class LiveScene:
         return f"http://{ADDRESS}:{self.port}/"
 
     def wait(self) -> None:
-        """Serve until Ctrl-C, or until the process is asked to end."""
-        ended = threading.Event()
+        """Serve until Ctrl-C, until the process is asked to end, or what started it has ended."""
+        ended, parent = threading.Event(), os.getppid()
         previous = {
             number: signal.signal(number, lambda *_: ended.set())
             for number in (signal.SIGINT, signal.SIGTERM)
         }
         try:
-            while not ended.wait(0.2):
+            while not ended.wait(0.2) and os.getppid() == parent:
                 pass
         finally:
             for number, handler in previous.items():
@@ -127,26 +138,29 @@ class LiveScene:
         asyncio.set_event_loop(loop)
         listeners: set[_Commands] = set()
         server = tornado.httpserver.HTTPServer(_application(self.scene, listeners))
-        loop.call_soon(server.add_sockets, self._sockets)
+        loop.call_soon(server.add_socket, self._socket)
         loop.call_soon(self._ready.set)
 
-        def forward(data: bytes) -> None:
+        def tell() -> None:
             for listener in tuple(listeners):
-                listener.write_message(data, binary=True)
+                task = loop.create_task(listener.catch_up())
+                tasks.add(task)  # the loop itself holds none
+                task.add_done_callback(tasks.discard)
 
-        def hand_over(data: bytes) -> None:
-            loop.call_soon_threadsafe(forward, data)
-
-        self.scene.listen(hand_over)
+        tasks: set[asyncio.Task[None]] = set()
+        self.scene.on_change = lambda: loop.call_soon_threadsafe(tell)
         try:
             loop.run_forever()
         finally:
-            self.scene.listen(None)
+            self.scene.on_change = None
             server.stop()
             for listener in tuple(listeners):
                 listener.close()
             loop.run_until_complete(server.close_all_connections())
-            loop.run_until_complete(loop.shutdown_asyncgens())
+            left = asyncio.all_tasks(loop)
+            for task in left:
+                task.cancel()
+            loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
             loop.close()
 
 
@@ -163,16 +177,20 @@ def _application(scene: Scene, listeners: set[_Commands]) -> tornado.web.Applica
     return application
 
 
-def _listen(port: int | None) -> list[Any]:
+def _listen(port: int | None) -> socket.socket:
     tried = [port] if port is not None else range(FIRST_PORT, FIRST_PORT + PORTS_TRIED)
+    reason = ""
     for candidate in tried:
         try:
-            return list(tornado.netutil.bind_sockets(candidate, address=ADDRESS))
+            found = socket.create_server((ADDRESS, candidate), backlog=128)
         except OSError as e:
-            reason = e.strerror
+            reason = str(e.strerror)
+            continue
+        found.setblocking(False)
+        return found
     if port is not None:
-        raise OrthocalError(f"port {port} of {ADDRESS} cannot be had: {reason}", where="--port")
+        raise OrthocalError(f"port {port} of {ADDRESS} cannot be had: {reason}", where="port")
     raise OrthocalError(
         f"no port of {ADDRESS} from {FIRST_PORT} to {FIRST_PORT + PORTS_TRIED - 1} is free",
-        where="--port",
+        where="port",
     )

@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 
 FRAMES_A_SECOND = 30
 
+STILL = 1e-12
+"""What changes by less does not move, [m or 1]."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timeline:
@@ -131,10 +134,12 @@ class Film:
         self._clips: dict[NodePath, AnimationClip] = {}
 
     def move(self, path: str, times: Array, poses: Array) -> None:
-        """Move a node through poses, shape (F, 4, 4), [m]."""
-        turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
-        self.track(path, "position", "vector3", times, poses[:, :3, 3])
-        self.track(path, "quaternion", "quaternion", times, turns)
+        """Move a node from its first pose through all others, shape (F, 4, 4), [m]."""
+        if np.ptp(poses[:, :3, 3], axis=0).max() > STILL:
+            self.track(path, "position", "vector3", times, poses[:, :3, 3])
+        if np.ptp(poses[:, :3, :3], axis=0).max() > STILL:
+            turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+            self.track(path, "quaternion", "quaternion", times, turns)
 
     def track(self, path: str, name: str, kind: str, times: Array, values: Array) -> None:
         """Change a property of a node: one row of values a time, shape (F, n)."""

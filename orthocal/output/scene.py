@@ -11,7 +11,7 @@ import base64
 import html
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib import resources
@@ -95,13 +95,13 @@ class _Recorder:
 
     def __init__(self) -> None:
         self.commands: list[dict[str, Any]] = []
-        self.on_command: Callable[[dict[str, Any]], None] | None = None
+        self.on_change: Callable[[], object] | None = None
         self._names: dict[str, str] = {}
 
     def send(self, command: Any) -> None:  # noqa: ANN401 - any of meshcat's commands
         self.commands.append(self._plain(command.lower()))
-        if self.on_command is not None:
-            self.on_command(self.commands[-1])
+        if self.on_change is not None:
+            self.on_change()
 
     def get_scene(self) -> str:
         raise NotImplementedError("a scene is written with save()")
@@ -173,6 +173,15 @@ class Scene:
         self.visualizer.set_animation(animation, play=False)
 
     @property
+    def on_change(self) -> Callable[[], object] | None:
+        """What is called after every command."""
+        return self._recorder.on_change
+
+    @on_change.setter
+    def on_change(self, listener: Callable[[], object] | None) -> None:
+        self._recorder.on_change = listener
+
+    @property
     def commands(self) -> tuple[Mapping[str, Any], ...]:
         """All commands so far, as meshcat's viewer takes them."""
         return tuple(self._recorder.commands)
@@ -191,13 +200,12 @@ class Scene:
                 pose = np.array(command["matrix"]).reshape(4, 4).T
         return pose
 
-    def pack(self) -> tuple[bytes, ...]:
-        """All commands so far, as meshcat's viewer takes them from a server."""
-        return tuple(_pack(c) for c in self.commands)
-
-    def listen(self, listener: Callable[[bytes], None] | None) -> None:
-        """Hand every command that follows to a listener, packed; None ends it."""
-        self._recorder.on_command = None if listener is None else lambda c: listener(_pack(c))
+    def pack(self, start: int = 0) -> Iterator[bytes]:
+        """Commands from one on, as meshcat's viewer takes them from a server."""
+        for command in self.commands[start:]:
+            # the viewer keeps what moves in single precision anyway
+            precision = "single" if command["type"] == "set_animation" else "double"
+            yield umsgpack.packb(command, force_float_precision=precision)
 
     def to_html(self) -> str:
         """One page that holds all it needs, meshcat's viewer too."""
@@ -249,12 +257,6 @@ class Scene:
         page = _read("scene.html")
         pieces = page.split("@@")  # text, name, text, name, ..., text
         return "".join(parts[p] if i % 2 else p for i, p in enumerate(pieces))
-
-
-def _pack(command: Mapping[str, Any]) -> bytes:
-    # the viewer keeps what moves in single precision anyway
-    precision = "single" if command["type"] == "set_animation" else "double"
-    return bytes(umsgpack.packb(command, force_float_precision=precision))
 
 
 def frame_of(page: str, *, height: str) -> str:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from orthocal.output.motion import Film, place_frames
@@ -132,7 +131,7 @@ class Stage:
         """Move what `draw_links` drew; frames of poses at times."""
         drawn = {path.split("/")[1] for path in self.scene.nodes if path.startswith(f"{node}/")}
         for link in self.links:
-            if link in drawn and np.ptp(poses[link], axis=0).max() > SAME:
+            if link in drawn:
                 film.move(f"{node}/{link}", times, poses[link])
 
     def move_leg_lines(self, film: Film, times: Array, poses: Mapping[str, Array]) -> None:
@@ -142,15 +141,6 @@ class Stage:
             film.move(f"{LINES}/leg {name}", times, line)
             scale = np.column_stack([np.ones((len(length), 2)), length])
             film.track(f"{LINES}/leg {name}", "scale", "vector3", times, scale)
-
-    @property
-    def moving_links(self) -> tuple[str, ...]:
-        """Links that some joint moves."""
-        model = self.robot.model
-        fixed = {
-            f.name for f in model.frames if f.type == pin.FrameType.BODY and f.parentJoint == 0
-        }
-        return tuple(link for link in self.links if link not in fixed)
 
 
 def _line_poses(root: Array, tip: Array) -> tuple[Array, Array]:

@@ -1,0 +1,252 @@
+"""The live server: this machine only, and nothing left of it however it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import meshcat.geometry as g
+import pytest
+import umsgpack
+from conftest import ROOT
+from tornado.httpclient import HTTPClientError, HTTPRequest
+from tornado.websocket import websocket_connect
+
+from orthocal import LiveScene, draw_scene
+from orthocal.errors import OrthocalError
+
+PATIENCE = 60.0
+"""[s] Until something that must happen has happened."""
+
+VIEW = [sys.executable, "-m", "orthocal.cli", "view", "orthoglide"]
+
+
+@pytest.fixture(scope="module")
+def scene(orthoglide):
+    return draw_scene(orthoglide)
+
+
+def get(port, path="/", host="127.0.0.1"):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.request("GET", path, headers={"Host": f"{host}:{port}"})
+    answer = connection.getresponse()
+    text = answer.read().decode(errors="replace")
+    connection.close()
+    return answer.status, text
+
+
+def is_open(port):
+    with socket.socket() as s:
+        s.settimeout(5)
+        return s.connect_ex(("127.0.0.1", port)) == 0
+
+
+def listening(pid):
+    """Addresses and ports on which a process listens, from the kernel's tables."""
+    sockets = set()
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        try:
+            found = re.fullmatch(r"socket:\[(\d+)\]", os.readlink(link))
+        except OSError:
+            continue
+        if found:
+            sockets.add(found[1])
+    result = []
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[3] == "0A" and fields[9] in sockets:
+                address, port = fields[1].split(":")
+                result.append((address, int(port, 16)))
+    return result
+
+
+def wait_until(condition, what):
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        if condition():
+            return
+        time.sleep(0.05)
+    pytest.fail(f"{what} did not happen in {PATIENCE} s")
+
+
+def start(*arguments, code=None):
+    """A view in a process of its own, and its port."""
+    command = [*VIEW, *arguments] if code is None else [sys.executable, "-c", code]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
+    )
+    line = process.stdout.readline()
+    found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\n", line)
+    if not found:
+        process.kill()
+        pytest.fail(f"no address: {line!r} {process.stderr.read()}")
+    return process, int(found[1])
+
+
+def children(pid):
+    found = []
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rsplit(")", 1)[1].split()
+        except OSError:
+            continue
+        if int(fields[1]) == pid:
+            found.append(int(path.parent.name))
+    return found
+
+
+async def hang_up(connection):
+    connection.close()
+    while await connection.read_message() is not None:
+        pass
+
+
+def alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+# ---- in this process
+
+
+def test_page_viewer_and_commands_come_from_the_server(scene):
+    with LiveScene(scene) as live:
+        status, page = get(live.port)
+        assert status == 200
+        assert scene.title in page
+        assert "main.min.js" in page
+        status, script = get(live.port, "/main.min.js")
+        assert status == 200
+        assert "MeshCat" in script[:400]
+        assert get(live.port, "/etc/passwd")[0] == 404
+        assert get(live.port, "/../setup.py")[0] == 404
+    assert not is_open(live.port)
+
+
+def test_answers_only_to_its_own_name(scene):
+    """A page from elsewhere that has a name resolve to 127.0.0.1 gets nothing."""
+    with LiveScene(scene) as live:
+        assert get(live.port, host="localhost")[0] == 200
+        assert get(live.port, host="evil.example")[0] == 404
+
+        async def listen(origin):
+            request = HTTPRequest(
+                f"ws://127.0.0.1:{live.port}/commands", headers={"Origin": origin}
+            )
+            connection = await websocket_connect(request)
+            first = await connection.read_message()
+            await hang_up(connection)
+            return umsgpack.unpackb(first)
+
+        assert asyncio.run(listen(f"http://127.0.0.1:{live.port}"))["type"] == "delete"
+        with pytest.raises(HTTPClientError, match="403"):
+            asyncio.run(listen("http://evil.example"))
+
+
+def test_what_is_added_later_is_sent_at_once(orthoglide):
+    scene = draw_scene(orthoglide)
+    known = len(scene.commands)
+
+    async def follow(live):
+        origin = f"http://127.0.0.1:{live.port}"
+        request = HTTPRequest(f"ws://127.0.0.1:{live.port}/commands", headers={"Origin": origin})
+        connection = await websocket_connect(request)
+        first = [umsgpack.unpackb(await connection.read_message()) for _ in range(known)]
+        scene.visualizer["/Mine"].set_object(g.Sphere(0.1))
+        later = umsgpack.unpackb(await asyncio.wait_for(connection.read_message(), PATIENCE))
+        await hang_up(connection)
+        return first, later
+
+    with LiveScene(scene) as live:
+        first, later = asyncio.run(follow(live))
+    assert [c["path"] for c in first] == [c["path"] for c in scene.commands[:known]]
+    assert later["path"] == "/Mine"
+    scene.visualizer["/Mine"].delete()  # nobody listens any more, and nothing breaks
+
+
+def test_listens_on_loopback_only(scene):
+    with LiveScene(scene) as live:
+        own = [a for a, p in listening(os.getpid()) if p == live.port]
+        assert own == ["0100007F"]  # 127.0.0.1 as the kernel writes it
+        others = [a for a, _ in listening(os.getpid()) if a not in ("0100007F",)]
+        assert others == []
+
+
+def test_two_views_find_two_ports(scene):
+    with LiveScene(scene) as one, LiveScene(scene) as two:
+        assert one.port != two.port
+        with pytest.raises(OrthocalError, match=f"port {one.port} of 127.0.0.1 cannot be had"):
+            LiveScene(scene, port=one.port)
+    assert not is_open(one.port)
+    assert not is_open(two.port)
+    with LiveScene(scene, port=one.port) as again:
+        assert again.port == one.port
+
+
+# ---- in a process of its own
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ends_cleanly_when_asked_to(number):
+    process, port = start()
+    assert [a for a, _ in listening(process.pid)] == ["0100007F"]
+    assert children(process.pid) == []
+    assert get(port)[0] == 200
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0
+    assert errors == "Open this in a browser on this machine; Ctrl-C ends.\n"
+    assert not is_open(port)
+
+
+def test_nothing_is_left_after_a_kill():
+    process, port = start()
+    process.kill()
+    process.wait(PATIENCE)
+    process.stdout.close()
+    process.stderr.close()
+    wait_until(lambda: not is_open(port), "the port's end")
+
+
+def test_nothing_is_left_after_a_kill_of_its_parent():
+    """As where a shell or a script that started the view is killed: the view ends, too."""
+    code = (
+        "import subprocess, sys\n"
+        f"view = subprocess.Popen({VIEW!r}, stdout=subprocess.PIPE, text=True)\n"
+        "print(view.stdout.readline(), end='', flush=True)\n"
+        "view.wait()\n"
+    )
+    process, port = start(code=code)
+    (view,) = children(process.pid)
+    assert [p for _, p in listening(view)] == [port]
+    process.kill()
+    process.wait(PATIENCE)
+    process.stdout.close()
+    process.stderr.close()
+    wait_until(lambda: not is_open(port), "the port's end")
+    wait_until(lambda: not alive(view), "the view's end")
+
+
+def test_nothing_is_left_after_an_exception():
+    code = (
+        "from orthocal import LiveScene, draw_scene, load_robot\n"
+        "live = LiveScene(draw_scene(load_robot('orthoglide')))\n"
+        "print(live.url, flush=True)\n"
+        "raise RuntimeError('something else went wrong')\n"
+    )
+    process, port = start(code=code)
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 1
+    assert "something else went wrong" in errors
+    wait_until(lambda: not is_open(port), "the port's end")
