@@ -1662,6 +1662,114 @@ SIMULATE_CASES = [
     ),
 ]
 
+VIEW = "view {tmp}/session.yaml --html {tmp}/out/page.html"
+NO_SUBJECT = (
+    ": there is no such file or folder; expected a calibration.json, a session.yaml, a folder that "
+    "holds one, or a robot (orthoglide, or its folder)"
+)
+MESH_LINE = '<geometry><box size="0.36 0.05 0.018"/></geometry>'
+
+
+def mesh(name: str, filename: str, message: str, *more: Edit) -> Case:
+    """A robot whose first visual is a mesh."""
+    old = MESH_LINE + '\n      <material name="frame"/>\n    </visual>\n    <visual>'
+    new = old.replace(MESH_LINE, f'<geometry><mesh filename="{filename}"/></geometry>')
+    return Case(
+        f"view-mesh-{name}",
+        "{tmp}/machine/orthoglide.urdf" + message,
+        (swap(URDF, old, new), *more),
+        command="view {tmp}/machine --html {tmp}/out/page.html",
+    )
+
+
+VIEW_CASES = [
+    Case("view-nothing", "{tmp}/none" + NO_SUBJECT, command="view {tmp}/none --html {tmp}/a.html"),
+    Case("view-robot-unknown", "delta" + NO_SUBJECT, command="view delta --html {tmp}/a.html"),
+    Case(
+        "view-empty-folder",
+        "{tmp}/empty: holds neither a calibration.json nor a session.yaml, nor is it a robot's "
+        "folder (no *.urdf)",
+        (write("empty/note.txt", ""),),
+        command="view {tmp}/empty --html {tmp}/a.html",
+    ),
+    Case(
+        "view-readings-as-subject",
+        "{tmp}/readings.csv:1: is not valid YAML: mapping values are not allowed here",
+        (write("readings.csv", "a: b: c\n"),),
+        command="view {tmp}/readings.csv --html {tmp}/a.html",
+    ),
+    Case(
+        "view-posture",
+        "posture: 'x_top' is not a posture; postures: x_max, x_min, y_max, y_min, z_max, z_min",
+        command=VIEW + " --posture x_top",
+    ),
+    Case(
+        "view-posture-of-a-robot",
+        "posture: a robot alone has no postures; it takes a session",
+        command="view orthoglide --html {tmp}/a.html --posture zero",
+    ),
+    Case(
+        "view-exaggerate",
+        "exaggeration: is -3; expected a positive number",
+        command=VIEW + " --exaggerate -3",
+    ),
+    Case(
+        "view-show",
+        "show: 'arrows' is none of readings, tool, all",
+        command=VIEW + " --show arrows",
+    ),
+    *(
+        Case(
+            f"view-size-{size}",
+            f"--size: found '{size}'; expected WIDTHxHEIGHT in pixels, such as 1400x900, each 100 "
+            "to 8000",
+            command=f"view orthoglide --png {{tmp}}/a.png --size {size}",
+        )
+        for size in ("big", "1400", "0x900", "1400x900x3", "9000x900", "-1x200", "1.5x200")
+    ),
+    Case(
+        "view-html-is-a-folder",
+        "{tmp}/machine: is a folder; expected a file",
+        command="view orthoglide --html {tmp}/machine",
+    ),
+    Case(
+        "view-html-in-a-file",
+        "{tmp}/session.yaml: is a file; expected a folder",
+        command="view orthoglide --html {tmp}/session.yaml/page.html",
+    ),
+    Case(
+        "report-in-a-file",
+        "{tmp}/session.yaml: is a file; expected a folder",
+        command="report {tmp}/calibration.json --out {tmp}/session.yaml/page.html",
+        base="machine",
+        calibrated=True,
+    ),
+    Case(
+        "report-of-nothing",
+        "{tmp}/calibration.json: there is no such file" + MAKE_ONE,
+        command="report {tmp}",
+    ),
+    mesh("missing", "part.stl", ":24: there is no mesh file {tmp}/machine/part.stl"),
+    mesh(
+        "outside",
+        "../../etc/part.stl",
+        ":24: the mesh '../../etc/part.stl' lies outside of the robot's folder",
+    ),
+    mesh(
+        "absolute",
+        "/etc/part.stl",
+        ":24: the mesh '/etc/part.stl' lies outside of the robot's folder",
+    ),
+    mesh("kind", "session.yaml", ":24: the mesh 'session.yaml' is none of .stl, .obj, .dae, .ply"),
+    mesh(
+        "broken",
+        "package://orthoglide/part.stl",
+        ": its visuals cannot be loaded: #",
+        write("machine/part.stl", "this is no mesh"),
+    ),
+]
+
+
 CASES = [
     *SESSION_KEY_CASES,
     *SESSION_TYPE_CASES,
@@ -1674,6 +1782,7 @@ CASES = [
     *CALIBRATION_CASES,
     *TABLE_CASES,
     *SIMULATE_CASES,
+    *VIEW_CASES,
 ]
 
 BY_NAME = {case.name: case for case in CASES}
@@ -1735,8 +1844,9 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 
 def without_digits(message: str) -> str:
-    """A message without the residual that an iteration in vain ends with: it is any number."""
+    """A message without what others say in it: a residual in vain, the words of a mesh reader."""
     message = re.sub(r"stay open by \S+ mm, \d+%", "stay open by # mm, #%", message)
+    message = re.sub(r"(visuals cannot be loaded: ).*\n", r"\1#\n", message)
     return re.sub(r"a residual of \S+ m", "a residual of # m", message)
 
 
@@ -1757,7 +1867,8 @@ def test_what_the_cases_spoil_is_good(base, tmp_path, monkeypatch, capfd):
     with pytest.raises(SystemExit) as stopped:
         main()
     assert stopped.value.code == 0
-    assert capfd.readouterr().err == f"Wrote {tmp_path}/out/calibration.json\n"
+    out = f"{tmp_path}/out"
+    assert capfd.readouterr().err == f"Wrote {out}/calibration.json and {out}/report.html\n"
 
 
 @pytest.mark.parametrize("command", [FORWARD, INVERSE, SIMULATE + ONE_ERROR, "validate"])

@@ -41,10 +41,65 @@ def test_calibrate_prints_and_writes(orthocal, experiment, tmp_path):
     code, out, err = orthocal("calibrate", experiment, "--out", tmp_path / "new/folder")
     assert code == 0
     assert "What to enter into the controller" in out
-    assert err == f"Wrote {tmp_path / 'new/folder/calibration.json'}\n"
-    found = load_calibration(tmp_path / "new/folder")
+    folder = tmp_path / "new/folder"
+    assert err == f"Wrote {folder / 'calibration.json'} and {folder / 'report.html'}\n"
+    found = load_calibration(folder)
     assert found["x_slide.offset"].value == pytest.approx(-0.5268e-3, abs=5e-6)
-    assert [p.name for p in (tmp_path / "new/folder").iterdir()] == ["calibration.json"]
+    assert {p.name for p in folder.iterdir()} == {"calibration.json", "report.html"}
+    assert "What to enter, and can it be believed?" in (folder / "report.html").read_text()
+
+
+def test_report_is_written_beside_its_calibration_or_where_asked(orthocal, experiment, tmp_path):
+    code, _, err = orthocal("calibrate", experiment, "--out", tmp_path)
+    page = (tmp_path / "report.html").read_bytes()
+    (tmp_path / "report.html").unlink()
+    (tmp_path / "pages").mkdir()
+    for words, target in (
+        ([], tmp_path / "report.html"),
+        (["--out", tmp_path / "pages"], tmp_path / "pages/report.html"),
+        (["--out", tmp_path / "new/mine.html"], tmp_path / "new/mine.html"),
+    ):
+        code, out, err = orthocal("report", tmp_path, *words)
+        assert (code, out, err) == (0, "", f"Wrote {target}\n")
+        assert target.read_bytes() == page
+
+
+def test_view_writes_a_page_of_anything(orthocal, experiment, root, tmp_path):
+    orthocal("calibrate", experiment, "--out", tmp_path)
+    for subject, expected in (
+        (tmp_path, "Machine, calibrated"),
+        (tmp_path / "calibration.json", "Machine, calibrated"),
+        (experiment, "Machine, nominal"),
+        (root / "examples/lines/plan.yaml", "none taken yet"),
+        ("orthoglide", "Mechanical zero"),
+        (root / "tests/robots/fivebar", "motor_a"),
+    ):
+        page = tmp_path / "pages/view.html"
+        code, out, err = orthocal("view", subject, "--html", page)
+        assert (code, out, err) == (0, "", f"Wrote {page}\n")
+        assert expected in page.read_text(encoding="utf-8")
+    code, _, _ = orthocal(
+        "view", tmp_path, "--html", page, "--posture", "x_max", "--exaggerate", "1", "--show", "all"
+    )
+    assert code == 0
+    assert "true scale" in page.read_text(encoding="utf-8")
+
+
+def test_view_says_what_a_picture_needs(orthocal, monkeypatch, tmp_path):
+    monkeypatch.setenv("ORTHOCAL_CHROMIUM", str(tmp_path / "none"))
+    code, _, err = orthocal("view", "orthoglide", "--png", tmp_path / "a.png")
+    assert code == 2
+    assert "a picture needs Chromium, and there is none" in err
+    assert "write the page with --html" in err
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_view_says_when_a_browser_takes_no_picture(orthocal, monkeypatch, tmp_path):
+    monkeypatch.setenv("ORTHOCAL_CHROMIUM", "false")
+    code, _, err = orthocal("view", "orthoglide", "--png", tmp_path / "a.png")
+    assert code == 2
+    assert err.rstrip().endswith("false took no picture")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_calibrate_prints_json_alone_on_stdout(orthocal, experiment):

@@ -27,6 +27,8 @@ def test_the_wheel_holds_robots_and_types(wheel):
     assert "orthocal/_robots/orthoglide/orthoglide.urdf" in names
     assert "orthocal/_robots/orthoglide/orthoglide.yaml" in names
     assert "orthocal/py.typed" in names
+    for name in ("scene.html", "scene.css", "scene.js", "report.css"):
+        assert f"orthocal/output/web/{name}" in names
     assert not [n for n in names if n.startswith(("tests", "examples"))]
 
 
@@ -46,7 +48,7 @@ def test_the_installed_wheel_calibrates_from_elsewhere(wheel, root, tmp_path):
         text = (root / "examples/table1/experiment-2" / name).read_text()
         (session / name).write_text(text)
     done = subprocess.run(
-        [tmp_path / "env/bin/orthocal", "calibrate", "session", "--json"],
+        [tmp_path / "env/bin/orthocal", "calibrate", "session", "--json", "--out", "out"],
         cwd=elsewhere,
         capture_output=True,
         text=True,
@@ -55,6 +57,7 @@ def test_the_installed_wheel_calibrates_from_elsewhere(wheel, root, tmp_path):
     document = json.loads(done.stdout)
     assert document["parameters"][0]["value"] == pytest.approx(-0.5268e-3, abs=5e-6)
     assert document["robot"]["folder"] is None
+    assert (elsewhere / "out/report.html").stat().st_size > 1e6
     where = subprocess.run(
         [python, "-c", "import orthocal; print(orthocal.__file__)"],
         cwd=elsewhere,
