@@ -166,8 +166,8 @@ def _explain_trust(calibration: Calibration) -> list[str]:
         sentences.append(
             f"± σ is what the scatter leaves open. Errors of legs and axes within their tolerances "
             f"would move the offsets by ±{mm(worst)} mm more: these are the offsets that make up "
-            "for them best in the postures measured. What is left of that at the tool is in the "
-            "table above."
+            "for them best in the postures measured. What is left of that at the tool is "
+            "'not known after' there."
         )
     k = calibration.confidence_factor
     if math.isinf(k) or math.isnan(calibration.sigma) or calibration.noise.source == "gauge":

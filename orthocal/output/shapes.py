@@ -252,3 +252,8 @@ def draw_axes(scene: Scene, path: str, *, length: float) -> None:
         scene.labels.append(
             Label(to_triple(1.12 * length * direction), (name,), f"{path}/{name}", rank=-1.0)
         )
+
+
+def css(colour: Colour) -> str:
+    """A colour as a page has it."""
+    return "#" + "".join(f"{round(255 * c):02x}" for c in colour)

@@ -306,7 +306,7 @@ def render_controller(calibration: Calibration) -> RenderableType:
         notes.append(
             Text(
                 "The other parameters need a controller with a model of the machine. What offsets "
-                "alone leave stands above, as 'with the offsets entered'."
+                "alone leave at the tool is 'with the offsets entered' there."
             )
         )
     return Group(table, *notes)

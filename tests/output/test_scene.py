@@ -16,7 +16,7 @@ from orthocal.identification.calibration_file import load_calibration
 from orthocal.measurement.session import DIRECTIONS
 from orthocal.measurement.session_file import load_plan
 from orthocal.measurement.synthetic import simulate_session
-from orthocal.output import drawing
+from orthocal.output import drawing, readings, stage, tool_errors
 from orthocal.output.deviations import measure_deviations
 from orthocal.output.motion import FRAMES_A_SECOND
 from orthocal.output.scene import round_scale
@@ -67,7 +67,7 @@ def links(scene, machine):
 def arrow_length(scene, path):
     """From the foot of an arrow to the tip of its head, along it."""
     shaft, head = scene.pose(f"{path}/shaft"), scene.pose(f"{path}/head")
-    width = 0.28 * dial(scene)
+    width = readings.arrow_width(dial(scene))
     assert np.isclose(shaft[2, 2], head[2, 3], atol=1e-8)
     return head[2, 3] + head[2, 2] * head_length(width)
 
@@ -191,7 +191,7 @@ def test_offsets_that_are_active_are_in_the_ghost(root):
 def test_leg_lines_go_from_root_to_tip(scene, calibration):
     """Through what is drawn: both ends belong to links that are."""
     root = world(scene, f"{drawing.SOLID}/x_yoke")[:3, 3]
-    line = scene.pose(f"{drawing.LINES}/leg x")
+    line = scene.pose(f"{stage.LINES}/leg x")
     assert line[:3, 3] == pytest.approx(root, abs=KINEMATICS)
     assert np.linalg.norm(line[:3, 2]) == pytest.approx(
         calibration.robot.legs["x"].length, abs=1e-3
@@ -202,11 +202,11 @@ def test_leg_lines_go_from_root_to_tip(scene, calibration):
 
 
 def test_arrows_are_as_long_as_the_residuals(scene, calibration):
-    assert set(drawing.BEFORE + "/" + r.setup for r in calibration.residuals) == {
-        p.rsplit("/", 1)[0] for p in scene.nodes if p.startswith(drawing.BEFORE)
+    assert set(readings.BEFORE + "/" + r.setup for r in calibration.residuals) == {
+        p.rsplit("/", 1)[0] for p in scene.nodes if p.startswith(readings.BEFORE)
     }
     for row in calibration.residuals:
-        for node, value in ((drawing.BEFORE, row.deviation), (drawing.AFTER, row.residual)):
+        for node, value in ((readings.BEFORE, row.deviation), (readings.AFTER, row.residual)):
             path = f"{node}/{row.setup}"
             assert arrow_length(scene, path) == pytest.approx(value * scene.arrow_scale, abs=1e-9)
             setup = next(s for s in calibration.setups if s.name == row.setup)
@@ -227,15 +227,15 @@ def test_arrow_that_is_shorter_than_its_head_is_a_smaller_head():
 
 def test_gauges_touch_the_leg_at_their_section(scene, calibration):
     for setup in calibration.setups:
-        tip = scene.pose(f"{drawing.GAUGES}/{setup.name}")[:3, 3]
-        line = scene.pose(f"{drawing.LINES}/leg {setup.leg}")
+        tip = scene.pose(f"{readings.GAUGES}/{setup.name}")[:3, 3]
+        line = scene.pose(f"{stage.LINES}/leg {setup.leg}")
         along = line[:3, 2] / np.linalg.norm(line[:3, 2])
         off = tip - line[:3, 3]
         assert np.linalg.norm(off - (off @ along) * along) < KINEMATICS
         leg = calibration.robot.legs[setup.leg]
         plane = leg.axis @ leg.zero_root + setup.section_value * leg.length
         assert leg.axis @ tip == pytest.approx(plane, abs=KINEMATICS)
-        stem = scene.pose(f"{drawing.GAUGES}/{setup.name}")[:3, 2]
+        stem = scene.pose(f"{readings.GAUGES}/{setup.name}")[:3, 2]
         assert stem == pytest.approx(np.array(DIRECTIONS[setup.direction]))
 
 
@@ -255,7 +255,7 @@ def test_of_many_gauges_the_overview_names_the_worst(full):
     assert len(named) == 6
     worst = max(full.residuals, key=lambda r: abs(r.deviation))
     assert worst.setup in named
-    assert len({p.split("/")[1] for p in scene.nodes if p.startswith(drawing.GAUGES)}) == 18
+    assert len({p.split("/")[1] for p in scene.nodes if p.startswith(readings.GAUGES)}) == 18
 
 
 @pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles", "lines", "sweep"])
@@ -276,7 +276,7 @@ def test_session_alone_shows_the_nominal_machine_and_what_was_seen(raw_cycles):
     scene = draw_scene(raw_cycles)
     assert links(scene, drawing.MACHINE)
     assert not links(scene, drawing.SOLID)
-    assert not [p for p in scene.nodes if p.startswith(drawing.AFTER)]
+    assert not [p for p in scene.nodes if p.startswith(readings.AFTER)]
     worst = max(measure_deviations(raw_cycles), key=lambda d: abs(d.before))
     assert f"{abs(worst.before) * 1e3:.3f} mm" in scene.headline
 
@@ -284,7 +284,7 @@ def test_session_alone_shows_the_nominal_machine_and_what_was_seen(raw_cycles):
 def test_plan_shows_where_gauges_will_stand(root):
     scene = draw_scene(load_plan(root / "examples/lines/plan.yaml"))
     assert scene.headline == "A plan: 270 readings in 135 postures, none taken yet."
-    assert not [p for p in scene.nodes if p.startswith(drawing.BEFORE)]
+    assert not [p for p in scene.nodes if p.startswith(readings.BEFORE)]
     assert {label.texts[0] for label in scene.labels if label.rank >= 0.0} == {
         *("yx", "zx", "xy", "zy", "xz", "yz")
     }
@@ -330,11 +330,11 @@ def test_animation_is_at_every_posture_when_its_step_says_so(full):
 def test_arrows_follow_the_readings_of_every_posture(raw_cycles):
     found = calibrate(raw_cycles)
     scene = draw_scene(found)
-    tracks, head = animation(scene), head_length(0.28 * dial(scene))
+    tracks, head = animation(scene), head_length(readings.arrow_width(dial(scene)))
     step = next(s for s in scene.steps if s.name == "y_min")
     for setup in ("xy", "zy", "yx"):
         rows = [r for r in found.residuals if r.setup == setup and r.posture == "y_min"]
-        for node, kind in ((drawing.BEFORE, "deviation"), (drawing.AFTER, "residual")):
+        for node, kind in ((readings.BEFORE, "deviation"), (readings.AFTER, "residual")):
             mean = np.mean([getattr(r, kind) for r in rows]) if rows else 0.0
             track = tracks[f"{node}/{setup}/head"]
             k = np.flatnonzero(np.isclose(track["position"][0], step.start))[0]
@@ -371,8 +371,8 @@ def test_errors_of_the_tool_are_those_of_the_calibration(full):
     scene = draw_scene(full, show="tool")
     found = assess_tool(full, cube(full.robot, points_a_side=3))
     for node, deviation in (
-        (drawing.TOOL_NOW, found.deviation),
-        (drawing.TOOL_LEFT, found.left),
+        (tool_errors.TOOL_NOW, found.deviation),
+        (tool_errors.TOOL_LEFT, found.left),
     ):
         for i in (0, 13, 26):
             pose = scene.pose(f"{node}/point {i + 1}")
@@ -383,7 +383,7 @@ def test_errors_of_the_tool_are_those_of_the_calibration(full):
             width = head_length(0.006 * np.ptp(scene.camera.points, axis=0).max())
             length = head[2, 3] + head[2, 2] * width
             assert length == pytest.approx(size * scene.tool_scale, rel=1e-3)
-    ball = scene.pose(f"{drawing.TOOL_UNKNOWN}/point 5")[:3, :3]
+    ball = scene.pose(f"{tool_errors.TOOL_UNKNOWN}/point 5")[:3, :3]
     assert ball @ ball.T == pytest.approx(
         scene.tool_scale**2 * found.after.covariance[4], rel=1e-6, abs=1e-16
     )
@@ -397,9 +397,9 @@ def test_what_is_shown_at_first_can_be_chosen(calibration):
             if c["type"] == "set_property" and c["property"] == "visible" and not c["value"]
         }
 
-    assert hidden(draw_scene(calibration)) == {drawing.TOOL_NOW, drawing.TOOL_UNKNOWN}
+    assert hidden(draw_scene(calibration)) == {tool_errors.TOOL_NOW, tool_errors.TOOL_UNKNOWN}
     assert hidden(draw_scene(calibration, show="tool")) == {
-        *(drawing.GAUGES, drawing.BEFORE, drawing.AFTER)
+        *(readings.GAUGES, readings.BEFORE, readings.AFTER)
     }
     assert hidden(draw_scene(calibration, show="all")) == set()
     with pytest.raises(ParameterError, match="'everything' is none of readings, tool, all"):
@@ -470,7 +470,7 @@ def test_names_of_strangers_cannot_leave_the_data(raw_cycles):
     page = scene.to_html()
     assert page.lower().count("</script>") == draw_scene(raw_cycles).to_html().count("</script>")
     assert "<img" not in page
-    gauges = {p.split("/")[1] for p in scene.nodes if p.startswith(drawing.GAUGES)}
+    gauges = {p.split("/")[1] for p in scene.nodes if p.startswith(readings.GAUGES)}
     assert len(gauges) == len(names)
     assert "<img" not in scene._repr_html_()
 

@@ -1,0 +1,268 @@
+"""Gauges in a scene, arrows as long as what they read, labels, and which leg is not parallel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.measurement.session import DIRECTIONS, Setup, section_plane
+from orthocal.output.deviations import Deviation, Measurement, Stop, worst_of_setups
+from orthocal.output.layout import signed
+from orthocal.output.motion import Film, Timeline
+from orthocal.output.scene import Label, LegendEntry, Scene, Step, round_scale
+from orthocal.output.shapes import (
+    Colour,
+    arrow_parts,
+    css,
+    draw_arrow,
+    draw_gauge,
+    to_triple,
+)
+from orthocal.output.stage import VIEW, Stage
+
+Array = NDArray[np.float64]
+
+GAUGES = "Gauges"
+BEFORE = "Readings before"
+AFTER = "Readings after"
+
+BEFORE_COLOUR: Colour = (0.93, 0.62, 0.0)
+AFTER_COLOUR: Colour = (0.0, 0.40, 0.72)
+GAUGE_COLOUR: Colour = (0.16, 0.17, 0.2)
+
+LONGEST_ARROW = 0.16
+"""Part of the machine's size that the longest arrow at a gauge is drawn as."""
+
+DIAL = 0.034
+"""Part of the machine's size that a dial's radius is drawn as, where there are not too many."""
+
+MANY_GAUGES = 9
+"""Gauges above which they are drawn smaller."""
+
+MOST_LABELS = 8
+"""Gauges above which the overview names the worst of each leg and direction only."""
+
+NOTHING = 1e-9
+"""Deviations below this are none, [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Kind:
+    """Arrows of what was read before, or of what is left after."""
+
+    node: str
+    colour: Colour
+    side: float
+    """Which side of the gauge they stand on, along the leg: -1 or 1."""
+
+    def length(self, row: Deviation | None) -> float:
+        """What the arrow stands for, [m]."""
+        if row is None:
+            return 0.0
+        return row.before if self.node == BEFORE else (row.after or 0.0)
+
+
+def draw_readings(
+    stage: Stage,
+    measured: Measurement,
+    stops: Sequence[Stop],
+    timeline: Timeline,
+    poses: Mapping[str, Array],
+    film: Film,
+    *,
+    shown: bool = True,
+) -> None:
+    """Gauges, and arrows and labels for what they read at every stop.
+
+    Args:
+        stage: The robot's scene.
+        measured: What was read.
+        stops: Where the machine stops.
+        timeline: When it does.
+        poses: Frame to its poses as they are drawn, shape (F, 4, 4), [m].
+        film: Takes how arrows change.
+        shown: Whether all of this is shown at first.
+    """
+    scene = stage.scene
+    used = [measured.setups[name] for name in dict.fromkeys(r.setup for r in measured.rows)]
+    kinds = _find_kinds(measured)
+    longest = max(abs(k.length(r)) for k in kinds for r in measured.rows) if kinds else 0.0
+    if longest > NOTHING:
+        scene.arrow_scale = round_scale(LONGEST_ARROW * stage.size / longest)
+    dial = DIAL * stage.size * min(1.0, math.sqrt(MANY_GAUGES / max(len(used), 1)))
+    overview = len(stops) > 1
+    named = _named_setups(used, measured)
+    for setup in used:
+        rows = [next((r for r in s.rows if r.setup == setup.name), None) for s in stops]
+        contact = _find_contact(stage, setup, poses)
+        direction = np.array(DIRECTIONS[setup.direction])
+        gauge = f"{GAUGES}/{_node(setup.name)}"
+        draw_gauge(scene, gauge, contact, direction, _facing(direction), dial)
+        tips = [contact for _ in rows]
+        for kind in kinds:
+            foot = contact + kind.side * 0.42 * dial * stage.robot.legs[setup.leg].axis
+            lengths = [kind.length(row) * scene.arrow_scale for row in rows]
+            path = f"{kind.node}/{_node(setup.name)}"
+            width = arrow_width(dial)
+            draw_arrow(
+                scene,
+                path,
+                foot,
+                direction,
+                length=lengths[0],
+                width=width,
+                colour=kind.colour,
+            )
+            _film_arrow(film, path, timeline, lengths, width)
+            if kind.node == BEFORE:
+                tips = [foot + v * direction for v in lengths]
+        silent = overview and setup.name not in named
+        texts = [
+            "" if row is None or (silent and stop is stops[0]) else _label(row, measured)
+            for row, stop in zip(rows, stops, strict=True)
+        ]
+        scene.labels.append(
+            Label(
+                to_triple(contact),
+                tuple(texts),
+                gauge,
+                rank=max(abs(r.before) for r in measured.rows if r.setup == setup.name),
+                uncovered=tuple(to_triple(tip) for tip in tips),
+            )
+        )
+    _explain(scene, len(kinds), shown)
+    captions = [_caption(s, measured, overview=overview and s is stops[0]) for s in stops]
+    write_steps(scene, stops, timeline, captions)
+
+
+def arrow_width(dial: float) -> float:
+    """Width of the arrows at a gauge whose dial has a radius, [m]."""
+    return 0.28 * dial
+
+
+def _find_kinds(measured: Measurement) -> tuple[_Kind, ...]:
+    before, after = _Kind(BEFORE, BEFORE_COLOUR, -1.0), _Kind(AFTER, AFTER_COLOUR, 1.0)
+    if measured.planned:
+        return ()
+    return (before, after) if any(r.after is not None for r in measured.rows) else (before,)
+
+
+def _named_setups(used: Sequence[Setup], measured: Measurement) -> set[str]:
+    """Setups that the overview names: of many the worst of each leg and direction."""
+    if len(used) <= MOST_LABELS:
+        return {s.name for s in used}
+    worst: dict[tuple[str, str], Deviation] = {}
+    for row in worst_of_setups(measured.rows):
+        setup = measured.setups[row.setup]
+        key = (setup.leg, setup.direction.strip("-"))
+        if key not in worst or abs(row.before) > abs(worst[key].before):
+            worst[key] = row
+    return {row.setup for row in worst.values()}
+
+
+def _find_contact(stage: Stage, setup: Setup, poses: Mapping[str, Array]) -> Array:
+    """Where the gauge touches the leg's line as it is drawn in the first frame, shape (3,), [m]."""
+    leg = stage.robot.legs[setup.leg]
+    plane, from_root = section_plane(stage.robot, setup)
+    if from_root:
+        plane = plane + float(leg.axis @ leg.zero_root)
+    root, tip = (poses[frame][0][:3, 3] for frame in (leg.root, leg.tip))
+    along = (plane - leg.axis @ root) / (leg.axis @ (tip - root))
+    return np.asarray(root + along * (tip - root))
+
+
+def _facing(direction: Array) -> Array:
+    """Way along an axis of the world across a direction that the camera sees best, shape (3,)."""
+    view = np.where(np.abs(direction) > 0.5, 0.0, VIEW)
+    axis = int(np.abs(view).argmax())
+    return np.asarray(np.eye(3)[axis] * np.sign(view[axis]))
+
+
+def _film_arrow(
+    film: Film, path: str, timeline: Timeline, lengths: Sequence[float], width: float
+) -> None:
+    """Let an arrow have its length at every stop, and change it between."""
+    times = np.array([timeline.times[f + k] for f in timeline.stops for k in (0, 1)])
+    parts = [arrow_parts(v, width) for v in lengths for _ in (0, 1)]
+    shafts, heads = np.array([p.shaft for p in parts]), np.array([p.head for p in parts])
+    feet = np.array([[0.0, 0.0, p.foot] for p in parts])
+    film.track(f"{path}/shaft", "scale", "vector3", times, shafts)
+    film.track(f"{path}/head", "position", "vector3", times, feet)
+    film.track(f"{path}/head", "scale", "vector3", times, heads)
+
+
+def _label(row: Deviation, measured: Measurement) -> str:
+    if measured.planned:
+        return row.setup
+    after = "" if row.after is None else f" → {_mm(row.after)}"
+    return f"{row.setup} {_mm(row.before)}{after} mm\n{row.where}"
+
+
+def _caption(stop: Stop, measured: Measurement, *, overview: bool) -> str:
+    if overview:
+        return (
+            "Overview at the zero: where the gauges will stand"
+            if measured.planned
+            else "Overview at the zero: the largest deviation that each gauge saw"
+        )
+    if not stop.rows:
+        return f"{stop.name}: nothing read here"
+    legs = ", ".join(sorted({measured.setups[r.setup].leg for r in stop.rows}))
+    readings = "; ".join(_label(r, measured).split("\n")[0] for r in stop.rows)
+    return f"{stop.name}, leg {legs}: {readings}"
+
+
+def _explain(scene: Scene, kinds: int, shown: bool) -> None:
+    """Legend and scale of gauges and of so many kinds of arrows at them."""
+    scene.explain(LegendEntry("Gauges", (GAUGES,), css(GAUGE_COLOUR), "solid", shown))
+    if kinds == 0:
+        return
+    scene.explain(
+        LegendEntry("Before: measured − nominal", (BEFORE,), css(BEFORE_COLOUR), "arrow", shown)
+    )
+    if kinds == 2:
+        text = "After: measured − calibrated"
+        scene.explain(LegendEntry(text, (AFTER,), css(AFTER_COLOUR), "arrow", shown))
+    scene.facts.insert(-1, f"Arrows at the gauges: × {scene.arrow_scale:g}.")
+
+
+def write_headline(measured: Measurement) -> str:
+    """Which leg is not parallel, by how much, where; and after the calibration."""
+    worst = max(measured.rows, key=lambda r: abs(r.before))
+    if measured.planned:
+        postures = len({r.posture for r in measured.rows})
+        return f"A plan: {len(measured.rows)} readings in {postures} postures, none taken yet."
+    if abs(worst.before) < NOTHING:
+        return "All legs are parallel to their axes: no gauge has seen anything."
+    leg = measured.setups[worst.setup].leg
+    text = (
+        f"Leg {leg} is furthest from parallel: {_mm(worst.before)} mm at gauge "
+        f"{worst.setup}, {worst.where}."
+    )
+    if worst.after is None:
+        return text
+    largest = max(abs(r.after) for r in measured.rows if r.after is not None)
+    return (
+        f"{text} Calibrated: {_mm(worst.after)} mm there, at most {largest * 1e3:.3f} mm anywhere."
+    )
+
+
+def write_steps(
+    scene: Scene, stops: Sequence[Stop], timeline: Timeline, captions: Sequence[str]
+) -> None:
+    """Say when the animation stops where, and what is to be seen there."""
+    for i, (stop, caption) in enumerate(zip(stops, captions, strict=True)):
+        scene.steps.append(Step(stop.name, caption, *timeline.interval(i)))
+
+
+def _mm(value: float) -> str:
+    return signed(value * 1e3).replace("-", "−")
+
+
+def _node(name: str) -> str:
+    """A setup's name as a node's: a slash would be a level."""
+    return name.replace("/", "∕")

@@ -1,0 +1,102 @@
+"""Errors of the tool in a scene: now, with the offsets entered, and what is not known of them."""
+
+from __future__ import annotations
+
+import math
+
+import meshcat.geometry as g
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.errors import ClosureError
+from orthocal.identification.calibration import Calibration
+from orthocal.output.layout import um
+from orthocal.output.scene import LegendEntry, Scene, round_scale
+from orthocal.output.shapes import Colour, css, draw_arrow, material
+from orthocal.output.stage import Stage
+from orthocal.study.accuracy import ToolAccuracy, assess_tool, cube
+
+Array = NDArray[np.float64]
+
+TOOL_NOW = "Tool error now"
+TOOL_LEFT = "Tool error, offsets entered"
+TOOL_UNKNOWN = "Tool error, not known"
+
+NOW_COLOUR: Colour = (0.84, 0.37, 0.0)
+LEFT_COLOUR: Colour = (0.25, 0.62, 0.90)
+UNKNOWN_COLOUR: Colour = (0.45, 0.40, 0.65)
+
+LONGEST_ARROW = 0.08
+"""Part of the machine's size that the largest error of the tool is drawn as."""
+
+ARROW_WIDTH = 0.006
+"""The same for the width of arrows."""
+
+VANISHING = 1e-7
+"""Errors of the tool below this are not drawn, [m]."""
+
+
+def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> None:
+    """Where the tool goes instead of where it is sent, now and with the offsets entered."""
+    scene, robot = stage.scene, calibration.robot
+    if robot.tcp is None:
+        return
+    try:
+        found = assess_tool(calibration, cube(robot, points_a_side=3))
+    except ClosureError:
+        scene.facts.append("Errors of the tool: the cube of ±60 mm is out of reach.")
+        return
+    unknown = None if found.after is None else found.after.covariance
+    now, left = (np.linalg.norm(d, axis=1).max() for d in (found.deviation, found.left))
+    spread = 0.0 if unknown is None else math.sqrt(np.linalg.eigvalsh(unknown).max())
+    largest = max(float(now), float(left), spread)
+    if largest < VANISHING:
+        return
+    scene.tool_scale = round_scale(LONGEST_ARROW * stage.size / largest)
+    width = ARROW_WIDTH * stage.size
+    for node, deviations, colour in (
+        (TOOL_NOW, found.deviation, NOW_COLOUR),
+        (TOOL_LEFT, found.left, LEFT_COLOUR),
+    ):
+        _draw_deviations(scene, node, found, deviations, colour, width)
+    text = f"Tool now: up to {um(float(now))} µm off"
+    scene.explain(LegendEntry(text, (TOOL_NOW,), css(NOW_COLOUR), "arrow", shown))
+    if left > VANISHING:
+        text = f"Tool with the offsets entered: up to {um(float(left))} µm off"
+        scene.explain(LegendEntry(text, (TOOL_LEFT,), css(LEFT_COLOUR), "arrow", shown))
+    if unknown is not None:
+        _draw_ellipsoids(scene, found, unknown)
+        text = f"Tool: not known, one σ: up to {um(spread)} µm"
+        scene.explain(LegendEntry(text, (TOOL_UNKNOWN,), css(UNKNOWN_COLOUR), "ball", shown))
+    scene.facts.insert(-1, f"Errors of the tool, over ±60 mm: × {scene.tool_scale:g}.")
+
+
+def _draw_deviations(
+    scene: Scene, node: str, found: ToolAccuracy, deviations: Array, colour: Colour, width: float
+) -> None:
+    for i, (target, deviation) in enumerate(zip(found.targets, deviations, strict=True)):
+        length = float(np.linalg.norm(deviation))
+        if length > VANISHING:
+            draw_arrow(
+                scene,
+                f"{node}/point {i + 1}",
+                target,
+                deviation / length,
+                length=length * scene.tool_scale,
+                width=width,
+                colour=colour,
+            )
+
+
+def _draw_ellipsoids(scene: Scene, found: ToolAccuracy, covariances: Array) -> None:
+    """One standard deviation of the tool's position, around where it is taken to be at best."""
+    for i, (target, covariance) in enumerate(zip(found.targets, covariances, strict=True)):
+        values, vectors = np.linalg.eigh(covariance)
+        if np.linalg.det(vectors) < 0.0:
+            vectors[:, 0] = -vectors[:, 0]
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = vectors, target
+        radii = scene.tool_scale * np.sqrt(np.maximum(values, 1e-18))
+        path = f"{TOOL_UNKNOWN}/point {i + 1}"
+        scene.add(path, g.Sphere(1.0), material(UNKNOWN_COLOUR, opacity=0.3))
+        scene.place(path, pose @ np.diag([*radii, 1.0]))
