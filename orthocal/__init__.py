@@ -14,18 +14,18 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Calibration": "orthocal.identification.calibration",
-    "LiveScene": "orthocal.output.live",
+    "LiveScene": "orthocal.output.view.live",
     "Loss": "orthocal.identification.loss",
     "OrthocalError": "orthocal.errors",
     "Robot": "orthocal.robot.model",
-    "Scene": "orthocal.output.scene",
+    "Scene": "orthocal.output.view.scene",
     "Session": "orthocal.measurement.session",
     "SolverOptions": "orthocal.identification.nlp",
     "assess_tool": "orthocal.study.accuracy",
     "calibrate": "orthocal.identification.calibrate",
     "compare_models": "orthocal.study.comparison",
     "draw_errors": "orthocal.measurement.synthetic",
-    "draw_scene": "orthocal.output.drawing",
+    "draw_scene": "orthocal.output.view.drawing",
     "load_calibration": "orthocal.identification.calibration_file",
     "load_plan": "orthocal.measurement.session_file",
     "load_robot": "orthocal.robot.loading",
@@ -33,7 +33,7 @@ _HOMES = {
     "simulate_session": "orthocal.measurement.synthetic",
     "summarize": "orthocal.output.summary",
     "validate_calibration": "orthocal.study.validation",
-    "write_report": "orthocal.output.report",
+    "write_report": "orthocal.output.report.page",
     "write_session": "orthocal.measurement.session_file",
 }
 
@@ -72,11 +72,11 @@ if TYPE_CHECKING:
     from orthocal.measurement.session import Session
     from orthocal.measurement.session_file import load_plan, load_session, write_session
     from orthocal.measurement.synthetic import draw_errors, simulate_session
-    from orthocal.output.drawing import draw_scene
-    from orthocal.output.live import LiveScene
-    from orthocal.output.report import write_report
-    from orthocal.output.scene import Scene
+    from orthocal.output.report.page import write_report
     from orthocal.output.summary import summarize
+    from orthocal.output.view.drawing import draw_scene
+    from orthocal.output.view.live import LiveScene
+    from orthocal.output.view.scene import Scene
     from orthocal.robot.loading import load_robot
     from orthocal.robot.model import Robot
     from orthocal.study.accuracy import assess_tool

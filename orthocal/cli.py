@@ -16,7 +16,7 @@ import orthocal
 from orthocal.errors import OrthocalError, ParameterError, SessionError
 
 if TYPE_CHECKING:
-    from orthocal.output.scene import Scene
+    from orthocal.output.view.scene import Scene
 
 app = typer.Typer(
     add_completion=False,
@@ -185,7 +185,7 @@ def calibrate(
     else:
         print_summary(result, all_rows=all_rows)
     if out is not None:
-        from orthocal.output.report import build_report
+        from orthocal.output.report.page import build_report
 
         # the report first: both are there, or none
         files = {"report.html": build_report(result), "calibration.json": result.to_json()}
@@ -367,7 +367,7 @@ def report(
     """Write a calibration as one page: what to enter, how far to believe it, and why."""
     from orthocal.documents import is_folder, require_writable_file
     from orthocal.identification.calibration_file import load_calibration
-    from orthocal.output.report import write_report
+    from orthocal.output.report.page import write_report
 
     result = load_calibration(calibration)
     folder = Path() if result.path is None else result.path.parent
@@ -421,9 +421,9 @@ def view(
     Without --html and --png on a server that only this machine reaches, until Ctrl-C.
     """
     from orthocal.documents import require_writable_file
-    from orthocal.output.browser import find_chromium, parse_size, take_picture
-    from orthocal.output.drawing import draw_scene
     from orthocal.output.subject import load_subject
+    from orthocal.output.view.browser import find_chromium, parse_size, take_picture
+    from orthocal.output.view.drawing import draw_scene
 
     width, height = parse_size(size)
     for path in (html, png):
@@ -510,7 +510,7 @@ def _globs(texts: list[str] | None) -> list[str]:
 
 def _serve(scene: Scene, port: int | None, browse: bool) -> None:
     """Show a scene until Ctrl-C."""
-    from orthocal.output.live import LiveScene
+    from orthocal.output.view.live import LiveScene
 
     with LiveScene(scene, port=port) as live:
         _out(live.url)

@@ -27,8 +27,9 @@ def test_the_wheel_holds_robots_and_types(wheel):
     assert "orthocal/_robots/orthoglide/orthoglide.urdf" in names
     assert "orthocal/_robots/orthoglide/orthoglide.yaml" in names
     assert "orthocal/py.typed" in names
-    for name in ("scene.html", "scene.css", "scene.js", "report.css"):
-        assert f"orthocal/output/web/{name}" in names
+    for name in ("view/web/scene.html", "view/web/scene.css", "view/web/scene.js"):
+        assert f"orthocal/output/{name}" in names
+    assert "orthocal/output/report/report.css" in names
     assert not [n for n in names if n.startswith(("tests", "examples"))]
 
 

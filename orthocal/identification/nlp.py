@@ -40,8 +40,8 @@ CONVERGED = frozenset({"Solve_Succeeded"})
 
 
 COMPLEMENTARITY = 1e-11
-"""Multiplier of a bound times the distance to it, both scaled, at most. What lies within the root of
-that of a bound which does not hold it would be said to be held: 16 nm of an offset of 5 mm."""
+"""Multiplier of a bound times the distance to it, both scaled, at most. A parameter within the root
+of that of its bound is said to be held by it, whether it is or not: 16 nm of an offset of 5 mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

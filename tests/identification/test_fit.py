@@ -68,6 +68,18 @@ def test_bounds_that_do_not_bind_change_nothing(session):
         assert b.at_bound is None
 
 
+def test_a_parameter_beside_its_bound_is_not_held_by_it(experiment_2):
+    """y is best at −0.0948 mm while x and z are held: 5 µm from a bound that does not hold it."""
+    narrow = calibrate(experiment_2, bounds={"*.offset": (-1e-4, 1e-4)})
+    others = {f"{k}_slide.offset": (-1e-4, 1e-4) for k in "xz"}
+    free = calibrate(experiment_2, bounds=others)
+    assert [p.at_bound for p in narrow.free] == ["lower", None, "lower"]
+    found, expected = narrow["y_slide.offset"], free["y_slide.offset"]
+    assert found.value == pytest.approx(expected.value, abs=1e-8)
+    assert found.std == pytest.approx(expected.std, rel=1e-4)
+    assert 0.0 < found.value + 1e-4 < 1e-5
+
+
 def test_a_known_value_with_its_tolerance_is_weighed_with_the_readings(session):
     """Precisions add: the hand-made mean of what the readings and the drawing say."""
     alone = fit_problem(build_problem(session, free=["*.offset"]))

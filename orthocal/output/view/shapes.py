@@ -9,7 +9,7 @@ import meshcat.geometry as g
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.output.scene import Label, Scene
+from orthocal.output.view.scene import Label, Scene
 
 Array = NDArray[np.float64]
 Colour = tuple[float, float, float]

@@ -282,4 +282,4 @@ def round_scale(value: float) -> float:
 
 
 def _read(name: str) -> str:
-    return (resources.files("orthocal.output") / "web" / name).read_text(encoding="utf-8")
+    return (resources.files("orthocal.output.view") / "web" / name).read_text(encoding="utf-8")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthocal.documents import read_text
 from orthocal.errors import RobotError
-from orthocal.output.shapes import Colour, cylinder, pose_along
+from orthocal.output.view.shapes import Colour, cylinder, pose_along
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]

@@ -15,20 +15,17 @@ from orthocal.errors import ClosureError, OrthocalError
 from orthocal.identification.calibration import Calibration
 from orthocal.markup import heading, paragraph, table
 from orthocal.output.accuracy import render_accuracy
-from orthocal.output.drawing import draw_scene
 from orthocal.output.explanation import explain_fit
 from orthocal.output.layout import bullets, mm, plain, signed
-from orthocal.output.plots import (
+from orthocal.output.report.parameter_plots import (
     plot_correlations,
     plot_linearised,
     plot_parameters,
-    plot_residuals,
-    plot_setups,
     plot_singular_values,
-    plot_spread,
 )
-from orthocal.output.rich_markup import to_markup
-from orthocal.output.scene import frame_of
+from orthocal.output.report.reading_plots import plot_residuals, plot_setups, plot_spread
+from orthocal.output.report.rich_markup import to_markup
+from orthocal.output.report.tool_map import Field, plot_tool_map
 from orthocal.output.tables import (
     render_controller,
     render_fit,
@@ -37,7 +34,8 @@ from orthocal.output.tables import (
     render_parameters,
     render_residuals,
 )
-from orthocal.output.tool_map import Field, plot_tool_map
+from orthocal.output.view.drawing import draw_scene
+from orthocal.output.view.scene import frame_of
 from orthocal.study.accuracy import HALF_SIDE, ToolAccuracy, assess_tool
 
 FEW_ROWS = 40
@@ -74,7 +72,7 @@ def build_report(calibration: Calibration) -> str:
         f'<section id="{name}">{heading(words)}{content}</section>'
         for name, words, content in sections
     )
-    style = (resources.files("orthocal.output") / "web" / "report.css").read_text(encoding="utf-8")
+    style = (resources.files("orthocal.output.report") / "report.css").read_text(encoding="utf-8")
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -129,7 +127,8 @@ def _maps(calibration: Calibration, found: ToolAccuracy) -> str:
     only_offsets = len(calibration.free) <= len(calibration.controller_entries())
     captions: dict[Field, str] = {
         "now": "Where the tool is, less where it is sent, with the controller as it was while "
-        "measuring.",
+        "measuring; the shift that is common to the whole cube is taken out here and below: a "
+        "workpiece is set up where the tool finds it.",
         "left": "The same once the identified offsets are entered, in a controller that knows of "
         "nothing else.",
         "unknown": "What is not known of the tool's position after this calibration: one standard "
@@ -163,7 +162,7 @@ def _fit(calibration: Calibration) -> str:
     parts.append(
         _figure(
             plot_linearised(calibration),
-            "What the paper's linear equations would have given, against the exact solution.",
+            "The solution of the linear equations, as in the paper, against the exact one.",
         )
     )
     return "".join(parts)

@@ -15,8 +15,8 @@ from rich.text import Text
 from orthocal import calibrate, load_calibration, load_session
 from orthocal.markup import items, paragraph, table
 from orthocal.output.layout import add_row, bullets, section, table_of
-from orthocal.output.report import build_report
-from orthocal.output.rich_markup import to_markup
+from orthocal.output.report.page import build_report
+from orthocal.output.report.rich_markup import to_markup
 
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & $x_{$'
 

@@ -11,7 +11,8 @@ from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 
 from orthocal import calibrate, load_plan, simulate_session
-from orthocal.output import plots, tool_map
+from orthocal.output.report import figure as style
+from orthocal.output.report import tool_map
 from orthocal.robot.model import Tcp
 from orthocal.study.accuracy import Workspace, assess_tool, cube
 
@@ -61,14 +62,16 @@ def maps(table1, accuracy):
 
 def draw(calibration, accuracy, which):
     lines = tool_map._find_grid(accuracy.workspace.points)
-    with plots.house_style():
+    with style.house_style():
         return tool_map._draw_tool_map(calibration, accuracy, which, lines)
 
 
 def with_error(accuracy, function):
     """The accuracy with another deviation: a function of x, y and z in mm, in µm."""
     deviation = np.stack(np.broadcast_arrays(*function(*accuracy.targets.T * 1e3)), axis=1)
-    return replace(accuracy, deviation=deviation * 1e-6)
+    weights = np.zeros(len(deviation))  # no shift is taken out
+    space = replace(accuracy.workspace, weights=weights)
+    return replace(accuracy, deviation=deviation * 1e-6, workspace=space)
 
 
 def contours(axes):
@@ -115,8 +118,9 @@ def test_sizes_are_those_of_the_error_in_question(accuracy):
     def sizes(which):
         return np.linalg.norm(tool_map._error_parts(accuracy, which), axis=1)
 
-    deviation, left = (np.linalg.norm(v, axis=1) for v in (accuracy.deviation, accuracy.left))
-    variance = np.trace(accuracy.after.covariance, axis1=1, axis2=2)
+    found = (accuracy.relative_deviation, accuracy.relative_left)
+    deviation, left = (np.linalg.norm(v, axis=1) for v in found)
+    variance = np.trace(accuracy.after.relative_covariance, axis1=1, axis2=2)
     np.testing.assert_allclose(sizes("now"), deviation * 1e6, rtol=GRID)
     np.testing.assert_allclose(sizes("left"), left * 1e6, rtol=GRID)
     np.testing.assert_allclose(sizes("unknown"), np.sqrt(variance) * 1e6, rtol=GRID)
@@ -180,7 +184,7 @@ def test_labels_of_levels_differ_however_little_the_error_does(table1, accuracy)
     for slope in (1e-7, 1e-5):
         error = with_error(accuracy, lambda x, y, z, a=slope: (1e4 * (1.0 + a * x), 0.0, 0.0 * y))
         figure = draw(table1, error, "now")
-        with plots.house_style():
+        with style.house_style():
             figure.draw_without_rendering()
         bar = [t.get_text() for t in figure.axes[-1].get_xticklabels()]
         assert len(set(bar)) == len(bar) >= 3

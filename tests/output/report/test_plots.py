@@ -15,16 +15,17 @@ import pytest
 from scipy import stats
 
 from orthocal import calibrate, load_session
-from orthocal.output import plots
+from orthocal.output.report import figure as style
+from orthocal.output.report import parameter_plots, reading_plots
 
 PLOTS = (
-    plots.plot_residuals,
-    plots.plot_setups,
-    plots.plot_spread,
-    plots.plot_linearised,
-    plots.plot_parameters,
-    plots.plot_correlations,
-    plots.plot_singular_values,
+    reading_plots.plot_residuals,
+    reading_plots.plot_setups,
+    reading_plots.plot_spread,
+    parameter_plots.plot_linearised,
+    parameter_plots.plot_parameters,
+    parameter_plots.plot_correlations,
+    parameter_plots.plot_singular_values,
 )
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -97,7 +98,7 @@ def drawn(table1, sweep, unknown):
 
 
 def draw(function, *args):
-    with plots.house_style():
+    with style.house_style():
         return function(*args)
 
 
@@ -169,16 +170,16 @@ def test_the_same_calibration_makes_the_same_plots(table1, drawn):
 
 
 def test_what_the_user_set_in_matplotlib_is_neither_used_nor_changed(table1):
-    usual = plots.plot_residuals(table1)
+    usual = reading_plots.plot_residuals(table1)
     with matplotlib.rc_context({"font.size": 20.0, "svg.fonttype": "path", "axes.grid": True}):
         before = dict(matplotlib.rcParams)
-        assert plots.plot_residuals(table1) == usual
+        assert reading_plots.plot_residuals(table1) == usual
         assert dict(matplotlib.rcParams) == before
 
 
 def test_pyplot_is_not_needed():
     code = (
-        "import sys, orthocal.output.plots, orthocal.output.tool_map\n"
+        "import sys, orthocal.output.report.reading_plots, orthocal.output.report.tool_map\n"
         "print('matplotlib.pyplot' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -198,23 +199,23 @@ def test_names_of_strangers_come_out_as_they_are(table1):
         assert "<b>" not in svg
         assert "\x07" not in svg
     assert {"$x_{$ <b>&\"'", "<b>&\"' 机器", "机器 bell "} <= set(
-        texts(plots.plot_residuals(strange))
+        texts(reading_plots.plot_residuals(strange))
     )
-    shown = set(texts(plots.plot_setups(strange)))
+    shown = set(texts(reading_plots.plot_setups(strange)))
     assert {"$x_{$", "<b>&\"'", "机器", "bell "} <= shown
     (long,) = (t for t in shown if t.startswith("nnn"))
     assert long == "n" * 22 + "…" + "n" * 21
-    assert set(names) <= set(texts(plots.plot_parameters(strange)))
-    assert set(names) <= set(texts(plots.plot_correlations(strange)))
+    assert set(names) <= set(texts(parameter_plots.plot_parameters(strange)))
+    assert set(names) <= set(texts(parameter_plots.plot_correlations(strange)))
 
 
 def test_dollars_in_pairs_are_not_mathematics(table1):
     rows = tuple(replace(r, setup="$\\frac{$") for r in table1.residuals)
-    assert "$\\frac{$" in texts(plots.plot_setups(replace(table1, residuals=rows)))
+    assert "$\\frac{$" in texts(reading_plots.plot_setups(replace(table1, residuals=rows)))
 
 
 def test_residuals_are_listed_before_and_after_the_worst_first(table1):
-    figure = draw(plots._draw_residuals, table1, 40)
+    figure = draw(reading_plots._draw_residuals, table1, 40)
     axes = figure.axes[0]
     rows = sorted(table1.residuals, key=lambda r: -abs(r.measured - r.nominal))
     assert row_names(axes) == [r.label for r in rows]
@@ -235,7 +236,7 @@ def test_residuals_are_listed_before_and_after_the_worst_first(table1):
 
 
 def test_markers_in_the_file_are_where_the_deviations_are(table1):
-    root = ElementTree.fromstring(plots.plot_residuals(table1))
+    root = ElementTree.fromstring(reading_plots.plot_residuals(table1))
     found = [e for e in root.iter(f"{SVG}use") if "#e69f00" in e.get("style", "")]
     assert len(found) == 7  # six readings, and one in the legend
     by_height = sorted(found, key=lambda e: float(e.get("y")))[1:]
@@ -252,7 +253,7 @@ def test_the_band_is_two_sigma_of_each_row(table1):
         table1, residuals=tuple(mixed), rows_are_differences=False, sigma=table1.sigma / np.sqrt(2)
     )
     for calibration, word in ((table1, "difference"), (mixed_up, "row")):
-        axes = draw(plots._draw_residuals, calibration, 40).axes[0]
+        axes = draw(reading_plots._draw_residuals, calibration, 40).axes[0]
         (band,) = axes.containers
         assert band.get_label() == f"±2 σ of a {word}"
         rows = sorted(calibration.residuals, key=lambda r: -abs(r.deviation))
@@ -265,26 +266,29 @@ def test_the_band_is_two_sigma_of_each_row(table1):
 
 def test_of_many_readings_the_largest_are_shown_and_that_is_said(sweep, many):
     assert "Readings before and after calibration: the 40 largest of 162" in texts(
-        plots.plot_residuals(sweep)
+        reading_plots.plot_residuals(sweep)
     )
-    figure = draw(plots._draw_residuals, sweep, 7)
+    figure = draw(reading_plots._draw_residuals, sweep, 7)
     assert title(figure).endswith("the 7 largest of 162")
     x, _ = line(figure.axes[0], "before")
     sizes = sorted((abs(r.deviation) * 1e3 for r in sweep.residuals), reverse=True)
     np.testing.assert_allclose(np.abs(x), sizes[:7], atol=UNIT)
-    for plot in (plots.plot_residuals, plots.plot_setups, plots.plot_spread):
+    for name in ("residuals", "setups", "spread"):
+        plot = getattr(reading_plots, f"plot_{name}")
         assert len(plot(many)) < LARGEST
 
 
 def test_cycles_are_named_where_there_are_some(raw, table1):
-    names = row_names(draw(plots._draw_residuals, raw, 40).axes[0])
+    names = row_names(draw(reading_plots._draw_residuals, raw, 40).axes[0])
     assert names[0] == "xz z_min, cycle 2"
     assert all(", cycle " in n for n in names)
-    assert not any("cycle" in n for n in row_names(draw(plots._draw_residuals, table1, 9).axes[0]))
+    assert not any(
+        "cycle" in n for n in row_names(draw(reading_plots._draw_residuals, table1, 9).axes[0])
+    )
 
 
 def test_setups_are_sorted_by_what_the_model_leaves_of_them(raw):
-    figure = draw(plots._draw_setups, raw, 40)
+    figure = draw(reading_plots._draw_setups, raw, 40)
     axes = figure.axes[0]
     names = row_names(axes)
     assert sorted(names) == sorted({r.setup for r in raw.residuals})
@@ -314,26 +318,26 @@ def test_setups_that_no_other_predicts_have_no_such_marker(table1, unknown):
         return replace(row, unseen=np.nan) if row.setup in ("xy", "zy") else row
 
     calibration = replace(table1, residuals=tuple(map(forget, table1.residuals)))
-    axes = draw(plots._draw_setups, calibration, 40).axes[0]
+    axes = draw(reading_plots._draw_setups, calibration, 40).axes[0]
     _, y = line(axes, "predicted")
     names = row_names(axes)
     assert {names[round(v - 0.2)] for v in y} == {"yx", "zx", "xz", "yz"}
-    labels = [a.get_label() for a in draw(plots._draw_setups, unknown, 40).axes[0].lines]
+    labels = [a.get_label() for a in draw(reading_plots._draw_setups, unknown, 40).axes[0].lines]
     assert labels == ["before", "after"]
 
 
 def test_the_worst_of_many_setups_are_shown(sweep):
-    figure = draw(plots._draw_setups, sweep, 5)
+    figure = draw(reading_plots._draw_setups, sweep, 5)
     assert title(figure).endswith("the 5 worst of 18")
     assert len(row_names(figure.axes[0])) == 5
 
 
 def test_setups_without_any_error_stay_on_a_logarithmic_axis(table1):
     rows = tuple(replace(r, predicted=r.measured, nominal=r.measured) for r in table1.residuals)
-    axes = draw(plots._draw_setups, replace(table1, residuals=rows), 40).axes[0]
-    assert (line(axes, "after")[0] == plots.SMALLEST_LENGTH * 1e3).all()
+    axes = draw(reading_plots._draw_setups, replace(table1, residuals=rows), 40).axes[0]
+    assert (line(axes, "after")[0] == reading_plots.SMALLEST_LENGTH * 1e3).all()
     low, high = axes.get_xlim()
-    assert 0.0 < low < plots.SMALLEST_LENGTH * 1e3 < table1.sigma * 1e3 < high
+    assert 0.0 < low < reading_plots.SMALLEST_LENGTH * 1e3 < table1.sigma * 1e3 < high
 
 
 @pytest.mark.parametrize(
@@ -346,24 +350,24 @@ def test_setups_without_any_error_stay_on_a_logarithmic_axis(table1):
     ],
 )
 def test_logarithmic_axes_have_round_ticks_on_both_sides(values, expected):
-    with plots.house_style():
-        axes = plots.open_figure(3.0, "").subplots()
-        plots._scale_log(axes, "x", np.array(values))
+    with style.house_style():
+        axes = style.open_figure(3.0, "").subplots()
+        style.scale_log(axes, "x", np.array(values))
         np.testing.assert_allclose(axes.get_xticks(), expected)
         np.testing.assert_allclose(axes.get_xlim(), [expected[0], expected[-1]])
 
 
 def test_ticks_of_many_decades_do_not_crowd():
-    with plots.house_style():
-        axes = plots.open_figure(3.0, "").subplots()
-        plots._scale_log(axes, "y", np.array([1e-13, 20.0]))
+    with style.house_style():
+        axes = style.open_figure(3.0, "").subplots()
+        style.scale_log(axes, "y", np.array([1e-13, 20.0]))
         assert 5 <= len(axes.get_yticks()) <= 9
         assert axes.get_ylim()[0] < 1e-13
         assert axes.get_ylim()[1] > 20.0
 
 
 def test_residuals_stand_in_order_against_normal_quantiles(raw):
-    axes = draw(plots._draw_spread, raw).axes[0]
+    axes = draw(reading_plots._draw_spread, raw).axes[0]
     x, y = line(axes, "residuals after: 54")
     np.testing.assert_allclose(y, np.sort([r.residual * 1e3 for r in raw.residuals]), atol=UNIT)
     np.testing.assert_allclose(x, stats.norm.ppf((np.arange(54) + 0.5) / 54), atol=QUANTILE)
@@ -372,7 +376,7 @@ def test_residuals_stand_in_order_against_normal_quantiles(raw):
 
 def test_lines_of_the_spread_are_sigma_less_what_was_fitted(table1, raw):
     for calibration in (table1, raw):
-        axes = draw(plots._draw_spread, calibration).axes[0]
+        axes = draw(reading_plots._draw_spread, calibration).axes[0]
         word = "difference" if calibration is table1 else "reading"
         x, y = line(axes, f"σ of a {word}: {calibration.sigma * 1e3:.2g} mm")
         slope = y[1] / x[1]
@@ -384,21 +388,21 @@ def test_lines_of_the_spread_are_sigma_less_what_was_fitted(table1, raw):
             given_y[1] / given_x[1] / slope, given / calibration.sigma, rtol=UNIT
         )
     # where σ is from the residuals, that is their root mean square
-    x, y = line(draw(plots._draw_spread, table1).axes[0], "σ of a difference")
+    x, y = line(draw(reading_plots._draw_spread, table1).axes[0], "σ of a difference")
     np.testing.assert_allclose(y[1] / x[1], table1.rms_after * 1e3, rtol=QUANTILE)
 
 
 def test_differences_count_as_readings_where_both_are(table1):
     rows = [replace(r, minus=None if i else r.minus) for i, r in enumerate(table1.residuals)]
     calibration = replace(table1, residuals=tuple(rows), rows_are_differences=False)
-    _, y = line(draw(plots._draw_spread, calibration).axes[0], "residuals")
+    _, y = line(draw(reading_plots._draw_spread, calibration).axes[0], "residuals")
     own = [r.residual * 1e3 / (np.sqrt(2) if i == 0 else 1.0) for i, r in enumerate(rows)]
     np.testing.assert_allclose(y, np.sort(own), atol=UNIT)
 
 
 def test_of_many_residuals_the_outermost_all_stay(many):
-    x, y = line(draw(plots._draw_spread, many).axes[0], "residuals after: 500 of 12150")
-    assert x.size == plots.MOST_POINTS
+    x, y = line(draw(reading_plots._draw_spread, many).axes[0], "residuals after: 500 of 12150")
+    assert x.size == reading_plots.MOST_POINTS
     values = np.sort([r.residual * 1e3 for r in many.residuals])
     np.testing.assert_allclose(y[:100], values[:100], atol=UNIT)
     np.testing.assert_allclose(y[-100:], values[-100:], atol=UNIT)
@@ -406,13 +410,13 @@ def test_of_many_residuals_the_outermost_all_stay(many):
 
 
 def test_unknown_noise_has_neither_band_nor_line(unknown):
-    assert not draw(plots._draw_residuals, unknown, 40).axes[0].containers
-    assert len(draw(plots._draw_spread, unknown).axes[0].lines) == 1
+    assert not draw(reading_plots._draw_residuals, unknown, 40).axes[0].containers
+    assert len(draw(reading_plots._draw_spread, unknown).axes[0].lines) == 1
 
 
 def test_linearising_is_shown_in_sigma_the_most_first(sweep):
-    shifts = plots._linearisation_shifts(sweep)
-    figure = draw(plots._draw_linearised, shifts)
+    shifts = parameter_plots._linearisation_shifts(sweep)
+    figure = draw(parameter_plots._draw_linearised, shifts)
     axes = figure.axes[0]
     x, _ = line(axes, "exact − linearised")
     free = sweep.free
@@ -428,20 +432,22 @@ def test_linearising_is_shown_in_sigma_the_most_first(sweep):
 
 
 def test_linearising_is_left_out_where_it_cannot_be_told(table1, bound, unknown):
-    assert plots.plot_linearised(table1)
-    assert plots.plot_linearised(unknown) == ""
+    assert parameter_plots.plot_linearised(table1)
+    assert parameter_plots.plot_linearised(unknown) == ""
     robust = replace(table1, solver=replace(table1.solver, loss="huber"))
-    assert plots.plot_linearised(robust) == ""
-    assert [p.name for _, p in plots._linearisation_shifts(bound)] == [
+    assert parameter_plots.plot_linearised(robust) == ""
+    assert [p.name for _, p in parameter_plots._linearisation_shifts(bound)] == [
         *("y_slide.offset", "z_slide.offset")
     ]
     first, *rest = table1.parameters
     open_one = replace(table1, parameters=(replace(first, std=np.inf), *rest))
-    assert [p.name for _, p in plots._linearisation_shifts(open_one)] == [p.name for p in rest]
+    assert [p.name for _, p in parameter_plots._linearisation_shifts(open_one)] == [
+        p.name for p in rest
+    ]
 
 
 def test_few_parameters_of_one_unit_are_in_that(table1):
-    figure = draw(plots._draw_parameters, table1, 30)
+    figure = draw(parameter_plots._draw_parameters, table1, 30)
     (axes,) = figure.axes  # without a prior the readings told all
     assert axes.get_xlabel() == "estimate [mm]"
     assert row_names(axes) == ["x_slide.offset", "y_slide.offset", "z_slide.offset"]
@@ -455,7 +461,7 @@ def test_few_parameters_of_one_unit_are_in_that(table1):
 
 
 def test_many_parameters_are_in_tolerances_what_is_told_best_first(sweep):
-    figure = draw(plots._draw_parameters, sweep, 30)
+    figure = draw(parameter_plots._draw_parameters, sweep, 30)
     axes, beside = figure.axes
     assert title(figure) == "Estimates with 95 % intervals: 30 of 126, offsets, then the best told"
     assert axes.get_xlabel() == "estimate [tolerances]"
@@ -483,7 +489,7 @@ def test_the_band_of_a_parameter_is_where_its_prior_was(sweep):
     known = replace(sweep.parameters[0], mean=0.01, tolerance=0.005, std=0.004)
     without = replace(sweep.parameters[1], prior=False)
     parameters = (known, without, *sweep.parameters[2:])
-    axes = draw(plots._draw_parameters, replace(sweep, parameters=parameters), 30).axes[0]
+    axes = draw(parameter_plots._draw_parameters, replace(sweep, parameters=parameters), 30).axes[0]
     (band,) = axes.containers
     bars = {round(b.get_y() + 0.5): (b.get_x(), b.get_width()) for b in band}
     names = row_names(axes)
@@ -493,7 +499,7 @@ def test_the_band_of_a_parameter_is_where_its_prior_was(sweep):
 
 
 def test_a_parameter_at_its_bound_is_marked_as_such(bound):
-    axes = draw(plots._draw_parameters, bound, 30).axes[0]
+    axes = draw(parameter_plots._draw_parameters, bound, 30).axes[0]
     x, y = line(axes, "held by its bound")
     assert row_names(axes)[int(y[0])] == "x_slide.offset at lower bound"
     np.testing.assert_allclose(x, [bound["x_slide.offset"].value * 1e3], atol=UNIT)
@@ -502,15 +508,15 @@ def test_a_parameter_at_its_bound_is_marked_as_such(bound):
 
 
 def test_without_noise_there_are_estimates_but_no_intervals(unknown):
-    svg = plots.plot_parameters(unknown)
+    svg = parameter_plots.plot_parameters(unknown)
     assert "no intervals: nothing tells the noise" in texts(svg)
-    axes = draw(plots._draw_parameters, unknown, 30).axes[0]
+    axes = draw(parameter_plots._draw_parameters, unknown, 30).axes[0]
     assert not axes.collections
     assert line(axes, "estimate")[0].size == 30
 
 
 def test_few_correlations_are_printed_as_numbers(table1):
-    figure = draw(plots._draw_correlations, table1, 40)
+    figure = draw(parameter_plots._draw_correlations, table1, 40)
     axes = figure.axes[0]
     r = table1.correlation
     shown = {
@@ -531,13 +537,13 @@ def test_few_correlations_are_printed_as_numbers(table1):
 
 
 def test_numbers_have_the_signs_that_axes_have():
-    assert [plots._signed(v, 2) for v in (-0.25, 0.25, -0.001, 0.0)] == [
+    assert [style.write_signed(v, 2) for v in (-0.25, 0.25, -0.001, 0.0)] == [
         *("−0.25", "+0.25", "0.00", "0.00")
     ]
 
 
 def test_of_many_parameters_those_with_the_strongest_correlations_are_shown(sweep):
-    figure = draw(plots._draw_correlations, sweep, 10)
+    figure = draw(parameter_plots._draw_correlations, sweep, 10)
     assert title(figure).endswith("the 10 of 126 parameters with the strongest")
     axes = figure.axes[0]
     names = [axes.get_xticklabels()[0].get_text(), *row_names(axes)]
@@ -553,11 +559,11 @@ def test_of_many_parameters_those_with_the_strongest_correlations_are_shown(swee
 
 
 def test_negative_correlations_can_be_told_without_colour(sweep):
-    axes = draw(plots._draw_correlations, sweep, 40).axes[0]
+    axes = draw(parameter_plots._draw_correlations, sweep, 40).axes[0]
     (cells,) = axes.collections
     assert len(cells.get_paths()) == 40 * 39 / 2
     centres = np.array([p.vertices[:4].mean(axis=0) for p in cells.get_paths()])
-    negative = np.asarray(cells.get_array()) < -plots.CLEAR
+    negative = np.asarray(cells.get_array()) < -parameter_plots.CLEAR
     marked = np.concatenate([a.get_xydata() for a in axes.lines])
     assert {tuple(p) for p in marked} == {tuple(p) for p in centres[negative]}
     assert 0 < len(marked) < 100
@@ -566,16 +572,16 @@ def test_negative_correlations_can_be_told_without_colour(sweep):
 
 def test_correlations_need_two_parameters_that_have_any(table1, bound, unknown):
     single = replace(table1, parameters=table1.parameters[:1], covariance=table1.covariance[:1, :1])
-    assert plots.plot_correlations(single) == ""
-    assert plots.plot_correlations(unknown) == ""
-    shown = texts(plots.plot_correlations(bound))
+    assert parameter_plots.plot_correlations(single) == ""
+    assert parameter_plots.plot_correlations(unknown) == ""
+    shown = texts(parameter_plots.plot_correlations(bound))
     assert "x_slide.offset" not in shown
     assert {"y_slide.offset", "z_slide.offset"} <= set(shown)
 
 
 def test_singular_values_above_the_noise_are_filled(sweep):
     found = sweep.identifiability
-    figure = draw(plots._draw_singular_values, sweep)
+    figure = draw(parameter_plots._draw_singular_values, sweep)
     assert title(figure).endswith(f"{found.rank} of 126 combinations rise above the noise")
     axes = figure.axes[0]
     values = found.singular_values * 1e3
@@ -586,20 +592,20 @@ def test_singular_values_above_the_noise_are_filled(sweep):
     np.testing.assert_array_equal(x, np.arange(found.rank + 1, found.structural_rank + 1))
     np.testing.assert_allclose(y, values[found.rank : found.structural_rank], rtol=UNIT)
     faces = [a.get_markerfacecolor() for a in axes.lines[:2]]
-    assert faces == [plots.AFTER, "white"]
+    assert faces == [style.AFTER, "white"]
     np.testing.assert_allclose(line(axes, "σ of a reading")[1], found.threshold * 1e3)
     assert axes.get_yscale() == "log"
     assert axes.get_xlabel().endswith(f"({126 - found.structural_rank} more are zero)")
 
 
 def test_all_singular_values_are_named_where_none_is_zero(table1):
-    axes = draw(plots._draw_singular_values, table1).axes[0]
+    axes = draw(parameter_plots._draw_singular_values, table1).axes[0]
     assert axes.get_xlabel() == "combination of parameters, the best told first"
     assert len(axes.lines) == 2
 
 
 def test_unknown_noise_is_not_called_noise(unknown):
-    axes = draw(plots._draw_singular_values, unknown).axes[0]
+    axes = draw(parameter_plots._draw_singular_values, unknown).axes[0]
     labels = [str(a.get_label()) for a in axes.lines]
     assert any(text.startswith("rounding: the noise is unknown") for text in labels)
     assert not any(text.startswith("σ") for text in labels)
@@ -613,21 +619,21 @@ def test_readings_that_tell_nothing_have_no_singular_values_to_show(table1):
         rank=0,
         structural_rank=0,
     )
-    assert plots.plot_singular_values(replace(table1, identifiability=nothing)) == ""
+    assert parameter_plots.plot_singular_values(replace(table1, identifiability=nothing)) == ""
 
 
 def test_nothing_is_cut_off_and_no_labels_overlap(sweep, many, table1):
     figures = [
-        draw(plots._draw_residuals, many, 40),
-        draw(plots._draw_setups, sweep, 40),
-        draw(plots._draw_spread, table1),
-        draw(plots._draw_linearised, plots._linearisation_shifts(sweep)),
-        draw(plots._draw_parameters, sweep, 30),
-        draw(plots._draw_correlations, sweep, 40),
-        draw(plots._draw_singular_values, sweep),
+        draw(reading_plots._draw_residuals, many, 40),
+        draw(reading_plots._draw_setups, sweep, 40),
+        draw(reading_plots._draw_spread, table1),
+        draw(parameter_plots._draw_linearised, parameter_plots._linearisation_shifts(sweep)),
+        draw(parameter_plots._draw_parameters, sweep, 30),
+        draw(parameter_plots._draw_correlations, sweep, 40),
+        draw(parameter_plots._draw_singular_values, sweep),
     ]
     for figure in figures:
-        with plots.house_style():
+        with style.house_style():
             figure.draw_without_rendering()
             inside = figure.bbox.padded(1.0)
             for box in (b for axes in figure.axes for b in label_boxes(axes)):

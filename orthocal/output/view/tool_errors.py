@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from orthocal.errors import ClosureError
 from orthocal.identification.calibration import Calibration
 from orthocal.output.layout import um
-from orthocal.output.scene import LegendEntry, Scene, round_scale
-from orthocal.output.shapes import Colour, css, draw_arrow, material
-from orthocal.output.stage import Stage
+from orthocal.output.view.scene import LegendEntry, Scene, round_scale
+from orthocal.output.view.shapes import Colour, css, draw_arrow, material
+from orthocal.output.view.stage import Stage
 from orthocal.study.accuracy import ToolAccuracy, assess_tool, cube
 
 Array = NDArray[np.float64]

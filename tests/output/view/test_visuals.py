@@ -9,7 +9,7 @@ import pytest
 import yourdfpy
 
 from orthocal import draw_scene, load_robot
-from orthocal.output.visuals import load_visuals
+from orthocal.output.view.visuals import load_visuals
 
 BOX = '<geometry><box size="0.36 0.05 0.018"/></geometry>'
 TETRAHEDRON = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.0, 0.3]])

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.measurement.session import DIRECTIONS, Setup, section_plane
-from orthocal.output.deviations import Deviation, Measurement, Stop, worst_of_setups
 from orthocal.output.layout import signed
-from orthocal.output.motion import Film, Timeline
-from orthocal.output.scene import Label, LegendEntry, Scene, Step, round_scale
-from orthocal.output.shapes import (
+from orthocal.output.view.deviations import Deviation, Measurement, Stop, worst_of_setups
+from orthocal.output.view.motion import Film, Timeline
+from orthocal.output.view.scene import Label, LegendEntry, Scene, Step, round_scale
+from orthocal.output.view.shapes import (
     Colour,
     arrow_parts,
     css,
@@ -22,7 +22,7 @@ from orthocal.output.shapes import (
     draw_gauge,
     to_triple,
 )
-from orthocal.output.stage import VIEW, Stage
+from orthocal.output.view.stage import VIEW, Stage
 
 Array = NDArray[np.float64]
 

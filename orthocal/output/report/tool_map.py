@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from orthocal.identification.calibration import Calibration
-from orthocal.output.plots import open_figure, render_figure
+from orthocal.output.report.figure import open_figure, render_figure
 from orthocal.study.accuracy import ToolAccuracy
 
 Array = NDArray[np.float64]
@@ -50,7 +50,7 @@ ARROW = 0.85
 
 
 def plot_tool_map(calibration: Calibration, accuracy: ToolAccuracy, *, which: Field) -> str:
-    """The tool's error in the planes through the middle of a region.
+    """The tool's error in the planes through the middle of a region, the common shift taken out.
 
     Args:
         calibration: The calibration.
@@ -86,12 +86,15 @@ def _find_grid(points: Array) -> list[Array] | None:
 
 
 def _error_parts(accuracy: ToolAccuracy, which: Field) -> Array:
-    """What the size of the error is the length of, (K, 3) or without direction (K, 1), [µm]."""
+    """What the size of the error is the length of, (K, 3) or without direction (K, 1), [µm].
+
+    A shift that is common to the region is no error of a workpiece that is set up there.
+    """
     if which == "now":
-        return accuracy.deviation * 1e6
+        return accuracy.relative_deviation * 1e6
     if which == "left" or accuracy.after is None:
-        return accuracy.left * 1e6
-    variance = np.trace(accuracy.after.covariance, axis1=1, axis2=2)
+        return accuracy.relative_left * 1e6
+    variance = np.trace(accuracy.after.relative_covariance, axis1=1, axis2=2)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0))[:, None] * 1e6)
 
 
@@ -118,9 +121,9 @@ def _draw_tool_map(
             at_x, at_y = (lines[k] * 1e3 for k in plane)
             taken = _draw_arrows(axes, at_x, at_y, cut, [world[k] for k in plane], levels)
         _draw_size(axes, x, y, size, levels, taken)
-    label = "size of the error [µm]; arrows: its part in the plane"
+    label = "size without the common shift [µm]; arrows: the part in the plane"
     if which == "unknown":
-        label = "standard deviation in space [µm]"
+        label = "standard deviation in space without the common shift [µm]"
     figure.colorbar(
         ScalarMappable(BoundaryNorm(levels, 256), COLOURS),
         ax=list(panels),

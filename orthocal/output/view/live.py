@@ -21,7 +21,7 @@ import tornado.web
 import tornado.websocket
 
 from orthocal.errors import OrthocalError
-from orthocal.output.scene import Scene
+from orthocal.output.view.scene import Scene
 
 ADDRESS = "127.0.0.1"
 FIRST_PORT = 7000

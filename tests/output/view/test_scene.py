@@ -16,11 +16,11 @@ from orthocal.identification.calibration_file import load_calibration
 from orthocal.measurement.session import DIRECTIONS
 from orthocal.measurement.session_file import load_plan
 from orthocal.measurement.synthetic import simulate_session
-from orthocal.output import drawing, readings, stage, tool_errors
-from orthocal.output.deviations import measure_deviations
-from orthocal.output.motion import FRAMES_A_SECOND
-from orthocal.output.scene import round_scale
-from orthocal.output.shapes import arrow_parts, head_length
+from orthocal.output.view import drawing, readings, stage, tool_errors
+from orthocal.output.view.deviations import measure_deviations
+from orthocal.output.view.motion import FRAMES_A_SECOND
+from orthocal.output.view.scene import round_scale
+from orthocal.output.view.shapes import arrow_parts, head_length
 from orthocal.study.accuracy import assess_tool, cube
 
 

@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from orthocal.errors import ClosureError, ParameterError
 from orthocal.identification.calibration import Calibration
 from orthocal.measurement.session import Session
-from orthocal.output.deviations import (
+from orthocal.output.view.deviations import (
     Measurement,
     Stop,
     measurement_of_calibration,
     measurement_of_session,
     plan_stops,
 )
-from orthocal.output.motion import (
+from orthocal.output.view.motion import (
     Film,
     Timeline,
     exaggerate,
@@ -33,11 +33,11 @@ from orthocal.output.motion import (
     place_frames,
     plan_motion,
 )
-from orthocal.output.readings import draw_readings, write_headline, write_steps
-from orthocal.output.scene import LegendEntry, Scene, round_scale
-from orthocal.output.shapes import Colour, css
-from orthocal.output.stage import GHOST_COLOUR, LINE_COLOUR, LINES, Stage
-from orthocal.output.tool_errors import draw_tool_errors
+from orthocal.output.view.readings import draw_readings, write_headline, write_steps
+from orthocal.output.view.scene import LegendEntry, Scene, round_scale
+from orthocal.output.view.shapes import Colour, css
+from orthocal.output.view.stage import GHOST_COLOUR, LINE_COLOUR, LINES, Stage
+from orthocal.output.view.tool_errors import draw_tool_errors
 from orthocal.robot.assembly import Assembly, nominal_assembly
 from orthocal.robot.model import Robot
 

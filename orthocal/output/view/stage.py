@@ -8,9 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.output.motion import Film, place_frames
-from orthocal.output.scene import Camera, Label, Scene
-from orthocal.output.shapes import (
+from orthocal.output.view.motion import Film, place_frames
+from orthocal.output.view.scene import Camera, Label, Scene
+from orthocal.output.view.shapes import (
     Colour,
     cylinder,
     draw_axes,
@@ -19,7 +19,7 @@ from orthocal.output.shapes import (
     pose_along,
     to_triple,
 )
-from orthocal.output.visuals import Visual, load_visuals
+from orthocal.output.view.visuals import Visual, load_visuals
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]

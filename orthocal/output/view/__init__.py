@@ -1,0 +1,1 @@
+"""The machine to look at: scenes for meshcat, live, as a page and as a picture."""
