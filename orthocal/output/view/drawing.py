@@ -93,8 +93,8 @@ def draw_scene(
         show: What of a calibration is shown at first: "readings", "tool" (its errors), or "all".
 
     Raises:
-        ParameterError: If there is no such posture, the exaggeration is not positive, or there is
-            no such thing to show.
+        ParameterError: If there is no such posture, nothing deviates or by no positive factor, or
+            there is no such thing to show.
         RobotError: If the robot's visuals cannot be loaded.
         ClosureError: If the machine cannot reach a posture.
     """
@@ -104,6 +104,10 @@ def draw_scene(
         )
     if show not in SHOWN:
         raise ParameterError(f"'{show}' is none of {', '.join(SHOWN)}", where="show")
+    if exaggeration is not None and not isinstance(subject, Calibration):
+        raise ParameterError(
+            "only a calibration has a machine that deviates from another", where="exaggeration"
+        )
     if isinstance(subject, Robot):
         return _draw_robot(subject, posture)
     if isinstance(subject, Session):

@@ -148,11 +148,15 @@ class LiveScene:
                 task.add_done_callback(tasks.discard)
 
         tasks: set[asyncio.Task[None]] = set()
-        self.scene.on_change = lambda: loop.call_soon_threadsafe(tell)
+
+        def change() -> None:
+            loop.call_soon_threadsafe(tell)
+
+        self.scene.listeners.append(change)
         try:
             loop.run_forever()
         finally:
-            self.scene.on_change = None
+            self.scene.listeners.remove(change)
             server.stop()
             for listener in tuple(listeners):
                 listener.close()

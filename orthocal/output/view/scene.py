@@ -95,13 +95,13 @@ class _Recorder:
 
     def __init__(self) -> None:
         self.commands: list[dict[str, Any]] = []
-        self.on_change: Callable[[], object] | None = None
+        self.listeners: list[Callable[[], object]] = []
         self._names: dict[str, str] = {}
 
     def send(self, command: Any) -> None:  # noqa: ANN401 - any of meshcat's commands
         self.commands.append(self._plain(command.lower()))
-        if self.on_change is not None:
-            self.on_change()
+        for listener in tuple(self.listeners):
+            listener()
 
     def get_scene(self) -> str:
         raise NotImplementedError("a scene is written with save()")
@@ -173,13 +173,9 @@ class Scene:
         self.visualizer.set_animation(animation, play=False)
 
     @property
-    def on_change(self) -> Callable[[], object] | None:
-        """What is called after every command."""
-        return self._recorder.on_change
-
-    @on_change.setter
-    def on_change(self, listener: Callable[[], object] | None) -> None:
-        self._recorder.on_change = listener
+    def listeners(self) -> list[Callable[[], object]]:
+        """What is called after every command; to be added to and taken from."""
+        return self._recorder.listeners
 
     @property
     def commands(self) -> tuple[Mapping[str, Any], ...]:
@@ -214,7 +210,9 @@ class Scene:
 
     def to_live_html(self) -> str:
         """A page that takes the viewer and the commands from the server that it came from."""
-        return self._page([], viewer='<script src="main.min.js"></script>', connect="'self'")
+        # not every browser counts a socket of its own server among 'self'
+        own = "'self' ws://127.0.0.1:* ws://localhost:*"
+        return self._page([], viewer='<script src="main.min.js"></script>', connect=own)
 
     def save(self, path: str | Path) -> Path:
         """Write the page.

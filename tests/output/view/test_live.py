@@ -169,6 +169,8 @@ def test_what_is_added_later_is_sent_at_once(orthoglide):
         return first, later
 
     with LiveScene(scene) as live:
+        with LiveScene(scene):
+            pass  # another view of the same scene that ends takes nothing from this one
         first, later = asyncio.run(follow(live))
     assert [c["path"] for c in first] == [c["path"] for c in scene.commands[:known]]
     assert later["path"] == "/Mine"

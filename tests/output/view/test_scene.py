@@ -435,6 +435,12 @@ def test_posture_must_be_one_of_the_session(calibration, orthoglide):
         draw_scene(orthoglide, posture="zero")
 
 
+def test_only_a_calibrated_machine_deviates(experiment_2, orthoglide):
+    for subject in (experiment_2, orthoglide):
+        with pytest.raises(ParameterError, match="only a calibration has a machine that deviates"):
+            draw_scene(subject, exaggeration=2.0)
+
+
 @pytest.mark.parametrize("factor", [0.0, -1.0, float("nan"), float("inf")])
 def test_exaggeration_must_be_positive(calibration, factor):
     with pytest.raises(ParameterError, match="expected a positive number"):
