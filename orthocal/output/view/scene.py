@@ -260,7 +260,7 @@ class Scene:
 def frame_of(page: str, *, height: str) -> str:
     """A page inside another one."""
     style = f"width:100%;height:{height};border:1px solid #ccc;border-radius:6px"
-    return f'<iframe title="3-D scene" srcdoc="{html.escape(page)}" style="{style}"></iframe>'
+    return f'<iframe title="3-D scene" loading="lazy" srcdoc="{html.escape(page)}" style="{style}"></iframe>'
 
 
 @cache
