@@ -15,7 +15,8 @@ calibrate: $(INSTALLED)
 	$(VENV)/bin/orthocal calibrate $(SESSION) --out out/$(notdir $(SESSION))
 
 test: $(TESTED) check
-	$(VENV)/bin/python -m pytest
+	$(VENV)/bin/python -m pytest --numprocesses auto --dist loadscope --ignore tests/benchmarks
+	$(VENV)/bin/python -m pytest tests/benchmarks  # by themselves: they compare times
 
 check: $(TESTED)
 	$(VENV)/bin/ruff check .

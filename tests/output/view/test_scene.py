@@ -350,7 +350,7 @@ def test_every_animated_node_is_one_that_is_drawn(scene):
 
 
 def test_many_postures_are_thinned_out_for_the_animation(root, monkeypatch):
-    monkeypatch.setattr("orthocal.output.deviations.MOST_STOPS", 20)
+    monkeypatch.setattr("orthocal.output.view.deviations.MOST_STOPS", 20)
     scene = draw_scene(load_session(root / "examples/sweep"))
     assert len(scene.steps) == 22
     assert any("stops at 20 of 30 postures" in fact for fact in scene.facts)
