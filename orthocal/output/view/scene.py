@@ -260,7 +260,8 @@ class Scene:
 def frame_of(page: str, *, height: str) -> str:
     """A page inside another one."""
     style = f"width:100%;height:{height};border:1px solid #ccc;border-radius:6px"
-    return f'<iframe title="3-D scene" loading="lazy" srcdoc="{html.escape(page)}" style="{style}"></iframe>'
+    source = html.escape(page)
+    return f'<iframe title="3-D scene" loading="lazy" srcdoc="{source}" style="{style}"></iframe>'
 
 
 @cache
