@@ -408,9 +408,9 @@ def view(
         ),
     ] = None,
     show: Annotated[
-        str,
+        str | None,
         typer.Option(metavar="readings|tool|all", help="What of a calibration is shown at first."),
-    ] = "readings",
+    ] = None,
     port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Where to listen; else one that is free.")
     ] = None,

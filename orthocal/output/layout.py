@@ -20,6 +20,9 @@ MANY_ROWS = 60
 
 WORST_ROWS = 20
 
+LONGEST_NAME = 44
+"""Characters of a name that are shown where there is little room."""
+
 
 WIDTH = 100
 """Columns of plain text."""
@@ -96,3 +99,10 @@ def choose_rows(
         return rows, ""
     worst = sorted(rows, key=key, reverse=True)[:WORST_ROWS]
     return worst, f"The {WORST_ROWS} largest of {len(rows)}; --all lists every reading."
+
+
+def short_name(text: str, longest: int = LONGEST_NAME) -> str:
+    """A name from a file as it can be shown: printable, and not too long."""
+    shown = "".join(c if c.isprintable() else " " for c in text)
+    half = longest // 2
+    return shown if len(shown) <= longest else f"{shown[:half]}…{shown[-half + 1 :]}"

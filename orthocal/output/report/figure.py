@@ -36,9 +36,6 @@ HEAD = 0.48
 
 BEFORE, AFTER, UNSEEN, BAND = "#E69F00", "#0072B2", "#009E73", "#DDDDDD"
 
-LONGEST_NAME = 44
-"""Characters of a name that are shown."""
-
 _STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial", "sans-serif"],
@@ -194,13 +191,6 @@ def write_signed(value: float, decimals: int) -> str:
     """A number with its sign as axes have it; no sign for nothing."""
     rounded = round(value, decimals)
     return f"{rounded:+.{decimals}f}".replace("-", "−") if rounded else f"{0.0:.{decimals}f}"
-
-
-def short_name(text: str, longest: int = LONGEST_NAME) -> str:
-    """A name from a file as it can be shown: printable, and not too long."""
-    shown = "".join(c if c.isprintable() else " " for c in text)
-    half = longest // 2
-    return shown if len(shown) <= longest else f"{shown[:half]}…{shown[-half + 1 :]}"
 
 
 def _name_ids(root: etree._Element, prefix: str) -> None:

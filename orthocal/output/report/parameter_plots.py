@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.records import ParameterEstimate
+from orthocal.output.layout import short_name
 from orthocal.output.report.figure import (
     AFTER,
     AFTER_LOOK,
@@ -27,7 +28,6 @@ from orthocal.output.report.figure import (
     render_figure,
     scale_log,
     shade,
-    short_name,
     write_signed,
 )
 

@@ -13,6 +13,7 @@ from scipy import special
 
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.records import ResidualRow
+from orthocal.output.layout import short_name
 from orthocal.output.report.figure import (
     AFTER_LOOK,
     BEFORE_LOOK,
@@ -25,7 +26,6 @@ from orthocal.output.report.figure import (
     render_figure,
     scale_log,
     shade,
-    short_name,
 )
 
 Array = NDArray[np.float64]

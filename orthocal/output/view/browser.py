@@ -83,7 +83,7 @@ def take_picture(page: str, path: str | Path, *, width: int = 1400, height: int 
             f"--window-size={width},{height}",
             f"--virtual-time-budget={PAGE_TIME_MS}",
             f"--screenshot={picture}",
-            source.as_uri(),
+            f"{source.as_uri()}#picture",
         ]
         try:
             done = subprocess.run(command, capture_output=True, timeout=PATIENCE, check=False)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from orthocal.measurement.session import Section, Session, Setup
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
+
+FEW_NAMES = 12
+"""Postures up to which a message names all."""
 
 MOST_STOPS = 150
 """Postures that an animation goes through; more are thinned out."""
@@ -32,6 +36,8 @@ class Deviation:
     """Measured less nominal, [m]."""
     after: float | None
     """Measured less calibrated, [m]; None without a calibration."""
+    cycles: int = 1
+    """Readings of which it is the mean."""
 
     @property
     def where(self) -> str:
@@ -50,6 +56,10 @@ class Measurement:
     offsets: Array
     """Active in the controller, shape (n_drives,), [m, rad]."""
     rows: tuple[Deviation, ...]
+    count: int
+    """Readings, every cycle counted."""
+    largest_after: float | None
+    """Largest residual of any single reading, [m]; None without a calibration."""
     planned: bool
     """Whether it has not been made yet: all readings are 0."""
 
@@ -62,6 +72,10 @@ class Stop:
     drives: Array
     rows: tuple[Deviation, ...]
     """What the gauges show there: at most one a setup."""
+    leg: str | None = None
+    """Leg that is being measured; None where it is all of them."""
+    taken_off: tuple[str, ...] = ()
+    """Postures from whose readings those of this one are taken off."""
 
 
 def measure_deviations(session: Session) -> tuple[Deviation, ...]:
@@ -103,6 +117,7 @@ def _average(rows: Sequence[Deviation]) -> tuple[Deviation, ...]:
             None
             if group[0].after is None
             else float(np.mean([r.after for r in group if r.after is not None])),
+            len(group),
         )
         for key, group in groups.items()
     )
@@ -116,6 +131,8 @@ def measurement_of_session(session: Session) -> Measurement:
         drives={name: p.drives for name, p in session.postures.items()},
         offsets=np.asarray(session.active_offsets),
         rows=measure_deviations(session),
+        count=len(session.readings),
+        largest_after=None,
         planned=not session.values.any(),
     )
 
@@ -137,6 +154,8 @@ def measurement_of_calibration(calibration: Calibration) -> Measurement:
                 for r in calibration.residuals
             ]
         ),
+        count=len(calibration.residuals),
+        largest_after=calibration.largest_after,
         planned=False,
     )
 
@@ -168,25 +187,34 @@ def plan_stops(measured: Measurement, posture: str | None) -> tuple[list[Stop], 
     if posture is not None:
         if posture not in measured.drives:
             raise ParameterError(
-                f"'{posture}' is not a posture; postures: {', '.join(measured.drives)}",
+                f"'{posture}' is not a posture; {_name_some(posture, measured.drives)}",
                 where="posture",
             )
-        rows = worst_of_setups([r for r in measured.rows if r.posture == posture])
-        return [Stop(posture, measured.drives[posture], rows)], 0
+        return [_stop_at(measured, posture, measured.rows, None)], 0
     overview = Stop("overview", zero, worst_of_setups(measured.rows))
     path: list[Stop] = []
     for leg in dict.fromkeys(measured.setups[r.setup].leg for r in measured.rows):
-        by_posture: dict[str, list[Deviation]] = {}
-        for row in measured.rows:
-            if measured.setups[row.setup].leg == leg:
-                by_posture.setdefault(row.posture, []).append(row)
-                if row.minus is not None:
-                    by_posture.setdefault(row.minus, [])
-        stops = [
-            Stop(n, measured.drives[n], worst_of_setups(rows)) for n, rows in by_posture.items()
-        ]
+        rows = [r for r in measured.rows if measured.setups[r.setup].leg == leg]
+        names = dict.fromkeys(n for r in rows for n in (r.posture, r.minus) if n is not None)
+        stops = [_stop_at(measured, name, rows, leg) for name in names]
         if not np.allclose(stops[0].drives, zero, rtol=0.0, atol=1e-9):
-            path.append(Stop("zero", zero, ()))
+            path.append(Stop("zero", zero, (), leg))
         path += stops
     chosen = np.unique(np.linspace(0, len(path) - 1, min(MOST_STOPS, len(path))).round())
     return [overview, *(path[int(i)] for i in chosen), overview], len(path) - len(chosen)
+
+
+def _stop_at(measured: Measurement, name: str, rows: Sequence[Deviation], leg: str | None) -> Stop:
+    here = worst_of_setups([r for r in rows if r.posture == name])
+    taken_off = dict.fromkeys(r.posture for r in rows if r.minus == name)
+    return Stop(name, measured.drives[name], here, leg, tuple(taken_off))
+
+
+def _name_some(name: str, known: Iterable[str]) -> str:
+    """Names that may have been meant: the nearest of many, or all of a few."""
+    names = list(known)
+    if len(names) <= FEW_NAMES:
+        return f"postures: {', '.join(names)}"
+    near = get_close_matches(name, names, n=3, cutoff=0.4)
+    meant = f"; did you mean {', '.join(near)}?" if near else ""
+    return f"there are {len(names)} in the session{meant}"

@@ -80,7 +80,7 @@ def draw_scene(
     *,
     posture: str | None = None,
     exaggeration: float | None = None,
-    show: str = "readings",
+    show: str | None = None,
 ) -> Scene:
     """A scene of a calibration, a session or a robot.
 
@@ -90,7 +90,8 @@ def draw_scene(
             played through the measurement.
         exaggeration: How many times its size the deviation of the calibrated machine is drawn; 1
             for true scale. By default as large as can be seen well.
-        show: What of a calibration is shown at first: "readings", "tool" (its errors), or "all".
+        show: What of a calibration is shown at first: "readings", which is what else there is,
+            "tool" (its errors), or "all".
 
     Raises:
         ParameterError: If there is no such posture, nothing deviates or by no positive factor, or
@@ -102,8 +103,10 @@ def draw_scene(
         raise ParameterError(
             f"is {exaggeration:g}; expected a positive number", where="exaggeration"
         )
-    if show not in SHOWN:
+    if show is not None and show not in SHOWN:
         raise ParameterError(f"'{show}' is none of {', '.join(SHOWN)}", where="show")
+    if show is not None and not isinstance(subject, Calibration):
+        raise ParameterError("only a calibration has a choice of what is shown", where="show")
     if exaggeration is not None and not isinstance(subject, Calibration):
         raise ParameterError(
             "only a calibration has a machine that deviates from another", where="exaggeration"
@@ -112,7 +115,7 @@ def draw_scene(
         return _draw_robot(subject, posture)
     if isinstance(subject, Session):
         return _draw_session(subject, posture)
-    return _draw_calibration(subject, posture, exaggeration, show)
+    return _draw_calibration(subject, posture, exaggeration, show or SHOWN[0])
 
 
 # ---- a robot alone
@@ -126,9 +129,10 @@ def _draw_robot(robot: Robot, posture: str | None) -> Scene:
     timeline = plan_motion([s.drives for s in stops])
     poses = _follow(robot, nominal_assembly(robot), timeline, stage.frames)
     stage.draw_links(MACHINE, poses)
+    stage.look_at(poses)
     stage.scene.explain(LegendEntry("Machine", (MACHINE,), css(SOLID_COLOUR), "solid"))
     if robot.legs:
-        stage.draw_leg_lines(poses)
+        stage.draw_leg_lines(poses, timeline.stops)
         _explain_lines(stage.scene)
     film = Film()
     stage.move_links(film, MACHINE, timeline.times, poses)
@@ -174,7 +178,8 @@ def _draw_session(session: Session, posture: str | None) -> Scene:
     timeline = plan_motion([s.drives + measured.offsets for s in stops])
     poses = _follow(robot, nominal_assembly(robot), timeline, stage.frames)
     stage.draw_links(MACHINE, poses)
-    stage.draw_leg_lines(poses)
+    stage.draw_leg_lines(poses, timeline.stops)
+    stage.look_at(poses)
     scene = stage.scene
     scene.explain(LegendEntry("Machine, nominal", (MACHINE,), css(SOLID_COLOUR), "solid"))
     _explain_lines(scene)
@@ -202,7 +207,8 @@ def _draw_calibration(
     scene.exaggeration = machines.exaggeration
     stage.draw_links(SOLID, machines.real)
     stage.draw_links(GHOST, machines.nominal, ghost_of=machines.real)
-    stage.draw_leg_lines(machines.real)
+    stage.draw_leg_lines(machines.real, machines.timeline.stops)
+    stage.look_at(machines.real, machines.nominal)
     _explain_machines(scene, machines)
     film = Film()
     times = machines.timeline.times
@@ -231,7 +237,7 @@ def _place_machines(
     nominal = _follow(robot, nominal_assembly(robot), believed, stage.frames)
     assembly = Assembly(robot, fixed=calibration.errors)
     real = _follow(robot.with_errors(calibration.errors), assembly, timeline, stage.frames)
-    largest, where = find_largest_shift(nominal, real)
+    largest, where = _find_largest(measured, assembly, calibration, stage)
     if exaggeration is None:
         wanted = LARGEST_DEVIATION * stage.size / largest if largest > NOTHING else 1.0
         exaggeration = round_scale(wanted)
@@ -239,11 +245,26 @@ def _place_machines(
     return _Machines(timeline, nominal, drawn, exaggeration, largest, where)
 
 
+def _find_largest(
+    measured: Measurement, assembly: Assembly, calibration: Calibration, stage: Stage
+) -> tuple[float, str]:
+    """Largest deviation of any frame in any posture of the session, whichever is shown, [m]."""
+    robot = measured.robot
+    drives = np.array([robot.drive_zero - measured.offsets, *measured.drives.values()])
+    believed = drives + measured.offsets
+    closed = nominal_assembly(robot).close(believed), assembly.close(drives)
+    nominal = place_frames(robot, believed, closed[0], stage.frames)
+    machine = robot.with_errors(calibration.errors)
+    return find_largest_shift(nominal, place_frames(machine, drives, closed[1], stage.frames))
+
+
 def _explain_machines(scene: Scene, machines: _Machines) -> None:
-    scene.explain(LegendEntry("Machine as calibrated", (SOLID,), css(SOLID_COLOUR), "solid"))
+    scene.explain(LegendEntry("Machine where it really is", (SOLID,), css(SOLID_COLOUR), "solid"))
     if machines.largest > NOTHING:
         scene.explain(
-            LegendEntry("Machine as the controller takes it", (GHOST,), css(GHOST_COLOUR), "ghost")
+            LegendEntry(
+                "Machine where the controller takes it to be", (GHOST,), css(GHOST_COLOUR), "ghost"
+            )
         )
     _explain_lines(scene)
     if machines.largest <= NOTHING:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.measurement.session import DIRECTIONS, Setup, section_plane
-from orthocal.output.layout import signed
+from orthocal.output.layout import short_name, signed
 from orthocal.output.view.deviations import Deviation, Measurement, Stop, worst_of_setups
 from orthocal.output.view.motion import Film, Timeline
 from orthocal.output.view.scene import Label, LegendEntry, Scene, Step, round_scale
@@ -18,6 +18,7 @@ from orthocal.output.view.shapes import (
     Colour,
     arrow_parts,
     css,
+    dial_distance,
     draw_arrow,
     draw_gauge,
     to_triple,
@@ -45,6 +46,9 @@ MANY_GAUGES = 9
 
 MOST_LABELS = 8
 """Gauges above which the overview names the worst of each leg and direction only."""
+
+LONGEST_NAME = 16
+"""Characters of a setup's name in a label."""
 
 NOTHING = 1e-9
 """Deviations below this are none, [m]."""
@@ -106,8 +110,7 @@ def draw_readings(
         for kind in kinds:
             foot = contact + kind.side * 0.42 * dial * stage.robot.legs[setup.leg].axis
             lengths = [kind.length(row) * scene.arrow_scale for row in rows]
-            path = f"{kind.node}/{_node(setup.name)}"
-            width = arrow_width(dial)
+            path, width = f"{kind.node}/{_node(setup.name)}", arrow_width(dial)
             draw_arrow(
                 scene,
                 path,
@@ -120,18 +123,22 @@ def draw_readings(
             _film_arrow(film, path, timeline, lengths, width)
             if kind.node == BEFORE:
                 tips = [foot + v * direction for v in lengths]
+        # while another leg is measured its gauge is not there: the leg moves sideways
+        there = [s.leg is None or s.leg == setup.leg for s in stops]
+        _film_presence(film, gauge, timeline, there)
         silent = overview and setup.name not in named
         texts = [
             "" if row is None or (silent and stop is stops[0]) else _label(row, measured)
             for row, stop in zip(rows, stops, strict=True)
         ]
+        middle = to_triple(contact + dial_distance(dial) * direction)
         scene.labels.append(
             Label(
-                to_triple(contact),
+                (middle,),
                 tuple(texts),
                 gauge,
                 rank=max(abs(r.before) for r in measured.rows if r.setup == setup.name),
-                uncovered=tuple(to_triple(tip) for tip in tips),
+                uncovered=tuple((to_triple(contact), to_triple(tip)) for tip in tips),
             )
         )
     _explain(scene, len(kinds), shown)
@@ -195,11 +202,18 @@ def _film_arrow(
     film.track(f"{path}/head", "scale", "vector3", times, heads)
 
 
+def _film_presence(film: Film, path: str, timeline: Timeline, there: Sequence[bool]) -> None:
+    """Let a node be there at some stops, and until the next one."""
+    if not all(there):
+        film.track(path, "visible", "bool", timeline.times[timeline.stops], np.array(there))
+
+
 def _label(row: Deviation, measured: Measurement) -> str:
+    name = short_name(row.setup, LONGEST_NAME)
     if measured.planned:
-        return row.setup
+        return name
     after = "" if row.after is None else f" → {_mm(row.after)}"
-    return f"{row.setup} {_mm(row.before)}{after} mm\n{row.where}"
+    return f"{name} {_mm(row.before)}{after} mm\n{short_name(row.where, 2 * LONGEST_NAME)}"
 
 
 def _caption(stop: Stop, measured: Measurement, *, overview: bool) -> str:
@@ -209,8 +223,10 @@ def _caption(stop: Stop, measured: Measurement, *, overview: bool) -> str:
             if measured.planned
             else "Overview at the zero: the largest deviation that each gauge saw"
         )
+    if not stop.rows and stop.taken_off:
+        return f"{stop.name}, leg {stop.leg}: taken off what is read at {', '.join(stop.taken_off)}"
     if not stop.rows:
-        return f"{stop.name}: nothing read here"
+        return f"{stop.name}: nothing is read here"
     legs = ", ".join(sorted({measured.setups[r.setup].leg for r in stop.rows}))
     readings = "; ".join(_label(r, measured).split("\n")[0] for r in stop.rows)
     return f"{stop.name}, leg {legs}: {readings}"
@@ -221,9 +237,8 @@ def _explain(scene: Scene, kinds: int, shown: bool) -> None:
     scene.explain(LegendEntry("Gauges", (GAUGES,), css(GAUGE_COLOUR), "solid", shown))
     if kinds == 0:
         return
-    scene.explain(
-        LegendEntry("Before: measured − nominal", (BEFORE,), css(BEFORE_COLOUR), "arrow", shown)
-    )
+    text = "Measured − nominal" if kinds == 1 else "Before: measured − nominal"
+    scene.explain(LegendEntry(text, (BEFORE,), css(BEFORE_COLOUR), "arrow", shown))
     if kinds == 2:
         text = "After: measured − calibrated"
         scene.explain(LegendEntry(text, (AFTER,), css(AFTER_COLOUR), "arrow", shown))
@@ -235,19 +250,20 @@ def write_headline(measured: Measurement) -> str:
     worst = max(measured.rows, key=lambda r: abs(r.before))
     if measured.planned:
         postures = len({r.posture for r in measured.rows})
-        return f"A plan: {len(measured.rows)} readings in {postures} postures, none taken yet."
+        return f"A plan: {measured.count} readings in {postures} postures, none taken yet."
     if abs(worst.before) < NOTHING:
         return "All legs are parallel to their axes: no gauge has seen anything."
     leg = measured.setups[worst.setup].leg
+    mean = f", mean of {worst.cycles} cycles" if worst.cycles > 1 else ""
     text = (
         f"Leg {leg} is furthest from parallel: {_mm(worst.before)} mm at gauge "
-        f"{worst.setup}, {worst.where}."
+        f"{worst.setup}, {worst.where}{mean}."
     )
-    if worst.after is None:
+    if worst.after is None or measured.largest_after is None:
         return text
-    largest = max(abs(r.after) for r in measured.rows if r.after is not None)
     return (
-        f"{text} Calibrated: {_mm(worst.after)} mm there, at most {largest * 1e3:.3f} mm anywhere."
+        f"{text} Calibrated: {_mm(worst.after)} mm there; no reading is off by more than "
+        f"{measured.largest_after * 1e3:.3f} mm."
     )
 
 

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from orthocal.documents import write_file
 
 Array = NDArray[np.float64]
+Point = tuple[float, float, float]
 Mark = Literal["solid", "ghost", "arrow", "line", "ball"]
 
 _POLICY = (
@@ -41,16 +42,16 @@ _POLICY = (
 class Label:
     """A text at a point of the scene; pages keep labels from covering each other."""
 
-    at: tuple[float, float, float]
-    """[m]."""
+    at: tuple[Point, ...]
+    """One a step of the animation, or one for all, [m]."""
     texts: tuple[str, ...]
-    """One a step of the animation; empty where there is none."""
+    """The same; empty where there is none."""
     node: str
     """Path of the node that it belongs to: it is hidden with that."""
     rank: float = 0.0
     """Where there is no room for all, those of the highest rank stay; below 0 a name, not a box."""
-    uncovered: tuple[tuple[float, float, float], ...] = ()
-    """Point a step that no label covers, nor the way there from `at`, [m]."""
+    uncovered: tuple[tuple[Point, ...], ...] = ()
+    """Points a step around all of which no label stands, [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,11 +83,11 @@ class Step:
 class Camera:
     """Where the scene is looked at from."""
 
-    target: tuple[float, float, float]
+    target: Point
     """[m]."""
-    direction: tuple[float, float, float]
+    direction: Point
     """From the target to the camera."""
-    points: tuple[tuple[float, float, float], ...] = ((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    points: tuple[Point, ...] = ((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     """What is in view at first, [m]."""
 
 

@@ -88,7 +88,14 @@ def material(colour: Colour, *, opacity: float = 1.0, shiny: bool = False) -> g.
         shiny: Whether it is lit; flat otherwise.
     """
     hexadecimal = sum(round(255 * c) << shift for c, shift in zip(colour, (16, 8, 0)))  # noqa: B905
-    extra = {} if opacity >= 1.0 else {"depthWrite": False}
+    extra: dict[str, object] = {}
+    if opacity < 1.0:  # where it lies in what is solid, that is what is seen
+        extra = {
+            "depthWrite": False,
+            "polygonOffset": True,
+            "polygonOffsetFactor": 2.0,
+            "polygonOffsetUnits": 2.0,
+        }
     kind = g.MeshPhongMaterial if shiny else g.MeshLambertMaterial
     return kind(color=hexadecimal, opacity=opacity, **extra)
 
@@ -159,6 +166,11 @@ def draw_arrow(
     scene.place(f"{path}/head", pose)
 
 
+def dial_distance(size: float) -> float:
+    """From the tip of a gauge to the middle of its dial, whose radius is given, [m]."""
+    return 2.3 * size
+
+
 def draw_gauge(
     scene: Scene, path: str, tip: Array, direction: Array, face: Array, size: float
 ) -> None:
@@ -186,7 +198,7 @@ def draw_gauge(
         material((0.75, 0.76, 0.8), shiny=True),
         material((0.97, 0.97, 0.95)),
     )
-    stem, reach = 0.16 * size, 2.3 * size
+    stem, reach = 0.16 * size, dial_distance(size)
     scene.add(f"{path}/probe", cylinder(reach - size, 0.55 * stem), steel)
     scene.add(f"{path}/tip", g.Sphere(stem), dark)
     scene.add(f"{path}/stem", cylinder(0.75 * size, stem, start=reach - 1.6 * size), dark)
@@ -205,30 +217,22 @@ def draw_gauge(
     scene.place(f"{path}/needle", needle)
 
 
-def draw_ground(
-    scene: Scene, path: str, *, height: float, centre: Array, side: float, pitch: float
-) -> None:
-    """Ground: a pale plate with lines at a pitch.
+def draw_ground(scene: Scene, path: str, *, side: float, pitch: float) -> None:
+    """Ground: a pale plate with lines at a pitch, around the node's origin.
 
     Args:
         scene: Where to draw.
         path: Of the node.
-        height: z of the ground, [m].
-        centre: x and y of its middle, shape (2,), [m].
         side: [m].
         pitch: [m].
     """
     count = max(2, math.ceil(side / pitch / 2.0))
     half = count * pitch
-    middle = np.round(np.asarray(centre) / pitch) * pitch
     line = np.linspace(-half, half, 2 * count + 1)
     ends = np.array([[-half, v] for v in line] + [[v, -half] for v in line])
     others = np.array([[half, v] for v in line] + [[v, half] for v in line])
     points = np.empty((2 * len(ends), 3), dtype=np.float32)
     points[0::2, :2], points[1::2, :2], points[:, 2] = ends, others, 0.0
-    plate = np.eye(4)
-    plate[:3, 3] = [*middle, height]
-    scene.place(path, plate)
     scene.add(f"{path}/plate", g.Box([2.0 * half, 2.0 * half, 0.002]), material((0.93, 0.94, 0.95)))
     lowered = np.eye(4)
     lowered[2, 3] = -0.002
@@ -250,7 +254,7 @@ def draw_axes(scene: Scene, path: str, *, length: float) -> None:
             colour=colour,
         )
         scene.labels.append(
-            Label(to_triple(1.12 * length * direction), (name,), f"{path}/{name}", rank=-1.0)
+            Label((to_triple(1.12 * length * direction),), (name,), f"{path}/{name}", rank=-1.0)
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,10 +62,12 @@ class Stage:
         passive = robot.zero[robot.passive_index]
         self.zero = place_frames(robot, robot.drive_zero, passive, self.frames)
         """Frame to its pose in the nominal mechanical zero, shape (1, 4, 4), [m]."""
-        self.points = np.concatenate([self._corners(v) for v in self.visuals])
-        self.low, self.high = self.points.min(axis=0), self.points.max(axis=0)
+        points = np.concatenate([self._corners(v) for v in self.visuals])
+        self.low, self.high = points.min(axis=0), points.max(axis=0)
         self.size = float((self.high - self.low).max())
         """Largest side of the box around the machine, [m]."""
+        self.pitch = 10.0 ** math.floor(math.log10(self.size / 2.0))
+        """Of the lines on the ground, [m]."""
         self._furnish()
 
     def _corners(self, visual: Visual) -> Array:
@@ -74,18 +76,14 @@ class Stage:
 
     def _furnish(self) -> None:
         scene, size = self.scene, self.size
-        centre = (self.low + self.high) / 2.0
         for default in ("Grid", "Axes"):
             scene.visualizer[f"/{default}"].delete()
         scene.set_property("Background", "top_color", [1.0, 1.0, 1.0])
         scene.set_property("Background", "bottom_color", [0.80, 0.85, 0.90])
-        pitch = 10.0 ** math.floor(math.log10(size / 2.0))
-        height = float(self.low[2] - 0.04 * size)
-        draw_ground(scene, GROUND, height=height, centre=centre[:2], side=2.0 * size, pitch=pitch)
-        scene.facts.append(f"Squares on the ground: {pitch * 1e3:g} mm.")
+        draw_ground(scene, GROUND, side=2.0 * size, pitch=self.pitch)
+        scene.facts.append(f"Squares on the ground: {self.pitch * 1e3:g} mm.")
         draw_axes(scene, AXES, length=0.15 * size)
-        points = np.unique(np.round(self.points, 4), axis=0)
-        scene.camera = Camera(to_triple(centre), VIEW, tuple(to_triple(p) for p in points))
+        self.look_at(self.zero)
 
     def draw_links(
         self,
@@ -117,15 +115,49 @@ class Stage:
         for link in counts:
             self.scene.place(f"{node}/{link}", poses[link][0])
 
-    def draw_leg_lines(self, poses: Mapping[str, Array]) -> None:
-        """Draw every leg's line, from its root to its tip, where their first poses are."""
+    def draw_leg_lines(
+        self, poses: Mapping[str, Array], stops: Sequence[int] | NDArray[np.int64]
+    ) -> None:
+        """Draw every leg's line, from its root to its tip, where their first poses are.
+
+        Args:
+            poses: Frame to poses, shape (F, 4, 4), [m].
+            stops: Frames of the stops, at each of which the leg's name is by its root.
+        """
         for name, leg in self.robot.legs.items():
             path = f"{LINES}/leg {name}"
             self.scene.add(path, cylinder(1.0, 0.0025 * self.size), material(LINE_COLOUR))
             line, length = _line_poses(poses[leg.root], poses[leg.tip])
             self.scene.place(path, line[0] @ np.diag([1.0, 1.0, length[0], 1.0]))
-            root = poses[leg.root][0][:3, 3]
-            self.scene.labels.append(Label(to_triple(root), (f"leg {name}",), path, rank=-1.0))
+            roots = tuple(to_triple(poses[leg.root][f][:3, 3]) for f in stops)
+            texts = (f"leg {name}",) * len(roots)
+            self.scene.labels.append(Label(roots, texts, path, rank=-1.0))
+
+    def look_at(self, *machines: Mapping[str, Array]) -> None:
+        """Have what is drawn in view, and the ground below all that it does.
+
+        Args:
+            machines: Frame to poses, shape (F, 4, 4), [m], of all machines that are drawn.
+        """
+        first, lowest = [], []
+        for poses in machines:
+            for visual in self.visuals:
+                pose = poses[visual.link]
+                corners = visual.corners @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]
+                first.append(corners[0])
+                lowest.append(corners[..., 2].min())
+        points = np.concatenate(first)
+        self.scene.place(GROUND, self._ground(min(lowest) - 0.03 * self.size))
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
+        points = np.unique(np.round(points, 4), axis=0)
+        self.scene.camera = Camera(to_triple(middle), VIEW, tuple(to_triple(p) for p in points))
+
+    def _ground(self, height: float) -> Array:
+        """Pose of the ground below the machine, its lines at multiples of their pitch."""
+        pose = np.eye(4)
+        middle = (self.low + self.high)[:2] / 2.0
+        pose[:3, 3] = [*np.round(middle / self.pitch) * self.pitch, height]
+        return pose
 
     def move_links(self, film: Film, node: str, times: Array, poses: Mapping[str, Array]) -> None:
         """Move what `draw_links` drew; frames of poses at times."""

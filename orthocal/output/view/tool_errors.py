@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import meshcat.geometry as g
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +12,7 @@ from orthocal.output.layout import um
 from orthocal.output.view.scene import LegendEntry, Scene, round_scale
 from orthocal.output.view.shapes import Colour, css, draw_arrow, material
 from orthocal.output.view.stage import Stage
-from orthocal.study.accuracy import ToolAccuracy, assess_tool, cube
+from orthocal.study.accuracy import ToolAccuracy, assess_tool
 
 Array = NDArray[np.float64]
 
@@ -22,8 +20,8 @@ TOOL_NOW = "Tool error now"
 TOOL_LEFT = "Tool error, offsets entered"
 TOOL_UNKNOWN = "Tool error, not known"
 
-NOW_COLOUR: Colour = (0.84, 0.37, 0.0)
-LEFT_COLOUR: Colour = (0.25, 0.62, 0.90)
+NOW_COLOUR: Colour = (0.78, 0.12, 0.42)
+LEFT_COLOUR: Colour = (0.10, 0.58, 0.42)
 UNKNOWN_COLOUR: Colour = (0.45, 0.40, 0.65)
 
 LONGEST_ARROW = 0.08
@@ -42,39 +40,50 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
     if robot.tcp is None:
         return
     try:
-        found = assess_tool(calibration, cube(robot, points_a_side=3))
+        found = assess_tool(calibration)
     except ClosureError:
         scene.facts.append("Errors of the tool: the cube of ±60 mm is out of reach.")
         return
-    unknown = None if found.after is None else found.after.covariance
-    now, left = (np.linalg.norm(d, axis=1).max() for d in (found.deviation, found.left))
-    spread = 0.0 if unknown is None else math.sqrt(np.linalg.eigvalsh(unknown).max())
-    largest = max(float(now), float(left), spread)
+    now, left = (float(np.linalg.norm(d, axis=1).max()) for d in (found.deviation, found.left))
+    # in space, as in all tables: the axes of an ellipsoid are shorter
+    spread = 0.0 if found.after is None else found.after.absolute.largest
+    largest = max(now, left, spread)
     if largest < VANISHING:
         return
+    chosen = _choose_points(found)
     scene.tool_scale = round_scale(LONGEST_ARROW * stage.size / largest)
     width = ARROW_WIDTH * stage.size
     for node, deviations, colour in (
         (TOOL_NOW, found.deviation, NOW_COLOUR),
         (TOOL_LEFT, found.left, LEFT_COLOUR),
     ):
-        _draw_deviations(scene, node, found, deviations, colour, width)
-    text = f"Tool now: up to {um(float(now))} µm off"
+        _draw_deviations(scene, node, found.targets[chosen], deviations[chosen], colour, width)
+    text = f"Tool now: up to {um(now)} µm off"
     scene.explain(LegendEntry(text, (TOOL_NOW,), css(NOW_COLOUR), "arrow", shown))
     if left > VANISHING:
-        text = f"Tool with the offsets entered: up to {um(float(left))} µm off"
+        text = f"Tool with the offsets entered: up to {um(left)} µm off"
         scene.explain(LegendEntry(text, (TOOL_LEFT,), css(LEFT_COLOUR), "arrow", shown))
-    if unknown is not None:
-        _draw_ellipsoids(scene, found, unknown)
+    if found.after is not None:
+        _draw_ellipsoids(scene, found.targets[chosen], found.after.covariance[chosen])
         text = f"Tool: not known, one σ: up to {um(spread)} µm"
         scene.explain(LegendEntry(text, (TOOL_UNKNOWN,), css(UNKNOWN_COLOUR), "ball", shown))
     scene.facts.insert(-1, f"Errors of the tool, over ±60 mm: × {scene.tool_scale:g}.")
 
 
+def _choose_points(found: ToolAccuracy) -> NDArray[np.int64]:
+    """Points of the grid that are drawn: middles and ends of its sides."""
+    points = found.workspace.points
+    chosen = np.ones(len(points), dtype=bool)
+    for column in points.T:
+        line = np.unique(column)
+        chosen &= np.isin(column, line[[0, line.size // 2, -1]])
+    return np.flatnonzero(chosen)
+
+
 def _draw_deviations(
-    scene: Scene, node: str, found: ToolAccuracy, deviations: Array, colour: Colour, width: float
+    scene: Scene, node: str, targets: Array, deviations: Array, colour: Colour, width: float
 ) -> None:
-    for i, (target, deviation) in enumerate(zip(found.targets, deviations, strict=True)):
+    for i, (target, deviation) in enumerate(zip(targets, deviations, strict=True)):
         length = float(np.linalg.norm(deviation))
         if length > VANISHING:
             draw_arrow(
@@ -88,9 +97,9 @@ def _draw_deviations(
             )
 
 
-def _draw_ellipsoids(scene: Scene, found: ToolAccuracy, covariances: Array) -> None:
+def _draw_ellipsoids(scene: Scene, targets: Array, covariances: Array) -> None:
     """One standard deviation of the tool's position, around where it is taken to be at best."""
-    for i, (target, covariance) in enumerate(zip(found.targets, covariances, strict=True)):
+    for i, (target, covariance) in enumerate(zip(targets, covariances, strict=True)):
         values, vectors = np.linalg.eigh(covariance)
         if np.linalg.det(vectors) < 0.0:
             vectors[:, 0] = -vectors[:, 0]

@@ -149,7 +149,7 @@ def test_measurement_plays(browser, page):
             changed = np.abs(pictures[one].astype(int) - pictures[two].astype(int)).max(axis=-1)
             assert (changed > 40).mean() > 0.005
         assert captions[1].startswith("x_max, leg x: ")
-        assert captions[2].startswith("y_min: nothing read here")
+        assert captions[2].startswith("y_min, leg y: taken off what is read at y_max")
         found.page.evaluate("viewer.animator.reset()")
         found.page.click("#bar button")
         found.wait_for("viewer.animator.time > 2.5")
@@ -163,7 +163,7 @@ def test_boxes_of_the_legend_show_and_hide(browser, page):
     with visit(browser, page.as_uri()) as found:
         found.wait_until_drawn()
         before = found.canvas()
-        found.page.click("#legend label:has-text('Machine as calibrated')")
+        found.page.click("#legend label:has-text('Machine where it really is')")
         found.wait_for("!viewer.scene_tree.find(['Machine, calibrated']).object.visible")
         assert (found.canvas() != before).any()
         assert any("zx" in r[4] and "→" in r[4] for r in boxes(found.page)[2:])

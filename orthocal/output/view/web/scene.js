@@ -79,7 +79,7 @@
     const width = window.innerWidth, height = window.innerHeight;
     const controls = document.querySelector(".dg.main");
     const leftSide = Math.min(panel.offsetWidth + 20, width / 2);
-    const rightSide = width >= 1100 && controls ? controls.offsetWidth : 0;
+    const rightSide = controls && controls.offsetHeight > height / 4 ? controls.offsetWidth : 0;
     const view = camera(), target = toView(data.camera.target);
     const points = data.camera.points.map((p) => toView(p).sub(target));
     const size = Math.max(...points.map((p) => p.length()));
@@ -119,9 +119,10 @@
   const labels = data.labels.map((label) => {
     const element = make("div", layer);
     element.className = label.rank < 0 ? "label plain" : "label";
-    return { ...label, element, line: makeSvg("line", leaders, {}), point: toView(label.at), path: split(label.node), last: null };
+    return { ...label, element, line: makeSvg("line", leaders, {}), points: label.at.map(toView), path: split(label.node), last: null };
   });
-  labels.sort((a, b) => b.rank - a.rank);
+  // names first, which are short and where they belong; then the largest readings
+  labels.sort((a, b) => (a.rank < 0 ? 1 : 0) === (b.rank < 0 ? 1 : 0) ? b.rank - a.rank : a.rank - b.rank);
   const places = [];
   for (const reach of [30, 48, 70, 96, 128, 166, 210]) {
     for (let i = 0; i < 16; i++) {
@@ -136,6 +137,7 @@
     const time = viewer.animator.time;
     return data.steps.findIndex((s) => time >= s.start - 1e-6 && time <= s.end + 1e-6);
   };
+  const ofStep = (values, now) => values[Math.min(Math.max(now, 0), values.length - 1)];
   const arrange = () => {
     const width = window.innerWidth, height = window.innerHeight, now = step();
     const taken = ["#panel", "#bar", ".dg.main"]
@@ -145,8 +147,8 @@
     const middle = toView(data.camera.target).project(camera());
     const shown = [];
     for (const label of labels) {
-      const text = now < 0 ? "" : label.texts[Math.min(now, label.texts.length - 1)];
-      const at = label.point.clone().project(camera());
+      const text = label.texts.length === 1 ? label.texts[0] : now < 0 ? "" : label.texts[now];
+      const at = ofStep(label.points, now).clone().project(camera());
       const inside = Math.abs(at.x) < 1 && Math.abs(at.y) < 1 && at.z < 1;
       label.element.style.display = label.line.style.display = "none";
       if (!text || !inside || !isShown(label.path)) continue;
@@ -157,9 +159,9 @@
       // no label stands on a point that another one explains
       if (label.rank >= 0) taken.push({ left: x - 12, right: x + 12, top: y - 12, bottom: y + 12 });
       if (label.uncovered.length > 0) {
-        const end = toView(label.uncovered[Math.min(now, label.uncovered.length - 1)]).project(camera());
-        const ex = ((end.x + 1) / 2) * width, ey = ((1 - end.y) / 2) * height;
-        taken.push({ left: Math.min(x, ex) - 8, right: Math.max(x, ex) + 8, top: Math.min(y, ey) - 8, bottom: Math.max(y, ey) + 8 });
+        const around = ofStep(label.uncovered, now).map((point) => toView(point).project(camera()));
+        const xs = around.map((p) => ((p.x + 1) / 2) * width), ys = around.map((p) => ((1 - p.y) / 2) * height);
+        taken.push({ left: Math.min(...xs) - 8, right: Math.max(...xs) + 8, top: Math.min(...ys) - 8, bottom: Math.max(...ys) + 8 });
       }
     }
     const mx = ((middle.x + 1) / 2) * width, my = ((1 - middle.y) / 2) * height;
@@ -231,13 +233,22 @@
 
   // ---- print: what the canvas shows, as an image
   window.addEventListener("beforeprint", () => {
-    const image = document.getElementById("print-image") || make("img", document.getElementById("stage"));
+    const stage = document.getElementById("stage");
+    const image = document.getElementById("print-image") || make("img", stage);
     image.id = "print-image";
-    image.style.cssText = "position:absolute;inset:0;width:100%;height:100%;z-index:-1";
     image.src = viewer.capture_image();
+    // paper has another width: all stays where it is
+    for (const element of [stage, image]) {
+      element.style.width = `${window.innerWidth}px`;
+      element.style.height = `${window.innerHeight}px`;
+    }
+  });
+  window.addEventListener("afterprint", () => {
+    document.getElementById("print-image").remove();
+    document.getElementById("stage").style.cssText = "";
   });
 
-  if (window.innerWidth >= 1100) viewer.gui.open();
+  if (location.hash === "#picture") document.body.classList.add("picture");
   viewer.set_3d_pane_size();
   fit(true);
 })();
