@@ -426,9 +426,9 @@ def view(
     from orthocal.output.view.drawing import draw_scene
 
     width, height = parse_size(size)
-    for path in (html, png):
+    for path, kinds in ((html, (".html", ".htm")), (png, (".png",))):
         if path is not None:
-            require_writable_file(path)
+            require_writable_file(path, kinds=kinds)
     if png is not None:
         find_chromium()
     scene = draw_scene(load_subject(subject), posture=posture, exaggeration=exaggerate, show=show)

@@ -386,12 +386,18 @@ def require_writable(folder: Path) -> None:
         raise OrthocalError(f"cannot be written: {e.strerror}", where=str(folder)) from None
 
 
-def require_writable_file(path: Path) -> None:
+def require_writable_file(path: Path, *, kinds: tuple[str, ...] = ()) -> None:
     """Refuse a file to be written later that cannot be one: before the work is done.
 
+    Args:
+        path: The file.
+        kinds: What its name may end with; anything if empty.
+
     Raises:
-        OrthocalError: If it is a folder, or its folder cannot be one.
+        OrthocalError: If it is a folder, its folder cannot be one, or its name ends otherwise.
     """
+    if kinds and path.suffix.lower() not in kinds and not is_folder(path):
+        raise OrthocalError(f"expected a name that ends with {kinds[0]}", where=str(path))
     if is_folder(path):
         raise OrthocalError("is a folder; expected a file", where=str(path))
     require_writable(path.parent)

@@ -1694,8 +1694,8 @@ VIEW_CASES = [
     ),
     Case(
         "view-readings-as-subject",
-        "{tmp}/readings.csv:1: is not valid YAML: mapping values are not allowed here",
-        (write("readings.csv", "a: b: c\n"),),
+        "{tmp}/readings.csv: is neither a calibration.json nor a session.yaml, nor a robot's URDF "
+        "or YAML",
         command="view {tmp}/readings.csv --html {tmp}/a.html",
     ),
     Case(
@@ -1736,6 +1736,26 @@ VIEW_CASES = [
         "view-html-in-a-file",
         "{tmp}/session.yaml: is a file; expected a folder",
         command="view orthoglide --html {tmp}/session.yaml/page.html",
+    ),
+    Case(
+        "view-html-ends-otherwise",
+        "{tmp}/page.png: expected a name that ends with .html",
+        command="view orthoglide --html {tmp}/page.png",
+    ),
+    Case(
+        "view-png-ends-otherwise",
+        "{tmp}/a.jpg: expected a name that ends with .png",
+        command="view orthoglide --png {tmp}/a.jpg",
+    ),
+    Case(
+        "view-show-of-a-session",
+        "show: only a calibration has a choice of what is shown",
+        command=VIEW + " --show tool",
+    ),
+    Case(
+        "view-exaggerate-a-session",
+        "exaggeration: only a calibration has a machine that deviates from another",
+        command=VIEW + " --exaggerate 3",
     ),
     Case(
         "report-in-a-file",

@@ -68,8 +68,8 @@ def render_accuracy(
         region: What the points are, in words.
     """
     weights = accuracy.workspace.weights
-    sizes = ("r.m.s. [µm]", "95 %", "worst point")
-    table = table_of("", *sizes, *sizes)
+    sizes = ("95 %", "worst point")
+    table = table_of("[µm]", "r.m.s.", *sizes, "shift out: r.m.s.", *sizes)
     rows: list[tuple[str, ErrorSize, ErrorSize]] = [
         (
             "off its target now",
@@ -96,7 +96,7 @@ def render_accuracy(
         add_row(table, name, *(um(v) for size in (absolute, relative) for v in _parts(size)))
     lines: list[RenderableType] = [
         table,
-        Text(f"Over {region}: absolute, then with the common shift taken out."),
+        Text(f"Over {region}: absolute, then with the common shift taken out (shift out)."),
     ]
     if accuracy.after is None:
         lines.append(Text("What is not known after cannot be told: nothing tells the noise."))

@@ -7,9 +7,11 @@ import math
 from scipy import special
 
 from orthocal.identification.calibration import Calibration
+from orthocal.identification.cross_validation import find_turned_setup
 from orthocal.identification.records import ResidualRow
 from orthocal.identification.uncertainty import confidence_factor
 from orthocal.output.layout import mm, plain, signed
+from orthocal.study.accuracy import find_excess
 
 WORST_SUSPICIOUS = 5
 """Suspicious readings that are named."""
@@ -17,8 +19,72 @@ WORST_SUSPICIOUS = 5
 MANY_SUSPICIOUS = 0.2
 """Part of the readings above which it is not the readings that are wrong."""
 
+FAR_BEYOND = 4.0
+"""Times the tolerances beyond which it is readings or description that are wrong."""
+
 STANDSTILL = 1e-6
 """Part of a tolerance by which a parameter must move to have moved."""
+
+
+def advise(calibration: Calibration) -> str:
+    """Whether to enter what was identified, in a sentence or two; empty where no offset was."""
+    if not calibration.controller_entries():
+        return ""
+    turned = find_turned_setup(calibration.residuals)
+    excess = find_excess(calibration)
+    suspicious = len(calibration.suspicious)
+    if turned is not None:
+        return (
+            f"Do not enter these yet: the readings of setup {turned.name} seem to have the wrong "
+            f"sign. As they are, they differ from what all others say by {mm(turned.as_read)} mm "
+            f"(r.m.s.); with the sign turned by {mm(turned.turned)} mm."
+        )
+    if excess > FAR_BEYOND:
+        return (
+            f"Do not enter these yet: what remains is {excess:.1f} times what a machine within its "
+            f"tolerances would leave.{_worst_setup(calibration)}"
+        )
+    if 0 < suspicious <= MANY_SUSPICIOUS * len(calibration.residuals):
+        word = "reading contradicts" if suspicious == 1 else "readings contradict"
+        return f"Before you enter these read again: {suspicious} {word} all others."
+    if calibration.noise.source == "unknown":
+        return "Enter these only if you must: nothing tells how far they can be trusted."
+    if calibration.spare_readings <= 0:
+        return "Enter these only if you must: no reading is left to check them."
+    if is_model_error(calibration):
+        return (
+            "Enter these, and measure again: they are the best for the postures measured, but what "
+            "remains is error of the model, not noise."
+        )
+    return "Enter these: what remains is what the noise of the readings leaves."
+
+
+def is_model_error(calibration: Calibration) -> bool:
+    """Whether what remains is more than the noise of the gauge or of repeated cycles explains."""
+    noise, gauge = calibration.noise, calibration.session.gauge_sigma
+    if noise.source != "residuals":
+        return False
+    if noise.cycles_dof > 0:
+        return True
+    if gauge is None:
+        return False
+    return noise.residual_sigma / gauge > _ratio_interval(noise.residual_dof)[1]
+
+
+def _worst_setup(calibration: Calibration) -> str:
+    """Which setup is furthest from what all others say, in a sentence."""
+    groups: dict[str, list[float]] = {}
+    for row in calibration.residuals:
+        if math.isfinite(row.unseen):
+            groups.setdefault(row.setup, []).append(row.unseen)
+    if not groups:
+        return ""
+    sizes = {n: math.sqrt(sum(v * v for v in vs) / len(vs)) for n, vs in groups.items()}
+    worst = max(sizes, key=lambda n: sizes[n])
+    return (
+        f" Look at setup {worst} first: it differs by {mm(sizes[worst])} mm (r.m.s.) from what all "
+        "others say."
+    )
 
 
 def explain_fit(calibration: Calibration) -> list[str]:

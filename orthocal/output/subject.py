@@ -37,7 +37,7 @@ def load_subject(path: str | Path) -> Subject:
             where=str(path),
         )
     if not is_folder(file):
-        return load_calibration(file) if file.suffix.lower() == ".json" else load_plan(file)
+        return _load_file(file)
     if exists(file / "calibration.json"):
         return load_calibration(file)
     if exists(file / "session.yaml"):
@@ -49,3 +49,17 @@ def load_subject(path: str | Path) -> Subject:
             where=str(path),
         )
     return load_robot(file.resolve())
+
+
+def _load_file(file: Path) -> Subject:
+    kind = file.suffix.lower()
+    if kind == ".json":
+        return load_calibration(file)
+    if kind == ".urdf" or (kind in (".yaml", ".yml") and exists(file.with_suffix(".urdf"))):
+        return load_robot(file.resolve().parent)
+    if kind in (".yaml", ".yml"):
+        return load_plan(file)
+    raise OrthocalError(
+        "is neither a calibration.json nor a session.yaml, nor a robot's URDF or YAML",
+        where=str(file),
+    )

@@ -8,7 +8,8 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from orthocal.identification.calibration import Calibration
-from orthocal.identification.records import ParameterEstimate, ResidualRow
+from orthocal.identification.records import ControllerEntry, ParameterEstimate, ResidualRow
+from orthocal.output.explanation import advise
 from orthocal.output.layout import add_row, choose_rows, mm, plain, signed, table_of
 
 MANY_PARAMETERS = 12
@@ -34,8 +35,8 @@ _SOURCES = {
 }
 
 
-def render_heading(calibration: Calibration) -> RenderableType:
-    """What was calibrated, from what and how."""
+def render_heading(calibration: Calibration, *, effort: bool = True) -> RenderableType:
+    """What was calibrated, from what and how, with what it took."""
     session, solver = calibration.session, calibration.solver
     kind = "differences" if calibration.rows_are_differences else "readings"
     legs = ", ".join(sorted({s.leg for s in calibration.setups}))
@@ -63,13 +64,12 @@ def render_heading(calibration: Calibration) -> RenderableType:
         prior = f"{with_prior} with a prior"
     kind = "base parameters" if calibration.base else "parameters"
     loss = ", Huber's loss" if solver.loss == "huber" else ""
-    lines.append(
-        Text(
-            f"Solved: {len(calibration.free)} {kind}, {prior}{loss}; Ipopt {solver.status}, "
-            f"{solver.iterations} iterations, {solver.seconds_build:.2f} + "
-            f"{solver.seconds_solve:.2f} s"
-        )
+    took = (
+        f"; Ipopt {solver.status}, {solver.iterations} iterations, {solver.seconds_build:.2f} + "
+        f"{solver.seconds_solve:.2f} s"
     )
+    solved = f"Solved: {len(calibration.free)} {kind}, {prior}{loss}"
+    lines.append(Text(f"{solved}{took if effort else ''}"))
     return Group(*lines)
 
 
@@ -197,14 +197,19 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
     return Group(*(Text(line) for line in lines))
 
 
-def render_residuals(calibration: Calibration, *, all_rows: bool = False) -> RenderableType:
-    """Readings before and after, the worst of many or all."""
+def render_residuals(
+    calibration: Calibration, *, all_rows: bool = False, worst_first: bool = False
+) -> RenderableType:
+    """Readings before and after, the worst of many or all, in their order or the worst first."""
     noise = calibration.noise.reading_sigma
 
     def spread(row: ResidualRow) -> float:
         return noise * (math.sqrt(2.0) if row.minus else 1.0)
 
-    rows, note = choose_rows(calibration.residuals, all_rows)
+    found = calibration.residuals
+    if worst_first:
+        found = tuple(sorted(found, key=lambda r: -max(abs(r.deviation), abs(r.residual))))
+    rows, note = choose_rows(found, all_rows)
     cycles = any(r.cycle != 1 for r in calibration.residuals)
     raw = not calibration.rows_are_differences
     columns = ["setup", "posture", *(["cycle"] if cycles else []), "measured [mm]"]
@@ -286,9 +291,7 @@ def render_controller(calibration: Calibration) -> RenderableType:
         if e.held:
             spread = [e.held, *([""] if biased else [])]
         add_row(table, e.drive, *now, signed(e.enter * factor), *spread, unit)
-    notes = [
-        Text("An offset is what to add to the encoder's coordinate to get the slider's true one."),
-    ]
+    notes = [Text(_example(calibration, entries[0]))]
     if biased:
         notes.append(
             Text(
@@ -309,4 +312,22 @@ def render_controller(calibration: Calibration) -> RenderableType:
                 "alone leave at the tool is 'with the offsets entered' there."
             )
         )
-    return Group(table, *notes)
+    return Group(Text(advise(calibration)), table, *notes)
+
+
+def _example(calibration: Calibration, entry: ControllerEntry) -> str:
+    """What an offset is, by the first drive at its mechanical zero."""
+    drive = next(d for d in calibration.robot.drives if d.name == entry.drive)
+    factor, unit = (1e3, "mm") if drive.unit == "m" else (1e3, "mrad")
+    whole = "the whole offset, in place of the active one" if entry.active is not None else "more"
+    at, really = drive.zero * factor, (drive.zero + entry.enter) * factor
+    if entry.active is None:
+        return (
+            "An offset is what to add to the encoder's coordinate to get the slider's true one; "
+            f"these are what to add {whole}."
+        )
+    return (
+        f"An offset is what to add to the encoder's coordinate to get the slider's true one: with "
+        f"{drive.name}'s encoder at {at:.3f} {unit} its slider is at {really:.3f} {unit}. Enter "
+        f"{whole}."
+    )

@@ -35,6 +35,9 @@ POINTS_A_SIDE = 7
 NOTABLE = 0.1
 """Tolerances by which a parameter must be off to be named in a combination."""
 
+ROUNDING = 1e-9
+"""Residuals below which there are none: as many parameters as readings leave that, [m]."""
+
 EXCESS = 1.5
 """Residuals by which errors must exceed their tolerances for the machine to be called worse."""
 
@@ -322,7 +325,7 @@ def find_excess(calibration: Calibration) -> float:
     its tolerances.
     """
     foretold = calibration.unmodelled.residual_rms
-    ratio = calibration.rms_after / foretold if foretold > 0.0 else 1.0
+    ratio = calibration.rms_after / foretold if foretold > ROUNDING else 1.0
     return ratio if ratio > EXCESS else 1.0
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from orthocal import calibrate, compare_models, load_session
-from orthocal.identification.cross_validation import predict_unseen
+from orthocal.identification.cross_validation import find_turned_setup, predict_unseen
 from orthocal.identification.fit import fit_problem
 from orthocal.identification.loss import Loss
 from orthocal.identification.nlp import SolverOptions
@@ -50,3 +50,35 @@ def test_with_a_robust_loss_it_is_the_robust_fit_that_predicts(raw_cycles):
     robust = predict_unseen(fit_problem(build_problem(raw_cycles), options=wide))
     squares = predict_unseen(fit_problem(build_problem(raw_cycles)))
     assert np.abs(robust - squares).max() < 1e-3 * np.abs(squares).max()
+
+
+def turn(session, setup):
+    values = [-r.value if r.setup == setup else r.value for r in session.readings]
+    return session.with_values(values)
+
+
+@pytest.mark.parametrize(
+    ("session", "model", "setup"),
+    [
+        *(("raw-cycles", "offsets", s) for s in ("yx", "zx", "xy", "zy", "xz", "yz")),
+        ("sweep", "full", "zy_50"),
+        ("lines", "offsets", "yx"),
+    ],
+)
+def test_a_setup_with_its_sign_turned_is_found(root, session, model, setup):
+    """It, no other, and what it would leave with the right sign is what it leaves so."""
+    right = load_session(root / "examples" / session)
+    assert find_turned_setup(calibrate(right, model=model).residuals) is None
+    found = find_turned_setup(calibrate(turn(right, setup), model=model).residuals)
+    assert found.name == setup
+    unseen = [r.unseen for r in calibrate(right, model=model).residuals if r.setup == setup]
+    # offsets alone bend a little with the wrong ones
+    assert found.turned == pytest.approx(np.sqrt(np.mean(np.square(unseen))), rel=0.5, abs=5e-6)
+
+
+@pytest.mark.parametrize("number", ["1-printed", "1-corrected", "2", "3"])
+def test_one_difference_a_setup_cannot_tell_of_its_sign(root, number):
+    session = load_session(root / f"examples/table1/experiment-{number}")
+    for setup in (None, *session.setups):
+        given = session if setup is None else turn(session, setup)
+        assert find_turned_setup(calibrate(given).residuals) is None

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from orthocal import calibrate, load_session, summarize
-from orthocal.output.explanation import explain_fit
+from orthocal.output.explanation import advise, explain_fit
 
 
 @pytest.fixture(scope="module")
@@ -115,3 +115,61 @@ def test_names_from_files_are_not_markup(table1):
     text = summarize(replace(table1, residuals=rows, session=titled))
     assert "[red]y " in text
     assert "[bold]x[/nonsense]" in text
+
+
+# ---- whether to enter what was identified
+
+
+def turn(session, setup):
+    values = [-r.value if r.setup == setup else r.value for r in session.readings]
+    return session.with_values(values)
+
+
+def test_sound_readings_are_to_be_entered(raw_cycles):
+    assert advise(calibrate(raw_cycles)) == (
+        "Enter these: what remains is what the noise of the readings leaves."
+    )
+
+
+def test_error_of_the_model_is_to_be_measured_again(experiment_2):
+    assert advise(calibrate(experiment_2)).startswith("Enter these, and measure again: ")
+
+
+def test_a_setup_of_the_wrong_sign_is_named_before_anything_is_entered(raw_cycles):
+    text = advise(calibrate(turn(raw_cycles, "zx")))
+    assert text.startswith(
+        "Do not enter these yet: the readings of setup zx seem to have the wrong"
+    )
+    assert "by 0.405 mm (r.m.s.); with the sign turned by 0.009 mm" in text
+    assert text in " ".join(summarize(calibrate(turn(raw_cycles, "zx"))).split())
+
+
+def test_readings_far_beyond_all_tolerances_are_not_to_be_entered(raw_cycles):
+    """One leg's readings off by millimetres: the setup that differs most from others is named."""
+    wrong = {"x_max": 2e-3, "x_min": -1e-3}
+    values = [
+        r.value + (wrong.get(r.posture, 0.0) if r.setup == "zx" else 0.0)
+        for r in raw_cycles.readings
+    ]
+    text = advise(calibrate(raw_cycles.with_values(values)))
+    assert text.startswith("Do not enter these yet: what remains is ")
+    assert "Look at setup zx first" in text
+
+
+def test_one_wrong_reading_is_to_be_read_again(raw_cycles):
+    values = raw_cycles.values.copy()
+    values[4] += 0.2e-3
+    text = advise(calibrate(raw_cycles.with_values(values)))
+    assert text == "Before you enter these read again: 1 reading contradicts all others."
+
+
+def test_without_word_or_check_it_is_said(experiment_2):
+    silent = replace(experiment_2, gauge=replace(experiment_2.gauge, sigma=None))
+    three = replace(silent, readings=silent.readings[1:4])
+    assert "nothing tells how far they can be trusted" in advise(calibrate(three))
+    given = replace(experiment_2, readings=experiment_2.readings[1:4])
+    assert "no reading is left to check them" in advise(calibrate(given))
+
+
+def test_nothing_is_advised_where_no_offset_was_identified(raw_cycles):
+    assert advise(calibrate(raw_cycles, free=["x_leg.length"])) == ""

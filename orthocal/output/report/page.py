@@ -13,7 +13,7 @@ from pathlib import Path
 from orthocal.documents import write_file
 from orthocal.errors import ClosureError, OrthocalError
 from orthocal.identification.calibration import Calibration
-from orthocal.markup import heading, paragraph, table
+from orthocal.markup import heading, items, paragraph, table
 from orthocal.output.accuracy import render_accuracy
 from orthocal.output.explanation import explain_fit
 from orthocal.output.layout import bullets, mm, plain, signed
@@ -44,6 +44,27 @@ FEW_ROWS = 40
 ALL_ROWS = 300
 """Readings up to which all are listed."""
 
+GLOSSARY = (
+    "σ: one standard deviation of a reading, from repeated cycles, else from the residuals, else "
+    "as given for the gauge. ± σ in all: with what errors that were left out add at their "
+    "tolerances.",
+    "tolerance: one standard deviation of what the workshop can be trusted with, from the robot's "
+    "YAML or --tolerance. told: the share of what it left open that the readings took away.",
+    "before: measured less what the machine would show as the controller knows it; after: measured "
+    "less what the calibrated machine shows; each with its best gauge zeros.",
+    "predicted: a setup's readings as all other setups foretell them.",
+    "studentised: how far a reading is from what all others say of it, in its own σ. moves by: the "
+    "σ by which a parameter would change without it, at most.",
+    "common shift taken out: less the mean error over the cube. A workpiece that is set up where "
+    "the tool finds it never sees that shift.",
+    "not known before: with every error at its tolerance, offsets too; after: with what the "
+    "readings told. worst point: one standard deviation there.",
+    "combination: a direction in which the errors can change together. The readings tell one if a "
+    "tolerance along it moves them together by more than their noise. Condition number and "
+    "observability O1 to O5 are the field's indices of how well.",
+)
+"""Words that a machine builder need not know."""
+
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
 )
@@ -64,6 +85,7 @@ def build_report(calibration: Calibration) -> str:
         ("parameters", "What was identified", _parameters(calibration)),
         ("correlations", "What hangs together", _correlations(calibration)),
         ("identifiability", "What the readings can tell", _identifiability(calibration)),
+        ("words", "What the words mean", items(GLOSSARY)),
         ("provenance", "Where this is from", _provenance(calibration)),
         ("scene", "The machine", _scene(calibration)),
     ]
@@ -72,6 +94,7 @@ def build_report(calibration: Calibration) -> str:
         f'<section id="{name}">{heading(words)}{content}</section>'
         for name, words, content in sections
     )
+    head = to_markup(render_heading(calibration, effort=False))
     style = (resources.files("orthocal.output.report") / "report.css").read_text(encoding="utf-8")
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
@@ -79,7 +102,7 @@ def build_report(calibration: Calibration) -> str:
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
         f'<title>{html.escape(title)}</title>\n<link rel="icon" href="data:,">\n'
         f"<style>\n{style}</style>\n</head>\n<body>\n"
-        f"<header>{heading('Calibration report', level=1)}{to_markup(render_heading(calibration))}"
+        f"<header>{heading('Calibration report', level=1)}{head}"
         f"<nav>{links}</nav></header>\n<main>{body}</main>\n</body>\n</html>\n"
     )
 
@@ -103,8 +126,8 @@ def _verdict(calibration: Calibration) -> str:
         "mm."
     )
     return (
-        paragraph(told, kind="lead")
-        + to_markup(render_controller(calibration))
+        to_markup(render_controller(calibration))
+        + paragraph(told)
         + heading("What it means", level=3)
         + to_markup(bullets(explain_fit(calibration)))
     )
@@ -170,7 +193,7 @@ def _fit(calibration: Calibration) -> str:
 
 def _residuals(calibration: Calibration) -> str:
     every = len(calibration.residuals) <= ALL_ROWS
-    listed = to_markup(render_residuals(calibration, all_rows=every))
+    listed = to_markup(render_residuals(calibration, all_rows=every, worst_first=True))
     words = "All readings" if every else "The largest"
     few = len(calibration.residuals) <= FEW_ROWS
     return _figure(plot_residuals(calibration), "") + _details(words, listed, shown=few)
@@ -199,8 +222,10 @@ def _correlations(calibration: Calibration) -> str:
 
 
 def _identifiability(calibration: Calibration) -> str:
-    return _figure(plot_singular_values(calibration), "") + to_markup(
-        render_identifiability(calibration, all_rows=len(calibration.free) <= 12)
+    few = len(calibration.free) <= 12
+    words = to_markup(render_identifiability(calibration, all_rows=True))
+    return _figure(plot_singular_values(calibration), "") + (
+        words if few else _details("In words", words)
     )
 
 
@@ -245,11 +270,8 @@ def _scene(calibration: Calibration) -> str:
         scene = draw_scene(calibration)
     except OrthocalError as e:  # the numbers stand without it
         return paragraph(f"It cannot be drawn: {e}.")
-    return (
-        paragraph(scene.headline, kind="lead")
-        + frame_of(scene.to_html(), height="640px")
-        + paragraph("Drag to turn, scroll to come nearer; play to go through the measurement.")
-    )
+    hint = "Drag to turn, scroll to come nearer; play to go through the measurement."
+    return frame_of(scene.to_html(), height="640px") + paragraph(hint, kind="screen")
 
 
 def _figure(svg: str, caption: str) -> str:

@@ -40,7 +40,7 @@ MOST_POINTS = 500
 
 
 def plot_residuals(calibration: Calibration, *, most: int = 40) -> str:
-    """Every reading before and after, the largest deviation first.
+    """Every reading before and after, the worst first: before or after, whichever is larger.
 
     Args:
         calibration: The calibration.
@@ -71,10 +71,10 @@ def plot_spread(calibration: Calibration) -> str:
 
 def _draw_residuals(calibration: Calibration, most: int) -> Figure:
     found = calibration.residuals
-    rows = sorted(found, key=lambda r: -abs(r.deviation))[:most]
-    title = "Readings before and after calibration, the largest deviation first"
+    rows = sorted(found, key=lambda r: -max(abs(r.deviation), abs(r.residual)))[:most]
+    title = "Readings before and after calibration, the worst first"
     if len(rows) < len(found):
-        title = f"Readings before and after calibration: the {len(rows)} largest of {len(found)}"
+        title = f"Readings before and after calibration: the {len(rows)} worst of {len(found)}"
     figure, axes = open_list(title, _row_names(calibration, rows))
     y = np.arange(len(rows))
     before, after = (np.array([f(r) for r in rows]) * 1e3 for f in (_deviation, _residual))

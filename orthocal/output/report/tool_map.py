@@ -24,9 +24,9 @@ Array = NDArray[np.float64]
 Field = Literal["now", "left", "unknown"]
 
 TITLES: dict[Field, str] = {
-    "now": "How far the tool is off its target now",
-    "left": "How far the tool is off its target with the offsets entered",
-    "unknown": "What is not known of the tool after calibration, 1 σ",
+    "now": "How far the tool is off its target now, common shift taken out",
+    "left": "How far the tool is off with the offsets entered, common shift taken out",
+    "unknown": "What is not known of the tool after calibration, 1 σ, common shift taken out",
 }
 
 FINEST = 1e-3
@@ -121,9 +121,9 @@ def _draw_tool_map(
             at_x, at_y = (lines[k] * 1e3 for k in plane)
             taken = _draw_arrows(axes, at_x, at_y, cut, [world[k] for k in plane], levels)
         _draw_size(axes, x, y, size, levels, taken)
-    label = "size without the common shift [µm]; arrows: the part in the plane"
+    label = "size of the error [µm]; arrows: its part in the plane"
     if which == "unknown":
-        label = "standard deviation in space without the common shift [µm]"
+        label = "standard deviation in space [µm]"
     figure.colorbar(
         ScalarMappable(BoundaryNorm(levels, 256), COLOURS),
         ax=list(panels),

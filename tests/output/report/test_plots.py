@@ -97,6 +97,11 @@ def drawn(table1, sweep, unknown):
     return [svg for c in (table1, sweep, unknown) for plot in PLOTS if (svg := plot(c))]
 
 
+def worst(row):
+    """Sorts the largest deviation, before or after, to the front."""
+    return -max(abs(row.deviation), abs(row.residual))
+
+
 def draw(function, *args):
     with style.house_style():
         return function(*args)
@@ -256,7 +261,7 @@ def test_the_band_is_two_sigma_of_each_row(table1):
         axes = draw(reading_plots._draw_residuals, calibration, 40).axes[0]
         (band,) = axes.containers
         assert band.get_label() == f"±2 σ of a {word}"
-        rows = sorted(calibration.residuals, key=lambda r: -abs(r.deviation))
+        rows = sorted(calibration.residuals, key=worst)
         sigma = np.array([table1.sigma / (1.0 if r.minus else np.sqrt(2)) for r in rows]) * 1e3
         left = np.array([bar.get_x() for bar in band])
         width = np.array([bar.get_width() for bar in band])
@@ -264,15 +269,27 @@ def test_the_band_is_two_sigma_of_each_row(table1):
         np.testing.assert_allclose(width, 4.0 * sigma, atol=UNIT)
 
 
-def test_of_many_readings_the_largest_are_shown_and_that_is_said(sweep, many):
-    assert "Readings before and after calibration: the 40 largest of 162" in texts(
+def test_of_many_readings_the_largest_are_shown_and_that_is_said(sweep):
+    assert "Readings before and after calibration: the 40 worst of 162" in texts(
         reading_plots.plot_residuals(sweep)
     )
     figure = draw(reading_plots._draw_residuals, sweep, 7)
-    assert title(figure).endswith("the 7 largest of 162")
+    assert title(figure).endswith("the 7 worst of 162")
     x, _ = line(figure.axes[0], "before")
-    sizes = sorted((abs(r.deviation) * 1e3 for r in sweep.residuals), reverse=True)
-    np.testing.assert_allclose(np.abs(x), sizes[:7], atol=UNIT)
+    rows = sorted(sweep.residuals, key=worst)[:7]
+    np.testing.assert_allclose(x, [r.deviation * 1e3 for r in rows], atol=UNIT)
+
+
+def test_a_reading_that_the_calibration_spoils_is_among_the_worst(table1):
+    best = min(table1.residuals, key=lambda r: abs(r.deviation))
+    spoilt = replace(best, predicted=best.measured - 3e-3)
+    rows = tuple(spoilt if r is best else r for r in table1.residuals)
+    figure = draw(reading_plots._draw_residuals, replace(table1, residuals=rows), 1)
+    x, _ = line(figure.axes[0], "after")
+    np.testing.assert_allclose(x, [3.0], atol=UNIT)
+
+
+def test_plots_of_many_readings_stay_small(many):
     for name in ("residuals", "setups", "spread"):
         plot = getattr(reading_plots, f"plot_{name}")
         assert len(plot(many)) < LARGEST

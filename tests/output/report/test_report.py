@@ -82,7 +82,7 @@ def test_reading_order_is_verdict_tool_fit_residuals_and_the_rest(page, read):
     names = re.findall(r'<section id="(\w+)">', page)
     assert names == [
         *("verdict", "tool", "fit", "residuals", "parameters", "correlations"),
-        *("identifiability", "provenance", "scene"),
+        *("identifiability", "words", "provenance", "scene"),
     ]
     assert not read.open
     assert all(f'href="#{name}"' in page for name in names)
