@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from orthocal.errors import ClosureError, ParameterError
 from orthocal.identification.calibration import Calibration
 from orthocal.measurement.session import Session
+from orthocal.output.layout import signed
 from orthocal.output.view.deviations import (
     Measurement,
     Stop,
@@ -219,6 +220,7 @@ def _draw_calibration(
     draw_readings(stage, measured, stops, machines.timeline, machines.real, film, shown=readings)
     draw_tool_errors(stage, calibration, shown=tool)
     scene.headline = write_headline(measured)
+    _state_offsets(scene, calibration)
     _finish(scene, film, calibration.session.source, stops, left_out)
     return scene
 
@@ -275,6 +277,19 @@ def _explain_machines(scene: Scene, machines: _Machines) -> None:
         scene.facts.insert(0, f"Machine: true scale ({size}).")
     else:
         scene.facts.insert(0, f"Machine: deviation × {machines.exaggeration:g} ({size}).")
+
+
+def _state_offsets(scene: Scene, calibration: Calibration) -> None:
+    """Say what is to be entered: the leg that leans is often not the one whose drive is off."""
+    entries = calibration.controller_entries()
+    if not entries:
+        return
+    words = []
+    for entry in entries:
+        factor, unit = (1e3, "mm") if entry.unit == "m" else (1e3, "mrad")
+        words.append(f"{entry.drive} {signed(entry.enter * factor).replace('-', '−')} {unit}")
+    found = f"Offsets found: {', '.join(words)}. A leg leans by its own drive's and by others'."
+    scene.facts.insert(0, found)
 
 
 def _explain_lines(scene: Scene) -> None:

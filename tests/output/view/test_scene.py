@@ -247,6 +247,13 @@ def test_labels_say_setup_millimetres_and_postures(scene, calibration):
     assert scene.headline.startswith("Leg x is furthest from parallel: −1.140 mm at gauge zx")
 
 
+def test_scene_says_which_offsets_were_found(scene, calibration):
+    """The leg that leans most, x, is not the one whose drive is most off, z."""
+    fact = next(f for f in scene.facts if f.startswith("Offsets found"))
+    for entry in calibration.controller_entries():
+        assert f"{entry.drive} {entry.enter * 1e3:+.3f}".replace("-", "−") + " mm" in fact
+
+
 def test_of_many_gauges_the_overview_names_the_worst(full):
     scene = draw_scene(full)
     named = [
