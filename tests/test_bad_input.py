@@ -1683,6 +1683,27 @@ def mesh(name: str, filename: str, message: str, *more: Edit) -> Case:
 
 
 VIEW_CASES = [
+    *(
+        Case(
+            f"view-calibration-{keys}",
+            f"{{tmp}}/calibration.json: {where}: 'w' is {message}",
+            (put("calibration.json", keys, "w"),),
+            command="view {tmp}/calibration.json --html {tmp}/a.html",
+            base="machine",
+            calibrated=True,
+        )
+        for keys, where, message in (
+            ("setups.1.leg", "setups[1].leg", "none of x, y, z"),
+            ("setups.0.direction", "setups[0].direction", "none of x, y, z, -x, -y, -z"),
+            (
+                "residuals.2.posture",
+                "residuals[2].posture",
+                "not among the file's postures",
+            ),
+            ("residuals.3.minus", "residuals[3].minus", "not among the file's postures"),
+            ("residuals.0.setup", "residuals[0].setup", "not among the file's setups"),
+        )
+    ),
     Case("view-nothing", "{tmp}/none" + NO_SUBJECT, command="view {tmp}/none --html {tmp}/a.html"),
     Case("view-robot-unknown", "delta" + NO_SUBJECT, command="view delta --html {tmp}/a.html"),
     Case(

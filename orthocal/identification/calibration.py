@@ -32,6 +32,7 @@ from orthocal.identification.records import (
 from orthocal.identification.uncertainty import confidence_factor
 from orthocal.identification.unmodelled import Unmodelled
 from orthocal.markup import paragraph, table
+from orthocal.measurement.session import DIRECTIONS
 from orthocal.robot.assembly import Assembly
 from orthocal.robot.loading import load_robot, packaged_robots
 from orthocal.robot.model import Robot
@@ -385,6 +386,28 @@ class Calibration:
                 raise CalibrationFileError(
                     e.problem, where=f"{prefix}unmodelled.names[{i}]"
                 ) from None
+        for i, setup in enumerate(self.setups):
+            for key, found, known_names in (
+                ("leg", setup.leg, tuple(robot.legs)),
+                ("direction", setup.direction, tuple(DIRECTIONS)),
+            ):
+                if found not in known_names:
+                    raise CalibrationFileError(
+                        f"'{found}' is none of {', '.join(known_names)}",
+                        where=f"{prefix}setups[{i}].{key}",
+                    )
+        postures, setups = {p.name for p in self.postures}, {s.name for s in self.setups}
+        for i, row in enumerate(self.residuals):
+            for key, name, kind, among in (
+                ("setup", row.setup, "setups", setups),
+                ("posture", row.posture, "postures", postures),
+                ("minus", row.minus or row.posture, "postures", postures),
+            ):
+                if name not in among:
+                    raise CalibrationFileError(
+                        f"'{name}' is not among the file's {kind}",
+                        where=f"{prefix}residuals[{i}].{key}",
+                    )
         offsets = self.session.controller_offsets
         if offsets is not None and len(offsets) != len(robot.drives):
             raise CalibrationFileError(

@@ -86,8 +86,10 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
     moved = sensitivity @ inverse / sigma**2
     left = own - weights * (moved * sensitivity).sum(axis=1)
     left[left < BLIND * own] = np.nan
-    deleted = projected / left
-    spread, dof = _spread_without(fit, projected**2 / left)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        deleted = projected / left
+        share = projected**2 / left
+    spread, dof = _spread_without(fit, share)
     std = np.sqrt(np.diag(inverse))
     with np.errstate(divide="ignore", invalid="ignore"):
         shifts = np.abs(moved * (weights * deleted)[:, None]) / np.where(std > 0.0, std, np.inf)

@@ -99,7 +99,7 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
             signed(p.linear * f),
             signed(p.value * f),
             "at bound" if p.at_bound else plain(p.std * f),
-            *([f"{p.data_share:.0%}" if p.prior and not p.at_bound else ""] if told else []),
+            *([_share(p)] if told else []),
             "" if p.at_bound else _interval(*c.interval(p), f),
             *([_interval(*p.interval, f) if p.interval else ""] if profiled else []),
             *([] if told or profiled or robust else [signed((p.value - p.linear) * f, 4)]),
@@ -136,6 +136,11 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
         more = f", and {len(pairs) - MOST_PAIRS} more" if len(pairs) > MOST_PAIRS else ""
         notes.append(Text(f"Correlations above 0.5: {words}{more}"))
     return Group(*notes)
+
+
+def _share(p: ParameterEstimate) -> str:
+    """How much the readings told of a parameter, where that can be said."""
+    return f"{p.data_share:.0%}" if math.isfinite(p.data_share) else ""
 
 
 def _worth_listing(p: ParameterEstimate) -> bool:

@@ -12,12 +12,14 @@ common shift taken out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import special
 
 from orthocal.errors import RobotError
 from orthocal.identification.calibration import Calibration
@@ -34,6 +36,9 @@ HALF_SIDE = 0.06
 POINTS_A_SIDE = 7
 NOTABLE = 0.1
 """Tolerances by which a parameter must be off to be named in a combination."""
+
+BY_CHANCE = 0.01
+"""Probability that noise alone makes a machine look worse than its tolerances."""
 
 ROUNDING = 1e-9
 """Residuals below which there are none: as many parameters as readings leave that, [m]."""
@@ -319,13 +324,27 @@ def error_covariance(calibration: Calibration, *, excess: float = 1.0) -> Array:
 
 
 def find_excess(calibration: Calibration) -> float:
-    """How many times what unmodelled errors at their tolerances would leave of readings is left.
+    """How many times their tolerances unmodelled errors must be for what remains of the readings.
 
-    1 where that is no more than EXCESS, or no errors were left out: the machine may be as good as
-    its tolerances.
+    Of the residuals only what the noise does not explain counts, r² = n² + e² u², with n from
+    repeated cycles or the gauge's own σ and u what errors at their tolerances would leave.
+
+    Returns:
+        e; 1 where that is no more than EXCESS, where noise explains what remains (99 %), where
+        nothing tells the noise but the residuals themselves, or where no errors were left out: the
+        machine may be as good as its tolerances.
     """
-    foretold = calibration.unmodelled.residual_rms
-    ratio = calibration.rms_after / foretold if foretold > ROUNDING else 1.0
+    noise, gauge = calibration.noise, calibration.session.gauge_sigma
+    known = noise.cycles_sigma if noise.cycles_dof > 0 else gauge
+    foretold, dof = calibration.unmodelled.residual_rms, noise.residual_dof
+    if known is None or foretold < ROUNDING or dof <= 0.0:
+        return 1.0
+    # residuals keep the noise that parameters and gauge zeros have not taken up
+    variance = (known * calibration.row_factor) ** 2 * dof / len(calibration.residuals)
+    square = calibration.rms_after**2
+    if square < variance * float(special.chdtri(dof, BY_CHANCE)) / dof:
+        return 1.0
+    ratio = math.sqrt(max(square - variance, 0.0)) / foretold
     return ratio if ratio > EXCESS else 1.0
 
 

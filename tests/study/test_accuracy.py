@@ -11,7 +11,7 @@ import pytest
 from derivatives import assert_derivative
 from machines import place
 
-from orthocal import calibrate, load_plan, load_robot
+from orthocal import calibrate, draw_errors, load_plan, load_robot, simulate_session
 from orthocal.errors import RobotError
 from orthocal.identification.problem import build_problem
 from orthocal.identification.uncertainty import decompose, project_out_zeros
@@ -23,6 +23,7 @@ from orthocal.study.accuracy import (
     Workspace,
     assess_tool,
     cube,
+    find_excess,
     find_remaining_errors,
     measure_uncertainty,
 )
@@ -215,3 +216,27 @@ def test_without_noise_nothing_is_said_of_what_is_not_known(experiment_2):
     rows = tuple(experiment_2.readings[i] for i in (2, 0, 4))
     session = replace(experiment_2, readings=rows, gauge=replace(experiment_2.gauge, sigma=None))
     assert assess_tool(calibrate(session)).after is None
+
+
+@pytest.mark.parametrize("sigma", [1e-5, 1e-4, 3e-4])
+def test_noise_does_not_make_a_machine_worse_than_its_tolerances(root, sigma):
+    """One offset and nothing else: whatever the noise, no leg or axis is worse than expected."""
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    session = simulate_session(plan, {"x_slide.offset": 1e-3}, sigma=sigma).session
+    assert find_excess(calibrate(session)) == 1.0
+
+
+FULL = ["*", "!frame.*", "!*.scale", "!*_leg.length"]
+
+
+@pytest.mark.parametrize("times", [3.0, 10.0])
+def test_a_machine_that_is_worse_than_its_tolerances_is_found_to_be(root, times):
+    """Errors drawn at so many times their tolerances, over twelve machines."""
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    found = []
+    for seed in range(12):
+        drawn = draw_errors(plan.robot, FULL, seed=seed)
+        errors = {n: v * (1.0 if n.endswith(".offset") else times) for n, v in drawn.items()}
+        wide = replace(plan, gauge=replace(plan.gauge, range=None))
+        found.append(find_excess(calibrate(simulate_session(wide, errors, seed=seed).session)))
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(times, rel=0.4)

@@ -85,9 +85,12 @@ class LiveScene:
 
     Raises:
         OrthocalError: If no port is free.
+        TypeError: If that is no scene.
     """
 
     def __init__(self, scene: Scene, *, port: int | None = None) -> None:
+        if not isinstance(scene, Scene):
+            raise TypeError(f"found a {type(scene).__name__}; expected a Scene: draw_scene(...)")
         self.scene = scene
         self._socket = _listen(port)
         self.port = int(self._socket.getsockname()[1])

@@ -190,8 +190,15 @@ class Scene:
         return tuple(dict.fromkeys(path.strip("/") for path in found))
 
     def pose(self, path: str) -> Array:
-        """Where a node is, in its parent, shape (4, 4), [m]."""
-        pose = np.eye(4)
+        """Where a node is, in its parent, shape (4, 4), [m].
+
+        Raises:
+            KeyError: If there is no such node.
+        """
+        path, pose = path.strip("/"), np.eye(4)
+        paths = [c["path"].strip("/") for c in self.commands]
+        if not any(p == path or p.startswith(f"{path}/") for p in paths):
+            raise KeyError(path)
         for command in self.commands:
             if command["type"] == "set_transform" and command["path"].strip("/") == path:
                 pose = np.array(command["matrix"]).reshape(4, 4).T

@@ -49,7 +49,8 @@ def load_visuals(robot: Robot) -> tuple[Visual, ...]:
     try:
         geometry = pin.buildGeomFromUrdfString(robot.model, text, pin.GeometryType.VISUAL)
     except (ValueError, RuntimeError) as e:
-        reason = " ".join(str(e).split("message:")[-1].split())  # without the place in its source
+        # without the place in its source, and a hint at a folder that was right
+        reason = " ".join(str(e).split("message:")[-1].split("Hint:")[0].split())
         raise RobotError(f"its visuals cannot be loaded: {reason}", where=str(robot.urdf)) from None
     visuals = tuple(_visual(robot, part) for part in geometry.geometryObjects)
     return visuals or tuple(_sticks(robot))

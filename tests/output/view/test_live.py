@@ -177,6 +177,11 @@ def test_what_is_added_later_is_sent_at_once(orthoglide):
     scene.visualizer["/Mine"].delete()  # nobody listens any more, and nothing breaks
 
 
+def test_what_is_no_scene_is_refused_at_once(orthoglide):
+    with pytest.raises(TypeError, match=r"found a Robot; expected a Scene: draw_scene"):
+        LiveScene(orthoglide)
+
+
 def test_listens_on_loopback_only(scene):
     with LiveScene(scene) as live:
         own = [a for a, p in listening(os.getpid()) if p == live.port]

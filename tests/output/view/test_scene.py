@@ -413,6 +413,12 @@ def test_what_is_shown_at_first_can_be_chosen(calibration):
         draw_scene(calibration, show="everything")
 
 
+def test_pose_of_a_node_that_is_not_there_is_an_error(scene):
+    assert (scene.pose("/Leg lines/leg x") == scene.pose("Leg lines/leg x")).all()
+    with pytest.raises(KeyError, match="Leg lines/leg w"):
+        scene.pose("Leg lines/leg w")
+
+
 def test_legend_names_nodes_that_are_there(scene):
     for entry in scene.legend:
         for node in entry.nodes:
