@@ -71,11 +71,12 @@ def require_browser():
 
 @contextmanager
 def open_browser():
+    executable = require_browser()
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as play:
         browser = play.chromium.launch(
-            executable_path=require_browser(), args=list(chromium_flags()), headless=True
+            executable_path=executable, args=list(chromium_flags()), headless=True
         )
         try:
             yield browser

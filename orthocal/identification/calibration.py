@@ -28,8 +28,9 @@ from orthocal.identification.records import (
     SessionRecord,
     SetupRecord,
     SolverRecord,
+    root_mean_square,
 )
-from orthocal.identification.uncertainty import confidence_factor
+from orthocal.identification.uncertainty import BY_CHANCE, confidence_factor
 from orthocal.identification.unmodelled import Unmodelled
 from orthocal.markup import paragraph, table
 from orthocal.measurement.session import DIRECTIONS
@@ -141,12 +142,12 @@ class Calibration:
     @property
     def rms_before(self) -> float:
         """Root mean square of the deviations, [m]."""
-        return _rms([r.deviation for r in self.residuals])
+        return root_mean_square(r.deviation for r in self.residuals)
 
     @property
     def rms_after(self) -> float:
         """Root mean square of the residuals, [m]."""
-        return _rms([r.residual for r in self.residuals])
+        return root_mean_square(r.residual for r in self.residuals)
 
     @property
     def largest_before(self) -> float:
@@ -157,6 +158,19 @@ class Calibration:
     def largest_after(self) -> float:
         """Largest absolute residual, [m]."""
         return max(abs(r.residual) for r in self.residuals)
+
+    @property
+    def has_model_error(self) -> bool:
+        """Whether more remains than the noise of repeated cycles, or of the gauge, explains.
+
+        False where nothing tells that noise.
+        """
+        noise, gauge = self.noise, self.session.gauge_sigma
+        if noise.source != "residuals":
+            return False
+        if noise.cycles_dof > 0:
+            return True  # else sigma would be theirs
+        return gauge is not None and noise.chance_in_residuals(gauge) < BY_CHANCE
 
     @property
     def row_factor(self) -> float:
@@ -435,10 +449,6 @@ def _identifiability_document(found: Identifiability) -> dict[str, Any]:
         "alike": [combination(c) for c in found.alike],
         "base": [combination(c) for c in found.base],
     }
-
-
-def _rms(values: list[float]) -> float:
-    return math.sqrt(sum(v * v for v in values) / len(values))
 
 
 def _number(value: float) -> float | None:

@@ -26,6 +26,7 @@ from orthocal.identification.records import (
     SolverRecord,
 )
 from orthocal.identification.unmodelled import Unmodelled
+from orthocal.measurement.session import SectionForm
 from orthocal.robot.model import read_only
 
 Array = NDArray[np.float64]
@@ -121,7 +122,7 @@ class _SetupKeys(_Keys):
     name: str
     leg: str
     direction: str
-    section_form: str
+    section_form: SectionForm
     section_value: Number
     zero: Number | None
 

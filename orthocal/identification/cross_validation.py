@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from orthocal.errors import NotIdentifiableError
 from orthocal.identification.fit import Fit, require_determined
-from orthocal.identification.records import ResidualRow
+from orthocal.identification.records import ResidualRow, root_mean_square, rows_by_setup
 from orthocal.identification.uncertainty import decompose, project_out_zeros
 
 Array = NDArray[np.float64]
@@ -82,11 +82,8 @@ def find_turned_setup(rows: Iterable[ResidualRow]) -> TurnedSetup | None:
     predict y − u; readings of the other sign would be missed by −2 y + u. Two independent readings
     are the least that can tell.
     """
-    groups: dict[str, list[ResidualRow]] = {}
-    for row in rows:
-        groups.setdefault(row.setup, []).append(row)
     found = None
-    for name, group in groups.items():
+    for name, group in rows_by_setup(rows).items():
         raw = np.array([r.minus is None for r in group])
         independent = len({(r.posture, r.minus) for r in group}) - int(raw.any())
         measured = np.array([r.measured for r in group])
@@ -95,7 +92,7 @@ def find_turned_setup(rows: Iterable[ResidualRow]) -> TurnedSetup | None:
             continue
         if raw.any():
             measured[raw] -= measured[raw].mean()
-        as_read, turned = (float(np.sqrt(np.mean(v**2))) for v in (missed, missed - 2.0 * measured))
+        as_read, turned = (root_mean_square(v) for v in (missed, missed - 2.0 * measured))
         if as_read > CLEARLY * turned and (found is None or as_read > found.as_read):
             found = TurnedSetup(name, as_read, turned)
     return found

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 from orthocal.identification.loss import LossKind
-from orthocal.identification.uncertainty import NoiseSource
+from orthocal.identification.uncertainty import NoiseSource, chance_of_excess
+from orthocal.measurement.session import SectionForm
 from orthocal.robot.parameters import InUnit, Unit
 
 
@@ -112,6 +114,16 @@ class NoiseRecord:
     residual_sigma: float
     residual_dof: float
 
+    def chance_in_residuals(self, sigma: float) -> float:
+        """Probability that readings of a standard deviation [m] leave residuals as large."""
+        return chance_of_excess(
+            (self.residual_sigma / sigma) ** 2 * self.residual_dof, self.residual_dof
+        )
+
+    def chance_in_cycles(self, sigma: float) -> float:
+        """Probability that readings of a standard deviation [m] scatter as much when repeated."""
+        return chance_of_excess((self.cycles_sigma / sigma) ** 2 * self.cycles_dof, self.cycles_dof)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualRow:
@@ -151,9 +163,28 @@ class ResidualRow:
         return self.measured - self.predicted
 
     @property
+    def postures(self) -> str:
+        """Posture, or one less another, in words."""
+        return f"{self.posture} − {self.minus}" if self.minus else self.posture
+
+    @property
     def label(self) -> str:
         """Setup and postures in words."""
-        return f"{self.setup} {self.posture}" + (f" − {self.minus}" if self.minus else "")
+        return f"{self.setup} {self.postures}"
+
+
+def rows_by_setup(rows: Iterable[ResidualRow]) -> dict[str, list[ResidualRow]]:
+    """Rows of every setup, in their order."""
+    groups: dict[str, list[ResidualRow]] = {}
+    for row in rows:
+        groups.setdefault(row.setup, []).append(row)
+    return groups
+
+
+def root_mean_square(values: Iterable[float]) -> float:
+    """Of what is known; NaN if nothing is."""
+    known = [v for v in values if math.isfinite(v)]
+    return math.sqrt(sum(v * v for v in known) / len(known)) if known else math.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,7 +205,7 @@ class SetupRecord:
     name: str
     leg: str
     direction: str
-    section_form: str
+    section_form: SectionForm
     section_value: float
     """[m], or 1 for a fraction."""
     zero: float | None
@@ -182,7 +213,7 @@ class SetupRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ControllerEntry:
+class ControllerEntry(InUnit):
     """What to enter into the controller for one drive."""
 
     drive: str

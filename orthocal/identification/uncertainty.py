@@ -26,8 +26,8 @@ RANK_THRESHOLD = 1e-10
 MOST_NAMED = 6
 """Parameters that a message names one by one."""
 
-MISFIT_LEVEL = 0.01
-"""Probability below which residuals are too large for repeated cycles to explain (F test)."""
+BY_CHANCE = 0.01
+"""Probability below which residuals that are larger than noise are not put down to chance."""
 
 NoiseSource = Literal["cycles", "residuals", "gauge", "unknown"]
 
@@ -136,12 +136,8 @@ def estimate_noise(
     if cycles_dof > 0:
         misfit = False
         if enough and cycles_sigma > 0.0:
-            # the cycles' own scatter is in both: compare the rest with it
-            rest_dof = residual_dof - cycles_dof
-            rest = residual_square - cycles_sigma**2 * cycles_dof
-            if rest_dof > 0.5 and rest > 0.0:
-                ratio = rest / rest_dof / cycles_sigma**2
-                misfit = float(special.fdtrc(rest_dof, cycles_dof, ratio)) < MISFIT_LEVEL
+            chi_square = residual_square / cycles_sigma**2
+            misfit = chance_of_excess(chi_square, residual_dof, cycles_dof=cycles_dof) < BY_CHANCE
         source: NoiseSource = "residuals" if misfit else "cycles"
     elif enough:
         source = "residuals"
@@ -156,6 +152,23 @@ def estimate_noise(
     return Noise(
         sigma, dof, source, cycles_sigma, cycles_dof, residual_sigma, max(residual_dof, 0.0)
     )
+
+
+def chance_of_excess(chi_square: float, dof: float, *, cycles_dof: float = 0.0) -> float:
+    """Probability that noise alone leaves residuals as large, or larger.
+
+    Args:
+        chi_square: Σ r²/σ² of single readings, zeros eliminated.
+        dof: Degrees of freedom of the residuals.
+        cycles_dof: Those of σ, where it is from repeated cycles: an F test of what the residuals
+            have beside the cycles' own scatter. 0 for a σ that was given: a χ² test.
+    """
+    if cycles_dof == 0.0:
+        return float(special.chdtrc(dof, chi_square))
+    rest, rest_dof = chi_square - cycles_dof, dof - cycles_dof
+    if rest_dof <= 0.5 or rest <= 0.0:
+        return 1.0
+    return float(special.fdtrc(rest_dof, cycles_dof, rest / rest_dof))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -31,6 +31,10 @@ DIRECTIONS: dict[str, tuple[float, float, float]] = {
 """Names of measured directions, and their unit vectors in the world."""
 
 
+SectionForm = Literal["coordinate_mm", "from_root_mm", "fraction"]
+"""How a section is given."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Gauge:
     """The indicator."""
@@ -60,7 +64,7 @@ class Posture:
 class Section:
     """Where along the leg's nominal axis the gauge touches."""
 
-    form: Literal["coordinate_mm", "from_root_mm", "fraction"]
+    form: SectionForm
     value: float
     """World coordinate [m], distance from the root in the zero posture [m], or fraction [1]."""
 

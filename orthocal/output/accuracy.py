@@ -18,8 +18,8 @@ from orthocal.study.accuracy import (
     HALF_SIDE,
     ErrorSize,
     ToolAccuracy,
+    assess_cube,
     assess_excess,
-    assess_tool,
     find_excess,
     find_remaining_errors,
     measure_deviations,
@@ -44,7 +44,7 @@ def render_tool(calibration: Calibration) -> RenderableType:
     if calibration.robot.tcp is None:
         return Text("This robot has no tool centre point: give orthocal.tcp in its YAML.")
     try:
-        accuracy = assess_tool(calibration)
+        accuracy = assess_cube(calibration)
     except ClosureError as e:
         return Text(f"The cube of ±{HALF_SIDE * 1e3:g} mm is out of reach: {e}.")
     return render_accuracy(

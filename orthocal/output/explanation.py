@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 
-from scipy import special
-
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.cross_validation import find_turned_setup
-from orthocal.identification.records import ResidualRow
-from orthocal.identification.uncertainty import confidence_factor
+from orthocal.identification.records import ResidualRow, root_mean_square, rows_by_setup
+from orthocal.identification.uncertainty import BY_CHANCE, confidence_factor
 from orthocal.output.layout import mm, plain, signed
 from orthocal.study.accuracy import find_excess
 
@@ -51,7 +49,7 @@ def advise(calibration: Calibration) -> str:
         return "Enter these only if you must: nothing tells how far they can be trusted."
     if calibration.spare_readings <= 0:
         return "Enter these only if you must: no reading is left to check them."
-    if is_model_error(calibration):
+    if calibration.has_model_error:
         return (
             "Enter these, and measure again: they are the best for the postures measured, but what "
             "remains is error of the model, not noise."
@@ -59,28 +57,14 @@ def advise(calibration: Calibration) -> str:
     return "Enter these: what remains is what the noise of the readings leaves."
 
 
-def is_model_error(calibration: Calibration) -> bool:
-    """Whether what remains is more than the noise of the gauge or of repeated cycles explains."""
-    noise, gauge = calibration.noise, calibration.session.gauge_sigma
-    if noise.source != "residuals":
-        return False
-    if noise.cycles_dof > 0:
-        return True
-    if gauge is None:
-        return False
-    return noise.residual_sigma / gauge > _ratio_interval(noise.residual_dof)[1]
-
-
 def _worst_setup(calibration: Calibration) -> str:
     """Which setup is furthest from what all others say, in a sentence."""
-    groups: dict[str, list[float]] = {}
-    for row in calibration.residuals:
-        if math.isfinite(row.unseen):
-            groups.setdefault(row.setup, []).append(row.unseen)
-    if not groups:
+    groups = rows_by_setup(calibration.residuals)
+    sizes = {n: root_mean_square(r.unseen for r in rows) for n, rows in groups.items()}
+    known = [n for n, size in sizes.items() if math.isfinite(size)]
+    if not known:
         return ""
-    sizes = {n: math.sqrt(sum(v * v for v in vs) / len(vs)) for n, vs in groups.items()}
-    worst = max(sizes, key=lambda n: sizes[n])
+    worst = max(known, key=lambda n: sizes[n])
     return (
         f" Look at setup {worst} first: it differs by {mm(sizes[worst])} mm (r.m.s.) from what all "
         "others say."
@@ -114,8 +98,7 @@ def explain_fit(calibration: Calibration) -> list[str]:
         )
     elif noise.source == "residuals" and gauge is not None:
         ratio = noise.residual_sigma / gauge
-        low, high = _ratio_interval(noise.residual_dof)
-        if ratio > high:
+        if calibration.has_model_error:
             sentences.append(
                 f"What remains, σ = {mm(calibration.sigma)} mm of {row}, is {_times(ratio)} "
                 f"what the gauge itself would leave ({mm(gauge * factor)} mm): it is error of the "
@@ -127,7 +110,7 @@ def explain_fit(calibration: Calibration) -> list[str]:
                     else f" With the model '{calibration.model}' it will stay."
                 )
             )
-        elif ratio < low:
+        elif noise.chance_in_residuals(gauge) > 1.0 - BY_CHANCE:
             sentences.append(
                 f"What remains is only {ratio:.2g} of what the gauge's own σ would leave: the σ "
                 "given for the gauge is too large, or readings were smoothed."
@@ -140,7 +123,7 @@ def explain_fit(calibration: Calibration) -> list[str]:
     elif noise.source == "cycles":
         fits = (
             "the model fits."
-            if gauge is None or noise.cycles_sigma <= gauge * _ratio_interval(noise.cycles_dof)[1]
+            if gauge is None or noise.chance_in_cycles(gauge) >= BY_CHANCE
             else "but see how they scatter."
         )
         sentences.append(f"What remains is what repeated cycles scatter by: {fits}")
@@ -260,9 +243,7 @@ def _explain_trust(calibration: Calibration) -> list[str]:
 def _explain_cycles(calibration: Calibration) -> list[str]:
     """Whether repeated readings scatter more than the gauge's σ allows, and where most."""
     noise, gauge = calibration.noise, calibration.session.gauge_sigma
-    if noise.cycles_dof == 0 or gauge is None:
-        return []
-    if noise.cycles_sigma / gauge <= _ratio_interval(noise.cycles_dof)[1]:
+    if noise.cycles_dof == 0 or gauge is None or noise.chance_in_cycles(gauge) >= BY_CHANCE:
         return []
     groups: dict[tuple[str, str], list[ResidualRow]] = {}
     for row in calibration.residuals:
@@ -282,9 +263,3 @@ def _explain_cycles(calibration: Calibration) -> list[str]:
 
 def _times(ratio: float) -> str:
     return f"{ratio:.1f} times" if ratio < 3.0 else f"{ratio:.0f} times"
-
-
-def _ratio_interval(dof: float) -> tuple[float, float]:
-    """Where a standard deviation from dof degrees of freedom lies, as a ratio, 98 %."""
-    low, high = (float(special.chdtri(dof, p)) for p in (0.99, 0.01))
-    return math.sqrt(low / dof), math.sqrt(high / dof)

@@ -82,6 +82,18 @@ def signed(value: float, decimals: int = 3) -> str:
     return f"{value:+.{decimals}f}" if math.isfinite(value) else "unknown"
 
 
+def typeset(value: float, decimals: int = 3) -> str:
+    """A number with its sign for a page or a picture: with a true minus, and zero without a sign.
+
+    Args:
+        value: The number.
+        decimals: Of them.
+    """
+    rounded = round(value, decimals)
+    text = signed(rounded, decimals) if rounded else plain(0.0, decimals)
+    return text.replace("-", "−")
+
+
 def um(value: float) -> str:
     """A length in µm, as many decimals as say something."""
     size = value * 1e6

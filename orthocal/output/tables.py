@@ -222,11 +222,10 @@ def render_residuals(
         *columns, "before [mm]", "after [mm]", "in σ", "studentised", "moves by", left=2
     )
     for r in rows:
-        where = f"{r.posture} − {r.minus}" if r.minus else r.posture
         add_row(
             table,
             r.setup,
-            where,
+            r.postures,
             *([str(r.cycle)] if cycles else []),
             signed(r.measured * 1e3),
             signed(r.deviation * 1e3),
@@ -290,12 +289,12 @@ def render_controller(calibration: Calibration) -> RenderableType:
     enter = ("active now", "enter") if stated else ("add to the present offset",)
     table = table_of("drive", *enter, "± σ", *(["± σ in all"] if biased else []), "unit")
     for e in entries:
-        factor, unit = (1e3, "mm") if e.unit == "m" else (1e3, "mrad")
+        factor = e.edge_factor
         now = [] if e.active is None else [signed(e.active * factor)]
         spread = [plain(e.std * factor), *([plain(e.std_in_all * factor)] if biased else [])]
         if e.held:
             spread = [e.held, *([""] if biased else [])]
-        add_row(table, e.drive, *now, signed(e.enter * factor), *spread, unit)
+        add_row(table, e.drive, *now, signed(e.enter * factor), *spread, e.edge_unit)
     notes = [Text(_example(calibration, entries[0]))]
     if biased:
         notes.append(
@@ -323,7 +322,7 @@ def render_controller(calibration: Calibration) -> RenderableType:
 def _example(calibration: Calibration, entry: ControllerEntry) -> str:
     """What an offset is, by the first drive at its mechanical zero."""
     drive = next(d for d in calibration.robot.drives if d.name == entry.drive)
-    factor, unit = (1e3, "mm") if drive.unit == "m" else (1e3, "mrad")
+    factor, unit = drive.edge_factor, drive.edge_unit
     whole = "the whole offset, in place of the active one" if entry.active is not None else "more"
     at, really = drive.zero * factor, (drive.zero + entry.enter) * factor
     if entry.active is None:

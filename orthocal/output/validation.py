@@ -119,7 +119,7 @@ def _validation_rows(validation: Validation, all_rows: bool) -> RenderableType:
         add_row(
             table,
             r.setup,
-            f"{r.posture} − {r.minus}" if r.minus else r.posture,
+            r.postures,
             *([str(r.cycle)] if cycles else []),
             signed(r.deviation * 1e3),
             signed(r.residual * 1e3),

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError, RobotError
 from orthocal.robot.parameters import (
+    InUnit,
     ParameterSet,
     Unit,
 )
@@ -30,7 +31,7 @@ def read_only(values: ArrayLike) -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drive:
+class Drive(InUnit):
     """An actuated joint."""
 
     name: str

@@ -15,11 +15,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 from orthocal.errors import RobotError
 from orthocal.identification.calibration import Calibration
@@ -36,9 +36,6 @@ HALF_SIDE = 0.06
 POINTS_A_SIDE = 7
 NOTABLE = 0.1
 """Tolerances by which a parameter must be off to be named in a combination."""
-
-BY_CHANCE = 0.01
-"""Probability that noise alone makes a machine look worse than its tolerances."""
 
 ROUNDING = 1e-9
 """Residuals below which there are none: as many parameters as readings leave that, [m]."""
@@ -303,6 +300,17 @@ def assess_tool(
     )
 
 
+@lru_cache(maxsize=1)
+def assess_cube(calibration: Calibration) -> ToolAccuracy:
+    """The same over the default cube; summary, report and scene of a calibration all show it.
+
+    Raises:
+        RobotError: If the robot has no tool centre point.
+        ClosureError: If the machine cannot reach a point.
+    """
+    return assess_tool(calibration)
+
+
 def error_covariance(calibration: Calibration, *, excess: float = 1.0) -> Array:
     """Covariance of what the estimate has wrong, free and unmodelled parameters in turn, [SI].
 
@@ -336,15 +344,13 @@ def find_excess(calibration: Calibration) -> float:
     """
     noise, gauge = calibration.noise, calibration.session.gauge_sigma
     known = noise.cycles_sigma if noise.cycles_dof > 0 else gauge
-    foretold, dof = calibration.unmodelled.residual_rms, noise.residual_dof
-    if known is None or foretold < ROUNDING or dof <= 0.0:
+    foretold = calibration.unmodelled.residual_rms
+    if known is None or foretold < ROUNDING or not calibration.has_model_error:
         return 1.0
     # residuals keep the noise that parameters and gauge zeros have not taken up
-    variance = (known * calibration.row_factor) ** 2 * dof / len(calibration.residuals)
-    square = calibration.rms_after**2
-    if square < variance * float(special.chdtri(dof, BY_CHANCE)) / dof:
-        return 1.0
-    ratio = math.sqrt(max(square - variance, 0.0)) / foretold
+    kept = noise.residual_dof / len(calibration.residuals)
+    variance = (known * calibration.row_factor) ** 2 * kept
+    ratio = math.sqrt(max(calibration.rms_after**2 - variance, 0.0)) / foretold
     return ratio if ratio > EXCESS else 1.0
 
 

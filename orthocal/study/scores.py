@@ -18,7 +18,7 @@ from orthocal.identification.linear import Linearisation
 from orthocal.identification.nlp import SolverOptions
 from orthocal.identification.problem import CalibrationProblem
 from orthocal.identification.uncertainty import decompose, project_out_zeros
-from orthocal.study.accuracy import ErrorSize, ToolAccuracy, assess_tool, measure_deviations
+from orthocal.study.accuracy import ErrorSize, ToolAccuracy, assess_cube, measure_deviations
 
 Array = NDArray[np.float64]
 Method = Literal["linearised", "exact"]
@@ -123,7 +123,7 @@ def _assess(calibration: Calibration) -> ToolAccuracy | None:
     if calibration.robot.tcp is None:
         return None
     try:
-        return assess_tool(calibration)
+        return assess_cube(calibration)
     except ClosureError:  # the cube is too large for this machine
         return None
 

@@ -19,7 +19,7 @@ from orthocal.errors import SessionError
 from orthocal.identification.calibrate import repeat_calibration
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.records import ResidualRow
-from orthocal.identification.uncertainty import confidence_factor
+from orthocal.identification.uncertainty import BY_CHANCE, confidence_factor
 from orthocal.measurement.session import Session
 from orthocal.robot.model import read_only
 from orthocal.robot.parameters import InUnit, Unit
@@ -29,9 +29,6 @@ Array = NDArray[np.float64]
 
 CHANGE_CHANCE = 0.05
 """Probability that any parameter of a calibration that is right is said to change."""
-
-EXCESS_CHANCE = 0.01
-"""Probability below which larger deviations than expected are not put down to chance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +78,7 @@ class Validation:
         """
         if math.isnan(self.excess_probability):
             return None
-        return self.excess_probability >= EXCESS_CHANCE
+        return self.excess_probability >= BY_CHANCE
 
     @property
     def confirmed(self) -> bool | None:
@@ -190,12 +187,16 @@ def _further_changes(calibration: Calibration, refit: Calibration) -> tuple[Furt
 
 def _require_offsets(calibration: Calibration, session: Session) -> None:
     """The offsets that a session states must be those of the calibration, up to rounding."""
-    for entry, stated in zip(calibration.controller_entries(), session.active_offsets, strict=True):
+    drives = [d.name for d in session.robot.drives]
+    for entry in calibration.controller_entries():
+        stated = float(session.active_offsets[drives.index(entry.drive)])
         allowed = max(0.5 * entry.std, 0.02e-3)
         if not math.isnan(allowed) and abs(stated - entry.enter) > allowed:
+            factor, unit = entry.edge_factor, entry.edge_unit
             raise SessionError(
-                f"{entry.drive} has {stated * 1e3:g} mm; the calibration identified "
-                f"{entry.enter * 1e3:.3f} mm. A validation needs the identified offsets active",
+                f"{entry.drive} has {stated * factor:g} {unit}; the calibration identified "
+                f"{entry.enter * factor:.3f} {unit}. A validation needs the identified offsets "
+                "active",
                 where=f"{session.path or 'session'}: controller.offsets_mm",
             )
 

@@ -13,17 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from scipy import special
-
+from orthocal.identification.uncertainty import BY_CHANCE, chance_of_excess
 from orthocal.measurement.session import Session
 from orthocal.study.accuracy import assess_excess, find_excess
 from orthocal.study.repetition import Repetition
 from orthocal.study.scores import ModelResult, Undetermined
 
 NoiseKind = Literal["cycles", "gauge", "unknown"]
-
-EXCESS_CHANCE = 0.01
-"""Probability below which residuals larger than the noise are not put down to chance."""
 
 TELLING = 0.5
 """Effective parameters by which a larger model must exceed a smaller one to say anything new."""
@@ -163,15 +159,13 @@ def _explain_remainder(
             "readings in cycles, or give gauge.sigma_mm."
         ]
         return None, 1.0, words
-    if math.isinf(noise.dof):
-        chance = float(special.chdtrc(dof, chi_square))
-    else:
-        chance = float(special.fdtrc(dof, noise.dof, chi_square / dof))
+    cycles_dof = 0.0 if math.isinf(noise.dof) else noise.dof
+    chance = chance_of_excess(chi_square, dof, cycles_dof=cycles_dof)
     factor = calibration.row_factor
     row = "a difference" if calibration.rows_are_differences else "a reading"
     where = {"cycles": "repeated cycles scatter", "gauge": "the gauge's own σ"}[noise.source]
     sizes = f"σ {found * factor * 1e3:.3g} mm of {row} against {noise.sigma * factor * 1e3:.2g} mm"
-    if chance >= EXCESS_CHANCE:
+    if chance >= BY_CHANCE:
         return False, 1.0, [f"What {best.model} leaves is noise: {sizes} ({where})."]
     words = [
         f"What {best.model} leaves is error of the model rather than noise: {sizes} ({where}), "

@@ -66,14 +66,15 @@ def turn(session, setup):
     ],
 )
 def test_a_setup_with_its_sign_turned_is_found(root, session, model, setup):
-    """It, no other, and what it would leave with the right sign is what it leaves so."""
+    """It and no other; without a prior what it would leave so is what it leaves when right."""
     right = load_session(root / "examples" / session)
     assert find_turned_setup(calibrate(right, model=model).residuals) is None
     found = find_turned_setup(calibrate(turn(right, setup), model=model).residuals)
     assert found.name == setup
-    unseen = [r.unseen for r in calibrate(right, model=model).residuals if r.setup == setup]
-    # offsets alone bend a little with the wrong ones
-    assert found.turned == pytest.approx(np.sqrt(np.mean(np.square(unseen))), rel=0.5, abs=5e-6)
+    if model == "offsets":  # beside a prior the others are believed less: they contradict the one
+        unseen = [r.unseen for r in calibrate(right, model=model).residuals if r.setup == setup]
+        # up to the curvature between the two solutions
+        assert found.turned == pytest.approx(np.sqrt(np.mean(np.square(unseen))), rel=0.02)
 
 
 @pytest.mark.parametrize("number", ["1-printed", "1-corrected", "2", "3"])

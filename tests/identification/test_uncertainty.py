@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 from tolerances import KINEMATICS
 
 from orthocal import calibrate, load_plan
@@ -14,6 +15,7 @@ from orthocal.identification.nlp import NonlinearProgram
 from orthocal.identification.problem import build_problem
 from orthocal.identification.uncertainty import (
     Information,
+    chance_of_excess,
     confidence_factor,
     decompose,
     estimate_noise,
@@ -103,6 +105,22 @@ def test_where_sigma_is_from(repeatability, square, dof, gauge, source, sigma):
     assert noise.source == source
     assert noise.sigma == pytest.approx(sigma, nan_ok=True)
     assert noise.misfit == (source == "residuals" and repeatability[1] > 0)
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_noise_leaves_large_residuals_as_often_as_chance_has_it(given):
+    """Twelve residuals, five of them the scatter of cycles: the chances of many are uniform."""
+    rng = np.random.default_rng(1)
+    rest, cycles = rng.chisquare(7, 4000), rng.chisquare(5, 4000)
+    if given:
+        chances = [chance_of_excess(r + c, 12) for r, c in zip(rest, cycles, strict=True)]
+    else:  # sigma² is what the cycles say it is
+        chances = [
+            chance_of_excess((r + c) / (c / 5), 12, cycles_dof=5)
+            for r, c in zip(rest, cycles, strict=True)
+        ]
+    assert stats.kstest(chances, "uniform").pvalue > 0.001
+    assert chance_of_excess(3.0, 5, cycles_dof=5) == 1.0  # nothing beside the cycles
 
 
 def test_confidence_factors_are_students():

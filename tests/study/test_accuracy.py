@@ -229,14 +229,17 @@ def test_noise_does_not_make_a_machine_worse_than_its_tolerances(root, sigma):
 FULL = ["*", "!frame.*", "!*.scale", "!*_leg.length"]
 
 
-@pytest.mark.parametrize("times", [3.0, 10.0])
-def test_a_machine_that_is_worse_than_its_tolerances_is_found_to_be(root, times):
-    """Errors drawn at so many times their tolerances, over twelve machines."""
+@pytest.mark.slow
+def test_machines_that_are_worse_than_their_tolerances_are_found_to_be(root):
+    """Errors drawn at three times their tolerances, over many machines."""
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    wide = replace(plan, gauge=replace(plan.gauge, range=None))
+    count, times = 40, 3.0
     found = []
-    for seed in range(12):
+    for seed in range(count):
         drawn = draw_errors(plan.robot, FULL, seed=seed)
         errors = {n: v * (1.0 if n.endswith(".offset") else times) for n, v in drawn.items()}
-        wide = replace(plan, gauge=replace(plan.gauge, range=None))
         found.append(find_excess(calibrate(simulate_session(wide, errors, seed=seed).session)))
-    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(times, rel=0.4)
+    # of one machine the square scatters by 0.84 of its mean: a few combinations of errors decide
+    three_sigma = 3.0 * 0.84 / 2.0 / np.sqrt(count)
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(times, rel=three_sigma)

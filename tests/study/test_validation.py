@@ -90,6 +90,15 @@ def test_a_session_with_other_offsets_is_no_validation(table1):
         validate_calibration(calibrate(table1[2]), stated)
 
 
+def test_offsets_that_were_not_identified_need_not_be_the_controllers(table1):
+    calibration = calibrate(table1[2], free=["x_slide.offset", "z_slide.offset"])
+    entered = [calibration.errors.get(f"{leg}_slide.offset", 0.0) for leg in "xyz"]
+    stated = with_offsets(table1[3], np.array(entered))
+    assert validate_calibration(calibration, stated).offsets_stated
+    with pytest.raises(SessionError, match=r"z_slide has 0 mm; the calibration identified -1\.6"):
+        validate_calibration(calibration, with_offsets(table1[3], np.array([entered[0], 0, 0])))
+
+
 def test_json_is_plain(table1):
     document = json.loads(validate_calibration(calibrate(table1[2]), table1[3]).to_json())
     assert document["schema"] == "orthocal/validation/1"

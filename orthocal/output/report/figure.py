@@ -187,12 +187,6 @@ def count_of(shown: int, count: int) -> str:
     return str(count) if shown == count else f"{shown} of {count}"
 
 
-def write_signed(value: float, decimals: int) -> str:
-    """A number with its sign as axes have it; no sign for nothing."""
-    rounded = round(value, decimals)
-    return f"{rounded:+.{decimals}f}".replace("-", "−") if rounded else f"{0.0:.{decimals}f}"
-
-
 def _name_ids(root: etree._Element, prefix: str) -> None:
     """Put a prefix before all ids and before what refers to them."""
     for element in root.iter():

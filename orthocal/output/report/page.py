@@ -11,10 +11,10 @@ from importlib import resources
 from pathlib import Path
 
 from orthocal.documents import write_file
-from orthocal.errors import ClosureError, OrthocalError
+from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.identification.calibration import Calibration
 from orthocal.markup import heading, items, paragraph, table
-from orthocal.output.accuracy import render_accuracy
+from orthocal.output.accuracy import render_tool
 from orthocal.output.explanation import explain_fit
 from orthocal.output.layout import bullets, mm, plain, signed
 from orthocal.output.report.parameter_plots import (
@@ -36,7 +36,7 @@ from orthocal.output.tables import (
 )
 from orthocal.output.view.drawing import draw_scene
 from orthocal.output.view.scene import frame_of
-from orthocal.study.accuracy import HALF_SIDE, ToolAccuracy, assess_tool
+from orthocal.study.accuracy import ToolAccuracy, assess_cube
 
 FEW_ROWS = 40
 """Readings up to which the list of all is open."""
@@ -134,16 +134,11 @@ def _verdict(calibration: Calibration) -> str:
 
 
 def _tool(calibration: Calibration) -> str:
-    if calibration.robot.tcp is None:
-        return paragraph(
-            "This robot has no tool centre point: give orthocal.tcp in its YAML to see its errors."
-        )
+    words = to_markup(render_tool(calibration))
     try:
-        found = assess_tool(calibration)
-    except ClosureError as e:
-        return paragraph(f"The cube of ±{HALF_SIDE * 1e3:g} mm is out of reach: {e}.")
-    region = f"a cube of ±{HALF_SIDE * 1e3:g} mm around the zero"
-    return to_markup(render_accuracy(calibration, found, region=region)) + _maps(calibration, found)
+        return words + _maps(calibration, assess_cube(calibration))
+    except (ClosureError, RobotError):  # the words say why
+        return words
 
 
 def _maps(calibration: Calibration, found: ToolAccuracy) -> str:
@@ -234,12 +229,9 @@ def _provenance(calibration: Calibration) -> str:
     sigma = session.gauge_sigma
     active = "not stated"
     if session.controller_offsets is not None:
-        units = [(1e3, "mm") if d.unit == "m" else (1e3, "mrad") for d in calibration.robot.drives]
         active = ", ".join(
-            f"{d.name} {signed(v * f)} {u}"
-            for d, v, (f, u) in zip(
-                calibration.robot.drives, session.controller_offsets, units, strict=True
-            )
+            f"{d.name} {signed(v * d.edge_factor)} {d.edge_unit}"
+            for d, v in zip(calibration.robot.drives, session.controller_offsets, strict=True)
         )
     rows: list[tuple[str, str]] = [
         ("Robot", f"{robot.name} ({robot.reference})"),

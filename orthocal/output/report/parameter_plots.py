@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.records import ParameterEstimate
-from orthocal.output.layout import short_name
+from orthocal.output.layout import short_name, typeset
 from orthocal.output.report.figure import (
     AFTER,
     AFTER_LOOK,
@@ -28,7 +28,6 @@ from orthocal.output.report.figure import (
     render_figure,
     scale_log,
     shade,
-    write_signed,
 )
 
 Array = NDArray[np.float64]
@@ -103,7 +102,7 @@ def plot_singular_values(calibration: Calibration) -> str:
 
 
 def _draw_linearised(shifts: list[tuple[float, ParameterEstimate]]) -> Figure:
-    costs = [write_signed((p.value - p.linear) * p.edge_factor, 4) for _, p in shifts]
+    costs = [typeset((p.value - p.linear) * p.edge_factor, 4) for _, p in shifts]
     names = [
         f"{short_name(p.name)} ({cost} {p.edge_unit})"
         for (_, p), cost in zip(shifts, costs, strict=True)
@@ -209,7 +208,7 @@ def _mark_signs(
     x, y, inks = columns + 0.5, rows + 0.5, np.where(np.abs(r) > DARK, "white", "black")
     if numbers:
         for i, value in enumerate(r):
-            text = write_signed(float(value), 2)
+            text = typeset(float(value), 2)
             axes.text(x[i], y[i], text, color=str(inks[i]), fontsize=7.5, **_MIDDLE)
         return
     for ink in ("black", "white"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from operator import attrgetter
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from orthocal.identification.calibration import Calibration
-from orthocal.identification.records import ResidualRow
+from orthocal.identification.records import ResidualRow, root_mean_square, rows_by_setup
 from orthocal.output.layout import short_name
 from orthocal.output.report.figure import (
     AFTER_LOOK,
@@ -92,10 +92,8 @@ def _draw_residuals(calibration: Calibration, most: int) -> Figure:
 
 
 def _draw_setups(calibration: Calibration, most: int) -> Figure:
-    groups: dict[str, list[ResidualRow]] = {}
-    for row in calibration.residuals:
-        groups.setdefault(row.setup, []).append(row)
-    names = sorted(groups, key=lambda n: -_rms(groups[n], _residual))[:most]
+    groups = rows_by_setup(calibration.residuals)
+    names = sorted(groups, key=lambda n: -root_mean_square(map(_residual, groups[n])))[:most]
     title = "Which setup the model fits, the worst first"
     if len(names) < len(groups):
         title = f"Which setup the model fits: the {len(names)} worst of {len(groups)}"
@@ -107,7 +105,7 @@ def _draw_setups(calibration: Calibration, most: int) -> Figure:
         (_residual, 0.0, "after", AFTER_LOOK),
         (_unseen, 0.2, "predicted from all other setups", UNSEEN_LOOK),
     ):
-        sizes = np.array([_rms(groups[n], get) for n in names])
+        sizes = np.array([root_mean_square(map(get, groups[n])) for n in names])
         known = np.isfinite(sizes)
         if known.any():
             sizes = np.maximum(sizes[known], SMALLEST_LENGTH) * 1e3
@@ -155,13 +153,6 @@ def _draw_spread(calibration: Calibration) -> Figure:
     axes.set_ylabel("residual after [mm]")
     draw_legend(figure, axes)
     return figure
-
-
-def _rms(rows: Sequence[ResidualRow], get: Callable[[ResidualRow], float]) -> float:
-    """Root mean square of what is known; NaN if nothing is."""
-    values = np.array([get(r) for r in rows])
-    values = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
 
 
 def _noise_factor(row: ResidualRow) -> float:

@@ -143,7 +143,7 @@ def measurement_of_calibration(calibration: Calibration) -> Measurement:
     return Measurement(
         robot=robot,
         setups={
-            s.name: Setup(s.name, s.leg, s.direction, Section(s.section_form, s.section_value))  # type: ignore[arg-type]
+            s.name: Setup(s.name, s.leg, s.direction, Section(s.section_form, s.section_value))
             for s in calibration.setups
         },
         drives={p.name: np.array(p.drives) for p in calibration.postures},

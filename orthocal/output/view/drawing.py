@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from orthocal.errors import ClosureError, ParameterError
 from orthocal.identification.calibration import Calibration
 from orthocal.measurement.session import Session
-from orthocal.output.layout import signed
+from orthocal.output.layout import typeset
 from orthocal.output.view.deviations import (
     Measurement,
     Stop,
@@ -286,8 +286,7 @@ def _state_offsets(scene: Scene, calibration: Calibration) -> None:
         return
     words = []
     for entry in entries:
-        factor, unit = (1e3, "mm") if entry.unit == "m" else (1e3, "mrad")
-        words.append(f"{entry.drive} {signed(entry.enter * factor).replace('-', '−')} {unit}")
+        words.append(f"{entry.drive} {typeset(entry.enter * entry.edge_factor)} {entry.edge_unit}")
     found = f"Offsets found: {', '.join(words)}. A leg leans by its own drive's and by others'."
     scene.facts.insert(0, found)
 

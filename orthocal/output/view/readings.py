@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.measurement.session import DIRECTIONS, Setup, section_plane
-from orthocal.output.layout import short_name, signed
+from orthocal.output.layout import short_name, typeset
 from orthocal.output.view.deviations import Deviation, Measurement, Stop, worst_of_setups
 from orthocal.output.view.motion import Film, Timeline
 from orthocal.output.view.scene import Label, LegendEntry, Scene, Step, round_scale
@@ -47,7 +47,7 @@ MANY_GAUGES = 9
 MOST_LABELS = 8
 """Gauges above which the overview names the worst of each leg and direction only."""
 
-LONGEST_NAME = 16
+LONGEST_LABEL = 16
 """Characters of a setup's name in a label."""
 
 NOTHING = 1e-9
@@ -209,11 +209,11 @@ def _film_presence(film: Film, path: str, timeline: Timeline, there: Sequence[bo
 
 
 def _label(row: Deviation, measured: Measurement) -> str:
-    name = short_name(row.setup, LONGEST_NAME)
+    name = short_name(row.setup, LONGEST_LABEL)
     if measured.planned:
         return name
     after = "" if row.after is None else f" → {_mm(row.after)}"
-    return f"{name} {_mm(row.before)}{after} mm\n{short_name(row.where, 2 * LONGEST_NAME)}"
+    return f"{name} {_mm(row.before)}{after} mm\n{short_name(row.where, 2 * LONGEST_LABEL)}"
 
 
 def _caption(stop: Stop, measured: Measurement, *, overview: bool) -> str:
@@ -276,7 +276,7 @@ def write_steps(
 
 
 def _mm(value: float) -> str:
-    return signed(value * 1e3).replace("-", "−")
+    return typeset(value * 1e3)
 
 
 def _node(name: str) -> str:

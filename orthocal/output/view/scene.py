@@ -94,10 +94,11 @@ class Camera:
 class _Recorder:
     """Stands in for meshcat's window: keeps commands in their order."""
 
-    def __init__(self) -> None:
+    def __init__(self, to_html: Callable[[], str]) -> None:
         self.commands: list[dict[str, Any]] = []
         self.listeners: list[Callable[[], object]] = []
         self._names: dict[str, str] = {}
+        self._to_html = to_html
 
     def send(self, command: Any) -> None:  # noqa: ANN401 - any of meshcat's commands
         self.commands.append(self._plain(command.lower()))
@@ -105,7 +106,8 @@ class _Recorder:
             listener()
 
     def get_scene(self) -> str:
-        raise NotImplementedError("a scene is written with save()")
+        """For `static_html` of meshcat's interface."""
+        return self._to_html()
 
     def _plain(self, value: Any) -> Any:  # noqa: ANN401 - a JSON-like tree
         """The same with plain numbers, and names counted instead of drawn at random."""
@@ -141,7 +143,7 @@ class Scene:
     """The same for errors of the tool."""
 
     def __post_init__(self) -> None:
-        self._recorder = _Recorder()
+        self._recorder = _Recorder(self.to_html)
         self.visualizer = meshcat.Visualizer(window=self._recorder)
         """meshcat's interface to this scene; `scene.visualizer["/Name"]` adds to it."""
 

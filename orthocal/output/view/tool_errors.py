@@ -12,7 +12,7 @@ from orthocal.output.layout import um
 from orthocal.output.view.scene import LegendEntry, Scene, round_scale
 from orthocal.output.view.shapes import Colour, css, draw_arrow, material
 from orthocal.output.view.stage import Stage
-from orthocal.study.accuracy import ToolAccuracy, assess_tool
+from orthocal.study.accuracy import HALF_SIDE, ToolAccuracy, assess_cube
 
 Array = NDArray[np.float64]
 
@@ -36,13 +36,14 @@ VANISHING = 1e-7
 
 def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> None:
     """Where the tool goes instead of where it is sent, now and with the offsets entered."""
-    scene, robot = stage.scene, calibration.robot
-    if robot.tcp is None:
+    scene = stage.scene
+    if calibration.robot.tcp is None:
         return
+    region = f"±{HALF_SIDE * 1e3:g} mm"
     try:
-        found = assess_tool(calibration)
+        found = assess_cube(calibration)
     except ClosureError:
-        scene.facts.append("Errors of the tool: the cube of ±60 mm is out of reach.")
+        scene.facts.append(f"Errors of the tool: the cube of {region} is out of reach.")
         return
     now, left = (float(np.linalg.norm(d, axis=1).max()) for d in (found.deviation, found.left))
     # in space, as in all tables: the axes of an ellipsoid are shorter
@@ -67,7 +68,7 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
         _draw_ellipsoids(scene, found.targets[chosen], found.after.covariance[chosen])
         text = f"Tool: not known, one σ: up to {um(spread)} µm"
         scene.explain(LegendEntry(text, (TOOL_UNKNOWN,), css(UNKNOWN_COLOUR), "ball", shown))
-    scene.facts.insert(-1, f"Errors of the tool, over ±60 mm: × {scene.tool_scale:g}.")
+    scene.facts.insert(-1, f"Errors of the tool, over {region}: × {scene.tool_scale:g}.")
 
 
 def _choose_points(found: ToolAccuracy) -> NDArray[np.int64]:

@@ -15,6 +15,7 @@ import pytest
 from scipy import stats
 
 from orthocal import calibrate, load_session
+from orthocal.output import layout
 from orthocal.output.report import figure as style
 from orthocal.output.report import parameter_plots, reading_plots
 
@@ -554,7 +555,7 @@ def test_few_correlations_are_printed_as_numbers(table1):
 
 
 def test_numbers_have_the_signs_that_axes_have():
-    assert [style.write_signed(v, 2) for v in (-0.25, 0.25, -0.001, 0.0)] == [
+    assert [layout.typeset(v, 2) for v in (-0.25, 0.25, -0.001, 0.0)] == [
         *("−0.25", "+0.25", "0.00", "0.00")
     ]
 

@@ -467,6 +467,10 @@ def test_same_calibration_makes_the_same_page(calibration):
     assert draw_scene(calibration).to_html() == draw_scene(calibration).to_html()
 
 
+def test_the_page_is_what_meshcats_own_interface_gives(scene):
+    assert scene.visualizer.static_html() == scene.to_html()
+
+
 def test_loaded_calibration_makes_the_same_scene(calibration, tmp_path):
     path = calibration.save(tmp_path / "calibration.json")
     assert draw_scene(load_calibration(path)).to_html() == draw_scene(calibration).to_html()
