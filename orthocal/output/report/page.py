@@ -7,6 +7,7 @@ then the residuals and all the rest. Plots are drawn into the page, which asks n
 from __future__ import annotations
 
 import html
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
@@ -43,6 +44,9 @@ FEW_ROWS = 40
 
 ALL_ROWS = 300
 """Readings up to which all are listed."""
+
+MOST_NAMED = 9
+"""Parameters of which provenance says what was given for them."""
 
 GLOSSARY = (
     "σ: one standard deviation of a reading, from repeated cycles, else from the residuals, else "
@@ -247,6 +251,7 @@ def _provenance(calibration: Calibration) -> str:
             f"{calibration.model}: {len(calibration.free)} free parameters, "
             + ("tolerances as a prior" if calibration.prior else "no prior"),
         ),
+        *_assumptions(calibration),
         (
             "Solver",
             f"{solver.name}, {solver.status}, {solver.iterations} iterations, "
@@ -255,6 +260,36 @@ def _provenance(calibration: Calibration) -> str:
         ("orthocal", calibration.version),
     ]
     return table(("", ""), rows, left=2)
+
+
+def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
+    """What was given beside the readings, of every parameter that it was given for."""
+    usual = calibration.robot.parameters
+    tolerances, known, bounds = [], [], []
+    for p in calibration.parameters:
+        f, unit = p.edge_factor, p.edge_unit
+        if not p.free:
+            known.append(f"{p.name} {p.value * f:g} {unit}")
+            continue
+        if p.prior and (p.mean != 0.0 or not calibration.prior):
+            known.append(f"{p.name} {p.mean * f:g} ± {p.tolerance * f:g} {unit}")
+        elif p.tolerance != usual[p.name].tolerance:
+            usually = usual[p.name].tolerance * f
+            tolerances.append(f"{p.name} {p.tolerance * f:g} {unit} instead of {usually:g}")
+        if p.lower is not None or p.upper is not None:
+            low, high = ("∞" if v is None else f"{v * f:g}" for v in (p.lower, p.upper))
+            bounds.append(f"{p.name} {low} … {high} {unit}".replace(" ∞ …", " −∞ …"))
+    return [
+        ("Tolerances", _some(tolerances) or "the robot's"),
+        ("Known values", _some(known) or "none"),
+        ("Bounds", _some(bounds) or "none"),
+    ]
+
+
+def _some(texts: Sequence[str]) -> str:
+    """All of a few, the first of many."""
+    more = len(texts) - MOST_NAMED
+    return "; ".join(texts[:MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
 
 
 def _scene(calibration: Calibration) -> str:

@@ -115,6 +115,24 @@ def test_provenance_names_files_by_their_sums(calibration, page):
     assert "Pashkevich, Chablat, Wenger (2006)" in page
 
 
+def test_provenance_says_what_was_given_beside_the_readings(root, read):
+    assert ["Tolerances", "the robot's"] in read.rows
+    assert ["Known values", "none"] in read.rows
+    assert ["Bounds", "none"] in read.rows
+    found = calibrate(
+        root / "examples/raw-cycles",
+        model="lengths",
+        tolerances={"*.offset": 2e-3},
+        known={"x_leg.length": 0.12e-3, "y_leg.length": (0.05e-3, 0.02e-3)},
+        bounds={"z_slide.offset": (-1e-3, 2e-3)},
+    )
+    rows = Reader(build_report(found)).rows
+    offsets = [f"{leg}_slide.offset 2 mm instead of 5" for leg in "xyz"]
+    assert ["Tolerances", "; ".join(offsets)] in rows
+    assert ["Known values", "y_leg.length 0.05 ± 0.02 mm; x_leg.length 0.12 mm"] in rows
+    assert ["Bounds", "z_slide.offset -1 … 2 mm"] in rows
+
+
 def test_plots_are_drawn_into_the_page(page, read):
     assert read.tags.count("svg") >= 9
     assert len(read.ids) == len(set(read.ids))
