@@ -6,8 +6,13 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from conftest import ROOT
+
+from orthocal import assess_tool, calibrate, draw_scene, load_session
+from orthocal.errors import NotIdentifiableError
+from orthocal.study.accuracy import measure_deviations
 
 SCRIPTS = sorted((ROOT / "examples").glob("[0-9]*.py"))
 
@@ -86,3 +91,32 @@ def test_what_the_readme_says_of_sweep_and_lines_is_what_the_example_prints():
     assert achieved["nominal"] == pytest.approx(300, abs=5)
     assert achieved["lines, full"] == pytest.approx(7, abs=0.5)
     assert achieved["sweep, full"] == pytest.approx(40, abs=5)
+
+
+def test_what_offsets_alone_leave_of_lines_is_what_the_readme_says(root):
+    assert "keeps 0.06 mm" in (ROOT / "README.md").read_text()
+    found = assess_tool(
+        calibrate(root / "examples/lines", model="full", tolerances={"*.offset": 2e-3})
+    )
+    left = measure_deviations(found.relative_left, found.workspace.weights)
+    assert left.rms == pytest.approx(0.06e-3, abs=0.005e-3)
+
+
+def test_what_the_readme_says_of_its_picture_and_of_what_remains_is_so(root):
+    text = " ".join((ROOT / "README.md").read_text().split())
+    calibration = calibrate(root / "examples/table1/experiment-2")
+    assert "drawn twelve times its size" in text
+    assert draw_scene(calibration).exaggeration == 12.0
+    assert "what remains is ten times what the gauge itself would leave" in text
+    noise, gauge = calibration.noise, calibration.session.gauge_sigma
+    assert noise.residual_sigma / gauge == pytest.approx(10.0, abs=0.5)
+
+
+def test_the_session_that_the_readme_shows_can_be_read(tmp_path):
+    (session,), (readings,) = blocks("yaml"), blocks("csv")
+    (tmp_path / "session.yaml").write_text(session)
+    (tmp_path / "readings.csv").write_text(readings)
+    loaded = load_session(tmp_path)
+    np.testing.assert_allclose(loaded.values, [0.0, 0.21e-3, -0.18e-3], rtol=1e-12)
+    with pytest.raises(NotIdentifiableError, match=r"do not determine z_slide\.offset"):
+        calibrate(loaded)  # "If readings leave an offset open, orthocal says so."
