@@ -176,7 +176,7 @@ def assemble_calibration(
             iterations=fit.iterations,
             seconds_build=fit.seconds_build,
             seconds_solve=fit.seconds_solve,
-            hessian=fit.program.options.hessian,
+            hessian=fit.solution.hessian,
             loss=loss.kind,
             loss_width=loss.width,
         ),

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import casadi as ca
@@ -32,6 +33,9 @@ scaled down with them: the same optimum, with rounding errors that stay below th
 EXACT_READINGS = 20_000
 """Readings up to which the tolerance is kept; with more it grows as their sum's rounding errors."""
 
+MOST_EXACT = 2_000
+"""Readings up to which the exact Hessian is tried where the other does not converge."""
+
 LEFT_OUT = 1e-9
 """Weight of readings that are left out: next to nothing, and their gauge zeros stay determined."""
 
@@ -49,7 +53,8 @@ class SolverOptions:
     """How Ipopt is run."""
 
     hessian: Hessian = "gauss-newton"
-    """Hessian of the Lagrangian: exact, or without the curvature of readings and closures."""
+    """Hessian of the Lagrangian: exact, or without the curvature of readings and closures. Where
+    the latter does not converge the exact one is tried."""
     tolerance: float = 1e-6
     """Ipopt's `tol` on the gradient of the scaled problem, in units of θ̂ (one tolerance) where
     only the prior holds a parameter, and far less where readings do. Readings of 0.3 m known to
@@ -78,6 +83,8 @@ class Solution:
     status: str
     """Ipopt's own word."""
     iterations: int
+    hessian: Hessian
+    """With which it was found."""
     seconds_build: float
     seconds_solve: float
     closure: float
@@ -208,6 +215,15 @@ class NonlinearProgram:
         seconds = time.perf_counter() - began
         stats = self._solver.stats()
         status, iterations = str(stats["return_status"]), int(stats["iter_count"])
+        if status not in CONVERGED and self._can_be_exact:
+            return self._exact.solve(
+                sigma=sigma,
+                values=values,
+                start=start,
+                start_passive=start_passive,
+                left_out=left_out,
+                held=held,
+            )
         if status not in CONVERGED:
             raise SolverError(
                 f"Ipopt did not converge: {status} after {iterations} iterations; there is no "
@@ -227,6 +243,7 @@ class NonlinearProgram:
             objective=float(answer["f"]) / _weighting(sigma)[1],
             status=status,
             iterations=iterations,
+            hessian=self.options.hessian,
             seconds_build=self.seconds_build,
             seconds_solve=seconds,
             closure=float(closures) * LENGTH_SCALE,
@@ -254,6 +271,16 @@ class NonlinearProgram:
     def functions(self) -> dict[str, ca.Function]:
         """The program's functions of (x, p[, lam_f, lam_g]), for checks of their derivatives."""
         return dict(self._functions)
+
+    @property
+    def _can_be_exact(self) -> bool:
+        few = self.problem.observations.size <= MOST_EXACT
+        return few and self.options.hessian != "exact"
+
+    @cached_property
+    def _exact(self) -> NonlinearProgram:
+        """The same with the exact Hessian: slower, and it converges where the other does not."""
+        return NonlinearProgram(self.problem, options=replace(self.options, hessian="exact"))
 
     def _bounds(self, side: Literal["lower", "upper"], held: Mapping[int, float]) -> Array:
         """Bounds of all variables, scaled: only parameters have any."""

@@ -9,7 +9,7 @@ from derivatives import central_differences
 from scipy.optimize import least_squares
 from tolerances import DERIVATIVE, SAME_OPTIMUM, TRUTH_BACK
 
-from orthocal import load_plan, simulate_session
+from orthocal import load_plan, load_session, simulate_session
 from orthocal.errors import SolverError
 from orthocal.identification.linear import solve_linearised
 from orthocal.identification.loss import SQUARES, Loss
@@ -165,6 +165,22 @@ def test_new_readings_do_not_rebuild(plan):
     again = program.solve(sigma=1e-5, values=build_problem(second).values)
     fresh = NonlinearProgram(build_problem(second)).solve(sigma=1e-5)
     assert np.abs(again.theta - fresh.theta).max() < SAME_OPTIMUM
+
+
+@pytest.mark.parametrize("experiment", ["1-printed", "1-corrected"])
+def test_where_gauss_newton_does_not_converge_the_exact_hessian_does(root, experiment):
+    """Six readings on the straight part of Huber's loss: where it ends its slope is 0."""
+    problem = build_problem(
+        load_session(root / f"examples/table1/experiment-{experiment}"), model="full"
+    )
+    program, sigma = NonlinearProgram(problem, options=SolverOptions(loss=HUBER)), 2e-5
+    solution = program.solve(sigma=sigma, start=solve_linearised(problem, sigma=sigma))
+    assert solution.hessian == "exact"
+    prediction, jacobian = problem.linearise(solution.theta, solution.passive)
+    residual = problem.values - prediction - solution.zeros[problem.observations.zero]
+    pulls = -jacobian * HUBER.influence(residual / sigma)[:, None] / sigma
+    slope = pulls.sum(axis=0) + problem.prior * solution.theta / problem.theta_scale
+    assert np.abs(slope).max() < DERIVATIVE * np.abs(pulls).sum(axis=0).max()
 
 
 def test_not_converged_is_an_error_and_never_a_result(plan):
