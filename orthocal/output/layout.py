@@ -94,6 +94,11 @@ def typeset(value: float, decimals: int = 3) -> str:
     return text.replace("-", "−")
 
 
+def counted(count: int, noun: str) -> str:
+    """So many of something, in words: 1 reading, 2 readings."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def um(value: float) -> str:
     """A length in µm, as many decimals as say something."""
     size = value * 1e6

@@ -10,7 +10,7 @@ from rich.text import Text
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.records import ControllerEntry, ParameterEstimate, ResidualRow
 from orthocal.output.explanation import advise
-from orthocal.output.layout import add_row, choose_rows, mm, plain, signed, table_of
+from orthocal.output.layout import add_row, choose_rows, counted, mm, plain, signed, table_of
 
 MANY_PARAMETERS = 12
 """Parameters above which only those that the readings tell are listed."""
@@ -38,8 +38,8 @@ _SOURCES = {
 def render_heading(calibration: Calibration, *, effort: bool = True) -> RenderableType:
     """What was calibrated, from what and how, with what it took."""
     session, solver = calibration.session, calibration.solver
-    kind = "differences" if calibration.rows_are_differences else "readings"
-    legs = ", ".join(sorted({s.leg for s in calibration.setups}))
+    kind = "difference" if calibration.rows_are_differences else "reading"
+    legs = sorted({s.leg for s in calibration.setups})
     lines = [
         Text(
             f"Calibration of {calibration.robot_record.name}, model '{calibration.model}'",
@@ -54,21 +54,22 @@ def render_heading(calibration: Calibration, *, effort: bool = True) -> Renderab
     }
     lines.append(
         Text(
-            f"Measured: {len(calibration.residuals)} {kind} in {len(used)} postures, "
-            f"{len(calibration.setups)} setups on legs {legs}"
+            f"Measured: {counted(len(calibration.residuals), kind)} in "
+            f"{counted(len(used), 'posture')}, {counted(len(calibration.setups), 'setup')} on "
+            f"{'leg' if len(legs) == 1 else 'legs'} {', '.join(legs)}"
         )
     )
     with_prior = sum(p.prior for p in calibration.free)
     prior = "tolerances as prior" if with_prior else "no prior"
     if 0 < with_prior < len(calibration.free):
         prior = f"{with_prior} with a prior"
-    kind = "base parameters" if calibration.base else "parameters"
+    kind = "base parameter" if calibration.base else "parameter"
     loss = ", Huber's loss" if solver.loss == "huber" else ""
     took = (
-        f"; Ipopt {solver.status}, {solver.iterations} iterations, {solver.seconds_build:.2f} + "
-        f"{solver.seconds_solve:.2f} s"
+        f"; Ipopt {solver.status}, {counted(solver.iterations, 'iteration')}, "
+        f"{solver.seconds_build:.2f} + {solver.seconds_solve:.2f} s"
     )
-    solved = f"Solved: {len(calibration.free)} {kind}, {prior}{loss}"
+    solved = f"Solved: {counted(len(calibration.free), kind)}, {prior}{loss}"
     lines.append(Text(f"{solved}{took if effort else ''}"))
     return Group(*lines)
 
@@ -167,13 +168,14 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
     """What the readings tell, and what they cannot tell apart."""
     found = calibration.identifiability
     count = found.singular_values.size
+    taken = found.n_readings - calibration.spare_readings
     o = found.observability
     lines = [
         f"{found.rank} of {count} combinations of parameters, each better than its tolerance "
         f"(singular values above the noise, {found.threshold * 1e6:.3g} µm a tolerance); perfect "
         f"readings of this kind would tell {found.structural_rank}.",
-        f"Of {found.n_readings} independent readings the parameters can take up "
-        f"{found.n_readings - calibration.spare_readings}; the others check the model.",
+        f"Of {counted(found.n_readings, 'independent reading')} the parameters can take up "
+        + (f"{taken}; the others check the model." if taken < found.n_readings else "all."),
     ]
     if found.rank:
         lines.append(
@@ -190,7 +192,8 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
             ", ".join(found.unseen) if all_rows or len(found.unseen) <= 6 else "--all lists them"
         )
         lines.append(
-            f"Below the noise: {len(found.unseen)} parameters, one tolerance of which moves all "
+            f"Below the noise: {counted(len(found.unseen), 'parameter')}, one tolerance of which "
+            "moves all "
             f"readings together by less ({names})."
         )
     sums = [c for c in found.base if len(c.terms) > 1]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from orthocal.errors import ClosureError, ParameterError
 from orthocal.identification.calibration import Calibration
 from orthocal.measurement.session import Session
-from orthocal.output.layout import typeset
+from orthocal.output.layout import counted, typeset
 from orthocal.output.view.deviations import (
     Measurement,
     Stop,
@@ -145,8 +145,8 @@ def _draw_robot(robot: Robot, posture: str | None) -> Scene:
         for d in robot.drives
     )
     stage.scene.facts.insert(0, f"Mechanical zero: {drives}.")
-    loops = f"{len(robot.closures)} closed loop{'' if len(robot.closures) == 1 else 's'}"
-    stage.scene.headline = f"{len(robot.drives)} drives, {loops}"
+    loops = counted(len(robot.closures), "closed loop")
+    stage.scene.headline = f"{counted(len(robot.drives), 'drive')}, {loops}"
     return stage.scene
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.measurement.session import DIRECTIONS, Setup, section_plane
-from orthocal.output.layout import short_name, typeset
+from orthocal.output.layout import counted, short_name, typeset
 from orthocal.output.view.deviations import Deviation, Measurement, Stop, worst_of_setups
 from orthocal.output.view.motion import Film, Timeline
 from orthocal.output.view.scene import Label, LegendEntry, Scene, Step, round_scale
@@ -250,7 +250,8 @@ def write_headline(measured: Measurement) -> str:
     worst = max(measured.rows, key=lambda r: abs(r.before))
     if measured.planned:
         postures = len({r.posture for r in measured.rows})
-        return f"A plan: {measured.count} readings in {postures} postures, none taken yet."
+        readings = counted(measured.count, "reading")
+        return f"A plan: {readings} in {counted(postures, 'posture')}, none taken yet."
     if abs(worst.before) < NOTHING:
         return "All legs are parallel to their axes: no gauge has seen anything."
     leg = measured.setups[worst.setup].leg
