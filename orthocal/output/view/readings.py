@@ -142,7 +142,10 @@ def draw_readings(
             )
         )
     _explain(scene, len(kinds), shown)
-    captions = [_caption(s, measured, overview=overview and s is stops[0]) for s in stops]
+    captions = [_caption(s, measured) for s in stops]
+    if overview:  # the last stop may be the first one again
+        of_all = _overview(measured, shown)
+        captions = [of_all if s is stops[0] else c for s, c in zip(stops, captions, strict=True)]
     write_steps(scene, stops, timeline, captions)
 
 
@@ -216,13 +219,15 @@ def _label(row: Deviation, measured: Measurement) -> str:
     return f"{name} {_mm(row.before)}{after} mm\n{short_name(row.where, 2 * LONGEST_LABEL)}"
 
 
-def _caption(stop: Stop, measured: Measurement, *, overview: bool) -> str:
-    if overview:
-        return (
-            "Overview at the zero: where the gauges will stand"
-            if measured.planned
-            else "Overview at the zero: the largest deviation that each gauge saw"
-        )
+def _overview(measured: Measurement, shown: bool) -> str:
+    if not shown:
+        return "Overview at the zero"
+    if measured.planned:
+        return "Overview at the zero: where the gauges will stand"
+    return "Overview at the zero: the largest deviation that each gauge saw"
+
+
+def _caption(stop: Stop, measured: Measurement) -> str:
     if not stop.rows and stop.taken_off:
         return f"{stop.name}, leg {stop.leg}: taken off what is read at {', '.join(stop.taken_off)}"
     if not stop.rows:
@@ -237,12 +242,14 @@ def _explain(scene: Scene, kinds: int, shown: bool) -> None:
     scene.explain(LegendEntry("Gauges", (GAUGES,), css(GAUGE_COLOUR), "solid", shown))
     if kinds == 0:
         return
+    drawn = f"drawn × {scene.arrow_scale:g}"
     text = "Measured − nominal" if kinds == 1 else "Before: measured − nominal"
-    scene.explain(LegendEntry(text, (BEFORE,), css(BEFORE_COLOUR), "arrow", shown))
+    scene.explain(
+        LegendEntry(f"{text}, {drawn}", (BEFORE,), css(BEFORE_COLOUR), "arrow", shown),
+    )
     if kinds == 2:
-        text = "After: measured − calibrated"
+        text = f"After: measured − calibrated, {drawn}"
         scene.explain(LegendEntry(text, (AFTER,), css(AFTER_COLOUR), "arrow", shown))
-    scene.facts.insert(-1, f"Arrows at the gauges: × {scene.arrow_scale:g}.")
 
 
 def write_headline(measured: Measurement) -> str:

@@ -59,16 +59,16 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
         (TOOL_LEFT, found.left, LEFT_COLOUR),
     ):
         _draw_deviations(scene, node, found.targets[chosen], deviations[chosen], colour, width)
-    text = f"Tool now: up to {um(now)} µm off"
+    drawn = f"drawn × {scene.tool_scale:g}"
+    text = f"Tool now, over {region}: up to {um(now)} µm off, {drawn}"
     scene.explain(LegendEntry(text, (TOOL_NOW,), css(NOW_COLOUR), "arrow", shown))
     if left > VANISHING:
-        text = f"Tool with the offsets entered: up to {um(left)} µm off"
+        text = f"Tool with the offsets entered: up to {um(left)} µm off, {drawn}"
         scene.explain(LegendEntry(text, (TOOL_LEFT,), css(LEFT_COLOUR), "arrow", shown))
     if found.after is not None:
         _draw_ellipsoids(scene, found.targets[chosen], found.after.covariance[chosen])
-        text = f"Tool: not known, one σ: up to {um(spread)} µm"
+        text = f"Tool: not known, one σ: up to {um(spread)} µm, {drawn}"
         scene.explain(LegendEntry(text, (TOOL_UNKNOWN,), css(UNKNOWN_COLOUR), "ball", shown))
-    scene.facts.insert(-1, f"Errors of the tool, over {region}: × {scene.tool_scale:g}.")
 
 
 def _choose_points(found: ToolAccuracy) -> NDArray[np.int64]:

@@ -212,7 +212,9 @@ def test_arrows_are_as_long_as_the_residuals(scene, calibration):
             setup = next(s for s in calibration.setups if s.name == row.setup)
             along = scene.pose(path)[:3, 2]
             assert along == pytest.approx(np.array(DIRECTIONS[setup.direction]))
-    assert any(f"× {scene.arrow_scale:g}" in fact for fact in scene.facts)
+    arrows = [e.text for e in scene.legend if e.nodes[0] in (readings.BEFORE, readings.AFTER)]
+    assert len(arrows) == 2
+    assert all(text.endswith(f"drawn × {scene.arrow_scale:g}") for text in arrows)
 
 
 def test_arrow_that_is_shorter_than_its_head_is_a_smaller_head():
@@ -390,6 +392,10 @@ def test_errors_of_the_tool_are_those_of_the_calibration(full):
             width = head_length(0.006 * np.ptp(scene.camera.points, axis=0).max())
             length = head[2, 3] + head[2, 2] * width
             assert length == pytest.approx(size * scene.tool_scale, rel=1e-3)
+    told = [e.text for e in scene.legend if e.nodes[0].startswith("Tool error")]
+    assert len(told) == 3
+    assert all(text.endswith(f"drawn × {scene.tool_scale:g}") for text in told)
+    assert scene.steps[0].caption == "Overview at the zero"  # no gauge is there
     ball = scene.pose(f"{tool_errors.TOOL_UNKNOWN}/point 5")[:3, :3]
     assert ball @ ball.T == pytest.approx(
         scene.tool_scale**2 * found.after.covariance[4], rel=1e-6, abs=1e-16

@@ -145,40 +145,44 @@
       .filter((element) => element && element.offsetWidth > 0)
       .map((element) => element.getBoundingClientRect());
     const middle = toView(data.camera.target).project(camera());
-    const shown = [];
+    const shown = [], spared = [];
     for (const label of labels) {
       const text = label.texts.length === 1 ? label.texts[0] : now < 0 ? "" : label.texts[now];
       const at = ofStep(label.points, now).clone().project(camera());
       const inside = Math.abs(at.x) < 1 && Math.abs(at.y) < 1 && at.z < 1;
       label.element.style.display = label.line.style.display = "none";
-      if (!text || !inside || !isShown(label.path)) continue;
-      if (label.element.textContent !== text) label.element.textContent = text;
-      label.element.style.display = "block";
+      if (!inside || !isShown(label.path)) continue;
       const x = ((at.x + 1) / 2) * width, y = ((1 - at.y) / 2) * height;
-      shown.push({ label, x, y, w: label.element.offsetWidth, h: label.element.offsetHeight });
-      // no label stands on a point that another one explains
-      if (label.rank >= 0) taken.push({ left: x - 12, right: x + 12, top: y - 12, bottom: y + 12 });
+      // no label stands on a point that another one explains, nor, where there is room, on others
+      const kept = text ? taken : spared;
+      if (label.rank >= 0) kept.push({ left: x - 12, right: x + 12, top: y - 12, bottom: y + 12 });
       if (label.uncovered.length > 0) {
         const around = ofStep(label.uncovered, now).map((point) => toView(point).project(camera()));
         const xs = around.map((p) => ((p.x + 1) / 2) * width), ys = around.map((p) => ((1 - p.y) / 2) * height);
-        taken.push({ left: Math.min(...xs) - 8, right: Math.max(...xs) + 8, top: Math.min(...ys) - 8, bottom: Math.max(...ys) + 8 });
+        kept.push({ left: Math.min(...xs) - 8, right: Math.max(...xs) + 8, top: Math.min(...ys) - 8, bottom: Math.max(...ys) + 8 });
       }
+      if (!text) continue;
+      if (label.element.textContent !== text) label.element.textContent = text;
+      label.element.style.display = "block";
+      shown.push({ label, x, y, w: label.element.offsetWidth, h: label.element.offsetHeight });
     }
     const mx = ((middle.x + 1) / 2) * width, my = ((1 - middle.y) / 2) * height;
     for (const { label, x, y, w, h } of shown) {
       const away = Math.hypot(x - mx, y - my) || 1;
       const cost = (p) => p.reach - 45 * ((p.x * (x - mx)) / away + (p.y * (y - my)) / away) - (p === label.last ? 25 : 0);
       const options = label.rank < 0 ? near : [...places].sort((p, q) => cost(p) - cost(q));
-      let found = null;
-      for (const place of options) {
-        const left = x + place.x * (place.reach + w / 2) - w / 2, top = y + place.y * (place.reach + h / 2) - h / 2;
-        const rect = { left: left - 2, right: left + w + 2, top: top - 2, bottom: top + h + 2 };
-        if (rect.left < 2 || rect.top < 2 || rect.right > width - 2 || rect.bottom > height - 2) continue;
-        if (taken.some((other) => overlap(rect, other))) continue;
-        found = { rect, left, top };
-        label.last = place;
-        break;
-      }
+      const tryAll = (forbidden) => {
+        for (const place of options) {
+          const left = x + place.x * (place.reach + w / 2) - w / 2, top = y + place.y * (place.reach + h / 2) - h / 2;
+          const rect = { left: left - 2, right: left + w + 2, top: top - 2, bottom: top + h + 2 };
+          if (rect.left < 2 || rect.top < 2 || rect.right > width - 2 || rect.bottom > height - 2) continue;
+          if (forbidden.some((other) => overlap(rect, other))) continue;
+          label.last = place;
+          return { rect, left, top };
+        }
+        return null;
+      };
+      const found = tryAll([...taken, ...spared]) || tryAll(taken);
       if (!found) {
         label.element.style.display = "none";
         continue;
