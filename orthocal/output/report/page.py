@@ -279,11 +279,12 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
         if p.lower is not None or p.upper is not None:
             low, high = ("∞" if v is None else f"{v * f:g}" for v in (p.lower, p.upper))
             bounds.append(f"{p.name} {low} … {high} {unit}".replace(" ∞ …", " −∞ …"))
-    return [
-        ("Tolerances", _some(tolerances) or "the robot's"),
-        ("Known values", _some(known) or "none"),
-        ("Bounds", _some(bounds) or "none"),
+    rows = [
+        (name, _some(texts))
+        for name, texts in (("Tolerances", tolerances), ("Known values", known), ("Bounds", bounds))
+        if texts
     ]
+    return rows or [("Given beside the readings", "nothing: the robot's own tolerances hold")]
 
 
 def _some(texts: Sequence[str]) -> str:
