@@ -34,7 +34,7 @@ _HOMES = {
     "summarize": "orthocal.output.summary",
     "validate_calibration": "orthocal.study.validation",
     "write_report": "orthocal.output.report.page",
-    "write_session": "orthocal.measurement.session_file",
+    "write_session": "orthocal.measurement.session_output",
 }
 
 __all__ = [
@@ -70,7 +70,8 @@ if TYPE_CHECKING:
     from orthocal.identification.loss import Loss
     from orthocal.identification.nlp import SolverOptions
     from orthocal.measurement.session import Session
-    from orthocal.measurement.session_file import load_plan, load_session, write_session
+    from orthocal.measurement.session_file import load_plan, load_session
+    from orthocal.measurement.session_output import write_session
     from orthocal.measurement.synthetic import draw_errors, simulate_session
     from orthocal.output.report.page import write_report
     from orthocal.output.summary import summarize

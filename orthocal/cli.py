@@ -156,7 +156,7 @@ def calibrate(
     all_rows: AllRows = False,
 ) -> None:
     """Identify the errors of a machine from a session of readings."""
-    from orthocal.documents import require_writable, write_files
+    from orthocal.files import require_writable, write_files
     from orthocal.identification.calibrate import calibrate as run
     from orthocal.identification.loss import Loss
     from orthocal.identification.nlp import SolverOptions
@@ -365,7 +365,7 @@ def report(
     ] = None,
 ) -> None:
     """Write a calibration as one page: what to enter, how far to believe it, and why."""
-    from orthocal.documents import is_folder, require_writable_file
+    from orthocal.files import is_folder, require_writable_file
     from orthocal.identification.calibration_file import load_calibration
     from orthocal.output.report.page import write_report
 
@@ -420,7 +420,7 @@ def view(
 
     Without --html and --png on a server that only this machine reaches, until Ctrl-C.
     """
-    from orthocal.documents import require_writable_file
+    from orthocal.files import require_writable_file
     from orthocal.output.subject import load_subject
     from orthocal.output.view.browser import find_chromium, parse_size, take_picture
     from orthocal.output.view.drawing import draw_scene
@@ -471,9 +471,10 @@ def simulate(
     ] = False,
 ) -> None:
     """Make a session of simulated readings of a machine whose errors are known."""
-    from orthocal.documents import exists, require_writable
+    from orthocal.files import exists, require_writable
     from orthocal.identification.selection import read_tolerances
-    from orthocal.measurement.session_file import load_plan, write_session
+    from orthocal.measurement.session_file import load_plan
+    from orthocal.measurement.session_output import write_session
     from orthocal.measurement.synthetic import (
         collect_errors,
         simulate_session,

@@ -12,7 +12,7 @@ from conftest import ROOT
 import orthocal
 
 STAGES = [
-    *("errors", "documents", "markup"),
+    *("errors", "files", "documents", "markup"),
     *("robot", "measurement", "identification", "study", "output", "cli"),
 ]
 

@@ -15,9 +15,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.documents import write_file
-from orthocal.errors import CalibrationFileError, ParameterError, RobotError
+from orthocal.files import write_file
 from orthocal.identification.identifiability import Combination, Identifiability
+from orthocal.identification.recorded_robot import (
+    load_recorded_robot,
+    require_names,
+    require_offsets,
+    require_parameters,
+)
 from orthocal.identification.records import (
     ControllerEntry,
     NoiseRecord,
@@ -33,9 +38,7 @@ from orthocal.identification.records import (
 from orthocal.identification.uncertainty import BY_CHANCE, confidence_factor
 from orthocal.identification.unmodelled import Unmodelled
 from orthocal.markup import paragraph, table
-from orthocal.measurement.session import DIRECTIONS
 from orthocal.robot.assembly import Assembly
-from orthocal.robot.loading import load_robot, packaged_robots
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
@@ -348,87 +351,12 @@ class Calibration:
         )
 
     def _load_robot(self) -> Robot:
-        record = self.robot_record
-        where = None if self.path is None else str(self.path)
-        if record.folder is None:
-            if record.name not in packaged_robots():
-                raise CalibrationFileError(
-                    f"names the robot '{record.name}', which does not come with this orthocal",
-                    where=where,
-                )
-            robot = load_robot(record.name)
-        else:
-            folder = Path(record.folder)
-            if not folder.is_dir() and self.path is not None:
-                folder = self.path.parent / record.reference
-            try:
-                robot = load_robot(folder)
-            except RobotError as e:
-                if e.where is not None:
-                    raise
-                raise CalibrationFileError(
-                    f"'{record.reference}' is neither a robot of orthocal "
-                    f"({', '.join(packaged_robots())}) nor a folder ({folder})",
-                    where=None if where is None else f"{where}: robot",
-                ) from None
-        if robot.sha256 != record.sha256:
-            raise CalibrationFileError(
-                f"was made for another version of robot '{record.name}': the files in "
-                f"{robot.folder} have changed since",
-                where=where,
-            )
-        self._check_against(robot)
-        return robot
-
-    def _check_against(self, robot: Robot) -> None:
-        """Refuse names and numbers that do not fit the robot: a file can be edited."""
+        robot = load_recorded_robot(self.robot_record, file=self.path)
         prefix = "" if self.path is None else f"{self.path}: "
-        for i, p in enumerate(self.parameters):
-            where = f"{prefix}parameters[{i}]"
-            try:
-                known = robot.parameters[p.name]
-            except ParameterError as e:
-                raise CalibrationFileError(e.problem, where=f"{where}.name") from None
-            if p.unit != known.unit:
-                raise CalibrationFileError(
-                    f"found '{p.unit}'; {p.name} is in {known.unit}", where=f"{where}.unit"
-                )
-        for i, name in enumerate(self.unmodelled.names):
-            try:
-                robot.parameters[name]
-            except ParameterError as e:
-                raise CalibrationFileError(
-                    e.problem, where=f"{prefix}unmodelled.names[{i}]"
-                ) from None
-        for i, setup in enumerate(self.setups):
-            for key, found, known_names in (
-                ("leg", setup.leg, tuple(robot.legs)),
-                ("direction", setup.direction, tuple(DIRECTIONS)),
-            ):
-                if found not in known_names:
-                    raise CalibrationFileError(
-                        f"'{found}' is none of {', '.join(known_names)}",
-                        where=f"{prefix}setups[{i}].{key}",
-                    )
-        postures, setups = {p.name for p in self.postures}, {s.name for s in self.setups}
-        for i, row in enumerate(self.residuals):
-            for key, name, kind, among in (
-                ("setup", row.setup, "setups", setups),
-                ("posture", row.posture, "postures", postures),
-                ("minus", row.minus or row.posture, "postures", postures),
-            ):
-                if name not in among:
-                    raise CalibrationFileError(
-                        f"'{name}' is not among the file's {kind}",
-                        where=f"{prefix}residuals[{i}].{key}",
-                    )
-        offsets = self.session.controller_offsets
-        if offsets is not None and len(offsets) != len(robot.drives):
-            raise CalibrationFileError(
-                f"has {len(offsets)} numbers; expected {len(robot.drives)}, one a drive: "
-                f"{', '.join(d.name for d in robot.drives)}",
-                where=f"{prefix}session.controller_offsets",
-            )
+        require_parameters(robot, self.parameters, self.unmodelled.names, prefix=prefix)
+        require_names(robot, self.setups, self.postures, self.residuals, prefix=prefix)
+        require_offsets(robot, self.session.controller_offsets, prefix=prefix)
+        return robot
 
 
 def _identifiability_document(found: Identifiability) -> dict[str, Any]:

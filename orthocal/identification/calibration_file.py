@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from orthocal.documents import Number, PositiveNumber, exists, is_folder, read_json, validate
+from orthocal.documents import Number, PositiveNumber, read_json, validate
 from orthocal.errors import CalibrationFileError
+from orthocal.files import exists, is_folder
 from orthocal.identification.calibration import SCHEMA, Calibration
 from orthocal.identification.identifiability import Combination, Identifiability
 from orthocal.identification.records import (

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.errors import SolverError
 from orthocal.identification.loss import SQUARES, Loss
 from orthocal.identification.problem import LENGTH_SCALE, CalibrationProblem, ReadingPiece
+from orthocal.identification.sparse import SparseSum
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -91,50 +92,6 @@ class Solution:
     """Largest closure residual that is left, rotations times characteristic length, [m]."""
     at_bound: NDArray[np.int8]
     """-1 where a parameter is held by its lower bound, 1 by its upper one, else 0, (n_free,)."""
-
-
-class _Gather:
-    """Sums of contributions into the nonzeros of one sparse matrix or vector."""
-
-    def __init__(self, n_rows: int, n_columns: int) -> None:
-        self._shape = (n_rows, n_columns)
-        self._rows: list[Indices] = []
-        self._columns: list[Indices] = []
-        self._values: list[ca.MX] = []
-
-    def add(self, rows: Indices, columns: Indices, values: ca.MX) -> None:
-        """Add values (a column vector) at positions."""
-        self._rows.append(np.asarray(rows, dtype=np.int64).reshape(-1))
-        self._columns.append(np.asarray(columns, dtype=np.int64).reshape(-1))
-        self._values.append(values)
-
-    def build(self) -> ca.MX:
-        """The sparse matrix."""
-        rows, columns = np.concatenate(self._rows), np.concatenate(self._columns)
-        values = ca.vertcat(*self._values)
-        keys = columns * self._shape[0] + rows  # order of compressed columns
-        unique, position = np.unique(keys, return_inverse=True)
-        sparsity = ca.Sparsity(
-            *self._shape,
-            _column_starts(unique // self._shape[0], self._shape[1]),
-            (unique % self._shape[0]).tolist(),
-        )
-        if unique.size == keys.size:
-            order = np.empty(keys.size, dtype=np.int64)
-            order[position] = np.arange(keys.size)
-            nonzeros = values[order.tolist()]
-        else:
-            summing = ca.Sparsity(
-                unique.size, keys.size, list(range(keys.size + 1)), position.tolist()
-            )
-            nonzeros = ca.mtimes(ca.MX(ca.DM.ones(summing)), values)
-        return ca.MX(sparsity, ca.densify(nonzeros))
-
-
-def _column_starts(columns: Indices, count: int) -> list[int]:
-    starts = np.zeros(count + 1, dtype=np.int64)
-    np.cumsum(np.bincount(columns, minlength=count), out=starts[1:])
-    return [int(v) for v in starts]
 
 
 class NonlinearProgram:
@@ -307,7 +264,7 @@ class NonlinearProgram:
 
         shared = list(self._shared_call(theta))
         objective = 0.5 * ca.dot(prior * from_mean, from_mean)
-        gradient, hessian = _Gather(n, 1), _Gather(n, n)
+        gradient, hessian = SparseSum(n, 1), SparseSum(n, n)
         diagonal = np.arange(self._n_theta)
         gradient.add(diagonal, np.zeros_like(diagonal), prior * from_mean)
         hessian.add(diagonal, diagonal, lam_f * prior)
@@ -372,8 +329,8 @@ class NonlinearProgram:
         p: ca.MX,
         shared: list[ca.MX],
         lam_f: ca.MX,
-        gradient: _Gather,
-        hessian: _Gather,
+        gradient: SparseSum,
+        hessian: SparseSum,
     ) -> ca.MX:
         """Add the readings of one leg to gradient and Hessian; returns their objective.
 
@@ -463,7 +420,7 @@ class NonlinearProgram:
         return function(self.problem.shared.symbols[0], piece.passive, piece.drives, piece.setup)
 
     def _add_closures(
-        self, x: ca.MX, lam_g: ca.MX, shared: list[ca.MX], hessian: _Gather
+        self, x: ca.MX, lam_g: ca.MX, shared: list[ca.MX], hessian: SparseSum
     ) -> tuple[ca.MX, ca.MX]:
         """Closures of all postures and their Jacobian; their curvature goes into the Hessian."""
         problem = self.problem
@@ -492,14 +449,14 @@ class NonlinearProgram:
             ]
         )
         rows = postures[:, None] * n_g + pattern_rows[None, :]
-        jacobian = _Gather(k * n_g, x.numel())
+        jacobian = SparseSum(k * n_g, x.numel())
         jacobian.add(rows, variables[:, pattern_columns], ca.vec(nonzeros))
         if self.options.hessian == "exact":
             self._add_closure_curvature(arguments[:3], lam_g, variables, hessian)
         return constraints, jacobian.build()
 
     def _add_closure_curvature(
-        self, arguments: list[ca.MX], lam_g: ca.MX, variables: Indices, hessian: _Gather
+        self, arguments: list[ca.MX], lam_g: ca.MX, variables: Indices, hessian: SparseSum
     ) -> None:
         """Σ λᵀ ∇²ĝ of every posture; arguments are q̂, drives and θ̂."""
         direct = self.problem.direct

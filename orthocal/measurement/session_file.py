@@ -1,31 +1,22 @@
-"""Sessions as files: session.yaml with its readings in a CSV beside it, in mm.
+"""Sessions from files: session.yaml with its readings in a CSV beside it, in mm.
 
-Read, checked against the robot and the nominal machine, and written.
+They are checked against the robot and the nominal machine.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from orthocal.documents import (
-    is_folder,
-    parse_number,
-    read_csv_rows,
-    read_yaml,
-    validate,
-    write_files,
-)
+from orthocal.documents import parse_number, read_csv_rows, read_yaml, validate
 from orthocal.errors import ClosureError, RobotError, SessionError
+from orthocal.files import is_folder
 from orthocal.measurement.gauge import locate_contacts
 from orthocal.measurement.schema import SectionKeys, SessionKeys, SetupKeys
 from orthocal.measurement.session import (
@@ -39,13 +30,10 @@ from orthocal.measurement.session import (
     section_plane,
 )
 from orthocal.robot.assembly import nominal_assembly
-from orthocal.robot.loading import load_robot, packaged_robots
+from orthocal.robot.loading import load_robot
 from orthocal.robot.model import Robot, read_only
 
 Array = NDArray[np.float64]
-
-COLUMNS = ("setup", "posture", "minus", "cycle", "reading_mm")
-"""Columns of a readings.csv; `minus` and `cycle` may be absent."""
 
 
 def load_session(path: str | Path) -> Session:
@@ -115,111 +103,6 @@ def check_contacts(session: Session) -> None:
                 f"the root; the leg reaches from 0 to {length:.1f} mm",
                 where=_where(session.path, f"setups.{setup}.section"),
             )
-
-
-def session_document(session: Session, *, readings: str = "readings.csv") -> dict[str, Any]:
-    """The session.yaml of a session, as plain data."""
-    document: dict[str, Any] = {"robot": session.robot_reference}
-    if session.title:
-        document["title"] = session.title
-    if session.source:
-        document["source"] = session.source
-    gauge = session.gauge
-    entries = {
-        "sigma_mm": None if gauge.sigma is None else to_mm(gauge.sigma),
-        "resolution_mm": None if gauge.resolution is None else to_mm(gauge.resolution),
-        "range_mm": None if gauge.range is None else [to_mm(v) for v in gauge.range],
-    }
-    entries = {k: v for k, v in entries.items() if v is not None}
-    if entries:
-        document["gauge"] = entries
-    document["postures"] = {
-        p.name: {
-            p.form: [_tidy(np.rad2deg(v)) if p.form == "joints_deg" else to_mm(v) for v in p.values]
-        }
-        for p in session.postures.values()
-    }
-    if session.controller_offsets is not None:
-        document["controller"] = {"offsets_mm": [to_mm(v) for v in session.controller_offsets]}
-    document["setups"] = {
-        s.name: {
-            "leg": s.leg,
-            "direction": s.direction,
-            "section": {
-                s.section.form: s.section.value
-                if s.section.form == "fraction"
-                else to_mm(s.section.value)
-            },
-        }
-        for s in session.setups.values()
-    }
-    document["readings"] = readings
-    return document
-
-
-def write_session(
-    session: Session,
-    folder: str | Path,
-    *,
-    decimals: int = 6,
-    comment: str = "",
-    extra: Mapping[str, str] | None = None,
-) -> Path:
-    """Write session.yaml and readings.csv into a folder, both or neither.
-
-    Args:
-        session: The session.
-        folder: Made if need be.
-        decimals: Decimals of a reading in mm.
-        comment: Lines put first into the YAML.
-        extra: Other files of the folder, name to text, written with them.
-
-    Returns:
-        Path of the session.yaml.
-
-    Raises:
-        OrthocalError: If the folder cannot be written to.
-    """
-    folder = Path(folder)
-    document = session_document(session)
-    if session.robot_reference not in packaged_robots():
-        document["robot"] = os.path.relpath(session.robot.folder.resolve(), folder.resolve())
-    head = "".join(f"# {line}\n" for line in comment.splitlines())
-    text = head + yaml.safe_dump(
-        document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
-    )
-    table = io.StringIO()
-    with_minus = any(r.minus for r in session.readings)
-    with_cycle = any(r.cycle != 1 for r in session.readings)
-    columns = [c for c in COLUMNS if (c != "minus" or with_minus) and (c != "cycle" or with_cycle)]
-    table.write(",".join(columns) + "\n")
-    for r in session.readings:
-        fields = {
-            "setup": r.setup,
-            "posture": r.posture,
-            "minus": r.minus or "",
-            "cycle": str(r.cycle),
-            "reading_mm": _trim(f"{r.value * 1e3:.{decimals}f}"),
-        }
-        table.write(",".join(fields[c] for c in columns) + "\n")
-    files = {"session.yaml": text, "readings.csv": table.getvalue(), **(extra or {})}
-    write_files(folder, files)
-    return folder / "session.yaml"
-
-
-def to_mm(value: float) -> float:
-    """Metres as mm, without the rounding that the factor brings."""
-    return _tidy(value * 1e3)
-
-
-def _tidy(value: float) -> float:
-    return float(f"{value:.12g}")
-
-
-def _trim(number: str) -> str:
-    """A decimal number without trailing zeros beyond the second decimal."""
-    whole, _, decimals = number.partition(".")
-    return f"{whole}.{decimals.rstrip('0').ljust(2, '0')}"
 
 
 def _where(path: Path | None, key: str) -> str:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from orthocal.documents import exists, is_folder
 from orthocal.errors import OrthocalError
+from orthocal.files import exists, is_folder
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.calibration_file import load_calibration
 from orthocal.measurement.session import Session

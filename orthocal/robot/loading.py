@@ -12,8 +12,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from orthocal.documents import is_folder
 from orthocal.errors import ClosureError, ParameterError, RobotError
+from orthocal.files import is_folder
 from orthocal.robot.description import RobotKeys, load_description
 from orthocal.robot.model import (
     Closure,

@@ -19,7 +19,6 @@ from orthocal.measurement.synthetic import load_errors
 from orthocal.robot.assembly import Assembly, nominal_assembly
 from orthocal.robot.orthoglide import inverse
 from orthocal.study.accuracy import (
-    ToolSensitivity,
     Workspace,
     assess_tool,
     cube,
@@ -27,6 +26,7 @@ from orthocal.study.accuracy import (
     find_remaining_errors,
     measure_uncertainty,
 )
+from orthocal.study.sensitivity import ToolSensitivity
 
 OFFSET_SIGMA = 2e-3
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
-from orthocal.documents import write_file
 from orthocal.errors import ClosureError, OrthocalError, RobotError
+from orthocal.files import write_file
 from orthocal.identification.calibration import Calibration
 from orthocal.markup import heading, items, paragraph, table
 from orthocal.output.accuracy import render_tool

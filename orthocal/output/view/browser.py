@@ -8,8 +8,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from orthocal.documents import write_file
 from orthocal.errors import OrthocalError
+from orthocal.files import write_file
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 

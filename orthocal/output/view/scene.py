@@ -25,7 +25,7 @@ from meshcat.animation import Animation
 from meshcat.geometry import Geometry, Material
 from numpy.typing import NDArray
 
-from orthocal.documents import write_file
+from orthocal.files import write_file
 
 Array = NDArray[np.float64]
 Point = tuple[float, float, float]

@@ -1,0 +1,124 @@
+"""Sessions to files: session.yaml with its readings in a CSV beside it, in mm."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from orthocal.files import write_files
+from orthocal.measurement.session import Session
+from orthocal.robot.loading import packaged_robots
+
+COLUMNS = ("setup", "posture", "minus", "cycle", "reading_mm")
+"""Columns of a readings.csv; `minus` and `cycle` may be absent."""
+
+
+def session_document(session: Session, *, readings: str = "readings.csv") -> dict[str, Any]:
+    """The session.yaml of a session, as plain data."""
+    document: dict[str, Any] = {"robot": session.robot_reference}
+    if session.title:
+        document["title"] = session.title
+    if session.source:
+        document["source"] = session.source
+    gauge = session.gauge
+    entries = {
+        "sigma_mm": None if gauge.sigma is None else to_mm(gauge.sigma),
+        "resolution_mm": None if gauge.resolution is None else to_mm(gauge.resolution),
+        "range_mm": None if gauge.range is None else [to_mm(v) for v in gauge.range],
+    }
+    entries = {k: v for k, v in entries.items() if v is not None}
+    if entries:
+        document["gauge"] = entries
+    document["postures"] = {
+        p.name: {
+            p.form: [_tidy(np.rad2deg(v)) if p.form == "joints_deg" else to_mm(v) for v in p.values]
+        }
+        for p in session.postures.values()
+    }
+    if session.controller_offsets is not None:
+        document["controller"] = {"offsets_mm": [to_mm(v) for v in session.controller_offsets]}
+    document["setups"] = {
+        s.name: {
+            "leg": s.leg,
+            "direction": s.direction,
+            "section": {
+                s.section.form: s.section.value
+                if s.section.form == "fraction"
+                else to_mm(s.section.value)
+            },
+        }
+        for s in session.setups.values()
+    }
+    document["readings"] = readings
+    return document
+
+
+def write_session(
+    session: Session,
+    folder: str | Path,
+    *,
+    decimals: int = 6,
+    comment: str = "",
+    extra: Mapping[str, str] | None = None,
+) -> Path:
+    """Write session.yaml and readings.csv into a folder, both or neither.
+
+    Args:
+        session: The session.
+        folder: Made if need be.
+        decimals: Decimals of a reading in mm.
+        comment: Lines put first into the YAML.
+        extra: Other files of the folder, name to text, written with them.
+
+    Returns:
+        Path of the session.yaml.
+
+    Raises:
+        OrthocalError: If the folder cannot be written to.
+    """
+    folder = Path(folder)
+    document = session_document(session)
+    if session.robot_reference not in packaged_robots():
+        document["robot"] = os.path.relpath(session.robot.folder.resolve(), folder.resolve())
+    head = "".join(f"# {line}\n" for line in comment.splitlines())
+    text = head + yaml.safe_dump(
+        document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
+    )
+    table = io.StringIO()
+    with_minus = any(r.minus for r in session.readings)
+    with_cycle = any(r.cycle != 1 for r in session.readings)
+    columns = [c for c in COLUMNS if (c != "minus" or with_minus) and (c != "cycle" or with_cycle)]
+    table.write(",".join(columns) + "\n")
+    for r in session.readings:
+        fields = {
+            "setup": r.setup,
+            "posture": r.posture,
+            "minus": r.minus or "",
+            "cycle": str(r.cycle),
+            "reading_mm": _trim(f"{r.value * 1e3:.{decimals}f}"),
+        }
+        table.write(",".join(fields[c] for c in columns) + "\n")
+    files = {"session.yaml": text, "readings.csv": table.getvalue(), **(extra or {})}
+    write_files(folder, files)
+    return folder / "session.yaml"
+
+
+def to_mm(value: float) -> float:
+    """Metres as mm, without the rounding that the factor brings."""
+    return _tidy(value * 1e3)
+
+
+def _tidy(value: float) -> float:
+    return float(f"{value:.12g}")
+
+
+def _trim(number: str) -> str:
+    """A decimal number without trailing zeros beyond the second decimal."""
+    whole, _, decimals = number.partition(".")
+    return f"{whole}.{decimals.rstrip('0').ljust(2, '0')}"
