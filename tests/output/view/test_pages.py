@@ -104,6 +104,28 @@ def test_no_label_covers_another_or_a_panel(browser, root, tmp_path, name, size)
         assert bottom <= size[1] + 1
 
 
+@pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")
+def test_labels_cover_no_dial_of_all_eighteen(browser, root, tmp_path, size):
+    """Six of them have a label, the worst of each leg and direction."""
+    page = draw_scene(load_session(root / "examples/sweep")).save(tmp_path / "page.html")
+    with visit(browser, page.as_uri(), size=size) as found:
+        found.wait_until_drawn()
+        dials = found.page.evaluate(
+            """() => JSON.parse(document.getElementById('scene-data').textContent).labels
+                 .filter((label) => label.node.startsWith('Gauges/'))
+                 .map(({ at: [[x, y, z]] }) => new MeshCat.THREE.Vector3(x, z, -y)
+                   .project(viewer.camera))
+                 .map((p) => [((p.x + 1) / 2) * window.innerWidth,
+                              ((1 - p.y) / 2) * window.innerHeight])"""
+        )
+        labels = [r for r in boxes(found.page) if " mm" in r[4] and len(r[4]) < 80]
+    assert len(dials) == 18
+    assert len(labels) == 6
+    for left, top, right, bottom, text in labels:
+        covered = [d for d in dials if left <= d[0] <= right and top <= d[1] <= bottom]
+        assert not covered, f"{text!r} covers {covered}"
+
+
 def test_whole_machine_is_in_view_beside_the_panels(browser, page):
     for size in SIZES:
         with visit(browser, page.as_uri(), size=size) as found:
