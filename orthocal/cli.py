@@ -165,7 +165,7 @@ def calibrate(
     from orthocal.output.summary import print_summary
 
     if out is not None:
-        require_writable(out)
+        require_writable(out, ("calibration.json", "report.html"))
     loaded = load_session(session)
     parameters = loaded.robot.parameters
     result = run(
@@ -361,7 +361,9 @@ def report(
     calibration: CalibrationPath,
     out: Annotated[
         Path | None,
-        typer.Option(help="The page, or its folder; else report.html beside the calibration."),
+        typer.Option(
+            help="A page, or a folder that is there; else report.html beside the calibration."
+        ),
     ] = None,
 ) -> None:
     """Write a calibration as one page: what to enter, how far to believe it, and why."""
@@ -374,7 +376,7 @@ def report(
     target = folder if out is None else out
     if is_folder(target):
         target = target / "report.html"
-    require_writable_file(target)
+    require_writable_file(target, kinds=(".html", ".htm"))
     _note(f"Wrote {write_report(result, target)}")
 
 

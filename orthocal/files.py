@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from orthocal.errors import OrthocalError
@@ -26,17 +26,25 @@ def exists(path: Path) -> bool:
         return False
 
 
-def require_writable(folder: Path) -> None:
+def require_writable(folder: Path, names: Iterable[str] = ()) -> None:
     """Refuse a folder to be written to later that cannot be one: before the work is done.
 
+    Args:
+        folder: The folder.
+        names: Of the files that will be written into it.
+
     Raises:
-        OrthocalError: If it is a file, or has a name that no file system takes.
+        OrthocalError: If it is a file, or has a name that no file system takes, or if there is a
+            folder with the name of one of the files.
     """
     try:
         if folder.exists() and not folder.is_dir():
             raise OrthocalError("is a file; expected a folder", where=str(folder))
     except OSError as e:
         raise OrthocalError(f"cannot be written: {e.strerror}", where=str(folder)) from None
+    for name in names:
+        if is_folder(folder / name):
+            raise OrthocalError("is a folder; expected a file", where=str(folder / name))
 
 
 def require_writable_file(path: Path, *, kinds: tuple[str, ...] = ()) -> None:
@@ -76,6 +84,7 @@ def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
     Raises:
         OrthocalError: If the folder cannot be made or written to.
     """
+    require_writable(folder, files)
     pending: list[tuple[str, Path]] = []
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -81,6 +81,13 @@ def remove(file: str) -> Edit:
     return edit
 
 
+def make_folder(name: str) -> Edit:
+    def edit(folder: Path) -> None:
+        (folder / name).mkdir(parents=True)
+
+    return edit
+
+
 def put(file: str, keys: str, value: Any) -> Edit:
     """Set what stands in a JSON file under keys such as parameters.0.name."""
 
@@ -598,7 +605,7 @@ OPTION_CASES = [
         "{tmp}/readings.csv: the readings do not determine x_slide.offset, y_slide.offset, "
         "z_slide.offset, x_fork.x, y_fork.x, z_fork.x and 3 more: 5 of 9 free parameters can be "
         "told from them. Read the legs that are missing, in postures along their own axes; or use "
-        "tolerances as a prior, or identify base parameters",
+        "tolerances as a prior (--prior), or identify base parameters (--base)",
     ),
     option(
         "known-without-value",
@@ -858,8 +865,8 @@ READINGS_CASES = [
         "readings-too-few",
         "{tmp}/readings.csv: the readings do not determine x_slide.offset, y_slide.offset, "
         "z_slide.offset: 1 of 3 free parameters can be told from them. Read the legs that are "
-        "missing, in postures along their own axes; or use tolerances as a prior, or identify base "
-        "parameters",
+        "missing, in postures along their own axes; or use tolerances as a prior (--prior), or "
+        "identify base parameters (--base)",
         (write("readings.csv", f"{HEADER}\nxy,y_max,y_min,-0.43\n"),),
     ),
 ]
@@ -1361,6 +1368,22 @@ CALIBRATION_CASES = [
         f"{CALIBRATION}: covariance: expected 3 × 3 numbers, as free parameters",
         put(FILE, "covariance.0", [1e-9, 0.0, 0.0, 0.0]),
     ),
+    calibration(
+        "section-form",
+        f"{CALIBRATION}: setups[0].section_form: found 'middle'; expected 'coordinate_mm', "
+        "'from_root_mm' or 'fraction'",
+        put(FILE, "setups.0.section_form", "middle"),
+    ),
+    calibration(
+        "posture-with-too-few-drives",
+        f"{CALIBRATION}: postures[1].drives: has 2 numbers; expected 3, one a drive",
+        put(FILE, "postures.1.drives", [0.3, 0.3]),
+    ),
+    calibration(
+        "posture-with-too-many-passive",
+        f"{CALIBRATION}: postures[0].passive: has 1 numbers; expected 18, one a passive joint",
+        put(FILE, "postures.0.passive", [0.0]),
+    ),
     calibration("no-residuals", f"{CALIBRATION}: residuals: is empty", put(FILE, "residuals", [])),
     calibration(
         "parameter-unknown",
@@ -1411,7 +1434,7 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "files-in-wrong-order",
-        "{tmp}/session.yaml:1: is not valid JSON: Expecting value",
+        f"{{tmp}}/session.yaml: is no calibration.json{MAKE_ONE}",
         command="validate {tmp}/session.yaml {tmp}/calibration.json",
     ),
     calibration(
@@ -1784,6 +1807,31 @@ VIEW_CASES = [
         command="report {tmp}/calibration.json --out {tmp}/session.yaml/page.html",
         base="machine",
         calibrated=True,
+    ),
+    Case(
+        "report-ends-otherwise",
+        "{tmp}/page.pdf: expected a name that ends with .html",
+        command="report {tmp}/calibration.json --out {tmp}/page.pdf",
+        base="machine",
+        calibrated=True,
+    ),
+    Case(
+        "out-with-a-folder-in-the-way",
+        "{tmp}/out/calibration.json: is a folder; expected a file",
+        (make_folder("out/calibration.json"),),
+    ),
+    Case(
+        "view-exaggerate-beyond-the-machine",
+        "exaggeration: is 100000; the largest deviation of 2.18 mm would be drawn larger than the "
+        "machine: expected at most 265",
+        command="view {tmp}/calibration.json --html {tmp}/page.html --exaggerate 1e5",
+        base="machine",
+        calibrated=True,
+    ),
+    Case(
+        "calibrate-readings",
+        "{tmp}/readings.csv: is no session.yaml",
+        command="calibrate {tmp}/readings.csv",
     ),
     Case(
         "report-of-nothing",

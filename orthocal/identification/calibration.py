@@ -19,9 +19,9 @@ from orthocal.files import write_file
 from orthocal.identification.identifiability import Combination, Identifiability
 from orthocal.identification.recorded_robot import (
     load_recorded_robot,
-    require_names,
     require_offsets,
     require_parameters,
+    require_rows,
 )
 from orthocal.identification.records import (
     ControllerEntry,
@@ -347,14 +347,17 @@ class Calibration:
             + table(headers, rows)
             + (paragraph(f"and {more} more parameters") if more else "")
             + paragraph(about)
-            + paragraph("orthocal.summarize(…) says more, orthocal.draw_scene(…) shows it.")
+            + (paragraph("That is more than noise: measure again.") if self.has_model_error else "")
+            + paragraph(
+                "orthocal.summarize(…) says whether to enter these, orthocal.draw_scene(…) shows it."
+            )
         )
 
     def _load_robot(self) -> Robot:
         robot = load_recorded_robot(self.robot_record, file=self.path)
         prefix = "" if self.path is None else f"{self.path}: "
         require_parameters(robot, self.parameters, self.unmodelled.names, prefix=prefix)
-        require_names(robot, self.setups, self.postures, self.residuals, prefix=prefix)
+        require_rows(robot, self.setups, self.postures, self.residuals, prefix=prefix)
         require_offsets(robot, self.session.controller_offsets, prefix=prefix)
         return robot
 

@@ -185,6 +185,12 @@ class _CalibrationKeys(_Keys):
     setups: list[_SetupKeys]
 
 
+MAKE_ONE = "`orthocal calibrate SESSION --out FOLDER` makes one"
+
+OTHER_KINDS = (".csv", ".html", ".urdf", ".yaml", ".yml")
+"""What the names of files of other kinds end with."""
+
+
 def load_calibration(path: str | Path) -> Calibration:
     """Read a calibration.json, or the one in a folder.
 
@@ -195,10 +201,9 @@ def load_calibration(path: str | Path) -> Calibration:
     if is_folder(file):
         file = file / "calibration.json"
     if not exists(file):
-        raise CalibrationFileError(
-            "there is no such file; `orthocal calibrate SESSION --out FOLDER` makes one",
-            where=str(file),
-        )
+        raise CalibrationFileError(f"there is no such file; {MAKE_ONE}", where=str(file))
+    if file.suffix.lower() in OTHER_KINDS:
+        raise CalibrationFileError(f"is no calibration.json; {MAKE_ONE}", where=str(file))
     data = read_json(file, error=CalibrationFileError)
     if isinstance(data, Mapping) and "schema" not in data:
         raise CalibrationFileError(f"is missing; expected '{SCHEMA}'", where=f"{file}: schema")

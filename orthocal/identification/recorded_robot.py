@@ -98,7 +98,7 @@ def require_parameters(
             raise CalibrationFileError(e.problem, where=f"{prefix}unmodelled.names[{i}]") from None
 
 
-def require_names(
+def require_rows(
     robot: Robot,
     setups: Sequence[SetupRecord],
     postures: Sequence[PostureRecord],
@@ -106,7 +106,7 @@ def require_names(
     *,
     prefix: str,
 ) -> None:
-    """Refuse setups on legs that the robot does not have, and rows of what is not there.
+    """Refuse setups and postures that the robot cannot have, and rows of what is not there.
 
     Args:
         robot: The robot.
@@ -126,6 +126,16 @@ def require_names(
             if found not in known:
                 raise CalibrationFileError(
                     f"'{found}' is none of {', '.join(known)}", where=f"{prefix}setups[{i}].{key}"
+                )
+    for i, posture in enumerate(postures):
+        for key, values, count, kind in (
+            ("drives", posture.drives, len(robot.drives), "drive"),
+            ("passive", posture.passive, robot.passive_index.size, "passive joint"),
+        ):
+            if len(values) != count:
+                raise CalibrationFileError(
+                    f"has {len(values)} numbers; expected {count}, one a {kind}",
+                    where=f"{prefix}postures[{i}].{key}",
                 )
     posture_names, setup_names = {p.name for p in postures}, {s.name for s in setups}
     for i, row in enumerate(residuals):

@@ -316,7 +316,8 @@ def require_identifiable(
         raise NotIdentifiableError(
             f"the readings do not determine {named}{more}: {information.rank} of {len(names)} free "
             "parameters can be told from them. Read the legs that are missing, in postures along "
-            "their own axes; or use tolerances as a prior, or identify base parameters",
+            "their own axes; or use tolerances as a prior (--prior), or identify base parameters "
+            "(--base)",
             parameters=lost,
             where=where,
         )

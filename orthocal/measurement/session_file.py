@@ -36,6 +36,10 @@ from orthocal.robot.model import Robot, read_only
 Array = NDArray[np.float64]
 
 
+OTHER_KINDS = (".csv", ".json", ".urdf")
+"""What the names of files of other kinds end with."""
+
+
 def load_session(path: str | Path) -> Session:
     """Read a session: its YAML, its CSV and its robot, checked against each other.
 
@@ -111,6 +115,8 @@ def _where(path: Path | None, key: str) -> str:
 
 def _read_keys(path: Path) -> tuple[Path, SessionKeys]:
     file = path / "session.yaml" if is_folder(path) else path
+    if file.suffix.lower() in OTHER_KINDS:
+        raise SessionError("is no session.yaml", where=str(file))
     data = read_yaml(file, error=SessionError)
     return file, validate(SessionKeys, data, where=str(file), error=SessionError)
 

@@ -108,6 +108,10 @@ def render_accuracy(
                 "were not identified at their tolerances."
             )
         )
+        if len(calibration.free) <= len(calibration.controller_entries()):
+            lines.append(
+                Text("With the offsets entered, 'not known after' is what the tool is good for.")
+            )
         if excess > 1.0:
             lines.append(
                 Text(

@@ -45,6 +45,12 @@ def advise(calibration: Calibration) -> str:
     if 0 < suspicious <= MANY_SUSPICIOUS * len(calibration.residuals):
         word = "reading contradicts" if suspicious == 1 else "readings contradict"
         return f"Before you enter these read again: {suspicious} {word} all others."
+    scattered = _find_scattered(calibration)
+    if scattered:
+        return (
+            f"Before you enter these read {scattered[0].label} again: repeated readings of it "
+            "differ by more than the gauge's σ explains, as with a wrong sign or row."
+        )
     if calibration.noise.source == "unknown":
         return "Enter these only if you must: nothing tells how far they can be trusted."
     if calibration.spare_readings <= 0:
@@ -52,9 +58,18 @@ def advise(calibration: Calibration) -> str:
     if calibration.has_model_error:
         return (
             "Enter these, and measure again: they are the best for the postures measured, but what "
-            "remains is error of the model, not noise."
+            "remains is error of the model, or of a whole setup, not noise."
         )
-    return "Enter these: what remains is what the noise of the readings leaves."
+    if calibration.noise.source == "residuals" and calibration.session.gauge_sigma is None:
+        return (
+            "Enter these, and measure again: only what remains says how large the noise is, so "
+            "error of the model, or of a whole setup, would look like noise. Repeat readings in "
+            "cycles, or give gauge.sigma_mm."
+        )
+    return (
+        "Enter these, and measure again to confirm them: what remains is what the noise of the "
+        "readings leaves."
+    )
 
 
 def _worst_setup(calibration: Calibration) -> str:
@@ -124,7 +139,7 @@ def explain_fit(calibration: Calibration) -> list[str]:
         fits = (
             "the model fits."
             if gauge is None or noise.chance_in_cycles(gauge) >= BY_CHANCE
-            else "but see how they scatter."
+            else "but they scatter by more than the gauge explains."
         )
         sentences.append(f"What remains is what repeated cycles scatter by: {fits}")
     sentences += _explain_cycles(calibration)
@@ -242,23 +257,31 @@ def _explain_trust(calibration: Calibration) -> list[str]:
 
 def _explain_cycles(calibration: Calibration) -> list[str]:
     """Whether repeated readings scatter more than the gauge's σ allows, and where most."""
+    worst, gauge = _find_scattered(calibration), calibration.session.gauge_sigma
+    if not worst or gauge is None:
+        return []
+    shown = ", ".join(f"{signed(r.measured * 1e3)} in cycle {r.cycle}" for r in worst[:6])
+    return [
+        f"Repeated readings scatter by {mm(calibration.noise.cycles_sigma)} mm, more than the "
+        f"gauge's {mm(gauge)} mm explain. They differ most at {worst[0].label} "
+        f"({calibration.where(worst[0])}): {shown} mm. Check these for a wrong sign or row before "
+        "anything is entered."
+    ]
+
+
+def _find_scattered(calibration: Calibration) -> list[ResidualRow]:
+    """Repeated readings that differ most, where they differ by more than the gauge explains."""
     noise, gauge = calibration.noise, calibration.session.gauge_sigma
     if noise.cycles_dof == 0 or gauge is None or noise.chance_in_cycles(gauge) >= BY_CHANCE:
         return []
-    groups: dict[tuple[str, str], list[ResidualRow]] = {}
+    groups: dict[str, list[ResidualRow]] = {}
     for row in calibration.residuals:
-        groups.setdefault((row.setup, row.label), []).append(row)
+        groups.setdefault(row.label, []).append(row)
 
     def spread(rows: list[ResidualRow]) -> float:
         return max(r.measured for r in rows) - min(r.measured for r in rows)
 
-    worst = max(groups.values(), key=spread)
-    shown = ", ".join(f"{signed(r.measured * 1e3)} in cycle {r.cycle}" for r in worst[:6])
-    return [
-        f"Repeated readings scatter by {mm(noise.cycles_sigma)} mm, more than the gauge's "
-        f"{mm(gauge)} mm explain. They differ most at {worst[0].label}: {shown} mm. Check these "
-        "for a wrong sign or row before anything is entered."
-    ]
+    return max(groups.values(), key=spread)
 
 
 def _times(ratio: float) -> str:

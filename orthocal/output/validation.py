@@ -93,9 +93,14 @@ def explain_validation(validation: Validation) -> list[str]:
             "model, which more readings of the same kind will not remove."
         )
     else:
+        reason = (
+            "it is nothing that the calibration has left, but new"
+            if validation.as_expected is False
+            else "it looks like noise"
+        )
         sentences.append(
             f"What remains does not repeat (correlation {repetition.correlation:.3f} over "
-            f"{repetition.matched} rows): it looks like noise."
+            f"{repetition.matched} rows): {reason}."
         )
     if not validation.offsets_stated:
         sentences.append(

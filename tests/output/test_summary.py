@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -127,7 +128,8 @@ def turn(session, setup):
 
 def test_sound_readings_are_to_be_entered(raw_cycles):
     assert advise(calibrate(raw_cycles)) == (
-        "Enter these: what remains is what the noise of the readings leaves."
+        "Enter these, and measure again to confirm them: what remains is what the noise of the "
+        "readings leaves."
     )
 
 
@@ -161,6 +163,29 @@ def test_one_wrong_reading_is_to_be_read_again(raw_cycles):
     values[4] += 0.2e-3
     text = advise(calibrate(raw_cycles.with_values(values)))
     assert text == "Before you enter these read again: 1 reading contradicts all others."
+
+
+def test_readings_that_do_not_repeat_are_to_be_read_again(raw_cycles):
+    """One sign of eighteen readings of each cycle: no single reading stands out of so few."""
+    two = replace(raw_cycles, readings=tuple(r for r in raw_cycles.readings if r.cycle < 3))
+    values = two.values.copy()
+    wrong = next(i for i, r in enumerate(two.readings) if (r.setup, r.posture) == ("xz", "z_min"))
+    values[wrong] *= -1.0
+    spoilt = calibrate(two.with_values(values))
+    text = " ".join(explain_fit(spoilt))
+    assert "They differ most at xz z_min (" in text
+    assert f"readings.csv:{two.readings[wrong].line})" in text
+    assert advise(replace(spoilt, critical=math.inf)) == (
+        "Before you enter these read xz z_min again: repeated readings of it differ by more than "
+        "the gauge's σ explains, as with a wrong sign or row."
+    )
+
+
+def test_noise_that_only_the_residuals_tell_does_not_confirm_the_model(raw_cycles):
+    once = tuple(r for r in raw_cycles.readings if r.cycle == 1)
+    silent = replace(raw_cycles, readings=once, gauge=replace(raw_cycles.gauge, sigma=None))
+    text = advise(calibrate(silent))
+    assert text.startswith("Enter these, and measure again: only what remains says how large")
 
 
 def test_without_word_or_check_it_is_said(experiment_2):

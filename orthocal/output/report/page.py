@@ -298,7 +298,10 @@ def _scene(calibration: Calibration) -> str:
         scene = draw_scene(calibration)
     except OrthocalError as e:  # the numbers stand without it
         return paragraph(f"It cannot be drawn: {e}.")
-    hint = "Drag to turn, scroll to come nearer; play to go through the measurement."
+    hint = (
+        "Drag to turn, scroll to come nearer; play to go through the measurement. Open Controls is "
+        "a tree of all parts, to show and hide."
+    )
     return frame_of(scene.to_html(), height="640px") + paragraph(hint, kind="screen")
 
 

@@ -49,6 +49,9 @@ SHOWN = ("readings", "tool", "all")
 LARGEST_DEVIATION = 0.05
 """Part of the machine's size that its largest deviation is drawn as."""
 
+FURTHEST = 1.0
+"""The same, at most."""
+
 NOTHING = 1e-9
 """Deviations below this are none, [m]."""
 
@@ -97,6 +100,7 @@ def draw_scene(
     Raises:
         ParameterError: If there is no such posture, nothing deviates or by no positive factor, or
             there is no such thing to show.
+        TypeError: If the subject is none of these.
         RobotError: If the robot's visuals cannot be loaded.
         ClosureError: If the machine cannot reach a posture.
     """
@@ -116,6 +120,11 @@ def draw_scene(
         return _draw_robot(subject, posture)
     if isinstance(subject, Session):
         return _draw_session(subject, posture)
+    if not isinstance(subject, Calibration):
+        raise TypeError(
+            f"found a {type(subject).__name__}; expected a Calibration, a Session or a Robot, such "
+            "as load_calibration(...)"
+        )
     return _draw_calibration(subject, posture, exaggeration, show or SHOWN[0])
 
 
@@ -218,8 +227,8 @@ def _draw_calibration(
     stage.move_leg_lines(film, times, machines.real)
     readings, tool = show in ("readings", "all"), show in ("tool", "all")
     draw_readings(stage, measured, stops, machines.timeline, machines.real, film, shown=readings)
-    draw_tool_errors(stage, calibration, shown=tool)
-    scene.headline = write_headline(measured)
+    of_tool = draw_tool_errors(stage, calibration, shown=tool)
+    scene.headline = of_tool if of_tool and not readings else write_headline(measured)
     _state_offsets(scene, calibration)
     _finish(scene, film, calibration.session.source, stops, left_out)
     return scene
@@ -243,6 +252,12 @@ def _place_machines(
     if exaggeration is None:
         wanted = LARGEST_DEVIATION * stage.size / largest if largest > NOTHING else 1.0
         exaggeration = round_scale(wanted)
+    if exaggeration * largest > FURTHEST * stage.size:
+        raise ParameterError(
+            f"is {exaggeration:g}; the largest deviation of {largest * 1e3:.3g} mm would be drawn "
+            f"larger than the machine: expected at most {stage.size / largest:.0f}",
+            where="exaggeration",
+        )
     drawn = {name: exaggerate(nominal[name], real[name], exaggeration) for name in real}
     return _Machines(timeline, nominal, drawn, exaggeration, largest, where)
 

@@ -41,6 +41,9 @@ LONGEST_ARROW = 0.16
 DIAL = 0.034
 """Part of the machine's size that a dial's radius is drawn as, where there are not too many."""
 
+FIRST_ARROW, NEXT_ARROW = 0.42, 0.6
+"""From a contact to the first arrow beside it, and from each to the next, in radii of a dial."""
+
 MANY_GAUGES = 9
 """Gauges above which they are drawn smaller."""
 
@@ -100,6 +103,7 @@ def draw_readings(
     dial = DIAL * stage.size * min(1.0, math.sqrt(MANY_GAUGES / max(len(used), 1)))
     overview = len(stops) > 1
     named = _named_setups(used, measured)
+    contacts: list[Array] = []
     for setup in used:
         rows = [next((r for r in s.rows if r.setup == setup.name), None) for s in stops]
         contact = _find_contact(stage, setup, poses)
@@ -107,8 +111,12 @@ def draw_readings(
         gauge = f"{GAUGES}/{_node(setup.name)}"
         draw_gauge(scene, gauge, contact, direction, _facing(direction), dial)
         tips = [contact for _ in rows]
+        # arrows of gauges that touch at the same place stand beside each other
+        beside = sum(float(np.linalg.norm(contact - other)) < dial for other in contacts)
+        contacts.append(contact)
         for kind in kinds:
-            foot = contact + kind.side * 0.42 * dial * stage.robot.legs[setup.leg].axis
+            away = kind.side * (FIRST_ARROW + NEXT_ARROW * beside) * dial
+            foot = contact + away * stage.robot.legs[setup.leg].axis
             lengths = [kind.length(row) * scene.arrow_scale for row in rows]
             path, width = f"{kind.node}/{_node(setup.name)}", arrow_width(dial)
             draw_arrow(

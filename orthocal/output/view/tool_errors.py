@@ -34,23 +34,32 @@ VANISHING = 1e-7
 """Errors of the tool below this are not drawn, [m]."""
 
 
-def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> None:
-    """Where the tool goes instead of where it is sent, now and with the offsets entered."""
+def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> str:
+    """Where the tool goes instead of where it is sent, now and with the offsets entered.
+
+    Args:
+        stage: The robot's scene.
+        calibration: The calibration.
+        shown: Whether that is shown at first.
+
+    Returns:
+        What is to be seen, in a sentence; empty where nothing is.
+    """
     scene = stage.scene
     if calibration.robot.tcp is None:
-        return
+        return ""
     region = f"±{HALF_SIDE * 1e3:g} mm"
     try:
         found = assess_cube(calibration)
     except ClosureError:
         scene.facts.append(f"Errors of the tool: the cube of {region} is out of reach.")
-        return
+        return ""
     now, left = (float(np.linalg.norm(d, axis=1).max()) for d in (found.deviation, found.left))
     # in space, as in all tables: the axes of an ellipsoid are shorter
     spread = 0.0 if found.after is None else found.after.absolute.largest
     largest = max(now, left, spread)
     if largest < VANISHING:
-        return
+        return ""
     chosen = _choose_points(found)
     scene.tool_scale = round_scale(LONGEST_ARROW * stage.size / largest)
     width = ARROW_WIDTH * stage.size
@@ -67,8 +76,12 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
         scene.explain(LegendEntry(text, (TOOL_LEFT,), css(LEFT_COLOUR), "arrow", shown))
     if found.after is not None:
         _draw_ellipsoids(scene, found.targets[chosen], found.after.covariance[chosen])
-        text = f"Tool: not known, one σ: up to {um(spread)} µm, {drawn}"
+        text = f"Tool, all that was found corrected: one σ, up to {um(spread)} µm, {drawn}"
         scene.explain(LegendEntry(text, (TOOL_UNKNOWN,), css(UNKNOWN_COLOUR), "ball", shown))
+    headline = f"The tool is up to {um(now)} µm off where it is sent, over {region}."
+    if found.after is not None:
+        headline += f" Corrected, it is known to {um(spread)} µm or better (one σ)."
+    return headline
 
 
 def _choose_points(found: ToolAccuracy) -> NDArray[np.int64]:

@@ -466,6 +466,27 @@ def test_exaggeration_must_be_positive(calibration, factor):
         draw_scene(calibration, exaggeration=factor)
 
 
+def test_arrows_at_one_place_stand_beside_each_other(scene):
+    """Both gauges of a leg touch it at the same point."""
+    for one, two in (("yx", "zx"), ("xy", "zy"), ("xz", "yz")):
+        for node in (readings.BEFORE, readings.AFTER):
+            feet = [scene.pose(f"{node}/{name}")[:3, 3] for name in (one, two)]
+            assert np.linalg.norm(feet[0] - feet[1]) > 0.01
+
+
+def test_a_scene_of_the_tool_says_how_far_it_is_off(calibration):
+    scene = draw_scene(calibration, show="tool")
+    found = assess_tool(calibration)
+    largest = np.linalg.norm(found.deviation, axis=1).max() * 1e6
+    assert scene.headline.startswith(f"The tool is up to {largest:.0f} µm off where it is sent")
+    assert f"known to {found.after.absolute.largest * 1e6:.0f} µm or better" in scene.headline
+
+
+def test_only_machines_sessions_and_calibrations_are_drawn():
+    with pytest.raises(TypeError, match="found a str; expected a Calibration"):
+        draw_scene("out/experiment-2")
+
+
 # ---- the page
 
 
