@@ -349,7 +349,7 @@ class Calibration:
             + paragraph(about)
             + (paragraph("That is more than noise: measure again.") if self.has_model_error else "")
             + paragraph(
-                "orthocal.summarize(…) says whether to enter these, orthocal.draw_scene(…) shows it."
+                "orthocal.summarize(…) says whether to enter these, draw_scene(…) shows it."
             )
         )
 

@@ -129,6 +129,7 @@ def draw_readings(
                 colour=kind.colour,
             )
             _film_arrow(film, path, timeline, lengths, width)
+            stage.lower_ground(min(float(foot[2] + v * direction[2]) for v in lengths))
             if kind.node == BEFORE:
                 tips = [foot + v * direction for v in lengths]
         # while another leg is measured its gauge is not there: the leg moves sideways
@@ -139,14 +140,15 @@ def draw_readings(
             "" if row is None or (silent and stop is stops[0]) else _label(row, measured)
             for row, stop in zip(rows, stops, strict=True)
         ]
-        middle = to_triple(contact + dial_distance(dial) * direction)
+        middle = contact + dial_distance(dial) * direction
+        rim = [to_triple(middle + r * axis) for axis in np.eye(3) for r in (-dial, dial)]
         scene.labels.append(
             Label(
-                (middle,),
+                (to_triple(middle),),
                 tuple(texts),
                 gauge,
                 rank=max(abs(r.before) for r in measured.rows if r.setup == setup.name),
-                uncovered=tuple((to_triple(contact), to_triple(tip)) for tip in tips),
+                uncovered=tuple((to_triple(contact), to_triple(tip), *rim) for tip in tips),
             )
         )
     _explain(scene, len(kinds), shown)

@@ -83,6 +83,8 @@ class Stage:
         draw_ground(scene, GROUND, side=2.0 * size, pitch=self.pitch)
         scene.facts.append(f"Squares on the ground: {self.pitch * 1e3:g} mm.")
         draw_axes(scene, AXES, length=0.15 * size)
+        self.lowest = float(self.low[2])
+        """Of all that is drawn and does not lie on the ground, [m]."""
         self.look_at(self.zero)
 
     def draw_links(
@@ -147,17 +149,24 @@ class Stage:
                 first.append(corners[0])
                 lowest.append(corners[..., 2].min())
         points = np.concatenate(first)
-        self.scene.place(GROUND, self._ground(min(lowest) - 0.03 * self.size))
+        self.lowest = float(min(lowest))
+        self._place_ground()
         middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
         points = np.unique(np.round(points, 4), axis=0)
         self.scene.camera = Camera(to_triple(middle), VIEW, tuple(to_triple(p) for p in points))
 
-    def _ground(self, height: float) -> Array:
-        """Pose of the ground below the machine, its lines at multiples of their pitch."""
+    def lower_ground(self, height: float) -> None:
+        """Have the ground below a height, too, [m]."""
+        self.lowest = min(self.lowest, height)
+        self._place_ground()
+
+    def _place_ground(self) -> None:
+        """The ground below all that is drawn, its lines at multiples of their pitch."""
         pose = np.eye(4)
         middle = (self.low + self.high)[:2] / 2.0
+        height = self.lowest - 0.03 * self.size
         pose[:3, 3] = [*np.round(middle / self.pitch) * self.pitch, height]
-        return pose
+        self.scene.place(GROUND, pose)
 
     def move_links(self, film: Film, node: str, times: Array, poses: Mapping[str, Array]) -> None:
         """Move what `draw_links` drew; frames of poses at times."""

@@ -474,6 +474,17 @@ def test_arrows_at_one_place_stand_beside_each_other(scene):
             assert np.linalg.norm(feet[0] - feet[1]) > 0.01
 
 
+@pytest.mark.parametrize("posture", [None, "x_max", "x_min"])
+def test_arrows_do_not_reach_through_the_ground(calibration, posture):
+    scene = draw_scene(calibration, posture=posture)
+    ground = scene.pose(stage.GROUND)[2, 3]
+    for row in calibration.residuals:
+        pose = scene.pose(f"{readings.BEFORE}/{row.setup}")
+        shown = posture is None or row.posture == posture
+        length = row.deviation * scene.arrow_scale if shown else 0.0
+        assert (pose[:3, 3] + length * pose[:3, 2])[2] > ground
+
+
 def test_a_scene_of_the_tool_says_how_far_it_is_off(calibration):
     scene = draw_scene(calibration, show="tool")
     found = assess_tool(calibration)
