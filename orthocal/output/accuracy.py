@@ -19,8 +19,7 @@ from orthocal.study.accuracy import (
     ErrorSize,
     ToolAccuracy,
     assess_cube,
-    assess_excess,
-    find_excess,
+    assess_remaining,
     find_remaining_errors,
     measure_deviations,
 )
@@ -86,12 +85,11 @@ def render_accuracy(
             )
         )
     rows.append(("not known before", accuracy.before.absolute, accuracy.before.relative))
-    excess = find_excess(calibration)
+    remaining, excess = assess_remaining(calibration, accuracy)
     if accuracy.after is not None:
         rows.append(("not known after", accuracy.after.absolute, accuracy.after.relative))
-        if excess > 1.0:
-            worse = assess_excess(calibration, accuracy, excess)
-            rows.append((f"  at {excess:.1f} × tolerances", worse.absolute, worse.relative))
+    if remaining is not None and excess > 1.0:
+        rows.append((f"  at {excess:.1f} × tolerances", remaining.absolute, remaining.relative))
     for name, absolute, relative in rows:
         add_row(table, name, *(um(v) for size in (absolute, relative) for v in _parts(size)))
     lines: list[RenderableType] = [
@@ -108,10 +106,6 @@ def render_accuracy(
                 "were not identified at their tolerances."
             )
         )
-        if len(calibration.free) <= len(calibration.controller_entries()):
-            lines.append(
-                Text("With the offsets entered, 'not known after' is what the tool is good for.")
-            )
         if excess > 1.0:
             lines.append(
                 Text(
@@ -119,6 +113,9 @@ def render_accuracy(
                     "leave: this machine seems to be as much worse than its tolerances."
                 )
             )
+        if len(calibration.free) <= len(calibration.controller_entries()):
+            last = "not known after" if excess == 1.0 else f"at {excess:.1f} × tolerances"
+            lines.append(Text(f"With the offsets entered, '{last}' is what the tool is good for."))
         lines += [Text(line) for line in describe_remaining(calibration, accuracy)]
     return Group(*lines)
 

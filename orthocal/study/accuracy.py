@@ -288,6 +288,23 @@ def assess_excess(
     return measure_uncertainty(accuracy.jacobian, covariance, accuracy.workspace)
 
 
+def assess_remaining(
+    calibration: Calibration, accuracy: ToolAccuracy
+) -> tuple[ToolUncertainty | None, float]:
+    """What is not known after a calibration, as far as the readings tell of the machine.
+
+    Returns:
+        Uncertainty, None where nothing tells the noise, and how many times their tolerances
+        unmodelled errors are taken to be: `find_excess`.
+    """
+    if accuracy.after is None:
+        return None, 1.0
+    excess = find_excess(calibration)
+    if excess == 1.0:
+        return accuracy.after, excess
+    return assess_excess(calibration, accuracy, excess), excess
+
+
 def find_remaining_errors(
     calibration: Calibration, accuracy: ToolAccuracy, *, count: int = 3
 ) -> tuple[RemainingError, ...]:

@@ -37,7 +37,7 @@ from orthocal.output.tables import (
 )
 from orthocal.output.view.drawing import draw_scene
 from orthocal.output.view.scene import frame_of
-from orthocal.study.accuracy import ToolAccuracy, assess_cube
+from orthocal.study.accuracy import ToolAccuracy, assess_cube, assess_remaining
 
 FEW_ROWS = 40
 """Readings up to which the list of all is open."""
@@ -147,6 +147,8 @@ def _tool(calibration: Calibration) -> str:
 
 def _maps(calibration: Calibration, found: ToolAccuracy) -> str:
     only_offsets = len(calibration.free) <= len(calibration.controller_entries())
+    _, excess = assess_remaining(calibration, found)
+    times = f"{excess:.1f} times " if excess > 1.0 else ""
     captions: dict[Field, str] = {
         "now": "Where the tool is, less where it is sent, with the controller as it was while "
         "measuring; the shift that is common to the whole cube is taken out here and below: a "
@@ -154,7 +156,7 @@ def _maps(calibration: Calibration, found: ToolAccuracy) -> str:
         "left": "The same once the identified offsets are entered, in a controller that knows of "
         "nothing else.",
         "unknown": "What is not known of the tool's position after this calibration: one standard "
-        "deviation in space, errors that were not identified at their tolerances.",
+        f"deviation in space, errors that were not identified at {times}their tolerances.",
     }
     if only_offsets:
         del captions["left"]

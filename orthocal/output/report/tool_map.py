@@ -17,7 +17,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from orthocal.identification.calibration import Calibration
 from orthocal.output.report.figure import open_figure, render_figure
-from orthocal.study.accuracy import ToolAccuracy
+from orthocal.study.accuracy import ToolAccuracy, assess_remaining
 
 Array = NDArray[np.float64]
 
@@ -85,16 +85,17 @@ def _find_grid(points: Array) -> list[Array] | None:
     return lines if np.array_equal(grid, points) else None
 
 
-def _error_parts(accuracy: ToolAccuracy, which: Field) -> Array:
+def _error_parts(calibration: Calibration, accuracy: ToolAccuracy, which: Field) -> Array:
     """What the size of the error is the length of, (K, 3) or without direction (K, 1), [µm].
 
     A shift that is common to the region is no error of a workpiece that is set up there.
     """
+    remaining, _ = assess_remaining(calibration, accuracy)
     if which == "now":
         return accuracy.relative_deviation * 1e6
-    if which == "left" or accuracy.after is None:
+    if which == "left" or remaining is None:
         return accuracy.relative_left * 1e6
-    variance = np.trace(accuracy.after.relative_covariance, axis1=1, axis2=2)
+    variance = np.trace(remaining.relative_covariance, axis1=1, axis2=2)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0))[:, None] * 1e6)
 
 
@@ -104,7 +105,7 @@ def _draw_tool_map(
     planes = list(combinations(range(len(lines)), 2))
     tcp = calibration.robot.tcp
     world = tuple(range(len(lines))) if tcp is None else tcp.coordinates
-    grid = _error_parts(accuracy, which).reshape(*(line.size for line in lines), -1)
+    grid = _error_parts(calibration, accuracy, which).reshape(*(line.size for line in lines), -1)
     cuts = [_cut(grid, plane) for plane in planes]
     fine = [
         _refine([lines[k] for k in plane], cut) for plane, cut in zip(planes, cuts, strict=True)
@@ -124,6 +125,9 @@ def _draw_tool_map(
     label = "size of the error [µm]; arrows: its part in the plane"
     if which == "unknown":
         label = "standard deviation in space [µm]"
+        _, excess = assess_remaining(calibration, accuracy)
+        if excess > 1.0:
+            label += f", errors at {excess:.1f} × their tolerances"
     figure.colorbar(
         ScalarMappable(BoundaryNorm(levels, 256), COLOURS),
         ax=list(panels),

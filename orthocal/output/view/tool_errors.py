@@ -12,7 +12,7 @@ from orthocal.output.layout import um
 from orthocal.output.view.scene import LegendEntry, Scene, round_scale
 from orthocal.output.view.shapes import Colour, css, draw_arrow, material
 from orthocal.output.view.stage import Stage
-from orthocal.study.accuracy import HALF_SIDE, ToolAccuracy, assess_cube
+from orthocal.study.accuracy import HALF_SIDE, ToolAccuracy, assess_cube, assess_remaining
 
 Array = NDArray[np.float64]
 
@@ -56,7 +56,8 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
         return ""
     now, left = (float(np.linalg.norm(d, axis=1).max()) for d in (found.deviation, found.left))
     # in space, as in all tables: the axes of an ellipsoid are shorter
-    spread = 0.0 if found.after is None else found.after.absolute.largest
+    after, excess = assess_remaining(calibration, found)
+    spread = 0.0 if after is None else after.absolute.largest
     largest = max(now, left, spread)
     if largest < VANISHING:
         return ""
@@ -74,12 +75,13 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
     if left > VANISHING:
         text = f"Tool with the offsets entered: up to {um(left)} µm off, {drawn}"
         scene.explain(LegendEntry(text, (TOOL_LEFT,), css(LEFT_COLOUR), "arrow", shown))
-    if found.after is not None:
-        _draw_ellipsoids(scene, found.targets[chosen], found.after.covariance[chosen])
-        text = f"Tool, all that was found corrected: one σ, up to {um(spread)} µm, {drawn}"
+    if after is not None:
+        _draw_ellipsoids(scene, found.targets[chosen], after.covariance[chosen])
+        worse = f" (errors {excess:.1f} × their tolerances)" if excess > 1.0 else ""
+        text = f"Tool, all that was found corrected: one σ, up to {um(spread)} µm{worse}, {drawn}"
         scene.explain(LegendEntry(text, (TOOL_UNKNOWN,), css(UNKNOWN_COLOUR), "ball", shown))
     headline = f"The tool is up to {um(now)} µm off where it is sent, over {region}."
-    if found.after is not None:
+    if after is not None:
         headline += f" Corrected, it is known to {um(spread)} µm or better (one σ)."
     return headline
 

@@ -14,7 +14,14 @@ from orthocal import calibrate, load_plan, simulate_session
 from orthocal.output.report import figure as style
 from orthocal.output.report import tool_map
 from orthocal.robot.model import Tcp
-from orthocal.study.accuracy import Workspace, assess_tool, cube
+from orthocal.study.accuracy import (
+    Workspace,
+    assess_tool,
+    cube,
+    error_covariance,
+    find_excess,
+    measure_uncertainty,
+)
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -114,21 +121,40 @@ def test_maps_of_one_page_share_no_ids(maps):
     assert len(set(found)) == len(found)
 
 
-def test_sizes_are_those_of_the_error_in_question(accuracy):
+def test_sizes_are_those_of_the_error_in_question(table1, accuracy):
     def sizes(which):
-        return np.linalg.norm(tool_map._error_parts(accuracy, which), axis=1)
+        return np.linalg.norm(tool_map._error_parts(table1, accuracy, which), axis=1)
 
     found = (accuracy.relative_deviation, accuracy.relative_left)
     deviation, left = (np.linalg.norm(v, axis=1) for v in found)
-    variance = np.trace(accuracy.after.relative_covariance, axis1=1, axis2=2)
     np.testing.assert_allclose(sizes("now"), deviation * 1e6, rtol=GRID)
     np.testing.assert_allclose(sizes("left"), left * 1e6, rtol=GRID)
-    np.testing.assert_allclose(sizes("unknown"), np.sqrt(variance) * 1e6, rtol=GRID)
 
 
-def test_the_map_goes_through_the_points_of_the_grid(accuracy):
+def test_without_an_excess_what_is_not_known_is_that_at_tolerances(planar):
+    accuracy = assess_tool(planar)
+    assert find_excess(planar) == 1.0
+    variance = np.trace(accuracy.after.relative_covariance, axis1=1, axis2=2)
+    sizes = tool_map._error_parts(planar, accuracy, "unknown")[:, 0]
+    np.testing.assert_allclose(sizes, np.sqrt(variance) * 1e6, rtol=GRID)
+
+
+def test_a_machine_worse_than_its_tolerances_is_known_less_well(experiment_2):
+    """What remains of the paper's readings is 2.2 times what errors at tolerances would leave."""
+    calibration = calibrate(experiment_2)
+    accuracy, excess = assess_tool(calibration), find_excess(calibration)
+    covariance = error_covariance(calibration, excess=excess)
+    worse = measure_uncertainty(accuracy.jacobian, covariance, accuracy.workspace)
+    variance = np.trace(worse.relative_covariance, axis1=1, axis2=2)
+    sizes = tool_map._error_parts(calibration, accuracy, "unknown")[:, 0]
+    np.testing.assert_allclose(sizes, np.sqrt(variance) * 1e6, rtol=GRID)
+    shown = texts(tool_map.plot_tool_map(calibration, accuracy, which="unknown"))
+    assert "standard deviation in space [µm], errors at 2.2 × their tolerances" in shown
+
+
+def test_the_map_goes_through_the_points_of_the_grid(table1, accuracy):
     lines = tool_map._find_grid(accuracy.workspace.points)
-    grid = tool_map._error_parts(accuracy, "now").reshape(7, 7, 7, 3)
+    grid = tool_map._error_parts(table1, accuracy, "now").reshape(7, 7, 7, 3)
     cut = tool_map._cut(grid, (0, 2))
     np.testing.assert_array_equal(cut, grid[:, 3, :])
     x, y, size = tool_map._refine([lines[0], lines[2]], cut)

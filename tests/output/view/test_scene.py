@@ -21,7 +21,13 @@ from orthocal.output.view.deviations import measure_deviations
 from orthocal.output.view.motion import FRAMES_A_SECOND
 from orthocal.output.view.scene import round_scale
 from orthocal.output.view.shapes import arrow_parts, head_length
-from orthocal.study.accuracy import assess_tool, cube
+from orthocal.study.accuracy import (
+    assess_tool,
+    cube,
+    error_covariance,
+    find_excess,
+    measure_uncertainty,
+)
 
 
 @pytest.fixture(scope="module")
@@ -490,7 +496,13 @@ def test_a_scene_of_the_tool_says_how_far_it_is_off(calibration):
     found = assess_tool(calibration)
     largest = np.linalg.norm(found.deviation, axis=1).max() * 1e6
     assert scene.headline.startswith(f"The tool is up to {largest:.0f} µm off where it is sent")
-    assert f"known to {found.after.absolute.largest * 1e6:.0f} µm or better" in scene.headline
+    # with errors as far beyond their tolerances as what remains of the readings says
+    covariance = error_covariance(calibration, excess=find_excess(calibration))
+    known = measure_uncertainty(found.jacobian, covariance, found.workspace).absolute.largest
+    assert known > 1.4 * found.after.absolute.largest
+    assert f"known to {known * 1e6:.0f} µm or better" in scene.headline
+    (told,) = (e.text for e in scene.legend if e.nodes == (tool_errors.TOOL_UNKNOWN,))
+    assert "(errors 2.2 × their tolerances)" in told
 
 
 def test_only_machines_sessions_and_calibrations_are_drawn():
