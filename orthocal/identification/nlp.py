@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import SolverError
 from orthocal.identification.loss import SQUARES, Loss
-from orthocal.identification.problem import LENGTH_SCALE, CalibrationProblem, ReadingPiece
+from orthocal.identification.pieces import ReadingPiece
+from orthocal.identification.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.identification.sparse import SparseSum
 
 Array = NDArray[np.float64]
