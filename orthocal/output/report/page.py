@@ -37,7 +37,7 @@ from orthocal.output.tables import (
 )
 from orthocal.output.view.drawing import draw_scene
 from orthocal.output.view.scene import frame_of
-from orthocal.study.accuracy import ToolAccuracy, assess_cube, assess_remaining
+from orthocal.study.accuracy import ToolAccuracy, assess_cube, find_excess
 
 FEW_ROWS = 40
 """Readings up to which the list of all is open."""
@@ -147,7 +147,7 @@ def _tool(calibration: Calibration) -> str:
 
 def _maps(calibration: Calibration, found: ToolAccuracy) -> str:
     only_offsets = len(calibration.free) <= len(calibration.controller_entries())
-    _, excess = assess_remaining(calibration, found)
+    excess = find_excess(calibration)
     times = f"{excess:.1f} times " if excess > 1.0 else ""
     captions: dict[Field, str] = {
         "now": "Where the tool is, less where it is sent, with the controller as it was while "

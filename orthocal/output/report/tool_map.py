@@ -17,7 +17,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from orthocal.identification.calibration import Calibration
 from orthocal.output.report.figure import open_figure, render_figure
-from orthocal.study.accuracy import ToolAccuracy, assess_remaining
+from orthocal.study.accuracy import ToolAccuracy, assess_remaining, find_excess
 
 Array = NDArray[np.float64]
 
@@ -90,9 +90,9 @@ def _error_parts(calibration: Calibration, accuracy: ToolAccuracy, which: Field)
 
     A shift that is common to the region is no error of a workpiece that is set up there.
     """
-    remaining, _ = assess_remaining(calibration, accuracy)
     if which == "now":
         return accuracy.relative_deviation * 1e6
+    remaining, _ = assess_remaining(calibration, accuracy)
     if which == "left" or remaining is None:
         return accuracy.relative_left * 1e6
     variance = np.trace(remaining.relative_covariance, axis1=1, axis2=2)
@@ -125,7 +125,7 @@ def _draw_tool_map(
     label = "size of the error [µm]; arrows: its part in the plane"
     if which == "unknown":
         label = "standard deviation in space [µm]"
-        _, excess = assess_remaining(calibration, accuracy)
+        excess = find_excess(calibration)
         if excess > 1.0:
             label += f", errors at {excess:.1f} × their tolerances"
     figure.colorbar(

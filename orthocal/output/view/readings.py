@@ -253,10 +253,8 @@ def _explain(scene: Scene, kinds: int, shown: bool) -> None:
     if kinds == 0:
         return
     drawn = f"drawn × {scene.arrow_scale:g}"
-    text = "Measured − nominal" if kinds == 1 else "Before: measured − nominal"
-    scene.explain(
-        LegendEntry(f"{text}, {drawn}", (BEFORE,), css(BEFORE_COLOUR), "arrow", shown),
-    )
+    text = f"{'Measured' if kinds == 1 else 'Before: measured'} − nominal, {drawn}"
+    scene.explain(LegendEntry(text, (BEFORE,), css(BEFORE_COLOUR), "arrow", shown))
     if kinds == 2:
         text = f"After: measured − calibrated, {drawn}"
         scene.explain(LegendEntry(text, (AFTER,), css(AFTER_COLOUR), "arrow", shown))
