@@ -252,11 +252,11 @@ def _explain(scene: Scene, kinds: int, shown: bool) -> None:
     scene.explain(LegendEntry("Gauges", (GAUGES,), css(GAUGE_COLOUR), "solid", shown))
     if kinds == 0:
         return
-    drawn = f"drawn × {scene.arrow_scale:g}"
-    text = f"{'Measured' if kinds == 1 else 'Before: measured'} − nominal, {drawn}"
+    drawn = f"× {scene.arrow_scale:g}"
+    text = f"{'Measured' if kinds == 1 else 'Before: measured'} − nominal ({drawn})"
     scene.explain(LegendEntry(text, (BEFORE,), css(BEFORE_COLOUR), "arrow", shown))
     if kinds == 2:
-        text = f"After: measured − calibrated, {drawn}"
+        text = f"After: measured − calibrated ({drawn})"
         scene.explain(LegendEntry(text, (AFTER,), css(AFTER_COLOUR), "arrow", shown))
 
 

@@ -69,16 +69,16 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
         (TOOL_LEFT, found.left, LEFT_COLOUR),
     ):
         _draw_deviations(scene, node, found.targets[chosen], deviations[chosen], colour, width)
-    drawn = f"drawn × {scene.tool_scale:g}"
-    text = f"Tool now, over {region}: up to {um(now)} µm off, {drawn}"
+    drawn = f"× {scene.tool_scale:g}"
+    text = f"Tool now, over {region}: up to {um(now)} µm off ({drawn})"
     scene.explain(LegendEntry(text, (TOOL_NOW,), css(NOW_COLOUR), "arrow", shown))
     if left > VANISHING:
-        text = f"Tool with the offsets entered: up to {um(left)} µm off, {drawn}"
+        text = f"Tool with the offsets entered: up to {um(left)} µm off ({drawn})"
         scene.explain(LegendEntry(text, (TOOL_LEFT,), css(LEFT_COLOUR), "arrow", shown))
     if after is not None:
         _draw_ellipsoids(scene, found.targets[chosen], after.covariance[chosen])
-        worse = f" (errors {excess:.1f} × their tolerances)" if excess > 1.0 else ""
-        text = f"Tool, all that was found corrected: one σ, up to {um(spread)} µm{worse}, {drawn}"
+        worse = f", errors {excess:.1f} × tolerances" if excess > 1.0 else ""
+        text = f"Tool, all that was found corrected: one σ, up to {um(spread)} µm{worse} ({drawn})"
         scene.explain(LegendEntry(text, (TOOL_UNKNOWN,), css(UNKNOWN_COLOUR), "ball", shown))
     headline = f"The tool is up to {um(now)} µm off where it is sent, over {region}."
     if after is not None:

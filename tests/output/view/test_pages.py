@@ -105,6 +105,18 @@ def test_no_label_covers_another_or_a_panel(browser, root, tmp_path, name, size)
 
 
 @pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")
+def test_all_that_the_panel_says_is_in_the_picture(browser, calibration, tmp_path, size):
+    page = draw_scene(calibration, show="all").save(tmp_path / "page.html")
+    with visit(browser, f"{page.as_uri()}#picture", size=size) as found:
+        found.wait_until_drawn()
+        text, room = found.page.evaluate(
+            "(({ scrollHeight, clientHeight }) => [scrollHeight, clientHeight])"
+            "(document.getElementById('panel'))"
+        )
+    assert text <= room
+
+
+@pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")
 def test_labels_cover_no_dial_of_all_eighteen(browser, root, tmp_path, size):
     """Six of them have a label, the worst of each leg and direction."""
     page = draw_scene(load_session(root / "examples/sweep")).save(tmp_path / "page.html")

@@ -220,7 +220,7 @@ def test_arrows_are_as_long_as_the_residuals(scene, calibration):
             assert along == pytest.approx(np.array(DIRECTIONS[setup.direction]))
     arrows = [e.text for e in scene.legend if e.nodes[0] in (readings.BEFORE, readings.AFTER)]
     assert len(arrows) == 2
-    assert all(text.endswith(f"drawn × {scene.arrow_scale:g}") for text in arrows)
+    assert all(text.endswith(f"(× {scene.arrow_scale:g})") for text in arrows)
 
 
 def test_arrow_that_is_shorter_than_its_head_is_a_smaller_head():
@@ -400,7 +400,7 @@ def test_errors_of_the_tool_are_those_of_the_calibration(full):
             assert length == pytest.approx(size * scene.tool_scale, rel=1e-3)
     told = [e.text for e in scene.legend if e.nodes[0].startswith("Tool error")]
     assert len(told) == 3
-    assert all(text.endswith(f"drawn × {scene.tool_scale:g}") for text in told)
+    assert all(text.endswith(f"(× {scene.tool_scale:g})") for text in told)
     assert scene.steps[0].caption == "Overview at the zero"  # no gauge is there
     ball = scene.pose(f"{tool_errors.TOOL_UNKNOWN}/point 5")[:3, :3]
     assert ball @ ball.T == pytest.approx(
@@ -502,7 +502,7 @@ def test_a_scene_of_the_tool_says_how_far_it_is_off(calibration):
     assert known > 1.4 * found.after.absolute.largest
     assert f"known to {known * 1e6:.0f} µm or better" in scene.headline
     (told,) = (e.text for e in scene.legend if e.nodes == (tool_errors.TOOL_UNKNOWN,))
-    assert "(errors 2.2 × their tolerances)" in told
+    assert "errors 2.2 × tolerances" in told
 
 
 def test_only_machines_sessions_and_calibrations_are_drawn():
