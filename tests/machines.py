@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from orthocal.measurement.session import DIRECTIONS, section_plane
+from orthocal.robot.loading import packaged_robots
 
 
 def place(machine, drives, frame, *, start=None):
@@ -27,3 +28,23 @@ def reading_by_pinocchio(session, machine, setup, posture):
         plane = plane + leg.axis @ place(machine, session.zero_drives, leg.root)
     along = (plane - leg.axis @ root) / (leg.axis @ (tip - root))
     return float(np.dot(DIRECTIONS[setup.direction], root + along * (tip - root)))
+
+
+def write_orthoglide(folder, length, *, travel=None):
+    """An Orthoglide of another leg length, as a builder writes it: both files copied and edited.
+
+    Args:
+        folder: Made anew.
+        length: Of the legs, [m].
+        travel: Least and largest drive coordinate, [m]; by default in proportion.
+    """
+    source = packaged_robots()["orthoglide"]
+    low, high = travel or (length * 0.12 / 0.31025, length * 0.39 / 0.31025)
+    urdf = (source / "orthoglide.urdf").read_text()
+    urdf = urdf.replace('"0.155125 ', f'"{length / 2:.9g} ').replace('"0.31025', f'"{length:.9g}')
+    urdf = urdf.replace('lower="0.12" upper="0.39"', f'lower="{low:.9g}" upper="{high:.9g}"')
+    text = (source / "orthoglide.yaml").read_text()
+    folder.mkdir(parents=True)
+    (folder / "machine.urdf").write_text(urdf)
+    (folder / "machine.yaml").write_text(text.replace("310.25", f"{length * 1e3:.9g}"))
+    return folder

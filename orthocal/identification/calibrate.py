@@ -37,8 +37,9 @@ from orthocal.identification.records import (
     SolverRecord,
 )
 from orthocal.identification.selection import Known, Selection
+from orthocal.identification.turned import find_turned_setup
 from orthocal.identification.uncertainty import estimate_repeatability, project_out_zeros
-from orthocal.identification.unmodelled import measure_unmodelled
+from orthocal.identification.unmodelled import find_other_errors, measure_unmodelled
 from orthocal.measurement.session import Session
 from orthocal.measurement.session_file import load_session
 from orthocal.robot.loading import packaged_robots
@@ -162,8 +163,11 @@ def assemble_calibration(
     """
     problem, noise, loss = fit.problem, fit.noise, fit.loss
     session = problem.session
-    diagnostics = diagnose_readings(fit)
     covariance = fit.covariance()
+    # a base parameter is the whole combination: nothing of it is left out
+    others = find_other_errors(fit, spoken_for=() if whole is None else whole.free)
+    diagnostics = diagnose_readings(fit)
+    residuals = _residual_rows(fit, diagnostics, nominal)
     factor = np.sqrt(2.0) if session.only_differences else 1.0
     return Calibration(
         robot_record=_robot_record(session),
@@ -182,7 +186,7 @@ def assemble_calibration(
         ),
         parameters=_estimates(fit, covariance, intervals or {}),
         covariance=read_only(covariance),
-        unmodelled=measure_unmodelled(fit),
+        unmodelled=measure_unmodelled(fit, others),
         identifiability=_identifiability(fit, whole),
         base=whole is not None,
         noise=NoiseRecord(
@@ -196,7 +200,8 @@ def assemble_calibration(
         sigma=noise.sigma * float(factor),
         dof=noise.dof,
         rows_are_differences=session.only_differences,
-        residuals=_residual_rows(fit, diagnostics, nominal),
+        residuals=residuals,
+        turned=find_turned_setup(fit, others, residuals),
         critical=diagnostics.critical,
         postures=tuple(
             PostureRecord(name, tuple(p.drives.tolist()), tuple(fit.solution.passive[i].tolist()))

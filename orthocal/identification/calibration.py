@@ -33,6 +33,7 @@ from orthocal.identification.records import (
     SessionRecord,
     SetupRecord,
     SolverRecord,
+    TurnedSetup,
     root_mean_square,
 )
 from orthocal.identification.uncertainty import BY_CHANCE, confidence_factor
@@ -76,6 +77,8 @@ class Calibration:
     """Degrees of freedom of sigma."""
     rows_are_differences: bool
     residuals: tuple[ResidualRow, ...]
+    turned: TurnedSetup | None
+    """The setup that seems to have been read with the wrong sign."""
     critical: float
     """Studentised residuals beyond this are suspicious; infinite if nothing tells the noise."""
     postures: tuple[PostureRecord, ...]
@@ -303,6 +306,7 @@ class Calibration:
             "largest_after": self.largest_after,
             "critical": _number(self.critical),
             "residuals": [{**_plain(r), "residual": r.residual} for r in self.residuals],
+            "turned": None if self.turned is None else _plain(self.turned),
             "postures": [_plain(p) for p in self.postures],
             "setups": [_plain(s) for s in self.setups],
         }

@@ -25,6 +25,7 @@ from orthocal.identification.records import (
     SessionRecord,
     SetupRecord,
     SolverRecord,
+    TurnedSetup,
 )
 from orthocal.identification.unmodelled import Unmodelled
 from orthocal.measurement.session import SectionForm
@@ -128,6 +129,13 @@ class _SetupKeys(_Keys):
     zero: Number | None
 
 
+class _TurnedKeys(_Keys):
+    name: str
+    as_read: Number | None
+    turned: Number | None
+    evidence: Number
+
+
 class _UnmodelledKeys(_Keys):
     names: list[str]
     tolerances: list[PositiveNumber]
@@ -181,6 +189,7 @@ class _CalibrationKeys(_Keys):
     largest_after: Number
     critical: Number | None
     residuals: list[_ResidualKeys]
+    turned: _TurnedKeys | None
     postures: list[_PostureKeys]
     setups: list[_SetupKeys]
 
@@ -266,6 +275,7 @@ def load_calibration(path: str | Path) -> Calibration:
         identifiability=_identifiability(keys.identifiability),
         base=keys.base,
         residuals=tuple(_residual(r) for r in keys.residuals),
+        turned=None if keys.turned is None else _turned(keys.turned),
         critical=math.inf if keys.critical is None else keys.critical,
         postures=tuple(
             PostureRecord(p.name, tuple(p.drives), tuple(p.passive)) for p in keys.postures
@@ -325,6 +335,10 @@ def _residual(keys: _ResidualKeys) -> ResidualRow:
     for name in ("linear", "studentised", "unseen"):
         values[name] = _float(values[name])
     return ResidualRow(**values)
+
+
+def _turned(keys: _TurnedKeys) -> TurnedSetup:
+    return TurnedSetup(keys.name, _float(keys.as_read), _float(keys.turned), keys.evidence)
 
 
 def _float(value: float | None) -> float:

@@ -10,34 +10,14 @@ what the setup's own was. The setup is then missed by rₛ − Fₛ δ.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import NotIdentifiableError
 from orthocal.identification.fit import Fit, require_determined
-from orthocal.identification.records import ResidualRow, root_mean_square, rows_by_setup
 from orthocal.identification.uncertainty import decompose, project_out_zeros
 
 Array = NDArray[np.float64]
-
-CLEARLY = 5.0
-"""Times by which readings must agree better with all others for a turned sign to be believed. Of 60
-simulated machines each, with cycles of 10 to 20 µm, none without a turned setup is accused up to
-errors of three times their tolerances, and 49 to 59 with one are found out."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TurnedSetup:
-    """A setup whose readings agree with all others once their sign is turned."""
-
-    name: str
-    as_read: float
-    """Root mean square of what they differ by from what all others say, [m]."""
-    turned: float
-    """The same with the sign turned, [m]."""
 
 
 def predict_unseen(fit: Fit) -> Array:
@@ -75,26 +55,3 @@ def predict_unseen(fit: Fit) -> Array:
         rows = out[o.plus]
         errors[rows] = o.rows(missed)[rows]
     return errors
-
-
-def find_turned_setup(rows: Iterable[ResidualRow]) -> TurnedSetup | None:
-    """The setup that all others would agree with, were its sign the other one.
-
-    With y the readings and u what others miss them by, both without their gauge zero, others
-    predict y − u; readings of the other sign would be missed by −2 y + u. Two independent readings
-    are the least that can tell.
-    """
-    found = None
-    for name, group in rows_by_setup(rows).items():
-        raw = np.array([r.minus is None for r in group])
-        independent = len({(r.posture, r.minus) for r in group}) - int(raw.any())
-        measured = np.array([r.measured for r in group])
-        missed = np.array([r.unseen for r in group])
-        if independent < 2 or not np.isfinite(missed).all():
-            continue
-        if raw.any():
-            measured[raw] -= measured[raw].mean()
-        as_read, turned = (root_mean_square(v) for v in (missed, missed - 2.0 * measured))
-        if as_read > CLEARLY * turned and (found is None or as_read > found.as_read):
-            found = TurnedSetup(name, as_read, turned)
-    return found

@@ -20,6 +20,7 @@ from orthocal.identification.uncertainty import (
     decompose,
     estimate_noise,
     estimate_repeatability,
+    noise_floor,
     project_out_zeros,
     require_identifiable,
 )
@@ -122,6 +123,7 @@ def fit_problem(
     *,
     options: SolverOptions | None = None,
     start: ArrayLike | None = None,
+    program: NonlinearProgram | None = None,
 ) -> Fit:
     """Solve a problem exactly, with sigma from the readings where they tell it.
 
@@ -130,6 +132,7 @@ def fit_problem(
         options: How Ipopt is run.
         start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
             solution.
+        program: Of the same problem with other readings, to be used again; `options` are its own.
 
     Raises:
         NotIdentifiableError: If neither readings nor a prior determine a parameter.
@@ -140,7 +143,10 @@ def fit_problem(
     linearisation = linearise_at_reference(problem)
     require_determined(problem, linearisation.information)
     repeatability = estimate_repeatability(problem.values, problem.observations)
-    program = NonlinearProgram(problem, options=options)
+    if program is None:
+        program = NonlinearProgram(problem, options=options)
+    else:
+        program = program.with_problem(problem)
     built = time.perf_counter()
     seconds, iterations = 0.0, 0
     sigma = _linearised_sigma(program, linearisation, repeatability)
@@ -233,9 +239,11 @@ def _linearised_sigma(
 def first_sigma(session: Session, repeatability: tuple[float, int]) -> float:
     """What a reading's standard deviation is taken to be before there is a solution, [m]."""
     cycles_sigma, cycles_dof = repeatability
+    gauge = session.gauge
+    floor = noise_floor(gauge.sigma, gauge.resolution)
     if cycles_dof > 0:
-        return max(cycles_sigma, SMALLEST_SIGMA)
-    return session.gauge.sigma or SIGMA_WITHOUT_WORD
+        return max(cycles_sigma, floor, SMALLEST_SIGMA)
+    return max(gauge.sigma or SIGMA_WITHOUT_WORD, floor)
 
 
 def require_determined(problem: CalibrationProblem, information: Information) -> None:

@@ -8,6 +8,7 @@ gradient, Jacobian and Hessian of the whole by index: building does not grow wit
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -114,6 +115,13 @@ class NonlinearProgram:
         self._n_passive = problem.robot.passive_index.size
         self._build()
         self.seconds_build = time.perf_counter() - began
+
+    def with_problem(self, problem: CalibrationProblem) -> NonlinearProgram:
+        """The same program for another `with_values` of its problem; nothing is built again."""
+        other = copy.copy(self)
+        other.problem = problem
+        other.__dict__.pop("_exact", None)
+        return other
 
     def solve(
         self,

@@ -11,6 +11,7 @@ are CasADi expressions in scaled variables of order one:
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
@@ -75,6 +76,17 @@ class CalibrationProblem:
         self.prior_precision = selection.prior.astype(np.float64)
         self.prior_mean = np.where(selection.prior, selection.mean, 0.0)
         self.passive_scale = LENGTH_SCALE / coordinate_units(self.robot)[self.robot.passive_index]
+
+    def with_values(self, values: ArrayLike) -> CalibrationProblem:
+        """The same problem for other readings of the same rows; nothing is built again.
+
+        Args:
+            values: Readings of the session's rows, shape (n_rows,), [m].
+        """
+        other = copy.copy(self)
+        other.session = self.session.with_values(np.asarray(values, dtype=np.float64))
+        other.__dict__.pop("values", None)
+        return other
 
     @property
     def n_free(self) -> int:

@@ -213,6 +213,19 @@ class SetupRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TurnedSetup:
+    """A setup whose readings agree with all others once their sign is turned."""
+
+    name: str
+    as_read: float
+    """Root mean square of what they differ by from what all others say, [m]; NaN if not known."""
+    turned: float
+    """The same with the sign turned, [m]."""
+    evidence: float
+    """Logarithm of the factor by which the turned sign makes all readings more likely."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ControllerEntry(InUnit):
     """What to enter into the controller for one drive."""
 

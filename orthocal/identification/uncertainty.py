@@ -104,6 +104,16 @@ def estimate_repeatability(values: Array, observations: Observations) -> tuple[f
     return (float(np.sqrt(total / dof)) if dof else float("nan")), dof
 
 
+def noise_floor(gauge_sigma: float | None, resolution: float | None) -> float:
+    """Standard deviation of a reading that no scatter can argue away, [m].
+
+    What is stated of the gauge, and what rounding to its resolution leaves, 1/√12 of it: readings
+    that happen to be alike, or are few, say nothing against either.
+    """
+    finest = 0.0 if resolution is None else resolution / math.sqrt(12.0)
+    return max(gauge_sigma or 0.0, finest)
+
+
 def estimate_noise(
     *,
     repeatability: tuple[float, int],
@@ -115,30 +125,28 @@ def estimate_noise(
     """Standard deviation of a reading: from repeated cycles, else from residuals, else the gauge's.
 
     Residuals win over cycles where an F test finds them too large for the cycles: then the model
-    is in error, and the spread of the cycles would flatter every standard deviation.
+    is in error, and the spread of the cycles would flatter every standard deviation. What is stated
+    of the gauge is a floor (`noise_floor`): with less it is the gauge's own that counts.
 
     Args:
         repeatability: From `estimate_repeatability`.
         residual_square: Σ r² of single readings, zeros eliminated, [m²].
         residual_dof: Readings less zeros less (effective) parameters.
         gauge_sigma: The session's `sigma_mm`, [m].
-        resolution: Of the gauge, [m]: readings rounded to it scatter by at least 1/√12 of it, also
-            where they happen to be equal.
+        resolution: Of the gauge, [m].
     """
     cycles_sigma, cycles_dof = repeatability
-    finest = 0.0 if resolution is None else resolution / math.sqrt(12.0)
-    if cycles_dof > 0:
-        cycles_sigma = max(cycles_sigma, finest)
+    floor = noise_floor(gauge_sigma, resolution)
     enough = residual_dof > 0.5
-    residual_sigma = float("nan")
-    if enough:
-        residual_sigma = max(float(np.sqrt(residual_square / residual_dof)), finest)
+    residual_sigma = math.sqrt(residual_square / residual_dof) if enough else math.nan
+    source: NoiseSource
     if cycles_dof > 0:
+        known, known_dof = (cycles_sigma, cycles_dof) if cycles_sigma > floor else (floor, 0)
         misfit = False
-        if enough and cycles_sigma > 0.0:
-            chi_square = residual_square / cycles_sigma**2
-            misfit = chance_of_excess(chi_square, residual_dof, cycles_dof=cycles_dof) < BY_CHANCE
-        source: NoiseSource = "residuals" if misfit else "cycles"
+        if enough and known > 0.0:
+            chi_square = residual_square / known**2
+            misfit = chance_of_excess(chi_square, residual_dof, cycles_dof=known_dof) < BY_CHANCE
+        source = "residuals" if misfit else "cycles"
     elif enough:
         source = "residuals"
     else:
@@ -146,9 +154,11 @@ def estimate_noise(
     sigma, dof = {
         "cycles": (cycles_sigma, float(cycles_dof)),
         "residuals": (residual_sigma, residual_dof),
-        "gauge": (gauge_sigma or float("nan"), float("inf")),
-        "unknown": (float("nan"), 0.0),
+        "gauge": (floor, math.inf),
+        "unknown": (math.nan, 0.0),
     }[source]
+    if sigma < floor:
+        source, sigma, dof = "gauge", floor, math.inf
     return Noise(
         sigma, dof, source, cycles_sigma, cycles_dof, residual_sigma, max(residual_dof, 0.0)
     )

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import SessionError
 from orthocal.markup import paragraph, table
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Robot, read_only
 
 Array = NDArray[np.float64]
 
@@ -167,6 +167,20 @@ class Session:
             + table(headers, rows, left=4)
             + paragraph(about)
         )
+
+    def with_controller(self, offsets: ArrayLike) -> Session:
+        """The same session with other offsets active in the controller than it states.
+
+        Args:
+            offsets: Shape (n_drives,), [m, rad].
+        """
+        active = np.asarray(offsets, dtype=np.float64)
+        shift = self.active_offsets - active
+        postures = {
+            name: replace(p, drives=read_only(p.drives + shift))
+            for name, p in self.postures.items()
+        }
+        return replace(self, postures=postures, controller_offsets=read_only(active), sha256="")
 
     def with_values(self, values: Sequence[float] | Array) -> Session:
         """The same session with other readings.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 from orthocal.identification.calibration import Calibration
-from orthocal.identification.cross_validation import find_turned_setup
 from orthocal.identification.records import ResidualRow, root_mean_square, rows_by_setup
 from orthocal.identification.uncertainty import BY_CHANCE, confidence_factor
 from orthocal.output.layout import mm, plain, signed
@@ -28,7 +27,7 @@ def advise(calibration: Calibration) -> str:
     """Whether to enter what was identified, in a sentence or two; empty where no offset was."""
     if not calibration.controller_entries():
         return ""
-    turned = find_turned_setup(calibration.residuals)
+    turned = calibration.turned
     excess = find_excess(calibration)
     suspicious = len(calibration.suspicious)
     if turned is not None:

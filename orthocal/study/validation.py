@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,6 @@ from orthocal.identification.calibration import Calibration
 from orthocal.identification.records import ResidualRow
 from orthocal.identification.uncertainty import BY_CHANCE, confidence_factor
 from orthocal.measurement.session import Session
-from orthocal.robot.model import read_only
 from orthocal.robot.parameters import InUnit, Unit
 from orthocal.study.repetition import Repetition, measure_repetition
 
@@ -153,7 +152,7 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
     elif entries:
         by_drive = {e.drive: e.enter for e in entries}
         offsets = np.array([by_drive.get(d.name, 0.0) for d in session.robot.drives])
-        session = _with_controller(session, offsets)
+        session = session.with_controller(offsets)
     refit = repeat_calibration(calibration, session)
     changes = _further_changes(calibration, refit)
     repetition = measure_repetition(calibration, refit)
@@ -199,15 +198,6 @@ def _require_offsets(calibration: Calibration, session: Session) -> None:
                 "active",
                 where=f"{session.path or 'session'}: controller.offsets_mm",
             )
-
-
-def _with_controller(session: Session, offsets: Array) -> Session:
-    """The session with other offsets active in the controller than it states."""
-    shift = session.active_offsets - offsets
-    postures = {
-        name: replace(p, drives=read_only(p.drives + shift)) for name, p in session.postures.items()
-    }
-    return replace(session, postures=postures, controller_offsets=read_only(offsets))
 
 
 def _excess_probability(calibration: Calibration, refit: Calibration) -> float:

@@ -11,11 +11,11 @@ import yaml
 AXES = "xyz"
 
 
-def paper() -> dict:
+def paper(**ends: float) -> dict:
     """The paper's seven postures, gauge in the middle of the leg: 18 readings."""
     postures = {"zero": {"tcp_mm": [0, 0, 0]}}
     for k, axis in enumerate(AXES):
-        for name, value in (("max", 60.0), ("min", -100.0)):
+        for name, value in (ends or {"max": 60.0, "min": -100.0}).items():
             postures[f"{axis}_{name}"] = {"tcp_mm": [value * (i == k) for i in range(3)]}
     read = {a: ["zero", f"{a}_max", f"{a}_min"] for a in AXES}
     return {"robot": "orthoglide", "postures": postures, "setups": setups(read, [0.5])}
