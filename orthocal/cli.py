@@ -240,8 +240,14 @@ def accuracy(
         typer.Argument(metavar="[TARGETS.csv]", help="Columns of the tool: x_mm, y_mm, z_mm."),
     ] = None,
     half_side_mm: Annotated[
-        float, typer.Option(min=0.001, max=1e5, help="Half the side of the cube, without points.")
-    ] = 60.0,
+        float | None,
+        typer.Option(
+            min=0.001,
+            max=1e5,
+            help="Half the side of the cube, without points; else the largest that the machine "
+            "reaches, of 60 mm at most.",
+        ),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Where the tool really is, and how well that is known: over a cube, or at points.
@@ -251,23 +257,22 @@ def accuracy(
     from orthocal.identification.calibration_file import load_calibration
     from orthocal.measurement.table import closures_named_by_row, read_points
     from orthocal.output.accuracy import accuracy_json, format_points, print_accuracy
-    from orthocal.study.accuracy import Workspace, assess_tool, cube
+    from orthocal.robot.workspace import Workspace, cube
+    from orthocal.study.accuracy import assess_tool
 
     result = load_calibration(calibration)
-    names = None
-    if points is None:
-        workspace = cube(result.robot, half_side=half_side_mm * 1e-3)
-        region = f"a cube of ±{half_side_mm:g} mm around the zero"
-    else:
+    names, workspace = None, None
+    if points is not None:
         names, given = read_points(points, result.robot)
         workspace = Workspace.even(given)
-        region = f"the {len(given)} points of {points}"
+    elif half_side_mm is not None:
+        workspace = cube(result.robot, half_side=half_side_mm * 1e-3)
     with closures_named_by_row():
         found = assess_tool(result, workspace, names=names)
     if json:
         _out(accuracy_json(result, found).rstrip("\n"))
     elif points is None:
-        print_accuracy(result, found, region=region)
+        print_accuracy(result, found)
     else:
         _out(format_points(found))
 

@@ -12,22 +12,17 @@ from orthocal.identification.fit import fit_problem
 from orthocal.identification.problem import build_problem
 from orthocal.identification.unmodelled import find_other_errors, machine_errors
 
-OFFSETS = 2e-3
-"""[m] One standard deviation of the offsets of machines."""
-
 
 class Fleet:
-    """Machines drawn from their tolerances, offsets from ±2 mm, all read by one plan."""
+    """Machines drawn from their robot's tolerances, all read by one plan."""
 
     def __init__(self, plan, *, model="offsets"):
         self.plan = plan
         robot = plan.robot
         self.machine = build_problem(plan, free=machine_errors(robot), prior=True)
-        own = np.array([p.tolerance for p in self.machine.parameters])
         self.is_offset = np.array([n.endswith(".offset") for n in self.machine.free])
-        self.tolerances = np.where(self.is_offset, OFFSETS, own)
-        tolerances = {"*.offset": OFFSETS} if model == "full" else None
-        problem = build_problem(plan, model=model, tolerances=tolerances)
+        self.tolerances = np.array([p.tolerance for p in self.machine.parameters])
+        problem = build_problem(plan, model=model)
         self.nominal = fit_problem(problem)
         self.problem, self.others = problem, find_other_errors(self.nominal)
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +24,6 @@ from orthocal.identification.recorded_robot import (
     require_rows,
 )
 from orthocal.identification.records import (
-    ControllerEntry,
     NoiseRecord,
     ParameterEstimate,
     PostureRecord,
@@ -43,6 +42,8 @@ from orthocal.robot.assembly import Assembly
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
+
+Found = TypeVar("Found")
 
 SCHEMA = "orthocal/calibration/1"
 
@@ -87,7 +88,8 @@ class Calibration:
     """Of orthocal."""
     path: Path | None = None
     """Where it was loaded from."""
-    _robot: list[Robot] = field(default_factory=list)
+    _kept: dict[str, Any] = field(default_factory=dict)
+    """What follows from the rest, once it was asked for."""
 
     def __getitem__(self, name: str) -> ParameterEstimate:
         for p in self.parameters:
@@ -188,19 +190,37 @@ class Calibration:
         """Standard deviations on either side of an estimate in its 95 % interval."""
         return confidence_factor(self.dof)
 
-    def interval(self, parameter: ParameterEstimate) -> tuple[float, float]:
-        """95 % interval of a free parameter, [unit]; infinite where nothing tells the noise.
+    @property
+    def total_std(self) -> Array:
+        """Standard deviations of the free parameters from all that is not known, (n_free,), [SI].
 
-        Student's factor counts for the share that the readings told: what only the prior tells has
-        no part in the degrees of freedom of their scatter.
+        What the scatter of the readings and the priors leave open, and what errors of the machine
+        that were not free, at their tolerances, have moved.
         """
-        share = 1.0 if math.isnan(parameter.data_share) else max(parameter.data_share, 0.0)
+        return np.asarray(np.hypot(self.standard_deviations, self._bias_std))
+
+    @property
+    def intervals(self) -> tuple[tuple[float, float], ...]:
+        """95 % intervals of the free parameters, with all that is not known, [unit].
+
+        Student's factor counts for the share that the readings told: what only the prior tells, or
+        the tolerances of errors that were not free, has no part in the degrees of freedom of their
+        scatter. Infinite where nothing tells the noise.
+        """
         student, normal = self.confidence_factor, confidence_factor(math.inf)
-        factor = normal
-        if share > 0.0:
-            factor = math.sqrt(share * student**2 + (1.0 - share) * normal**2)
-        half = factor * parameter.std
-        return parameter.value - half, parameter.value + half
+        found = []
+        for p, bias in zip(self.free, self._bias_std, strict=True):
+            share = 1.0 if math.isnan(p.data_share) else max(p.data_share, 0.0)
+            square = (share * student**2 if share > 0.0 else 0.0) + (1.0 - share) * normal**2
+            half = math.sqrt(square * p.std**2 + (normal * float(bias)) ** 2)
+            found.append((p.value - half, p.value + half))
+        return tuple(found)
+
+    @property
+    def _bias_std(self) -> Array:
+        bound = np.array([p.at_bound is not None for p in self.free])
+        bias = np.sqrt(np.diag(self.unmodelled.bias_covariance))
+        return np.where(bound, 0.0, bias)
 
     @property
     def robot(self) -> Robot:
@@ -210,40 +230,31 @@ class Calibration:
             RobotError: If it cannot be found or loaded.
             CalibrationFileError: If its files are not those that were calibrated.
         """
-        if not self._robot:
-            self._robot.append(self._load_robot())
-        return self._robot[0]
+        return self.remember("robot", self._load_robot)
 
-    def controller_entries(self) -> tuple[ControllerEntry, ...]:
-        """What to enter into the controller; empty where no offset was identified."""
-        active = self.session.controller_offsets
-        entries = []
-        free = [p.name for p in self.free]
-        bias = np.sqrt(np.diag(self.unmodelled.bias_covariance))
-        for i, drive in enumerate(self.robot.drives):
-            estimate = next((p for p in self.parameters if p.name == f"{drive.name}.offset"), None)
-            if estimate is None:
-                continue
-            now = None if active is None else active[i]
-            change = estimate.value - (now or 0.0)
-            held: Literal["known", "lower bound", "upper bound"] | None = None
-            if not estimate.free:
-                held = "known"
-            elif estimate.at_bound is not None:
-                held = "lower bound" if estimate.at_bound == "lower" else "upper bound"
-            entries.append(
-                ControllerEntry(
-                    drive=drive.name,
-                    unit=drive.unit,
-                    active=now,
-                    enter=estimate.value,
-                    change=change,
-                    std=estimate.std,
-                    bias_std=0.0 if held else float(bias[free.index(estimate.name)]),
-                    held=held,
-                )
-            )
-        return tuple(entries)
+    def remember(self, name: str, find: Callable[[], Found]) -> Found:
+        """What follows from this calibration, found once and kept with it.
+
+        Args:
+            name: Of what is found.
+            find: How.
+        """
+        if name not in self._kept:
+            self._kept[name] = find()
+        found: Found = self._kept[name]
+        return found
+
+    @property
+    def active_offsets(self) -> Array:
+        """Offsets in the controller while measuring, 0 where not stated, (n_drives,), [m, rad]."""
+        stated = self.session.controller_offsets
+        return np.zeros(len(self.robot.drives)) if stated is None else np.array(stated)
+
+    @property
+    def only_offsets(self) -> bool:
+        """Whether the machine as identified has no errors but offsets."""
+        offsets = {f"{d.name}.offset" for d in self.robot.drives}
+        return all(p.name in offsets for p in self.parameters if p.free or p.value != 0.0)
 
     def forward(self, joints: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
         """Tool centre point of the calibrated machine.
@@ -330,21 +341,19 @@ class Calibration:
             f"{len(self.residuals)} {'differences' if self.rows_are_differences else 'readings'}; "
             f"r.m.s. {self.rms_before * 1e3:.3f} mm before, {self.rms_after * 1e3:.3f} mm after"
         )
-        offsets = {f"{e.drive}.offset": e for e in self.controller_entries()}
-        listed = [p for p in self.free if p.name in offsets or len(self.free) <= FEW]
+        offsets = {f"{d.name}.offset" for d in self.robot.drives}
         rows = []
-        for p in listed:
-            entry, f = offsets.get(p.name), p.edge_factor
-            in_all = entry.std_in_all if entry and not entry.held else p.std
-            numbers = (p.linear * f, p.value * f, p.std * f, in_all * f)
-            formats = ("+.3f", "+.3f", ".3f", ".3f")
+        for p, std in zip(self.free, self.total_std.tolist(), strict=True):
+            if p.name not in offsets and len(self.free) > FEW:
+                continue
+            numbers = (v * p.edge_factor for v in (p.linear, p.value, std))
             cells = [
                 format(n, form) if math.isfinite(n) else "unknown"
-                for n, form in zip(numbers, formats, strict=True)
+                for n, form in zip(numbers, ("+.3f", "+.3f", ".3f"), strict=True)
             ]
             rows.append((p.name, *cells, p.edge_unit))
-        headers = ("parameter", "linear", "exact", "± σ", "± σ in all", "unit")
-        more = len(self.free) - len(listed)
+        headers = ("parameter", "linear", "exact", "± σ", "unit")
+        more = len(self.free) - len(rows)
         return (
             paragraph(f"Calibration of {self.robot_record.name}, model '{self.model}'")
             + paragraph(self.session.title)

@@ -233,18 +233,15 @@ class ControllerEntry(InUnit):
     unit: Unit
     active: float | None
     """Offset now in the controller, [unit]; None where the session does not say."""
+    identified: float
+    """Offset of the identified machine, [unit]."""
     enter: float
     """Offset to enter, [unit]; what to add to the present one where that is not known."""
     change: float
     """enter − active, [unit]."""
     std: float
-    """What the scatter leaves open, [unit]."""
-    bias_std: float
-    """What errors that were not identified, at their tolerances, add to it, [unit]."""
+    """Standard deviation from all that is not known, [unit]; NaN if nothing tells."""
+    scatter: float
+    """What the scatter of the readings has in it, [unit]."""
     held: Literal["known", "lower bound", "upper bound"] | None
     """What holds it instead of the readings."""
-
-    @property
-    def std_in_all(self) -> float:
-        """Standard deviation from both, [unit]."""
-        return math.hypot(self.std, self.bias_std)

@@ -22,7 +22,7 @@ from orthocal.robot.model import Robot
 Array = NDArray[np.float64]
 
 LARGEST_ZERO = 0.2e-3
-"""Gauge zeros are drawn from ± this, [m]."""
+"""What a dial shows in the first posture of its setup is drawn from ± this, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +78,7 @@ def simulate_session(
         errors: Parameter name to value, [SI]; absent ones are 0.
         seed: Of noise and gauge zeros.
         sigma: Standard deviation of a reading, [m]; the plan's gauge by default.
-        exact: No noise, no gauge zeros, no rounding to the gauge's resolution.
+        exact: No noise, no rounding to the gauge's resolution; dials show 0 where they begin.
 
     Raises:
         SessionError: If the noise is not known, or a reading leaves the gauge's range.
@@ -87,20 +87,21 @@ def simulate_session(
     rng = np.random.default_rng(seed)
     observations = build_observations(plan)
     entries = predict_entries(plan, observations, errors)
+    # the dial is set where its setup begins
+    deviation = plan.gauge.sigma if sigma is None else sigma
+    if deviation is None and not exact:
+        raise SessionError(
+            "is missing: the noise to simulate is not known",
+            where="gauge.sigma_mm" if plan.path is None else f"{plan.path}: gauge.sigma_mm",
+        )
     zeros = dict.fromkeys(plan.setups, 0.0)
+    for i, name in enumerate(zeros):
+        zeros[name] = -float(entries[observations.setup == i][:1].sum())
+        if not exact:
+            zeros[name] += round(float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO)), 6)
+    entries = entries + np.array(list(zeros.values()))[observations.setup]
     if not exact:
-        deviation = plan.gauge.sigma if sigma is None else sigma
-        if deviation is None:
-            raise SessionError(
-                "is missing: the noise to simulate is not known",
-                where="gauge.sigma_mm" if plan.path is None else f"{plan.path}: gauge.sigma_mm",
-            )
-        zeros = {
-            name: round(float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO)), 6) for name in plan.setups
-        }
-        by_setup = np.array(list(zeros.values()))
-        entries = entries + by_setup[observations.setup]
-        entries = entries + deviation * rng.normal(size=observations.size)
+        entries = entries + (deviation or 0.0) * rng.normal(size=observations.size)
         if plan.gauge.resolution is not None:
             entries = np.round(entries / plan.gauge.resolution) * plan.gauge.resolution
     rows = observations.rows(entries)

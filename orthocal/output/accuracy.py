@@ -11,18 +11,25 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from orthocal.errors import ClosureError
+from orthocal.errors import ClosureError, RobotError
 from orthocal.identification.calibration import Calibration
 from orthocal.output.layout import add_row, print_rich, table_of, um
 from orthocal.study.accuracy import (
-    HALF_SIDE,
     ErrorSize,
+    ErrorSizes,
     ToolAccuracy,
-    assess_cube,
     assess_remaining,
+    assess_tool,
+    expect_after_offsets,
     find_remaining_errors,
-    measure_deviations,
 )
+from orthocal.study.entering import find_entries
+
+THREE_WAYS = (
+    "With shift and rotation taken out, as a workpiece sees it that is aligned on the machine; "
+    "shift out: with the common shift alone taken out (r.m.s.); absolute (r.m.s.)."
+)
+"""What the three forms of an error at the tool are."""
 
 POINT_COLUMNS = (
     "x_mm",
@@ -40,84 +47,75 @@ POINT_COLUMNS = (
 
 def render_tool(calibration: Calibration) -> RenderableType:
     """The tool's errors over the cube around the mechanical zero."""
-    if calibration.robot.tcp is None:
-        return Text("This robot has no tool centre point: give orthocal.tcp in its YAML.")
     try:
-        accuracy = assess_cube(calibration)
-    except ClosureError as e:
-        return Text(f"The cube of ±{HALF_SIDE * 1e3:g} mm is out of reach: {e}.")
-    return render_accuracy(
-        calibration, accuracy, region=f"a cube of ±{HALF_SIDE * 1e3:g} mm around the zero"
-    )
+        return render_accuracy(calibration, assess_tool(calibration))
+    except (ClosureError, RobotError) as e:
+        return Text(f"Nothing can be said of the tool: {e}.")
 
 
-def print_accuracy(calibration: Calibration, accuracy: ToolAccuracy, *, region: str) -> None:
+def print_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> None:
     """Print the tool's errors over a region."""
-    print_rich(render_accuracy(calibration, accuracy, region=region))
+    print_rich(render_accuracy(calibration, accuracy))
 
 
-def render_accuracy(
-    calibration: Calibration, accuracy: ToolAccuracy, *, region: str
-) -> RenderableType:
+def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> RenderableType:
     """The tool's errors over a region.
 
     Args:
         calibration: The calibration.
         accuracy: Its errors at the tool.
-        region: What the points are, in words.
     """
-    weights = accuracy.workspace.weights
-    sizes = ("95 %", "worst point")
-    table = table_of("[µm]", "r.m.s.", *sizes, "shift out: r.m.s.", *sizes)
-    rows: list[tuple[str, ErrorSize, ErrorSize]] = [
-        (
-            "off its target now",
-            measure_deviations(accuracy.deviation, weights),
-            measure_deviations(accuracy.relative_deviation, weights),
-        ),
-    ]
-    if len(calibration.free) > len(calibration.controller_entries()):
-        rows.append(
-            (
-                "with the offsets entered",
-                measure_deviations(accuracy.left, weights),
-                measure_deviations(accuracy.relative_left, weights),
-            )
-        )
-    rows.append(("not known before", accuracy.before.absolute, accuracy.before.relative))
+    table = table_of("[µm]", "r.m.s.", "95 %", "worst point", "shift out", "absolute")
+    rows = [("off its target now", accuracy.measure(accuracy.deviation))]
+    if not calibration.only_offsets and find_entries(calibration):
+        rows.append(("with the offsets entered", accuracy.measure(accuracy.error_after_offsets)))
+    rows.append(("not known before", accuracy.before.sizes))
     remaining, excess = assess_remaining(calibration, accuracy)
     if accuracy.after is not None:
-        rows.append(("not known after", accuracy.after.absolute, accuracy.after.relative))
+        rows.append(("not known after", accuracy.after.sizes))
     if remaining is not None and excess > 1.0:
-        rows.append((f"  at {excess:.1f} × tolerances", remaining.absolute, remaining.relative))
-    for name, absolute, relative in rows:
-        add_row(table, name, *(um(v) for size in (absolute, relative) for v in _parts(size)))
-    lines: list[RenderableType] = [
-        table,
-        Text(f"Over {region}: absolute, then with the common shift taken out (shift out)."),
-    ]
+        rows.append((f"  at {excess:.1f} × tolerances", remaining.sizes))
+    for name, sizes in rows:
+        aligned = ("", "", "") if sizes.aligned is None else tuple(map(um, _parts(sizes.aligned)))
+        add_row(table, name, *aligned, um(sizes.relative.rms), um(sizes.absolute.rms))
+    lines: list[RenderableType] = [table, Text(f"Over {accuracy.workspace.words}. {THREE_WAYS}")]
     if accuracy.after is None:
         lines.append(Text("What is not known after cannot be told: nothing tells the noise."))
-    else:
+        return Group(*lines)
+    lines.append(
+        Text(
+            "Not known: one standard deviation in space (95 %: 95 of 100 errors are smaller; "
+            "worst point: one standard deviation there), with all errors of the machine that "
+            "were not identified at their tolerances."
+        )
+    )
+    if excess > 1.0:
         lines.append(
             Text(
-                "Not known: one standard deviation in space (95 %: 95 of 100 errors are smaller; "
-                "worst point: one standard deviation there), with all errors of the machine that "
-                "were not identified at their tolerances."
+                f"What remains of the readings is {excess:.1f} times what such errors would "
+                "leave: this machine seems to be as much worse than its tolerances."
             )
         )
-        if excess > 1.0:
-            lines.append(
-                Text(
-                    f"What remains of the readings is {excess:.1f} times what such errors would "
-                    "leave: this machine seems to be as much worse than its tolerances."
-                )
-            )
-        if len(calibration.free) <= len(calibration.controller_entries()):
-            last = "not known after" if excess == 1.0 else f"at {excess:.1f} × tolerances"
-            lines.append(Text(f"With the offsets entered, '{last}' is what the tool is good for."))
-        lines += [Text(line) for line in describe_remaining(calibration, accuracy)]
+    promise = describe_promise(calibration, accuracy)
+    lines += [Text(line) for line in [*promise, *describe_remaining(calibration, accuracy)]]
     return Group(*lines)
+
+
+def describe_promise(calibration: Calibration, accuracy: ToolAccuracy) -> list[str]:
+    """What the tool is good for once the offsets are entered, in a line; none if unknown."""
+    expected = expect_after_offsets(calibration, accuracy)
+    if expected is None or not find_entries(calibration):
+        return []
+    line = (
+        f"With the offsets entered the tool is good for {um(expected)} µm (r.m.s., shift and "
+        "rotation out)"
+    )
+    remaining, _ = assess_remaining(calibration, accuracy)
+    if calibration.only_offsets or remaining is None:
+        return [f"{line}."]
+    return [
+        f"{line}; in a controller that knows all errors, for {um(remaining.sizes.headline.rms)} µm."
+    ]
 
 
 def describe_remaining(calibration: Calibration, accuracy: ToolAccuracy) -> list[str]:
@@ -149,32 +147,30 @@ def format_points(accuracy: ToolAccuracy) -> str:
 
 def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
     """Sizes over the region as JSON, SI units."""
-    weights = accuracy.workspace.weights
 
-    def size(s: ErrorSize) -> dict[str, float]:
+    def size(s: ErrorSize | None) -> dict[str, float] | None:
+        if s is None:
+            return None
         return {"rms": s.rms, "percentile_95": s.percentile_95, "largest": s.largest}
 
-    def both(name: str) -> dict[str, Any] | None:
-        found = getattr(accuracy, name)
-        if found is None:
-            return None
-        return {"absolute": size(found.absolute), "relative": size(found.relative)}
+    def all_sizes(sizes: ErrorSizes) -> dict[str, Any]:
+        return {
+            "aligned": size(sizes.aligned),
+            "relative": size(sizes.relative),
+            "absolute": size(sizes.absolute),
+        }
 
+    after = accuracy.after
     document = {
-        "schema": "orthocal/accuracy/1",
+        "schema": "orthocal/accuracy/2",
         "robot": calibration.robot_record.name,
         "model": calibration.model,
         "points": len(accuracy.workspace.points),
-        "deviation": {
-            "absolute": size(measure_deviations(accuracy.deviation, weights)),
-            "relative": size(measure_deviations(accuracy.relative_deviation, weights)),
-        },
-        "offsets_entered": {
-            "absolute": size(measure_deviations(accuracy.left, weights)),
-            "relative": size(measure_deviations(accuracy.relative_left, weights)),
-        },
-        "uncertainty_before": both("before"),
-        "uncertainty_after": both("after"),
+        "half_side": accuracy.workspace.half_side,
+        "deviation": all_sizes(accuracy.measure(accuracy.deviation)),
+        "offsets_entered": all_sizes(accuracy.measure(accuracy.error_after_offsets)),
+        "uncertainty_before": all_sizes(accuracy.before.sizes),
+        "uncertainty_after": None if after is None else all_sizes(after.sizes),
     }
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
 

@@ -64,7 +64,7 @@ def _scores(comparison: Comparison) -> RenderableType:
                 _short(score.aicc),
                 _short(score.bic),
                 plain(score.unseen_rms * 1e3, 4),
-                "" if after is None or first else um(after.relative.rms),
+                "" if after is None or first else um(after.sizes.headline.rms),
             )
     for u in comparison.undetermined:
         add_row(table, u.model, "", str(u.n_free), "", "not determined", *([""] * 6))
@@ -74,8 +74,8 @@ def _scores(comparison: Comparison) -> RenderableType:
         Text("AICc, BIC: the lower the better; – with too few readings to spare"),
         Text("unseen: error in predicting the readings of each setup from all others, r.m.s."),
         Text(
-            "tool: what is not known of its position over the workspace, common shift taken out, "
-            "r.m.s."
+            "tool: what is not known of its position over the workspace, shift and rotation taken "
+            "out, r.m.s."
         ),
     )
 

@@ -9,6 +9,7 @@ from orthocal.identification.records import ResidualRow, root_mean_square, rows_
 from orthocal.identification.uncertainty import BY_CHANCE, confidence_factor
 from orthocal.output.layout import mm, plain, signed
 from orthocal.study.accuracy import find_excess
+from orthocal.study.entering import find_entries
 
 WORST_SUSPICIOUS = 5
 """Suspicious readings that are named."""
@@ -25,7 +26,7 @@ STANDSTILL = 1e-6
 
 def advise(calibration: Calibration) -> str:
     """Whether to enter what was identified, in a sentence or two; empty where no offset was."""
-    if not calibration.controller_entries():
+    if not find_entries(calibration):
         return ""
     turned = calibration.turned
     excess = find_excess(calibration)
@@ -210,28 +211,23 @@ def _explain_standstill(calibration: Calibration) -> list[str]:
 def _explain_linearisation(calibration: Calibration) -> list[str]:
     if calibration.solver.loss == "huber":  # the linearised estimate is by squares
         return []
-    shifts = [(abs(p.value - p.linear), p) for p in calibration.free]
-    largest, parameter = max(shifts, key=lambda s: s[0] / max(s[1].std, 1e-300))
-    if math.isnan(parameter.std) or parameter.std <= 0.0:
+    shifts = [
+        (abs(p.value - p.linear), std, p)
+        for p, std in zip(calibration.free, calibration.total_std.tolist(), strict=True)
+    ]
+    largest, std, parameter = max(shifts, key=lambda s: s[0] / max(s[1], 1e-300))
+    if math.isnan(std) or std <= 0.0:
         return []
     return [
         f"Linearising costs at most {plain(largest * parameter.edge_factor)} "
-        f"{parameter.edge_unit} ({parameter.name}), {largest / parameter.std:.2g} of its σ."
+        f"{parameter.edge_unit} ({parameter.name}), {largest / std:.2g} of its σ."
     ]
 
 
 def _explain_trust(calibration: Calibration) -> list[str]:
     """Which offsets are proved, errors that were not identified taken at their tolerances."""
-    entries = [e for e in calibration.controller_entries() if e.held is None]
-    sentences = []
-    worst = max((e.bias_std for e in entries), default=0.0)
-    if worst > 0.0:
-        sentences.append(
-            f"± σ is what the scatter leaves open. Errors of legs and axes within their tolerances "
-            f"would move the offsets by ±{mm(worst)} mm more: these are the offsets that make up "
-            "for them best in the postures measured. What is left of that at the tool is "
-            "'not known after' there."
-        )
+    entries = [e for e in find_entries(calibration) if e.held is None]
+    sentences: list[str] = []
     k = calibration.confidence_factor
     if math.isinf(k) or math.isnan(calibration.sigma) or calibration.noise.source == "gauge":
         return sentences
@@ -239,7 +235,8 @@ def _explain_trust(calibration: Calibration) -> list[str]:
     clear: list[str] = []
     vague: list[str] = []
     for e in entries:
-        proved = abs(e.change) > math.hypot(k * e.std, normal * e.bias_std)
+        rest = math.sqrt(max(e.std**2 - e.scatter**2, 0.0))
+        proved = abs(e.change) > math.hypot(k * e.scatter, normal * rest)
         (clear if proved else vague).append(e.drive)
     if clear:
         sentences.append(

@@ -7,10 +7,14 @@ import math
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from orthocal.errors import ClosureError, RobotError
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.records import ControllerEntry, ParameterEstimate, ResidualRow
+from orthocal.output.accuracy import describe_promise
 from orthocal.output.explanation import advise
 from orthocal.output.layout import add_row, choose_rows, counted, mm, plain, signed, table_of
+from orthocal.study.accuracy import assess_tool
+from orthocal.study.entering import find_entries
 
 MANY_PARAMETERS = 12
 """Parameters above which only those that the readings tell are listed."""
@@ -79,11 +83,14 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
     c, told = calibration, calibration.prior
     robust = c.solver.loss == "huber"  # the linearised estimate is by squares
     profiled = any(p.interval for p in c.free)
+    biased = bool((c.total_std > c.standard_deviations).any())
+    rows = list(zip(c.free, c.total_std.tolist(), c.intervals, strict=True))
     table = table_of(
         "parameter",
         "linear",
         "exact",
         "± σ",
+        *(["scatter"] if all_rows and biased else []),
         *(["told"] if told else []),
         "95 % interval",
         *(["profile interval"] if profiled else []),
@@ -91,20 +98,22 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
         *([] if (told and profiled) or robust else ["in σ"]),
         "unit",
     )
-    listed = [p for p in c.free if all_rows or len(c.free) <= MANY_PARAMETERS or _worth_listing(p)]
-    for p in listed:
+    few = all_rows or len(c.free) <= MANY_PARAMETERS
+    listed = [row for row in rows if few or _worth_listing(row[0])]
+    for p, std, interval in listed:
         f = p.edge_factor
         add_row(
             table,
             p.name,
             signed(p.linear * f),
             signed(p.value * f),
-            "at bound" if p.at_bound else plain(p.std * f),
+            "at bound" if p.at_bound else plain(std * f),
+            *([plain(p.std * f)] if all_rows and biased else []),
             *([_share(p)] if told else []),
-            "" if p.at_bound else _interval(*c.interval(p), f),
+            "" if p.at_bound else _interval(*interval, f),
             *([_interval(*p.interval, f) if p.interval else ""] if profiled else []),
             *([] if told or profiled or robust else [signed((p.value - p.linear) * f, 4)]),
-            *([] if (told and profiled) or robust else [_ratio(p.value - p.linear, p.std)]),
+            *([] if (told and profiled) or robust else [_ratio(p.value - p.linear, std)]),
             p.edge_unit,
         )
     notes: list[RenderableType] = [table]
@@ -125,6 +134,14 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
             Text(
                 f"Held by a bound: {', '.join(bound)}. The readings want it beyond; it has no ± of "
                 "its own, and the others' ± holds with it there."
+            )
+        )
+    if biased:
+        words = "scatter: the part of it that the noise of the readings has." if all_rows else ""
+        notes.append(
+            Text(
+                "± σ: one standard deviation from all that is not known, errors of the machine "
+                f"that were not identified at their tolerances. {words}".strip()
             )
         )
     if told:
@@ -284,42 +301,44 @@ def render_fit(calibration: Calibration) -> RenderableType:
 
 def render_controller(calibration: Calibration) -> RenderableType:
     """What to enter into the controller."""
-    entries = calibration.controller_entries()
+    entries = find_entries(calibration)
     if not entries:
         return Text("Nothing: no offset was identified.")
     stated = entries[0].active is not None
-    biased = any(e.bias_std > 0.0 for e in entries)
+    others = not calibration.only_offsets
     enter = ("active now", "enter") if stated else ("add to the present offset",)
-    table = table_of("drive", *enter, "± σ", *(["± σ in all"] if biased else []), "unit")
+    table = table_of("drive", *enter, "± σ", *(["identified"] if others else []), "unit")
     for e in entries:
         factor = e.edge_factor
         now = [] if e.active is None else [signed(e.active * factor)]
-        spread = [plain(e.std * factor), *([plain(e.std_in_all * factor)] if biased else [])]
-        if e.held:
-            spread = [e.held, *([""] if biased else [])]
-        add_row(table, e.drive, *now, signed(e.enter * factor), *spread, e.edge_unit)
+        spread = e.held or plain(e.std * factor)
+        own = [signed(e.identified * factor)] if others else []
+        add_row(table, e.drive, *now, signed(e.enter * factor), spread, *own, e.edge_unit)
     notes = [Text(_example(calibration, entries[0]))]
-    if biased:
-        notes.append(
-            Text(
-                "± σ: what the scatter leaves open. In all: with what errors that were not "
-                "identified, at their tolerances, add to it."
-            )
-        )
     if not stated:
         notes.append(
             Text(
                 "The session does not state the offsets that were active: there is no `controller`."
             )
         )
-    if len(calibration.free) > len(entries):
+    if others:
         notes.append(
             Text(
-                "The other parameters need a controller with a model of the machine. What offsets "
-                "alone leave at the tool is 'with the offsets entered' there."
+                "For a controller that takes offsets and nothing else: these leave the least error "
+                "at the tool, making up for a part of the other errors. The identified ones are "
+                "for what knows all errors (`orthocal inverse`)."
             )
         )
+        notes += [Text(line) for line in _promise(calibration)]
     return Group(Text(advise(calibration)), table, *notes)
+
+
+def _promise(calibration: Calibration) -> list[str]:
+    """What the tool is good for with the offsets entered, where that can be said."""
+    try:
+        return describe_promise(calibration, assess_tool(calibration))
+    except (ClosureError, RobotError):  # there is no tool to speak of
+        return []
 
 
 def _example(calibration: Calibration, entry: ControllerEntry) -> str:

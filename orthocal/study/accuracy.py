@@ -1,11 +1,10 @@
 """How well the tool's position is known: the number that users decide by.
 
 A machine with errors θ, commanded to a posture, has its tool at p(θ). What is not known of θ
-becomes a position error J dθ with J = ∂p/∂θ (`sensitivity`).
+becomes a position error J dθ with J = ∂p/∂θ (`robot.sensitivity`).
 
-A shift that is common to the whole workspace is a choice of origin, not an error of the machine: a
-workpiece is set up where the tool finds it. So every figure is given twice, absolute and with the
-common shift taken out.
+Every figure is given three times: with shift and rotation taken out, which is what a workpiece sees
+that is aligned on the machine; with the common shift taken out; and absolute (`robot.workspace`).
 """
 
 from __future__ import annotations
@@ -13,22 +12,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from orthocal.errors import ClosureError
 from orthocal.identification.calibration import Calibration
-from orthocal.robot.assembly import nominal_assembly
-from orthocal.robot.model import Robot, read_only
-from orthocal.study.sensitivity import ToolSensitivity
+from orthocal.robot.model import read_only
+from orthocal.robot.workspace import FEWEST_ALIGNED, Workspace
+from orthocal.study.entering import entered_offsets
+from orthocal.study.tool import CalibratedTool, error_covariance, find_tool, place_tool
 
 Array = NDArray[np.float64]
 
-HALF_SIDE = 0.06
-"""Half the side of the cube around the mechanical zero that is looked at by default, [m]."""
-
-POINTS_A_SIDE = 7
 NOTABLE = 0.1
 """Tolerances by which a parameter must be off to be named in a combination."""
 
@@ -55,34 +51,30 @@ class ErrorSize:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ToolUncertainty:
-    """Uncertainty of the tool's position over a set of points."""
+class ErrorSizes:
+    """Size of a field of position errors, told three ways."""
 
-    points: Array
-    """Nominal tool positions, shape (K, 3), [m]."""
-    covariance: Array
-    """Of the position at each point, shape (K, 3, 3), [m²]."""
-    relative_covariance: Array
-    """The same with the common shift taken out."""
-    absolute: ErrorSize
+    aligned: ErrorSize | None
+    """With shift and rotation taken out; None for points too few to have a size then."""
     relative: ErrorSize
     """With the common shift taken out."""
+    absolute: ErrorSize
+
+    @property
+    def headline(self) -> ErrorSize:
+        """The one that decides: aligned, where there are points enough."""
+        return self.relative if self.aligned is None else self.aligned
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Workspace:
-    """Points that stand for a region, with weights that make their mean the region's."""
+class ToolUncertainty:
+    """Uncertainty of the tool's position over a set of points."""
 
-    points: Array
-    """Tool positions in the coordinates that the drives control, shape (K, n_coordinates), [m]."""
-    weights: Array
-    """Shape (K,), sum 1."""
-
-    @classmethod
-    def even(cls, points: ArrayLike) -> Workspace:
-        """Points that all count alike, shape (K, n_coordinates), [m]."""
-        p = read_only(np.atleast_2d(np.asarray(points, dtype=np.float64)))
-        return cls(p, read_only(np.full(len(p), 1.0 / len(p))))
+    covariance: Array
+    """Of the position at each point, shape (K, 3, 3), [m²]."""
+    aligned_covariance: Array
+    """The same with shift and rotation taken out."""
+    sizes: ErrorSizes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,22 +90,22 @@ class ToolAccuracy:
     """∂p/∂θ at every point, shape (K, 3, n), [m per parameter unit]."""
     deviation: Array
     """Where the calibrated machine's tool is now, less where it is commanded, (K, 3), [m]."""
-    left: Array
-    """The same once the identified offsets are in a controller that is nominal otherwise."""
+    error_after_offsets: Array
+    """The same with what is to be entered in a controller that is nominal otherwise."""
     before: ToolUncertainty
     """With all errors within their tolerances and nothing known."""
     after: ToolUncertainty | None
     """With the machine as calibrated; None where nothing tells the noise."""
 
-    @property
-    def relative_deviation(self) -> Array:
-        """The deviation with the common shift taken out, shape (K, 3), [m]."""
-        return np.asarray(self.deviation - self.workspace.weights @ self.deviation)
+    def align(self, field: Array) -> Array:
+        """A field of position errors with shift and rotation taken out, shape (K, 3, ...)."""
+        if len(self.targets) < FEWEST_ALIGNED:
+            return self.workspace.remove_shift(field)
+        return self.workspace.remove_motion(field, self.targets)
 
-    @property
-    def relative_left(self) -> Array:
-        """What is left, with the common shift taken out, shape (K, 3), [m]."""
-        return np.asarray(self.left - self.workspace.weights @ self.left)
+    def measure(self, deviations: Array) -> ErrorSizes:
+        """Size of known position errors, shape (K, 3), [m]."""
+        return measure_deviations(deviations, self.workspace, self.targets)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,33 +113,13 @@ class RemainingError:
     """A combination of parameters that is not well known, and what it does at the tool."""
 
     rms: float
-    """Over the workspace, the common shift taken out, [m]."""
+    """Over the workspace, shift and rotation taken out, [m]."""
     parts: tuple[tuple[str, float], ...]
     """Parameters and by how many tolerances each is off, the largest first."""
 
 
-def cube(
-    robot: Robot, *, half_side: float = HALF_SIDE, points_a_side: int = POINTS_A_SIDE
-) -> Workspace:
-    """A cube around the mechanical zero: a grid with Simpson's weights, faces and corners included.
-
-    Args:
-        robot: The robot; a planar one has a square.
-        half_side: Half the side, [m].
-        points_a_side: An odd number of at least 3.
-    """
-    count = 3 if robot.tcp is None else len(robot.tcp.coordinates)
-    line = np.linspace(-half_side, half_side, points_a_side)
-    simpson = np.where(np.arange(points_a_side) % 2 == 1, 4.0, 2.0)
-    simpson[[0, -1]] = 1.0
-    simpson /= simpson.sum()
-    points = np.stack(np.meshgrid(*[line] * count, indexing="ij"), axis=-1).reshape(-1, count)
-    weights = np.stack(np.meshgrid(*[simpson] * count, indexing="ij"), axis=-1)
-    return Workspace(points, weights.prod(axis=-1).reshape(-1))
-
-
 def measure_uncertainty(
-    jacobian: Array, covariance: Array, workspace: Workspace
+    jacobian: Array, covariance: Array, workspace: Workspace, positions: Array
 ) -> ToolUncertainty:
     """Position uncertainty from sensitivities and the covariance of the parameters.
 
@@ -155,25 +127,45 @@ def measure_uncertainty(
         jacobian: ∂p/∂θ at every point, shape (K, 3, n), [m per parameter unit].
         covariance: Of θ, shape (n, n), [SI].
         workspace: The points, and the weights of their mean.
+        positions: Of the points in space, shape (K, 3), [m].
     """
-    relative = jacobian - np.tensordot(workspace.weights, jacobian, axes=1)
-    covariances = [j @ covariance @ j.transpose(0, 2, 1) for j in (jacobian, relative)]
-    sizes = [_spread_size(c, workspace.weights) for c in covariances]
-    return ToolUncertainty(workspace.points, covariances[0], covariances[1], sizes[0], sizes[1])
+    fields = {
+        "absolute": jacobian,
+        "relative": workspace.remove_shift(jacobian),
+        "aligned": workspace.remove_motion(jacobian, positions),
+    }
+    spread = {name: j @ covariance @ j.transpose(0, 2, 1) for name, j in fields.items()}
+    sizes = {name: _spread_size(c, workspace.weights) for name, c in spread.items()}
+    few = len(positions) < FEWEST_ALIGNED
+    return ToolUncertainty(
+        covariance=spread["absolute"],
+        aligned_covariance=spread["relative" if few else "aligned"],
+        sizes=ErrorSizes(None if few else sizes["aligned"], sizes["relative"], sizes["absolute"]),
+    )
 
 
-def measure_deviations(deviations: Array, weights: Array) -> ErrorSize:
+def measure_deviations(deviations: Array, workspace: Workspace, positions: Array) -> ErrorSizes:
     """Size of known position errors.
 
     Args:
         deviations: Shape (K, 3), [m].
-        weights: Of the points in the mean, shape (K,), sum 1.
+        workspace: The points, and the weights of their mean.
+        positions: Of the points in space, shape (K, 3), [m].
     """
-    lengths = np.linalg.norm(deviations, axis=1)
-    return ErrorSize(
-        rms=float(np.sqrt(weights @ lengths**2)),
-        percentile_95=_weighted_percentile(lengths, weights),
-        largest=float(lengths.max()),
+
+    def size(field: Array) -> ErrorSize:
+        lengths = np.linalg.norm(field, axis=1)
+        return ErrorSize(
+            rms=float(np.sqrt(workspace.weights @ lengths**2)),
+            percentile_95=_weighted_percentile(lengths, workspace.weights),
+            largest=float(lengths.max()),
+        )
+
+    few = len(positions) < FEWEST_ALIGNED
+    return ErrorSizes(
+        aligned=None if few else size(workspace.remove_motion(deviations, positions)),
+        relative=size(workspace.remove_shift(deviations)),
+        absolute=size(deviations),
     )
 
 
@@ -190,70 +182,50 @@ def assess_tool(
 
     Args:
         calibration: The calibration.
-        workspace: Tool positions that are commanded; the cube of ±60 mm by default.
+        workspace: Tool positions that are commanded; by default the largest cube around the zero
+            that the machine reaches, of ±60 mm at most.
         names: What to call the points in messages.
 
     Raises:
-        RobotError: If the robot has no tool centre point.
-        ClosureError: If the machine cannot reach a point.
+        RobotError: If the robot has no tool centre point, or its drives do not command it.
+        ClosureError: If the machine cannot reach a point, or its tool hardly moves at all.
     """
-    robot, values = calibration.robot, calibration.errors
-    space = cube(robot) if workspace is None else workspace
+    if workspace is None:
+        return calibration.remember("accuracy", lambda: _assess_largest_cube(calibration))
+    return _assess(calibration, place_tool(calibration, workspace, names=names), names)
+
+
+def _assess_largest_cube(calibration: Calibration) -> ToolAccuracy:
+    tool = find_tool(calibration)
+    if tool is None:
+        raise ClosureError(
+            "cannot be reached: there is no cube around it, not even of a millimetre, that the "
+            "machine reaches within its limits",
+            posture="mechanical zero",
+        )
+    return _assess(calibration, tool, None)
+
+
+def _assess(
+    calibration: Calibration, tool: CalibratedTool, names: Sequence[str] | None
+) -> ToolAccuracy:
     unmodelled = calibration.unmodelled
-    free = [p.name for p in calibration.free]
-    tool = ToolSensitivity(robot, free=[*free, *unmodelled.names], values=values)
-    nominal = nominal_assembly(robot)
-    names = names or [f"point {i + 1}" for i in range(len(space.points))]
-    target = nominal.inverse(space.points, names=names)
-    active = calibration.session.controller_offsets
-    commanded = target - (np.zeros(len(robot.drives)) if active is None else np.array(active))
-    offsets = np.array([values.get(f"{d.name}.offset", 0.0) for d in robot.drives])
-    where = nominal.forward(target, names=names)
-    jacobian = tool(commanded, names=names)
     tolerances = np.r_[[p.tolerance for p in calibration.free], unmodelled.tolerances]
+    jacobian = tool.jacobian[:, :, : len(tolerances)]
+    space, where = tool.workspace, tool.targets
     after = None
     if np.isfinite(calibration.covariance).all():
-        after = measure_uncertainty(jacobian, error_covariance(calibration), space)
+        after = measure_uncertainty(jacobian, error_covariance(calibration), space, where)
+    left = tool.deviation(entered_offsets(calibration), names=names)
     return ToolAccuracy(
         workspace=space,
-        targets=read_only(where),
-        names=tool.free,
-        jacobian=read_only(jacobian),
-        deviation=read_only(tool.assembly.forward(commanded, names=names) - where),
-        left=read_only(tool.assembly.forward(target - offsets, names=names) - where),
-        before=measure_uncertainty(jacobian, np.diag(tolerances**2), space),
+        targets=where,
+        names=tool.sensitivity.free[: len(tolerances)],
+        jacobian=jacobian,
+        deviation=read_only(tool.deviation(calibration.active_offsets, names=names)),
+        error_after_offsets=read_only(left),
+        before=measure_uncertainty(jacobian, np.diag(tolerances**2), space, where),
         after=after,
-    )
-
-
-@lru_cache(maxsize=1)
-def assess_cube(calibration: Calibration) -> ToolAccuracy:
-    """The same over the default cube; summary, report and scene of a calibration all show it.
-
-    Raises:
-        RobotError: If the robot has no tool centre point.
-        ClosureError: If the machine cannot reach a point.
-    """
-    return assess_tool(calibration)
-
-
-def error_covariance(calibration: Calibration, *, excess: float = 1.0) -> Array:
-    """Covariance of what the estimate has wrong, free and unmodelled parameters in turn, [SI].
-
-    With e = θ − θ̂ it is −L θᵤ and the estimate's own scatter for the free ones, θᵤ for the others.
-
-    Args:
-        calibration: The calibration.
-        excess: How many times their tolerances the unmodelled errors are taken to be.
-    """
-    unmodelled = calibration.unmodelled
-    variance = (excess * unmodelled.tolerances) ** 2
-    taken_on = unmodelled.leakage * variance
-    return np.block(
-        [
-            [calibration.covariance + taken_on @ unmodelled.leakage.T, -taken_on],
-            [-taken_on.T, np.diag(variance)],
-        ]
     )
 
 
@@ -285,7 +257,7 @@ def assess_excess(
 ) -> ToolUncertainty:
     """Uncertainty after a calibration with unmodelled errors beyond their tolerances."""
     covariance = error_covariance(calibration, excess=excess)
-    return measure_uncertainty(accuracy.jacobian, covariance, accuracy.workspace)
+    return measure_uncertainty(accuracy.jacobian, covariance, accuracy.workspace, accuracy.targets)
 
 
 def assess_remaining(
@@ -305,16 +277,31 @@ def assess_remaining(
     return assess_excess(calibration, accuracy, excess), excess
 
 
+def expect_after_offsets(calibration: Calibration, accuracy: ToolAccuracy) -> float | None:
+    """Error of the tool to be expected with what is to be entered, r.m.s. and headline form, [m].
+
+    What the offsets cannot make up for of the identified errors, and what is not known of them.
+
+    Returns:
+        None where nothing tells the noise.
+    """
+    remaining, _ = assess_remaining(calibration, accuracy)
+    if remaining is None:
+        return None
+    left = accuracy.measure(accuracy.error_after_offsets)
+    return math.hypot(left.headline.rms, remaining.sizes.headline.rms)
+
+
 def find_remaining_errors(
     calibration: Calibration, accuracy: ToolAccuracy, *, count: int = 3
 ) -> tuple[RemainingError, ...]:
     """The combinations of errors that matter most at the tool after a calibration.
 
     Principal directions of what is not known of the parameters, weighed by the mean square that it
-    makes at the tool with the common shift taken out; the largest first.
+    makes at the tool with shift and rotation taken out; the largest first.
     """
     weights = accuracy.workspace.weights
-    relative = accuracy.jacobian - np.tensordot(weights, accuracy.jacobian, axes=1)
+    relative = accuracy.align(accuracy.jacobian)
     root = _square_root(error_covariance(calibration))
     effect = relative @ root
     _, directions = np.linalg.eigh(np.einsum("k,kin,kim->nm", weights, effect, effect))

@@ -179,7 +179,8 @@ def _result_document(result: ModelResult) -> dict[str, Any]:
         "linearised": score(result.linearised),
         "exact": score(result.exact),
         "standard_deviations": {p.name: _number(p.std) for p in result.calibration.free},
-        "tool_uncertainty": size(None if after is None else after.absolute),
-        "tool_uncertainty_relative": size(None if after is None else after.relative),
+        "tool_uncertainty": size(None if after is None else after.sizes.aligned),
+        "tool_uncertainty_relative": size(None if after is None else after.sizes.relative),
+        "tool_uncertainty_absolute": size(None if after is None else after.sizes.absolute),
         "linearisation_at_tool": size(result.linearisation_cost),
     }

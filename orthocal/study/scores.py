@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.errors import ClosureError, NotIdentifiableError, SolverError
+from orthocal.errors import ClosureError, NotIdentifiableError, RobotError, SolverError
 from orthocal.identification.calibrate import assemble_calibration
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.fit import SMALLEST_SIGMA, Fit, fit_problem, require_determined
@@ -18,7 +18,7 @@ from orthocal.identification.linear import Linearisation
 from orthocal.identification.nlp import SolverOptions
 from orthocal.identification.problem import CalibrationProblem
 from orthocal.identification.uncertainty import decompose, project_out_zeros
-from orthocal.study.accuracy import ErrorSize, ToolAccuracy, assess_cube, measure_deviations
+from orthocal.study.accuracy import ErrorSize, ToolAccuracy, assess_tool
 
 Array = NDArray[np.float64]
 Method = Literal["linearised", "exact"]
@@ -73,7 +73,7 @@ class ModelResult:
     tool: ToolAccuracy | None
     """None for a robot without a tool centre point."""
     linearisation_cost: ErrorSize | None
-    """Distance at the tool between the two estimates, common shift taken out."""
+    """Distance at the tool between the two estimates, shift and rotation taken out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,11 +120,9 @@ def score_model(
 
 
 def _assess(calibration: Calibration) -> ToolAccuracy | None:
-    if calibration.robot.tcp is None:
-        return None
     try:
-        return assess_cube(calibration)
-    except ClosureError:  # the cube is too large for this machine
+        return assess_tool(calibration)
+    except (ClosureError, RobotError):  # no tool, or one that hardly moves
         return None
 
 
@@ -197,6 +195,4 @@ def _linearisation_cost(fit: Fit, tool: ToolAccuracy) -> ErrorSize:
     """Tool distance between the linearised and the exact estimate, to first order."""
     change = np.zeros(len(tool.names))
     change[: fit.problem.n_free] = fit.linear - fit.solution.theta
-    moved = tool.jacobian @ change
-    weights = tool.workspace.weights
-    return measure_deviations(moved - weights @ moved, weights)
+    return tool.measure(tool.jacobian @ change).headline

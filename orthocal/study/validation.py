@@ -22,6 +22,7 @@ from orthocal.identification.records import ResidualRow
 from orthocal.identification.uncertainty import BY_CHANCE, confidence_factor
 from orthocal.measurement.session import Session
 from orthocal.robot.parameters import InUnit, Unit
+from orthocal.study.entering import find_entries
 from orthocal.study.repetition import Repetition, measure_repetition
 
 Array = NDArray[np.float64]
@@ -146,7 +147,7 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
             where=where,
         )
     stated = session.controller_offsets is not None
-    entries = calibration.controller_entries()
+    entries = find_entries(calibration)
     if stated:
         _require_offsets(calibration, session)
     elif entries:
@@ -187,9 +188,9 @@ def _further_changes(calibration: Calibration, refit: Calibration) -> tuple[Furt
 def _require_offsets(calibration: Calibration, session: Session) -> None:
     """The offsets that a session states must be those of the calibration, up to rounding."""
     drives = [d.name for d in session.robot.drives]
-    for entry in calibration.controller_entries():
+    for entry in find_entries(calibration):
         stated = float(session.active_offsets[drives.index(entry.drive)])
-        allowed = max(0.5 * entry.std, 0.02e-3)
+        allowed = max(0.5 * entry.scatter, 0.02e-3)
         if not math.isnan(allowed) and abs(stated - entry.enter) > allowed:
             factor, unit = entry.edge_factor, entry.edge_unit
             raise SessionError(

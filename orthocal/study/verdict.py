@@ -206,16 +206,17 @@ def _explain_tool(best: ModelResult, excess: float) -> list[str]:
     """What the supported model is good for at the tool, with errors beyond their tolerances."""
     if best.tool is None or best.tool.after is None:
         return []
-    after, cost = best.tool.after.relative, best.linearisation_cost
+    after, cost = best.tool.after.sizes.headline, best.linearisation_cost
     words = [
-        f"At the tool {best.model} is good for {after.rms * 1e6:.0f} µm r.m.s. over the workspace, "
-        "common shift taken out, if the tolerances hold."
+        f"At the tool {best.model} is good for {after.rms * 1e6:.0f} µm r.m.s. over "
+        f"{best.tool.workspace.words}, shift and rotation taken out, if the tolerances hold."
     ]
     if excess > 1.0:
-        size = assess_excess(best.calibration, best.tool, excess).relative
+        size = assess_excess(best.calibration, best.tool, excess).sizes.headline
         words[0] = (
-            f"At the tool {best.model} is good for about {size.rms * 1e6:.0f} µm r.m.s. over the "
-            f"workspace, common shift taken out, with errors {excess:.1f} times their tolerances."
+            f"At the tool {best.model} is good for about {size.rms * 1e6:.0f} µm r.m.s. over "
+            f"{best.tool.workspace.words}, shift and rotation taken out, with errors "
+            f"{excess:.1f} times their tolerances."
         )
     if cost is not None:
         words.append(f"Linearising it costs {cost.rms * 1e6:.1f} µm r.m.s. there.")

@@ -85,11 +85,9 @@ def accused(fleet, fit):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("level", "found"), [(0.0, 58), (0.3, 58), (1.0, 56), (3.0, 49)])
+@pytest.mark.parametrize(("level", "found"), [(0.0, 59), (0.3, 59), (1.0, 56), (3.0, 49)])
 def test_turned_setups_are_found_among_sixty_machines(fleet, level, found):
-    """Offsets of ±2 mm, all other errors so many times their tolerances. Of the machines without
-    errors two have offsets that hardly show in the setup that was turned.
-    """
+    """Offsets within their tolerances, all other errors so many times theirs."""
     o, names, count = fleet.problem.observations, list(fleet.plan.setups), 0
     for machine in range(60):
         rng = np.random.default_rng(machine)

@@ -26,7 +26,7 @@ from orthocal.study.accuracy import (
     find_remaining_errors,
     measure_uncertainty,
 )
-from orthocal.study.sensitivity import ToolSensitivity
+from orthocal.robot.sensitivity import ToolSensitivity
 
 OFFSET_SIGMA = 2e-3
 

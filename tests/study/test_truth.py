@@ -16,7 +16,7 @@ from orthocal.identification.problem import build_problem
 from orthocal.identification.uncertainty import confidence_factor, decompose
 from orthocal.robot.assembly import Assembly
 from orthocal.study.accuracy import assess_tool, cube, measure_uncertainty
-from orthocal.study.sensitivity import ToolSensitivity
+from orthocal.robot.sensitivity import ToolSensitivity
 
 SIGMA = 5e-6
 OFFSETS = {"*.offset": 2e-3}

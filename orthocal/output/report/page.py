@@ -37,7 +37,7 @@ from orthocal.output.tables import (
 )
 from orthocal.output.view.drawing import draw_scene
 from orthocal.output.view.scene import frame_of
-from orthocal.study.accuracy import ToolAccuracy, assess_cube, find_excess
+from orthocal.study.accuracy import ToolAccuracy, assess_tool, find_excess
 
 FEW_ROWS = 40
 """Readings up to which the list of all is open."""
@@ -50,8 +50,9 @@ MOST_NAMED = 9
 
 GLOSSARY = (
     "σ: one standard deviation of a reading, from repeated cycles, else from the residuals, else "
-    "as given for the gauge. ± σ in all: with what errors that were left out add at their "
-    "tolerances.",
+    "as given for the gauge. ± σ: one standard deviation from all that is not known, errors of the "
+    "machine that were left out at their tolerances; scatter: the part of it that the noise of the "
+    "readings has.",
     "tolerance: one standard deviation of what the workshop can be trusted with, from the robot's "
     "YAML or --tolerance. told: the share of what it left open that the readings took away.",
     "before: measured less what the machine would show as the controller knows it; after: measured "
@@ -59,8 +60,8 @@ GLOSSARY = (
     "predicted: a setup's readings as all other setups foretell them.",
     "studentised: how far a reading is from what all others say of it, in its own σ. moves by: the "
     "σ by which a parameter would change without it, at most.",
-    "common shift taken out: less the mean error over the cube. A workpiece that is set up where "
-    "the tool finds it never sees that shift.",
+    "shift and rotation taken out: less the shift and the rotation of the whole cube that take "
+    "most of the error away. A workpiece that is aligned on the machine never sees them.",
     "not known before: with every error at its tolerance, offsets too; after: with what the "
     "readings told. worst point: one standard deviation there.",
     "combination: a direction in which the errors can change together. The readings tell one if a "
@@ -140,26 +141,23 @@ def _verdict(calibration: Calibration) -> str:
 def _tool(calibration: Calibration) -> str:
     words = to_markup(render_tool(calibration))
     try:
-        return words + _maps(calibration, assess_cube(calibration))
+        return words + _maps(calibration, assess_tool(calibration))
     except (ClosureError, RobotError):  # the words say why
         return words
 
 
 def _maps(calibration: Calibration, found: ToolAccuracy) -> str:
-    only_offsets = len(calibration.free) <= len(calibration.controller_entries())
     excess = find_excess(calibration)
     times = f"{excess:.1f} times " if excess > 1.0 else ""
     captions: dict[Field, str] = {
         "now": "Where the tool is, less where it is sent, with the controller as it was while "
-        "measuring; the shift that is common to the whole cube is taken out here and below: a "
-        "workpiece is set up where the tool finds it.",
-        "left": "The same once the identified offsets are entered, in a controller that knows of "
+        "measuring; shift and rotation of the whole cube are taken out here and below: a "
+        "workpiece is aligned on the machine.",
+        "left": "The same once the offsets above are entered, in a controller that knows of "
         "nothing else.",
         "unknown": "What is not known of the tool's position after this calibration: one standard "
         f"deviation in space, errors that were not identified at {times}their tolerances.",
     }
-    if only_offsets:
-        del captions["left"]
     return "".join(
         _figure(plot_tool_map(calibration, found, which=which), words)
         for which, words in captions.items()

@@ -136,7 +136,8 @@ def _draw_parameters(calibration: Calibration, most: int) -> Figure:
         shade(axes, prior, means - 1.0, means + 1.0, "±1 tolerance: known before")
     axes.axvline(0.0, color="black", linewidth=0.8)
     bound = np.array([p.at_bound is not None for p in rows])
-    ends = np.array([calibration.interval(p) for p in rows]) * scale[:, None]
+    intervals = {p.name: i for p, i in zip(free, calibration.intervals, strict=True)}
+    ends = np.array([intervals[p.name] for p in rows]) * scale[:, None]
     known = np.isfinite(ends).all(axis=1) & ~bound
     if known.any():
         look: Look = {"color": AFTER, "linewidth": 1.6, "label": "95 % interval"}

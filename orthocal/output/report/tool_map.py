@@ -18,15 +18,16 @@ from scipy.interpolate import RectBivariateSpline
 from orthocal.identification.calibration import Calibration
 from orthocal.output.report.figure import open_figure, render_figure
 from orthocal.study.accuracy import ToolAccuracy, assess_remaining, find_excess
+from orthocal.study.entering import find_entries
 
 Array = NDArray[np.float64]
 
 Field = Literal["now", "left", "unknown"]
 
 TITLES: dict[Field, str] = {
-    "now": "How far the tool is off its target now, common shift taken out",
-    "left": "How far the tool is off with the offsets entered, common shift taken out",
-    "unknown": "What is not known of the tool after calibration, 1 σ, common shift taken out",
+    "now": "How far the tool is off its target now, shift and rotation taken out",
+    "left": "How far the tool is off with the offsets entered, shift and rotation out",
+    "unknown": "What is not known of the tool after calibration, 1 σ, shift and rotation out",
 }
 
 FINEST = 1e-3
@@ -50,7 +51,7 @@ ARROW = 0.85
 
 
 def plot_tool_map(calibration: Calibration, accuracy: ToolAccuracy, *, which: Field) -> str:
-    """The tool's error in the planes through the middle of a region, the common shift taken out.
+    """The tool's error in the planes through the middle of a region, shift and rotation taken out.
 
     Args:
         calibration: The calibration.
@@ -65,7 +66,7 @@ def plot_tool_map(calibration: Calibration, accuracy: ToolAccuracy, *, which: Fi
     lines = _find_grid(accuracy.workspace.points)
     told = {
         "now": True,
-        "left": len(calibration.free) > len(calibration.controller_entries()),
+        "left": not calibration.only_offsets and bool(find_entries(calibration)),
         "unknown": accuracy.after is not None,
     }
     if lines is None or not told[which]:
@@ -88,14 +89,14 @@ def _find_grid(points: Array) -> list[Array] | None:
 def _error_parts(calibration: Calibration, accuracy: ToolAccuracy, which: Field) -> Array:
     """What the size of the error is the length of, (K, 3) or without direction (K, 1), [µm].
 
-    A shift that is common to the region is no error of a workpiece that is set up there.
+    Shift and rotation of the whole region are no errors of a workpiece that is aligned there.
     """
     if which == "now":
-        return accuracy.relative_deviation * 1e6
+        return accuracy.align(accuracy.deviation) * 1e6
     remaining, _ = assess_remaining(calibration, accuracy)
     if which == "left" or remaining is None:
-        return accuracy.relative_left * 1e6
-    variance = np.trace(remaining.relative_covariance, axis1=1, axis2=2)
+        return accuracy.align(accuracy.error_after_offsets) * 1e6
+    variance = np.trace(remaining.aligned_covariance, axis1=1, axis2=2)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0))[:, None] * 1e6)
 
 

@@ -41,6 +41,7 @@ from orthocal.output.view.stage import GHOST_COLOUR, LINE_COLOUR, LINES, Stage
 from orthocal.output.view.tool_errors import draw_tool_errors
 from orthocal.robot.assembly import Assembly, nominal_assembly
 from orthocal.robot.model import Robot
+from orthocal.study.entering import find_entries
 
 Array = NDArray[np.float64]
 
@@ -296,13 +297,13 @@ def _explain_machines(scene: Scene, machines: _Machines) -> None:
 
 def _state_offsets(scene: Scene, calibration: Calibration) -> None:
     """Say what is to be entered: the leg that leans is often not the one whose drive is off."""
-    entries = calibration.controller_entries()
+    entries = find_entries(calibration)
     if not entries:
         return
     words = []
     for entry in entries:
         words.append(f"{entry.drive} {typeset(entry.enter * entry.edge_factor)} {entry.edge_unit}")
-    found = f"Offsets found: {', '.join(words)}. A leg leans by its own drive's and by others'."
+    found = f"Offsets to enter: {', '.join(words)}. A leg leans by its own drive's and by others'."
     scene.facts.insert(0, found)
 
 

@@ -6,13 +6,13 @@ import meshcat.geometry as g
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.errors import ClosureError
+from orthocal.errors import ClosureError, RobotError
 from orthocal.identification.calibration import Calibration
 from orthocal.output.layout import um
 from orthocal.output.view.scene import LegendEntry, Scene, round_scale
 from orthocal.output.view.shapes import Colour, css, draw_arrow, material
 from orthocal.output.view.stage import Stage
-from orthocal.study.accuracy import HALF_SIDE, ToolAccuracy, assess_cube, assess_remaining
+from orthocal.study.accuracy import ToolAccuracy, assess_remaining, assess_tool
 
 Array = NDArray[np.float64]
 
@@ -48,16 +48,17 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
     scene = stage.scene
     if calibration.robot.tcp is None:
         return ""
-    region = f"±{HALF_SIDE * 1e3:g} mm"
     try:
-        found = assess_cube(calibration)
-    except ClosureError:
-        scene.facts.append(f"Errors of the tool: the cube of {region} is out of reach.")
+        found = assess_tool(calibration)
+    except (ClosureError, RobotError) as e:
+        scene.facts.append(f"Errors of the tool: none are shown. {e}.")
         return ""
-    now, left = (float(np.linalg.norm(d, axis=1).max()) for d in (found.deviation, found.left))
+    region = f"±{(found.workspace.half_side or 0.0) * 1e3:.3g} mm"
+    fields = found.align(found.deviation), found.align(found.error_after_offsets)
+    now, left = (float(np.linalg.norm(d, axis=1).max()) for d in fields)
     # in space, as in all tables: the axes of an ellipsoid are shorter
     after, excess = assess_remaining(calibration, found)
-    spread = 0.0 if after is None else after.absolute.largest
+    spread = 0.0 if after is None else after.sizes.headline.largest
     largest = max(now, left, spread)
     if largest < VANISHING:
         return ""
@@ -65,10 +66,11 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
     scene.tool_scale = round_scale(LONGEST_ARROW * stage.size / largest)
     width = ARROW_WIDTH * stage.size
     for node, deviations, colour in (
-        (TOOL_NOW, found.deviation, NOW_COLOUR),
-        (TOOL_LEFT, found.left, LEFT_COLOUR),
+        (TOOL_NOW, fields[0], NOW_COLOUR),
+        (TOOL_LEFT, fields[1], LEFT_COLOUR),
     ):
         _draw_deviations(scene, node, found.targets[chosen], deviations[chosen], colour, width)
+    scene.facts.append("Errors of the tool: shift and rotation of the whole region taken out.")
     drawn = f"× {scene.tool_scale:g}"
     text = f"Tool now, over {region}: up to {um(now)} µm off ({drawn})"
     scene.explain(LegendEntry(text, (TOOL_NOW,), css(NOW_COLOUR), "arrow", shown))
@@ -76,7 +78,7 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
         text = f"Tool with the offsets entered: up to {um(left)} µm off ({drawn})"
         scene.explain(LegendEntry(text, (TOOL_LEFT,), css(LEFT_COLOUR), "arrow", shown))
     if after is not None:
-        _draw_ellipsoids(scene, found.targets[chosen], after.covariance[chosen])
+        _draw_ellipsoids(scene, found.targets[chosen], after.aligned_covariance[chosen])
         worse = f", errors {excess:.1f} × tolerances" if excess > 1.0 else ""
         text = f"Tool, all that was found corrected: one σ, up to {um(spread)} µm{worse} ({drawn})"
         scene.explain(LegendEntry(text, (TOOL_UNKNOWN,), css(UNKNOWN_COLOUR), "ball", shown))

@@ -1,0 +1,165 @@
+"""Regions of the tool: points that stand for a volume, and what of an error a workpiece sees.
+
+A field of position errors over a region is told three ways: absolute; with the shift that is
+common to the region taken out; and with shift and rotation taken out. The last is what matters: a
+workpiece is aligned on the machine, and nothing in readings of its legs knows the world's axes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.errors import ClosureError
+from orthocal.robot.assembly import nominal_assembly
+from orthocal.robot.model import Robot, read_only
+
+Array = NDArray[np.float64]
+
+LARGEST_HALF_SIDE = 0.06
+"""Half the side of the cube around the mechanical zero that is looked at, at most, [m]."""
+
+SMALLEST_HALF_SIDE = 1e-3
+"""A machine whose tool cannot move that far has no region, [m]."""
+
+POINTS_A_SIDE = 7
+
+FEWEST_ALIGNED = 4
+"""Points below which a rigid motion leaves nothing of their errors, whatever they are."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Workspace:
+    """Points that stand for a region, with weights that make their mean the region's."""
+
+    points: Array
+    """Tool positions in the coordinates that the drives control, shape (K, n_coordinates), [m]."""
+    weights: Array
+    """Shape (K,), sum 1."""
+    half_side: float | None = None
+    """Of a cube around the mechanical zero, [m]; None for other points."""
+
+    @classmethod
+    def even(cls, points: ArrayLike) -> Workspace:
+        """Points that all count alike, shape (K, n_coordinates), [m]."""
+        p = read_only(np.atleast_2d(np.asarray(points, dtype=np.float64)))
+        return cls(p, read_only(np.full(len(p), 1.0 / len(p))))
+
+    @property
+    def words(self) -> str:
+        """What it is: a cube of ±60 mm around the zero."""
+        if self.half_side is None:
+            return f"{len(self.points)} points"
+        shape = {1: "line", 2: "square"}.get(self.points.shape[1], "cube")
+        return f"a {shape} of ±{self.half_side * 1e3:.3g} mm around the zero"
+
+    def remove_shift(self, field: Array) -> Array:
+        """A field of position errors less its mean, shape (K, 3, ...)."""
+        return np.asarray(field - np.tensordot(self.weights, field, axes=1))
+
+    def remove_motion(self, field: Array, positions: Array) -> Array:
+        """A field of position errors less the shift and rotation that take most out of it.
+
+        To first order: d − a − b × p, with a and b from weighted least squares.
+
+        Args:
+            field: Position errors d, shape (K, 3, ...).
+            positions: Of the points in space, shape (K, 3), [m].
+        """
+        arms = positions - self.weights @ positions
+        motions = np.zeros((len(arms), 3, 6))
+        motions[:, :, :3] = np.eye(3)
+        for k in range(3):
+            motions[:, :, 3 + k] = np.cross(np.eye(3)[k], arms)
+        root = np.sqrt(np.repeat(self.weights, 3))[:, None]
+        size = max(float(np.abs(arms).max()), 1e-300)
+        basis = root * motions.reshape(-1, 6) / np.array([1.0] * 3 + [size] * 3)
+        flat = root * field.reshape(3 * len(field), -1)
+        left, sizes, _ = np.linalg.svd(basis, full_matrices=False)
+        span = left[:, sizes > 1e-9 * sizes[0]]
+        with np.errstate(invalid="ignore"):
+            kept = (flat - span @ (span.T @ flat)) / root
+        return np.asarray(kept.reshape(field.shape))
+
+
+def cube(
+    robot: Robot,
+    *,
+    half_side: float = LARGEST_HALF_SIDE,
+    points_a_side: int = POINTS_A_SIDE,
+) -> Workspace:
+    """A cube around the mechanical zero: a grid with Simpson's weights, faces and corners included.
+
+    Args:
+        robot: The robot; a planar one has a square.
+        half_side: Half the side, [m].
+        points_a_side: An odd number of at least 3.
+    """
+    middle = tool_at_zero(robot)
+    line = np.linspace(-half_side, half_side, points_a_side)
+    simpson = np.where(np.arange(points_a_side) % 2 == 1, 4.0, 2.0)
+    simpson[[0, -1]] = 1.0
+    simpson /= simpson.sum()
+    count = middle.size
+    points = np.stack(np.meshgrid(*[line] * count, indexing="ij"), axis=-1).reshape(-1, count)
+    weights = np.stack(np.meshgrid(*[simpson] * count, indexing="ij"), axis=-1)
+    return Workspace(
+        read_only(middle + points), read_only(weights.prod(axis=-1).reshape(-1)), half_side
+    )
+
+
+def tool_at_zero(robot: Robot) -> Array:
+    """Coordinates of the tool that the drives control, in the nominal mechanical zero, [m].
+
+    Raises:
+        RobotError: If the robot has no tool centre point.
+    """
+    passive = robot.zero[robot.passive_index]
+    position = nominal_assembly(robot).tcp(robot.drive_zero, passive)
+    coordinates = () if robot.tcp is None else robot.tcp.coordinates
+    return np.asarray(position[list(coordinates)])
+
+
+def largest_cube(robot: Robot, reach: Callable[[Array], object]) -> Workspace | None:
+    """The largest cube around the mechanical zero that a machine reaches, at most ±60 mm.
+
+    Args:
+        robot: The robot.
+        reach: Raises ClosureError where points, shape (K, n_coordinates), are out of reach.
+
+    Returns:
+        None for a machine whose tool hardly moves. Sizes are whole millimetres, small ones of two
+        digits.
+    """
+
+    def fits(half_side: float, points_a_side: int) -> bool:
+        try:
+            reach(cube(robot, half_side=half_side, points_a_side=points_a_side).points)
+        except ClosureError:
+            return False
+        return True
+
+    if fits(LARGEST_HALF_SIDE, POINTS_A_SIDE):
+        return cube(robot)
+    low, high = 0.0, LARGEST_HALF_SIDE
+    while high - low > 0.004 * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if fits(middle, 3) else (low, middle)
+        if high < SMALLEST_HALF_SIDE:
+            return None
+    half_side = _round_down(low)
+    while not fits(half_side, POINTS_A_SIDE):
+        half_side = _round_down(0.95 * half_side)
+        if half_side < SMALLEST_HALF_SIDE:
+            return None
+    return cube(robot, half_side=half_side)
+
+
+def _round_down(length: float) -> float:
+    """To whole millimetres, or to tenths below ten, [m]."""
+    step = 1e-3 if length >= 10e-3 else 1e-4
+    return round(math.floor(length / step + 1e-9) * step, 6)
