@@ -38,12 +38,17 @@ from orthocal.identification.records import (
 )
 from orthocal.identification.selection import Known, Selection
 from orthocal.identification.turned import find_turned_setup
-from orthocal.identification.uncertainty import estimate_repeatability, project_out_zeros
+from orthocal.identification.uncertainty import (
+    Information,
+    estimate_repeatability,
+    project_out_zeros,
+)
 from orthocal.identification.unmodelled import find_other_errors, measure_unmodelled
 from orthocal.measurement.session import Session
 from orthocal.measurement.session_file import load_session
 from orthocal.robot.loading import packaged_robots
 from orthocal.robot.model import read_only
+from orthocal.robot.parameters import Parameter
 
 Array = NDArray[np.float64]
 
@@ -125,6 +130,12 @@ def repeat_calibration(calibration: Calibration, session: Session) -> Calibratio
     Raises:
         NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
     """
+    nominal = np.array([p.value for p in calibration.free])
+    return assemble_calibration(repeat_fit(calibration, session), nominal=nominal)
+
+
+def repeat_fit(calibration: Calibration, session: Session) -> Fit:
+    """The fit of `repeat_calibration`."""
     free = calibration.free
     parameters = session.robot.parameters
     selection = Selection(
@@ -138,10 +149,7 @@ def repeat_calibration(calibration: Calibration, session: Session) -> Calibratio
     )
     solver = calibration.solver
     options = SolverOptions(loss=Loss(solver.loss, solver.loss_width))
-    return assemble_calibration(
-        fit_problem(CalibrationProblem(session, selection), options=options),
-        nominal=np.array([p.value for p in free]),
-    )
+    return fit_problem(CalibrationProblem(session, selection), options=options)
 
 
 def assemble_calibration(
@@ -252,17 +260,22 @@ def _match_profiled(problem: CalibrationProblem, patterns: Sequence[str]) -> lis
 
 def _identifiability(fit: Fit, whole: CalibrationProblem | None) -> Identifiability:
     """Of the free parameters; of base parameters, together with what they stand for."""
+
+    def analyse(information: Information, parameters: Sequence[Parameter]) -> Identifiability:
+        return analyse_identifiability(
+            information,
+            parameters,
+            sigma=fit.noise.sigma,
+            n_postures=fit.problem.n_postures,
+            n_readings=fit.independent_readings,
+        )
+
+    own = analyse(fit.linearisation.information, fit.problem.parameters)
     if whole is None:
-        information, parameters = fit.linearisation.information, fit.problem.parameters
-    else:
-        information, parameters = linearise_at_reference(whole).information, whole.parameters
-    return analyse_identifiability(
-        information,
-        parameters,
-        sigma=fit.noise.sigma,
-        n_postures=fit.problem.n_postures,
-        n_readings=fit.independent_readings,
-    )
+        return own
+    # how well the base parameters are told; which they are follows from the whole
+    found = analyse(linearise_at_reference(whole).information, whole.parameters)
+    return replace(found, singular_values=own.singular_values, rank=own.structural_rank)
 
 
 def _estimates(

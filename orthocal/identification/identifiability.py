@@ -20,8 +20,8 @@ from orthocal.robot.parameters import Parameter
 
 Array = NDArray[np.float64]
 
-NEGLIGIBLE = 1e-3
-"""Coefficients of a combination below this, in tolerances, are left out of it."""
+NEGLIGIBLE = 1e-9
+"""Coefficients of a combination below this, in tolerances, are rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +50,9 @@ class Combination:
             factor = "" if size == "1" else f"{size} "
             text += f" {'+' if coefficient > 0 else '−'} {factor}{name}"
         left_out = 0 if most is None else len(self.terms) - most
-        return f"{text} and {left_out} more" if left_out > 0 else text
+        if left_out <= 0:
+            return text
+        return f"{text} and {left_out} more, of at most {abs(rest[(most or 1) - 1][1]):.2g} each"
 
     @property
     def words(self) -> str:
@@ -68,13 +70,14 @@ class Identifiability:
     """What the readings tell of the parameters, and what not."""
 
     singular_values: Array
-    """Of the scaled identification Jacobian, descending, shape (n_free,), [m per tolerance]."""
+    """Of the scaled identification Jacobian of the free parameters, descending, shape (n_free,),
+    [m per tolerance]; of base parameters it is the reduced one, of their columns."""
     threshold: float
     """Singular values above it count as seen, [m per tolerance]."""
     rank: int
     """Number of singular values above the threshold."""
     structural_rank: int
-    """Number above RANK_THRESHOLD of the largest: what perfect readings would tell."""
+    """What perfect readings would tell: with base parameters, of all that they stand for."""
     n_postures: int
     n_readings: int
     """Independent readings: repeated ones once, less gauge zeros."""
@@ -99,7 +102,8 @@ class Identifiability:
 
         O1 = (∏ s)^(1/r)/√postures (Borm and Menq 1991), O2 = s_r/s_1 (Driels and Pathre 1990, [1]),
         O3 = s_r and O4 = s_r²/s_1 (Nahvi and Hollerbach 1994, 1996), O5 = 1/Σ 1/s (Sun and
-        Hollerbach 2008). 0 where nothing counts.
+        Hollerbach 2008). 0 where nothing counts. Plans that see different numbers r of directions
+        cannot be compared by any of them.
         """
         s = self.singular_values[: self.rank]
         if not self.rank:

@@ -26,6 +26,9 @@ RANK_THRESHOLD = 1e-10
 MOST_NAMED = 6
 """Parameters that a message names one by one."""
 
+MOST_LOST = 2
+"""Ways to change parameters unseen that a message names."""
+
 BY_CHANCE = 0.01
 """Probability below which residuals that are larger than noise are not put down to chance."""
 
@@ -137,6 +140,7 @@ def estimate_noise(
     """
     cycles_sigma, cycles_dof = repeatability
     floor = noise_floor(gauge_sigma, resolution)
+    cycles_sigma = max(cycles_sigma, noise_floor(None, resolution)) if cycles_dof else cycles_sigma
     enough = residual_dof > 0.5
     residual_sigma = math.sqrt(residual_square / residual_dof) if enough else math.nan
     source: NoiseSource
@@ -325,12 +329,52 @@ def require_identifiable(
         more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
         raise NotIdentifiableError(
             f"the readings do not determine {named}{more}: {information.rank} of {len(names)} free "
-            "parameters can be told from them. Read the legs that are missing, in postures along "
-            "their own axes; or use tolerances as a prior (--prior), or identify base parameters "
-            "(--base)",
+            f"parameters can be told from them. {_advise_lost(information, names, null)} Or use "
+            "tolerances as a prior (--prior), or identify base parameters (--base)",
             parameters=lost,
             where=where,
         )
+
+
+def _advise_lost(information: Information, names: tuple[str, ...], null: Array) -> str:
+    """Which directions no reading sees, and what would help."""
+    sizes = np.linalg.norm(information.factor, axis=0)
+    unread = sizes <= RANK_THRESHOLD * max(float(sizes.max(initial=0.0)), 1e-300)
+    words = []
+    if unread.any():
+        listed = [n for n, out in zip(names, unread, strict=True) if out]
+        rest = f" and {len(listed) - MOST_NAMED} more" if len(listed) > MOST_NAMED else ""
+        words.append(
+            f"No reading depends on {', '.join(listed[:MOST_NAMED])}{rest}: read the legs that are "
+            "missing, in postures along their own axes."
+        )
+    # each row of the reduced echelon form is one way to change the others that nothing sees
+    rest_null = _reduce(null[:, ~unread])
+    seen = [n for n, out in zip(names, unread, strict=True) if not out]
+    for row in rest_null[:MOST_LOST]:
+        order = np.argsort(-np.abs(row))
+        terms = [i for i in order if abs(row[i]) > 1e-6]
+        ways = ", ".join(
+            f"{seen[i]} {'up' if row[i] * row[terms[0]] > 0 else 'down'}"
+            for i in terms[:MOST_NAMED]
+        )
+        others = f" and {len(terms) - MOST_NAMED} more" if len(terms) > MOST_NAMED else ""
+        words.append(f"No reading sees a change of these together: {ways}{others}.")
+    return " ".join(words)
+
+
+def _reduce(rows: Array) -> Array:
+    """Reduced echelon form of what rows span, its pivots the largest entries."""
+    left = np.array(rows)
+    found: list[Array] = []
+    while left.size:
+        i, j = np.unravel_index(np.abs(left).argmax(), left.shape)
+        if abs(left[i, j]) < 1e-6:
+            break
+        row = left[i] / left[i, j]
+        found = [f - f[j] * row for f in found] + [row]
+        left = np.delete(left - np.outer(left[:, j], row), i, axis=0)
+    return np.array(found).reshape(-1, rows.shape[1])
 
 
 def confidence_factor(dof: float, level: float = 0.95) -> float:

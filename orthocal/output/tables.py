@@ -187,18 +187,27 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
     count = found.singular_values.size
     taken = found.n_readings - calibration.spare_readings
     o = found.observability
-    lines = [
-        f"{found.rank} of {count} combinations of parameters, each better than its tolerance "
-        f"(singular values above the noise, {found.threshold * 1e6:.3g} µm a tolerance); perfect "
-        f"readings of this kind would tell {found.structural_rank}.",
+    sight = f"singular values above the noise, {found.threshold * 1e6:.3g} µm a tolerance"
+    if calibration.base:
+        lines = [
+            f"{count} base parameters: as many sums of errors as the readings tell better than "
+            f"their tolerances ({sight})."
+        ]
+    else:
+        lines = [
+            f"{found.rank} of {count} combinations of parameters, each better than its tolerance "
+            f"({sight}); perfect readings of this kind would tell {found.structural_rank}."
+        ]
+    lines.append(
         f"Of {counted(found.n_readings, 'independent reading')} the parameters can take up "
-        + (f"{taken}; the others check the model." if taken < found.n_readings else "all."),
-    ]
+        + (f"{taken}; the others check the model." if taken < found.n_readings else "all.")
+    )
     if found.rank:
         lines.append(
             f"Condition number {found.condition:.3g}; observability O1 {o['O1'] * 1e3:.3g} mm, "
             f"O2 {o['O2']:.3g}, O3 {o['O3'] * 1e3:.3g} mm, O4 {o['O4'] * 1e3:.3g} mm, "
-            f"O5 {o['O5'] * 1e3:.3g} mm a tolerance."
+            f"O5 {o['O5'] * 1e3:.3g} mm a tolerance: of {counted(found.rank, 'direction')}, and "
+            "to be compared only with plans that see as many."
         )
     shown = found.alike if all_rows else found.alike[:6]
     lines += [f"Not told apart: {c.words}." for c in shown]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from rich.console import Group, RenderableType
 from rich.text import Text
 
@@ -15,6 +17,7 @@ from orthocal.output.layout import (
     signed,
     table_of,
 )
+from orthocal.study.mistakes import Mistake
 from orthocal.study.validation import FurtherChange, Validation
 
 REMOVED = 0.7
@@ -55,6 +58,11 @@ def render_validation(validation: Validation, *, all_rows: bool = False) -> Rend
         section("What a further fit would still change", changes),
         section("Readings of the new session", _validation_rows(validation, all_rows)),
         section("What it means", bullets(explain_validation(validation))),
+        *(
+            [section("What belongs into the controller", _enter_next(validation))]
+            if validation.mistake is not None
+            else []
+        ),
     )
 
 
@@ -76,6 +84,11 @@ def explain_validation(validation: Validation) -> list[str]:
         sentences.append(
             f"The calibration is not confirmed: r.m.s. {achieved} mm was achieved where {expected} "
             "mm was expected, more than chance explains. " + _explain_change(validation)
+        )
+    elif validation.mistake is not None:
+        sentences.append(
+            "The calibration is not confirmed, though the deviations are no larger than expected. "
+            + _explain_change(validation)
         )
     else:
         names = ", ".join(c.name for c in validation.changes if c.significant)
@@ -132,22 +145,50 @@ def _validation_rows(validation: Validation, all_rows: bool) -> RenderableType:
     return Group(table, Text(note)) if note else table
 
 
+_MISTAKES: dict[Mistake, str] = {
+    "not entered": "were not entered: what was active before still is",
+    "wrong sign": "were entered with the wrong sign",
+    "entered twice": "were entered twice, or on top of what was active",
+}
+
+
 def _explain_change(validation: Validation) -> str:
-    """What may have happened where more was found than expected."""
-    if not validation.nothing_to_change:
-        return "Check the signs of the offsets in the controller first."
+    """What may have happened where more was found than expected, and what to do."""
+    mistake = validation.mistake
+    if mistake is not None:
+        whose = "The offsets" if mistake.all_drives else f"The offsets of {_and(mistake.drives)}"
+        return (
+            f"{whose} seem not to be in the controller as identified: they "
+            f"{_MISTAKES[mistake.kind]}. That leaves r.m.s. {mm(mistake.rms)} mm of these readings "
+            "unexplained. Enter what stands below, whole and in place of what is active, and "
+            "measure again."
+        )
     if validation.refit_rms < REMOVED * validation.achieved_rms:
         largest = sorted(validation.changes, key=lambda c: -abs(c.change) / max(c.std, 1e-300))
         names = ", ".join(c.name for c in largest[:3])
+        told = "" if any(c.significant for c in largest) else " No single parameter is told apart."
         return (
-            f"A further fit would take it to {mm(validation.refit_rms)} mm: the geometry has "
-            f"changed, or the offsets were not entered as identified. No single parameter is told "
-            f"apart; most would change, in their σ: {names}."
+            f"A further fit would take it to {mm(validation.refit_rms)} mm, and no mistake in "
+            "entering the offsets explains it: the geometry has changed, or the gauge stood "
+            f"elsewhere than the session says.{told} Most would change, in their σ: {names}. "
+            "Calibrate again from this session."
         )
     return (
-        "No parameter would change, so the offsets are not to blame: the readings scatter more "
-        "than before, or something has moved."
+        "Other offsets would not help, so those entered are not to blame: the readings scatter "
+        "more than before, or something else has moved."
     )
+
+
+def _and(names: Sequence[str]) -> str:
+    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def _enter_next(validation: Validation) -> RenderableType:
+    """What belongs into the controller where something else is in it."""
+    table = table_of("drive", "enter", "unit")
+    for entry in validation.enter:
+        add_row(table, entry.drive, signed(entry.enter * entry.edge_factor), entry.edge_unit)
+    return table
 
 
 def _listed(validation: Validation, all_rows: bool) -> list[FurtherChange]:

@@ -9,20 +9,26 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
 from orthocal.errors import SessionError
-from orthocal.identification.calibrate import repeat_calibration
+from orthocal.identification.calibrate import assemble_calibration, repeat_fit
 from orthocal.identification.calibration import Calibration
-from orthocal.identification.records import ResidualRow
-from orthocal.identification.uncertainty import BY_CHANCE, confidence_factor
+from orthocal.identification.fit import Fit
+from orthocal.identification.records import ControllerEntry, ResidualRow
+from orthocal.identification.uncertainty import (
+    BY_CHANCE,
+    confidence_factor,
+    project_out_zeros,
+)
 from orthocal.measurement.session import Session
 from orthocal.robot.parameters import InUnit, Unit
 from orthocal.study.entering import find_entries
+from orthocal.study.mistakes import EnteringMistake, find_mistake
 from orthocal.study.repetition import Repetition, measure_repetition
 
 Array = NDArray[np.float64]
@@ -65,6 +71,11 @@ class Validation:
     """Probability that the achieved sum of squares would be as large by chance (F test); NaN if
     the calibration had no readings to spare."""
     changes: tuple[FurtherChange, ...]
+    mistake: EnteringMistake | None
+    """What seems to have gone wrong in entering; None where nothing did, or nothing explains it."""
+    enter: tuple[ControllerEntry, ...]
+    """What belongs into the controller: as it was, where a mistake explains the readings or nothing
+    is to change; else what the new readings say, with their session."""
     repetition: Repetition
     """Whether what both fits leave is the same."""
     rows: tuple[ResidualRow, ...]
@@ -99,7 +110,7 @@ class Validation:
             return value if math.isfinite(value) else None
 
         document = {
-            "schema": "orthocal/validation/1",
+            "schema": "orthocal/validation/2",
             "title": self.title,
             "offsets_stated": self.offsets_stated,
             "expected_rms": self.expected_rms,
@@ -121,6 +132,15 @@ class Validation:
                 }
                 for c in self.changes
             ],
+            "mistake": None
+            if self.mistake is None
+            else {
+                "kind": self.mistake.kind,
+                "drives": list(self.mistake.drives),
+                "active": self.mistake.active.tolist(),
+                "rms": self.mistake.rms,
+            },
+            "enter": [{"drive": e.drive, "unit": e.unit, "value": e.enter} for e in self.enter],
             **self.repetition.to_document(),
         }
         return json.dumps(document, indent=1, allow_nan=False) + "\n"
@@ -154,10 +174,9 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         by_drive = {e.drive: e.enter for e in entries}
         offsets = np.array([by_drive.get(d.name, 0.0) for d in session.robot.drives])
         session = session.with_controller(offsets)
-    refit = repeat_calibration(calibration, session)
-    changes = _further_changes(calibration, refit)
-    repetition = measure_repetition(calibration, refit)
-    return Validation(
+    fit = repeat_fit(calibration, session)
+    refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
+    found = Validation(
         title=session.title,
         offsets_stated=stated,
         expected_rms=calibration.rms_after,
@@ -167,9 +186,42 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         refit_rms=refit.rms_after,
         refit_largest=refit.largest_after,
         excess_probability=_excess_probability(calibration, refit),
-        changes=changes,
-        repetition=repetition,
+        changes=_further_changes(calibration, refit),
+        mistake=None,
+        enter=entries,
+        repetition=measure_repetition(calibration, refit),
         rows=refit.residuals,
+    )
+    if found.confirmed is not False:
+        return found
+    mistake = _find_mistake(calibration, fit, session)
+    enter = entries if mistake is not None else find_entries(refit)
+    return replace(found, mistake=mistake, enter=enter)
+
+
+def _find_mistake(calibration: Calibration, fit: Fit, session: Session) -> EnteringMistake | None:
+    """The mistake in entering offsets that explains a session, if one does."""
+    drives, o, problem = session.robot.drives, fit.problem.observations, fit.problem
+    theta = np.array([p.value for p in calibration.free])
+    deviations = project_out_zeros(problem.values - problem.predict(theta), o)
+    slopes = np.zeros((o.size, len(drives)))
+    for i, drive in enumerate(drives):
+        name = f"{drive.name}.offset"
+        if name in problem.free:
+            k = problem.free.index(name)
+            slopes[:, i] = fit.jacobian[:, k] / problem.theta_scale[k]
+    entries = {e.drive: e for e in find_entries(calibration)}
+    change, scatter = (
+        np.array([getattr(entries[d.name], key) if d.name in entries else 0.0 for d in drives])
+        for key in ("change", "scatter")
+    )
+    return find_mistake(
+        deviations,
+        project_out_zeros(slopes, o),
+        change,
+        entered=session.active_offsets,
+        names=tuple(d.name for d in drives),
+        rounding=np.nan_to_num(scatter),
     )
 
 

@@ -21,6 +21,7 @@ from orthocal import (
 from orthocal.errors import CalibrationFileError
 from orthocal.output.explanation import explain_fit
 from orthocal.robot import orthoglide as closed_form
+from orthocal.study.entering import find_entries
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
@@ -172,16 +173,10 @@ def test_every_doubt_of_an_offset_is_in_what_is_entered(root):
     """Scatter and errors that were left out, at their tolerances."""
     result = calibrate(load_session(root / "examples/sweep"))
     bias = np.sqrt(np.diag(result.unmodelled.bias_covariance))
-    for entry, own in zip(result.controller_entries(), bias, strict=True):
-        assert entry.std_in_all == pytest.approx(np.hypot(entry.std, own))
-        assert entry.std_in_all > 10.0 * entry.std
+    for entry, own in zip(find_entries(result), bias, strict=True):
+        assert entry.std == pytest.approx(np.hypot(entry.scatter, own))
+        assert entry.std > 10.0 * entry.scatter
         assert entry.held is None
-    assert (
-        calibrate(load_session(root / "examples/sweep"), model="full")
-        .controller_entries()[0]
-        .bias_std
-        == 0.0
-    )
 
 
 def test_what_a_bound_or_a_known_value_holds_is_not_proved(experiment_2):
@@ -190,7 +185,7 @@ def test_what_a_bound_or_a_known_value_holds_is_not_proved(experiment_2):
         bounds={"x_slide.offset": (-0.2e-3, 2e-3)},
         known={"y_slide.offset": 0.5e-3},
     )
-    held = {e.drive: e.held for e in bounded.controller_entries()}
+    held = {e.drive: e.held for e in find_entries(bounded)}
     assert held == {"x_slide": "lower bound", "y_slide": "known", "z_slide": None}
     text = summarize(bounded)
     entered = text[text.index("What to enter into the controller") :]
@@ -204,11 +199,14 @@ def test_what_a_bound_or_a_known_value_holds_is_not_proved(experiment_2):
 def test_students_factor_counts_for_what_the_readings_told(experiment_2):
     """Three degrees of freedom say nothing of a length that only its prior tells."""
     result = calibrate(experiment_2, model="lengths")
-    length, offset = result["x_leg.length"], result["x_slide.offset"]
-    low, high = result.interval(length)
-    assert (high - low) / 2 == pytest.approx(1.96 * length.std, rel=0.02)
-    low, high = result.interval(offset)
-    assert (high - low) / 2 == pytest.approx(result.confidence_factor * offset.std, rel=0.02)
+    names = [p.name for p in result.free]
+    bias = np.sqrt(np.diag(result.unmodelled.bias_covariance))
+    for name, factor in (("x_leg.length", 1.96), ("x_slide.offset", result.confidence_factor)):
+        low, high = result.intervals[names.index(name)]
+        rest = 1.96 * bias[names.index(name)]
+        assert (high - low) / 2 == pytest.approx(
+            math.hypot(factor * result[name].std, rest), rel=0.02
+        )
 
 
 def test_cycles_that_are_all_equal_scatter_by_the_resolution(raw_cycles):

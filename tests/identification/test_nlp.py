@@ -14,7 +14,7 @@ from orthocal.errors import SolverError
 from orthocal.identification.linear import solve_linearised
 from orthocal.identification.loss import SQUARES, Loss
 from orthocal.identification.nlp import NonlinearProgram, SolverOptions
-from orthocal.identification.problem import build_problem
+from orthocal.identification.problem import LENGTH_SCALE, build_problem
 from orthocal.identification.uncertainty import project_out_zeros
 
 HUBER = Loss("huber")
@@ -96,7 +96,9 @@ def test_the_gauss_newton_hessian_is_the_exact_one_without_curvature(perfect):
     problem = build_problem(perfect, prior=True)
     theta = np.array(list(TRUTH.values()))
     passive = problem.close(theta)
-    x = np.r_[theta / problem.theta_scale, np.zeros(6), (passive / problem.passive_scale).ravel()]
+    left = problem.values - problem.predict(theta, passive)
+    zeros = [left[problem.observations.zero == i].mean() / LENGTH_SCALE for i in range(6)]
+    x = np.r_[theta / problem.theta_scale, zeros, (passive / problem.passive_scale).ravel()]
     matrices = []
     for hessian in ("exact", "gauss-newton"):
         program = NonlinearProgram(problem, options=SolverOptions(hessian=hessian))

@@ -21,10 +21,25 @@ def plan(root):
     return load_plan(root / "examples/raw-cycles/plan.yaml")
 
 
-def test_exact_readings_are_the_predictions(plan):
+def test_exact_readings_are_the_predictions_from_where_a_setup_begins(plan):
+    """A dial is set in the first posture of its setup, wherever in the world that is."""
     simulated = simulate_session(plan, ERRORS, exact=True)
     o = build_observations(plan)
-    assert np.abs(simulated.session.values - predict_entries(plan, o, ERRORS)).max() == 0.0
+    predicted = predict_entries(plan, o, ERRORS)
+    for i, name in enumerate(plan.setups):
+        own = o.setup == i
+        assert simulated.session.values[own][0] == 0.0
+        shown = predicted[own] - predicted[own][0]
+        assert np.abs(simulated.session.values[own] - shown).max() < KINEMATICS
+        assert simulated.zeros[name] == -predicted[own][0]
+
+
+def test_a_dial_is_set_where_it_stands_also_on_displaced_lines(root):
+    """At the coordinate of a line displaced by 20 mm no dial of ±5 mm could be read."""
+    lines = load_plan(root / "examples/lines/plan.yaml")
+    session = simulate_session(lines, ERRORS, seed=1).session
+    first = {r.setup: r.value for r in reversed(session.readings)}
+    assert max(abs(v) for v in first.values()) < 0.25e-3
 
 
 def test_it_says_that_it_is_simulated(plan):
@@ -41,12 +56,12 @@ def test_one_seed_one_session(plan):
 
 def test_noise_zeros_and_rounding_are_as_asked(plan):
     fine = replace(plan, gauge=replace(plan.gauge, resolution=None))
-    exact = simulate_session(plan, ERRORS, exact=True).session.values
+    predicted = predict_entries(plan, build_observations(plan), ERRORS)
     residuals = []
     for seed in range(40):
         simulated = simulate_session(fine, ERRORS, seed=seed)
         zero = np.array([simulated.zeros[r.setup] for r in plan.readings])
-        residuals.append(simulated.session.values - exact - zero)
+        residuals.append(simulated.session.values - predicted - zero)
     spread = np.std(residuals)
     assert abs(spread / 0.01e-3 - 1.0) < 4.0 / np.sqrt(2 * 40 * 54)  # four standard errors
     rounded = simulate_session(plan, ERRORS).session.values / 0.01e-3
@@ -87,7 +102,7 @@ def test_errors_are_drawn_then_read_then_given(tmp_path, orthoglide):
 
 def test_readings_beyond_the_gauge_are_refused(plan):
     with pytest.raises(SessionError, match=r"the simulated reading .* the gauge's range ends at"):
-        simulate_session(plan, {"x_slide.offset": 15e-3, "y_slide.offset": -15e-3})
+        simulate_session(plan, {"x_slide.offset": 25e-3, "y_slide.offset": -25e-3})
 
 
 def test_no_errors_are_an_error(orthoglide):

@@ -18,6 +18,7 @@ from orthocal.identification.uncertainty import decompose, project_out_zeros
 from orthocal.measurement.synthetic import load_errors
 from orthocal.robot.assembly import Assembly, nominal_assembly
 from orthocal.robot.orthoglide import inverse
+from orthocal.robot.sensitivity import ToolSensitivity
 from orthocal.study.accuracy import (
     Workspace,
     assess_tool,
@@ -26,7 +27,6 @@ from orthocal.study.accuracy import (
     find_remaining_errors,
     measure_uncertainty,
 )
-from orthocal.robot.sensitivity import ToolSensitivity
 
 OFFSET_SIGMA = 2e-3
 

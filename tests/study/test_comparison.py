@@ -60,7 +60,7 @@ def test_what_remains_of_table_1_is_model_error_not_noise(table1):
     assert table1.verdict.exit_code == 3
     assert "error of the model rather than noise: σ 0.276 mm of a difference against 0.028" in text
     assert "10 times as much" in text
-    assert "worse than its tolerances, by about 2.2 times" in text
+    assert "worse than its tolerances, by about 2.1 times" in text
     assert table1.repetition.repeats
     assert table1.repetition.correlation == pytest.approx(0.9937, abs=5e-5)
     assert "What remains repeats in 'Experiment 3" in text
@@ -130,7 +130,8 @@ def test_displaced_lines_support_the_full_model(lines):
     assert verdict.exit_code == 0
     full, offsets = lines["full"], lines["offsets"]
     assert full.exact.unseen_rms < 0.8 * offsets.exact.unseen_rms
-    assert full.tool.after.relative.rms < 0.1 * offsets.tool.after.relative.rms
+    # errors that no reading of a leg tells are in both, those of drives and rods' ends too
+    assert full.tool.after.sizes.aligned.rms < 0.25 * offsets.tool.after.sizes.aligned.rms
     assert "264 independent readings support full." in verdict.reasons
 
 

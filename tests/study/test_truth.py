@@ -15,8 +15,8 @@ from orthocal.identification.nlp import NonlinearProgram
 from orthocal.identification.problem import build_problem
 from orthocal.identification.uncertainty import confidence_factor, decompose
 from orthocal.robot.assembly import Assembly
-from orthocal.study.accuracy import assess_tool, cube, measure_uncertainty
 from orthocal.robot.sensitivity import ToolSensitivity
+from orthocal.study.accuracy import assess_tool, cube, measure_uncertainty
 
 SIGMA = 5e-6
 OFFSETS = {"*.offset": 2e-3}

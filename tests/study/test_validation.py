@@ -19,6 +19,7 @@ from orthocal import (
 )
 from orthocal.errors import SessionError
 from orthocal.measurement.synthetic import load_errors
+from orthocal.study.entering import find_entries
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
@@ -126,7 +127,7 @@ def test_a_calibration_of_all_errors_is_confirmed_with_its_offsets_entered(root)
     truth = load_errors(root / "examples/lines/truth.yaml", plan.robot)
     session = load_session(root / "examples/lines")
     calibration = calibrate(session, model="full", tolerances={"*.offset": 2e-3})
-    offsets = np.array([e.enter for e in calibration.controller_entries()])
+    offsets = np.array([e.enter for e in find_entries(calibration)])
     entered = with_offsets(plan, offsets)
     again = simulate_session(entered, truth, seed=99).session
     found = validate_calibration(calibration, again)
