@@ -88,7 +88,7 @@ class Calibration:
     """Of orthocal."""
     path: Path | None = None
     """Where it was loaded from."""
-    _kept: dict[str, Any] = field(default_factory=dict)
+    _kept: dict[str, Any] = field(init=False, default_factory=dict)
     """What follows from the rest, once it was asked for."""
 
     def __getitem__(self, name: str) -> ParameterEstimate:

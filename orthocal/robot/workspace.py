@@ -151,9 +151,9 @@ def largest_cube(robot: Robot, reach: Callable[[Array], object]) -> Workspace | 
         low, high = (middle, high) if fits(middle, 3) else (low, middle)
         if high < SMALLEST_HALF_SIDE:
             return None
-    half_side = _round_down(low)
+    half_side = _round_down(high)
     while not fits(half_side, POINTS_A_SIDE):
-        half_side = _round_down(0.95 * half_side)
+        half_side = _round_down(half_side - 1e-6)
         if half_side < SMALLEST_HALF_SIDE:
             return None
     return cube(robot, half_side=half_side)

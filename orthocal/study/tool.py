@@ -90,7 +90,7 @@ def place_tool(
         ClosureError: If a point cannot be reached.
     """
     known = calibration.remember("tool", lambda: _find_tool(calibration))
-    if known is not None and known.workspace.half_side == workspace.half_side is not None:
+    if known is not None and np.array_equal(known.workspace.points, workspace.points):
         return known
     return _place(calibration, workspace, _sensitivity(calibration), names)
 

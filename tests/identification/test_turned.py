@@ -125,7 +125,7 @@ def dense_plan(tmp_path_factory, length=None, plan=plans.paper):
 def test_nobody_is_accused_whose_offsets_were_entered(
     fleet, raw_plan, tmp_path_factory, kind, model, count
 ):
-    """200 machines, measured, offsets entered, measured again; errors of 0.3, 1 and 3 tolerances."""
+    """200 machines with errors of 0.3, 1 and 3 tolerances, measured before and after entering."""
     if kind == "cycles":
         own = fleet if model == "offsets" else Fleet(raw_plan, model=model)
     elif kind == "sweep":

@@ -14,9 +14,11 @@ from orthocal.identification.fit import fit_problem
 from orthocal.identification.nlp import NonlinearProgram
 from orthocal.identification.problem import build_problem
 from orthocal.identification.uncertainty import confidence_factor, decompose
+from orthocal.measurement.session import Gauge
 from orthocal.robot.assembly import Assembly
 from orthocal.robot.sensitivity import ToolSensitivity
-from orthocal.study.accuracy import assess_tool, cube, measure_uncertainty
+from orthocal.robot.workspace import cube
+from orthocal.study.accuracy import assess_tool, measure_uncertainty
 
 SIGMA = 5e-6
 OFFSETS = {"*.offset": 2e-3}
@@ -71,7 +73,9 @@ def test_the_tools_error_is_what_the_posterior_predicts(machines):
     covariance = decompose(slopes, problem.observations).covariance(
         sigma=SIGMA, precision=problem.prior_precision
     ) * np.outer(problem.theta_scale, problem.theta_scale)
-    predicted = measure_uncertainty(jacobian, covariance, m.workspace).relative.rms
+    predicted = measure_uncertainty(
+        jacobian, covariance, m.workspace, m.workspace.points
+    ).sizes.relative.rms
     assert predicted * 1e3 == pytest.approx(PREDICTED[m.name], rel=0.05, abs=0.0006)
     squares = []
     for seed in range(MACHINES[m.name]):
@@ -92,13 +96,15 @@ def test_perfect_readings_give_the_tool_where_they_determine_it(machines):
     """Points and directions whose posterior is below 0.3 µm are right to 1 µm."""
     m, problem = machines, machines.problem
     truth = m.draw(7)
-    plan = replace(m.plan, gauge=replace(m.plan.gauge, resolution=None))  # nothing is rounded
+    plan = replace(m.plan, gauge=Gauge(None, None, None))  # nothing is rounded
     session = plan.with_values(problem.observations.rows(problem.predict(truth)))
     fit = fit_problem(build_problem(session, model="full", tolerances=OFFSETS))
     accuracy = assess_tool(assemble_calibration(fit), m.workspace)
     error = m.tool(fit.solution.theta) - m.tool(truth)
     error -= m.workspace.weights @ error
-    spread = np.sqrt(np.diagonal(accuracy.after.relative_covariance, axis1=1, axis2=2))
+    jacobian = m.workspace.remove_shift(accuracy.jacobian)[:, :, : problem.n_free]
+    posterior = jacobian @ fit.covariance() @ jacobian.transpose(0, 2, 1)
+    spread = np.sqrt(np.diagonal(posterior, axis1=1, axis2=2))
     determined = spread < 0.3e-6
     assert np.abs(error)[determined].max() < 1e-6
     if m.name == "lines":  # the common shift alone is left open: all points are determined
