@@ -17,8 +17,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError, RobotError
 from orthocal.robot.batch import BatchFunction
-from orthocal.robot.model import Robot, Tcp
-from orthocal.robot.symbolic import SymbolicRobot, closure_row_units, coordinate_units
+from orthocal.robot.model import (
+    Robot,
+    Tcp,
+    closure_row_units,
+    closure_turns,
+    coordinate_limits,
+    coordinate_units,
+)
+from orthocal.robot.symbolic import SymbolicRobot
 
 Array = NDArray[np.float64]
 
@@ -226,7 +233,7 @@ class Assembly:
         robot = self.robot
         residual = self._symbolic.closure_residual() * closure_row_units(robot)
         units = coordinate_units(robot)[robot.passive_index]
-        lower, upper = _limits(robot)
+        lower, upper = coordinate_limits(robot)
         return _System(
             evaluate=_residual_function("closing", passive, drives, theta, residual),
             n_rows=residual.numel(),
@@ -255,7 +262,7 @@ class Assembly:
         residual = ca.vertcat(closing, reached - target)
         x = ca.vertcat(drives, passive)
         index = np.concatenate([robot.drive_index, robot.passive_index])
-        lower, upper = _limits(robot)
+        lower, upper = coordinate_limits(robot)
         zero_passive = robot.zero[robot.passive_index]
         origin = nominal_assembly(robot).tcp(robot.drive_zero, zero_passive)[list(tcp.coordinates)]
         return _System(
@@ -412,21 +419,6 @@ def _newton(
         active = active[moved]
         active = active[worst[active] >= tolerance]
     return x, worst
-
-
-def _limits(robot: Robot) -> tuple[Array, Array]:
-    """Bounds of the joint coordinates, shape (nv,); infinite for unbounded revolute joints."""
-    model = robot.model
-    lower, upper = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
-    for joint in list(model.joints)[1:]:
-        if joint.nq == joint.nv:
-            lower[joint.idx_v : joint.idx_v + joint.nv] = model.lowerPositionLimit[
-                joint.idx_q : joint.idx_q + joint.nq
-            ]
-            upper[joint.idx_v : joint.idx_v + joint.nv] = model.upperPositionLimit[
-                joint.idx_q : joint.idx_q + joint.nq
-            ]
-    return lower, upper
 
 
 def _joint_names(robot: Robot, index: NDArray[np.int64]) -> tuple[str, ...]:
