@@ -334,6 +334,12 @@ def coordinate_limits(robot: Robot) -> tuple[Array, Array]:
     return lower, upper
 
 
+def joint_turns(model: pin.Model, joint: int) -> bool:
+    """Whether a joint turns, and does not slide: revolute, bounded or not."""
+    axis = joint_axis(model, joint) if model.joints[joint].nv == 1 else np.zeros(6)
+    return bool(np.any(axis[3:]) and not np.any(axis[:3]))
+
+
 def find_frame(model: pin.Model, name: str, *, where: str) -> int:
     """Index of the frame of a link, or else of a fixed or moving joint, of this name.
 

@@ -13,26 +13,36 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import RobotError
-from orthocal.robot.closing import Closing, close_loops, describe_opening
+from orthocal.robot.closing import MAX_STEPS, Closing, close_loops, describe_opening
 from orthocal.robot.model import (
     Robot,
     closure_row_units,
     closure_turns,
     coordinate_limits,
     coordinate_units,
+    joint_turns,
     read_only,
 )
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 TRIES = 6
-"""Starts from which the loops are tried to be closed; all but the first are drawn, always alike."""
+"""Starts from which loops are closed, at most: the first as given, the others drawn around it,
+always alike."""
 
 SPREAD = 0.3
 """How far apart these are, [rad] or characteristic lengths."""
 
+WORK = 5e8
+"""Products of numbers that the tries may take, roughly: large robots get fewer tries."""
+
+NEAR = 1e-3
+"""Drives that end as near to where they were wanted are put there, [rad] or characteristic
+lengths."""
+
 MAX_RETURNS = 60
-"""Steps by which moved drives are brought back towards 0."""
+"""Steps by which drives that were moved are brought back."""
 
 LARGEST_RETURN = 0.2
 """Of a drive in one of these, [rad] or characteristic lengths."""
@@ -56,58 +66,63 @@ def stand_at_zero(robot: Robot, passive_start: ArrayLike, *, given: ArrayLike) -
     start = robot.joint_coordinates(robot.drive_zero, passive_start)
     movable = robot.drive_index[~np.asarray(given, dtype=np.bool_)]
     start[movable] = np.clip(start[movable], lower[movable], upper[movable])
-    found = _search(robot, start, movable)
-    coordinates = found.coordinates
+    zero = _without_turns(robot, _search(robot, start, movable))
     drives = tuple(
-        replace(d, zero=float(coordinates[i]), zero_found=True)
-        if i in movable and coordinates[i] != d.zero
-        else d
-        for d, i in zip(robot.drives, robot.drive_index, strict=True)
+        replace(drive, zero=float(zero[i]), zero_found=True)
+        if i in movable and zero[i] != drive.zero
+        else drive
+        for drive, i in zip(robot.drives, robot.drive_index, strict=True)
     )
-    return replace(robot, drives=drives, zero=read_only(coordinates))
+    return replace(robot, drives=drives, zero=read_only(zero))
 
 
-def _search(robot: Robot, start: Array, movable: NDArray[np.int64]) -> Closing:
-    """Close with the drives where they are; if that fails, with movable drives moved as little."""
-    best = _close(robot, start, robot.passive_index)
-    if best.closed:
-        return best
+def _search(robot: Robot, start: Array, movable: Indices) -> Array:
+    """Coordinates with closed loops: drives where they are, or movable ones moved too."""
     free = np.concatenate([movable, robot.passive_index])
-    for attempt in _starts(robot, start, free, first=bool(movable.size)):
-        found = _close(robot, attempt, free)
-        if found.closed:
-            return _return_drives(robot, found, movable, start[movable])
-        best = min(best, found, key=lambda c: _size(robot, c))
-    turns, stretches = closure_turns(robot), closure_row_units(robot)
-    worst = int(np.abs(stretches * best.residual).argmax())
-    owners = [c.name for c in robot.closures for _ in c.rows]
-    moved = ", drives moved too" if movable.size else ""
-    advice = (
-        "orthocal.passive_start"
-        if not movable.size
-        else "orthocal.drives.<motor>.zero_mm (or zero_deg) and orthocal.passive_start"
-    )
-    raise RobotError(
-        "its loops do not close in any posture that was found: the best, within the joints' limits"
-        f"{moved}, leaves them open by {describe_opening(best.residual, turns)}, most of all "
-        f"'{owners[worst]}'; set {advice} near a posture that closes",
-        where=str(robot.yaml),
+    tried: list[Closing] = []
+    for moving in (robot.passive_index, free) if movable.size else (free,):
+        for attempt in _starts(robot, start, moving):
+            found = _close(robot, attempt, moving)
+            if found.closed:
+                if moving is free and movable.size:
+                    found = _return_drives(robot, found, movable, start)
+                return found.coordinates
+            tried.append(found)
+    best = min(tried, key=lambda c: float(np.square(closure_row_units(robot) * c.residual).sum()))
+    raise RobotError(_explain_open_loops(robot, best, movable), where=str(robot.yaml))
+
+
+def _explain_open_loops(robot: Robot, best: Closing, movable: Indices) -> str:
+    turns = closure_turns(robot)
+    owners = [closure.name for closure in robot.closures for _ in closure.rows]
+    worst = int(np.abs(closure_row_units(robot) * best.residual).argmax())
+    own = [owner == owners[worst] for owner in owners]
+    opening = describe_opening(best.residual[own], turns[own])
+    closure = robot.closures[list(dict.fromkeys(owners)).index(owners[worst])]
+    moved = ", with its drives moved too," if movable.size else ""
+    keys = ["orthocal.passive_start"]
+    if movable.size:
+        keys.insert(0, "orthocal.drives.<motor>.zero_mm (or zero_deg)")
+    return (
+        f"its loops do not close in any posture that was found{moved} within the limits of its "
+        f"joints: the best leaves '{closure.frame_a}' and '{closure.frame_b}' apart by {opening}; "
+        f"set {' and '.join(keys)} near a posture that closes"
     )
 
 
-def _starts(robot: Robot, start: Array, free: NDArray[np.int64], *, first: bool) -> Iterator[Array]:
-    """The start itself if it was not tried yet with these free, and others around it."""
-    if first:
-        yield start
+def _starts(robot: Robot, start: Array, free: Indices) -> Iterator[Array]:
+    """The start itself, and others around it in which the free coordinates differ."""
+    yield start
     draw = np.random.default_rng(0)
-    lengths = np.where(coordinate_units(robot) == 1.0, robot.characteristic_length, 1.0)
-    for _ in range(TRIES - 1):
+    spread = SPREAD * _reach(robot)
+    effort = MAX_STEPS * robot.closure_rows * robot.model.nv**2
+    for _ in range(min(TRIES - 1, int(WORK / max(effort, 1)))):
         shift = np.zeros(len(start))
-        shift[free] = SPREAD * draw.normal(size=free.size)
-        yield start + shift * lengths
+        shift[free] = draw.normal(size=free.size)
+        yield start + spread * shift
 
 
-def _close(robot: Robot, start: Array, free: NDArray[np.int64]) -> Closing:
+def _close(robot: Robot, start: Array, free: Indices) -> Closing:
     """Close by the free coordinates; the result has all of them."""
     lower, upper = coordinate_limits(robot)
 
@@ -130,45 +145,45 @@ def _close(robot: Robot, start: Array, free: NDArray[np.int64]) -> Closing:
     return Closing(complete(found.coordinates), found.residual)
 
 
-def _size(robot: Robot, closing: Closing) -> float:
-    """Of what stays open, [m²]."""
-    return float(np.square(closure_row_units(robot) * closing.residual).sum())
-
-
-def _return_drives(
-    robot: Robot, found: Closing, movable: NDArray[np.int64], wanted: Array
-) -> Closing:
+def _return_drives(robot: Robot, found: Closing, movable: Indices, wanted: Array) -> Closing:
     """Bring moved drives back towards where they were wanted, with the loops closed.
 
     Each step goes along the motions that leave the loops closed to first order, as far as brings
     the drives nearest, and is closed again.
     """
-    units = coordinate_units(robot)
-    units = np.where(units == 1.0, 1.0 / robot.characteristic_length, 1.0)
+    reach = _reach(robot)
     free = np.concatenate([movable, robot.passive_index])
-    count = movable.size
 
-    def distance(closing: Closing) -> float:
-        return float(np.linalg.norm((closing.coordinates[movable] - wanted) * units[movable]))
+    def missing(closing: Closing) -> Array:
+        return np.asarray((wanted - closing.coordinates)[movable] / reach[movable])
 
     size = 1.0
     for _ in range(MAX_RETURNS):
         _, jacobian = robot.evaluate_constraints_at(found.coordinates)
-        motions = _null_space(jacobian[:, free] / units[free])
-        missing = (wanted - found.coordinates[movable]) * units[movable]
-        share = np.linalg.lstsq(motions[:count], missing, rcond=1e-6)[0]
+        motions = _null_space(jacobian[:, free] * reach[free])
+        share = np.linalg.lstsq(motions[: movable.size], missing(found), rcond=1e-6)[0]
         step = motions @ share
         step *= size * min(1.0, LARGEST_RETURN / max(float(np.abs(step).max()), 1e-300))
         trial = np.array(found.coordinates)
-        trial[free] += step / units[free]
+        trial[free] += step * reach[free]
         closed = _close(robot, trial, free)
-        if closed.closed and distance(closed) < (1.0 - LEAST_GAIN) * distance(found):
+        left, before = (float(np.linalg.norm(missing(c))) for c in (closed, found))
+        if closed.closed and left < (1.0 - LEAST_GAIN) * before:
             found, size = closed, min(1.0, 2.0 * size)
+        elif size < 0.01:
+            break
         else:
             size *= 0.25
-        if size < 1e-2:
-            break
-    return found
+    trial, near = np.array(found.coordinates), movable[np.abs(missing(found)) < NEAR]
+    trial[near] = wanted[near]
+    closed = _close(robot, trial, np.setdiff1d(free, near))
+    return closed if closed.closed else found
+
+
+def _reach(robot: Robot) -> Array:
+    """What a large motion of each coordinate is, shape (nv,): 1 rad or characteristic length."""
+    units = coordinate_units(robot)
+    return np.where(units == 1.0, robot.characteristic_length, 1.0)
 
 
 def _null_space(matrix: Array) -> Array:
@@ -176,3 +191,16 @@ def _null_space(matrix: Array) -> Array:
     _, values, right = np.linalg.svd(matrix)
     rank = int((values > 1e-9 * values.max(initial=0.0)).sum())
     return np.asarray(right[rank:].T)
+
+
+def _without_turns(robot: Robot, coordinates: Array) -> Array:
+    """Without whole turns of passive joints that have no limits; at most half a turn is left."""
+    lower, upper = coordinate_limits(robot)
+    turned = np.array(coordinates)
+    for i in range(1, robot.model.njoints):
+        joint = robot.model.joints[i]
+        k = joint.idx_v
+        endless = joint.nv == 1 and lower[k] == -np.inf and upper[k] == np.inf
+        if endless and joint_turns(robot.model, i) and k in robot.passive_index:
+            turned[k] -= 2.0 * np.pi * np.round(turned[k] / (2.0 * np.pi))
+    return turned
