@@ -196,8 +196,11 @@ class Robot:
             ClosureError: If the loops stay open.
         """
 
+        data = self.model.createData()
+
         def evaluate(passive: Array) -> tuple[Array, Array]:
-            residual, jacobian = self.evaluate_constraints(drives, passive)
+            coordinates = self.joint_coordinates(drives, passive)
+            residual, jacobian = self.evaluate_constraints_at(coordinates, data=data)
             return residual, jacobian[:, self.passive_index]
 
         row_units = closure_row_units(self)
@@ -228,9 +231,11 @@ class Robot:
         """
         return self.evaluate_constraints_at(self.joint_coordinates(drives, passive))
 
-    def evaluate_constraints_at(self, coordinates: ArrayLike) -> tuple[Array, Array]:
-        """The same at joint coordinates, shape (nv,), [m, rad]."""
-        data = self.model.createData()
+    def evaluate_constraints_at(
+        self, coordinates: ArrayLike, *, data: pin.Data | None = None
+    ) -> tuple[Array, Array]:
+        """The same at joint coordinates, shape (nv,), [m, rad]; Pinocchio's data may be reused."""
+        data = self.model.createData() if data is None else data
         pin.computeJointJacobians(self.model, data, self.configuration(coordinates))
         residuals, jacobians = [np.zeros(0)], [np.zeros((0, self.model.nv))]
         for closure, constraint in zip(self.closures, self.constraints, strict=True):

@@ -125,6 +125,7 @@ def _starts(robot: Robot, start: Array, free: Indices) -> Iterator[Array]:
 def _close(robot: Robot, start: Array, free: Indices) -> Closing:
     """Close by the free coordinates; the result has all of them."""
     lower, upper = coordinate_limits(robot)
+    data = robot.model.createData()
 
     def complete(part: Array) -> Array:
         coordinates = np.array(start)
@@ -132,7 +133,7 @@ def _close(robot: Robot, start: Array, free: Indices) -> Closing:
         return coordinates
 
     def evaluate(part: Array) -> tuple[Array, Array]:
-        residual, jacobian = robot.evaluate_constraints_at(complete(part))
+        residual, jacobian = robot.evaluate_constraints_at(complete(part), data=data)
         return residual, jacobian[:, free]
 
     found = close_loops(
