@@ -76,6 +76,13 @@ def stand_at_zero(robot: Robot, passive_start: ArrayLike, *, given: ArrayLike) -
     return replace(robot, drives=drives, zero=read_only(zero))
 
 
+def count_free_motions(robot: Robot) -> int:
+    """How many passive motions the loops leave free in the mechanical zero, drives at rest."""
+    _, jacobian = robot.evaluate_constraints_at(robot.zero)
+    scaled = closure_row_units(robot)[:, None] * jacobian / coordinate_units(robot)
+    return int(_null_space(scaled[:, robot.passive_index]).shape[1])
+
+
 def _search(robot: Robot, start: Array, movable: Indices) -> Array:
     """Coordinates with closed loops: drives where they are, or movable ones moved too."""
     free = np.concatenate([movable, robot.passive_index])
