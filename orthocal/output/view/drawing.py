@@ -175,7 +175,8 @@ def _state_zero(robot: Robot) -> list[str]:
         facts.append(f"Found by closing the loops, not given: the zero of {', '.join(found)}.")
     free = count_free_motions(robot)
     if free:
-        facts.append(f"The loops leave {counted(free, 'passive motion")} free; where they stand is a choice.")
+        loose = counted(free, "passive motion")
+        facts.append(f"The loops leave {loose} free; where they stand is a choice.")
     return facts
 
 
