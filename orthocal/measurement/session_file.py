@@ -18,7 +18,13 @@ from orthocal.documents import parse_number, read_csv_rows, read_yaml, validate
 from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.files import is_folder
 from orthocal.measurement.gauge import locate_contacts
-from orthocal.measurement.schema import SectionKeys, SessionKeys, SetupKeys
+from orthocal.measurement.schema import (
+    OFFSET_KEYS,
+    ControllerKeys,
+    SectionKeys,
+    SessionKeys,
+    SetupKeys,
+)
 from orthocal.measurement.session import (
     DIRECTIONS,
     Gauge,
@@ -31,13 +37,17 @@ from orthocal.measurement.session import (
 )
 from orthocal.robot.assembly import nominal_assembly
 from orthocal.robot.loading import load_robot
-from orthocal.robot.model import Robot, read_only
+from orthocal.robot.model import Leg, Robot, read_only
 
 Array = NDArray[np.float64]
 
 
 OTHER_KINDS = (".csv", ".json", ".urdf")
 """What the names of files of other kinds end with."""
+
+LARGEST_OBLIQUITY_DEG = 1.0
+"""How far a measured direction may be from square to the leg; the nominal leg, in the mechanical
+zero."""
 
 
 def load_session(path: str | Path) -> Session:
@@ -134,13 +144,7 @@ def _build_plan(file: Path, keys: SessionKeys) -> Session:
             f"'{robot.name}' has no legs for a gauge to touch; add orthocal.legs to {robot.yaml}",
             where=f"{file}: robot",
         )
-    offsets = None
-    if keys.controller is not None:
-        where = f"{file}: controller.offsets_mm"
-        _check_count(keys.controller.offsets_mm, robot, where)
-        if any(d.unit != "m" for d in robot.drives):
-            raise SessionError("the robot has revolute drives; mm do not fit", where=where)
-        offsets = read_only(np.array(keys.controller.offsets_mm) * 1e-3)
+    offsets = _build_offsets(keys.controller, robot, f"{file}: controller")
     setups = {n: _build_setup(n, s, robot, f"{file}: setups.{n}") for n, s in keys.setups.items()}
     _check_planned_postures(file, keys)
     g = keys.gauge
@@ -162,6 +166,36 @@ def _build_plan(file: Path, keys: SessionKeys) -> Session:
         readings_path=None,
         sha256="",
     )
+
+
+def _build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Array | None:
+    """Offsets of all drives, shape (n_drives,), [m, rad]: a key for those in m, one for the others."""
+    if keys is None:
+        return None
+    offsets = np.zeros(len(robot.drives))
+    units: set[str] = set()
+    for key in keys.stated:
+        values, (unit, factor) = getattr(keys, key), OFFSET_KEYS[key]
+        drives = [i for i, d in enumerate(robot.drives) if d.unit == unit]
+        kind = "prismatic" if unit == "m" else "revolute"
+        if not drives:
+            raise SessionError(f"{robot.name} has no {kind} drive", where=f"{where}.{key}")
+        if len(values) != len(drives):
+            names = ", ".join(robot.drives[i].name for i in drives)
+            one = "drive" if len(drives) == len(robot.drives) else f"{kind} drive"
+            raise SessionError(
+                f"has {len(values)} numbers; expected {len(drives)}, one a {one}: {names}",
+                where=f"{where}.{key}",
+            )
+        offsets[drives] = np.array(values) * factor
+        units.add(unit)
+    for drive in robot.drives:
+        if drive.unit not in units:
+            expected = " or ".join(k for k, (unit, _) in OFFSET_KEYS.items() if unit == drive.unit)
+            raise SessionError(
+                f"states no offset of {drive.name}; expected {expected}, too", where=where
+            )
+    return read_only(offsets)
 
 
 def _check_planned_postures(file: Path, keys: SessionKeys) -> None:
@@ -190,12 +224,7 @@ def _build_setup(name: str, keys: SetupKeys, robot: Robot, where: str) -> Setup:
             f"found '{keys.direction}'; expected one of {', '.join(DIRECTIONS)}",
             where=f"{where}.direction",
         )
-    along = abs(float(np.dot(DIRECTIONS[keys.direction], robot.legs[keys.leg].axis)))
-    if along > 1.0 - 1e-6:
-        raise SessionError(
-            f"'{keys.direction}' is along leg {keys.leg}; a gauge measures across it",
-            where=f"{where}.direction",
-        )
+    _check_direction(keys.direction, robot.legs[keys.leg], where=f"{where}.direction")
     setup = Setup(name, keys.leg, keys.direction, _build_section(keys.section))
     if setup.section.form == "fraction" and not 0.0 <= setup.section.value <= 1.0:
         raise SessionError(
@@ -204,6 +233,30 @@ def _build_setup(name: str, keys: SetupKeys, robot: Robot, where: str) -> Setup:
         )
     section_plane(robot, setup, where=f"{where}.section")
     return setup
+
+
+def _check_direction(direction: str, leg: Leg, *, where: str) -> None:
+    """Refuse a gauge that does not measure square to the leg, as every model of it takes for granted.
+
+    An oblique plunger also sees how far the leg moves along itself, which none accounts for.
+    """
+    angles = {
+        name: float(np.degrees(np.arccos(np.clip(np.dot(axis, leg.axis), -1.0, 1.0))))
+        for name, axis in DIRECTIONS.items()
+    }
+    if abs(angles[direction] - 90.0) <= LARGEST_OBLIQUITY_DEG:
+        return
+    square = [n for n, a in angles.items() if abs(a - 90.0) <= LARGEST_OBLIQUITY_DEG]
+    choice = f"; square to it: {', '.join(square)}" if square else ""
+    found = min(angles[direction], 180.0 - angles[direction])
+    if found < LARGEST_OBLIQUITY_DEG:
+        problem = f"'{direction}' is along leg {leg.name}; a gauge measures across it{choice}"
+    else:
+        problem = (
+            f"'{direction}' is at {found:.1f}° to leg {leg.name} in the mechanical zero; expected "
+            f"a direction square to the leg, to within {LARGEST_OBLIQUITY_DEG:g}°{choice}"
+        )
+    raise SessionError(problem, where=where)
 
 
 def _build_section(keys: SectionKeys) -> Section:
@@ -229,6 +282,7 @@ def _build_postures(
     """Commanded drive coordinates of all postures, through the nominal inverse kinematics."""
     assembly = nominal_assembly(robot)
     active = np.zeros(len(robot.drives)) if offsets is None else offsets
+    stated = [] if keys.controller is None else keys.controller.stated
     nominal: dict[str, Array] = {}
     given: dict[str, tuple[Any, Array]] = {}
     targets: dict[str, Array] = {}
@@ -268,7 +322,7 @@ def _build_postures(
         nominal.update(zip(targets, joints, strict=True))
     for name in keys.postures:
         _check_travel(robot, nominal[name], where=f"{file}: postures.{name}")
-        where = f"{file}: controller.offsets_mm: in posture '{name}'"
+        where = f"{file}: controller.{' and '.join(stated)}: in posture '{name}'"
         _check_travel(robot, nominal[name] - active, where=where, joiner=" ")
     try:
         assembly.close(np.array([nominal[n] for n in keys.postures]), names=list(keys.postures))

@@ -1,7 +1,8 @@
 """The mechanical zero of a robot: the coordinates in which it stands with its loops closed.
 
 Drives stand where the robot's YAML says, and at 0 where it says nothing. Where the loops cannot be
-closed so, the drives whose zero nobody gave are moved too, no further than it takes.
+closed so, the drives whose zero nobody gave are moved too, no further than it takes to close them
+clear of a singular posture: the least motion of all ends in one, at the edge of what closes.
 """
 
 from __future__ import annotations
@@ -37,6 +38,9 @@ SPREAD = 0.3
 WORK = 5e8
 """Products of numbers that the tries may take, roughly: large robots get fewer tries."""
 
+RANK = 1e-9
+"""Singular values below this share of the largest are none."""
+
 NEAR = 1e-3
 """Drives that end as near to where they were wanted are put there, [rad] or characteristic
 lengths."""
@@ -49,6 +53,10 @@ LARGEST_RETURN = 0.2
 
 LEAST_GAIN = 1e-4
 """Share of what the drives have moved that such a step has to take off."""
+
+
+CLEAR = 0.5
+"""Share of the smallest singular value that such a step has to leave, or more."""
 
 
 def stand_at_zero(robot: Robot, passive_start: ArrayLike, *, given: ArrayLike) -> Robot:
@@ -160,6 +168,13 @@ def _return_drives(robot: Robot, found: Closing, movable: Indices, wanted: Array
     the drives nearest, and is closed again.
     """
     reach = _reach(robot)
+    values = _singular_values(robot, found)
+    last = int((values > RANK).sum()) - 1  # rows that repeat others have none anywhere
+    clear = CLEAR * values[last]
+
+    def is_clear(closing: Closing) -> bool:
+        return bool(_singular_values(robot, closing)[last] >= clear)
+
     free = np.concatenate([movable, robot.passive_index])
 
     def missing(closing: Closing) -> Array:
@@ -176,7 +191,8 @@ def _return_drives(robot: Robot, found: Closing, movable: Indices, wanted: Array
         trial[free] += step * reach[free]
         closed = _close(robot, trial, free)
         left, before = (float(np.linalg.norm(missing(c))) for c in (closed, found))
-        if closed.closed and left < (1.0 - LEAST_GAIN) * before:
+        nearer = closed.closed and left < (1.0 - LEAST_GAIN) * before
+        if nearer and is_clear(closed):
             found, size = closed, min(1.0, 2.0 * size)
         elif size < 0.01:
             break
@@ -185,7 +201,15 @@ def _return_drives(robot: Robot, found: Closing, movable: Indices, wanted: Array
     trial, near = np.array(found.coordinates), movable[np.abs(missing(found)) < NEAR]
     trial[near] = wanted[near]
     closed = _close(robot, trial, np.setdiff1d(free, near))
-    return closed if closed.closed else found
+    return closed if closed.closed and is_clear(closed) else found
+
+
+def _singular_values(robot: Robot, closing: Closing) -> Array:
+    """Of the closures by the passive motions, in metres, relative to the largest."""
+    _, jacobian = robot.evaluate_constraints_at(closing.coordinates)
+    scaled = closure_row_units(robot)[:, None] * jacobian / coordinate_units(robot)
+    values = np.linalg.svd(scaled[:, robot.passive_index], compute_uv=False)
+    return np.asarray(values / max(float(values.max(initial=0.0)), 1e-300))
 
 
 def _reach(robot: Robot) -> Array:
@@ -197,7 +221,7 @@ def _reach(robot: Robot) -> Array:
 def _null_space(matrix: Array) -> Array:
     """Orthonormal columns that a matrix takes to 0."""
     _, values, right = np.linalg.svd(matrix)
-    rank = int((values > 1e-9 * values.max(initial=0.0)).sum())
+    rank = int((values > RANK * values.max(initial=0.0)).sum())
     return np.asarray(right[rank:].T)
 
 

@@ -165,8 +165,7 @@ def _draw_robot(robot: Robot, posture: str | None) -> Scene:
 def _state_zero(robot: Robot) -> list[str]:
     """Where the machine stands, who says so, and what its loops leave free there."""
     drives = ", ".join(
-        f"{d.name} {d.zero * (1e3 if d.unit == 'm' else 1.0):g} "
-        f"{'mm' if d.unit == 'm' else 'rad'}"
+        f"{d.name} {d.zero * (1e3 if d.unit == 'm' else 1.0):g} {'mm' if d.unit == 'm' else 'rad'}"
         for d in robot.drives
     )
     facts = [f"Mechanical zero: {drives}."]
