@@ -169,7 +169,7 @@ def _build_plan(file: Path, keys: SessionKeys) -> Session:
 
 
 def _build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Array | None:
-    """Offsets of all drives, shape (n_drives,), [m, rad]: a key for those in m, one for the others."""
+    """Offsets of all drives, shape (n_drives,), [m, rad]; each key has those of its unit."""
     if keys is None:
         return None
     offsets = np.zeros(len(robot.drives))
@@ -179,7 +179,10 @@ def _build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Arr
         drives = [i for i, d in enumerate(robot.drives) if d.unit == unit]
         kind = "prismatic" if unit == "m" else "revolute"
         if not drives:
-            raise SessionError(f"{robot.name} has no {kind} drive", where=f"{where}.{key}")
+            fitting = "offsets_deg or offsets_mrad" if unit == "m" else "offsets_mm"
+            raise SessionError(
+                f"{robot.name} has no {kind} drive; expected {fitting}", where=f"{where}.{key}"
+            )
         if len(values) != len(drives):
             names = ", ".join(robot.drives[i].name for i in drives)
             one = "drive" if len(drives) == len(robot.drives) else f"{kind} drive"
@@ -236,9 +239,9 @@ def _build_setup(name: str, keys: SetupKeys, robot: Robot, where: str) -> Setup:
 
 
 def _check_direction(direction: str, leg: Leg, *, where: str) -> None:
-    """Refuse a gauge that does not measure square to the leg, as every model of it takes for granted.
+    """Refuse a gauge that does not measure square to the leg, as its model takes for granted.
 
-    An oblique plunger also sees how far the leg moves along itself, which none accounts for.
+    An oblique plunger also sees how far the leg moves along itself.
     """
     angles = {
         name: float(np.degrees(np.arccos(np.clip(np.dot(axis, leg.axis), -1.0, 1.0))))

@@ -20,6 +20,9 @@ Evaluate = Callable[[Array], tuple[Array, Array]]
 CLOSED = 1e-12
 """Largest closure residual of closed loops, [m or rad]."""
 
+NOTHING = 1e-9
+"""What is open by less is not worth a word, [m or rad]."""
+
 MAX_STEPS = 150
 LARGEST_STEP = 0.5
 """Change of a coordinate in one step, [m or rad]."""
@@ -133,6 +136,10 @@ def describe_opening(residual: ArrayLike, rotations: ArrayLike) -> str:
         rotations: Which rows are rotations, shape (m,).
     """
     r, turned = np.abs(np.asarray(residual)), np.asarray(rotations, dtype=bool)
-    words = [f"{largest(r[~turned]) * 1e3:.3g} mm"] if (~turned).any() else []
-    words += [f"{largest(r[turned]) * 1e3:.3g} mrad"] if turned.any() else []
-    return " and ".join(words)
+    parts = [(largest(r[~turned]), "mm"), (largest(r[turned]), "mrad")]
+    open_ones = [part for part in parts if part[0] > NOTHING] or parts[:1]
+    return " and ".join(f"{_three_digits(size * 1e3)} {unit}" for size, unit in open_ones)
+
+
+def _three_digits(value: float) -> str:
+    return f"{value:.0f}" if value >= 1000.0 else f"{value:.3g}"

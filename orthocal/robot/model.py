@@ -195,7 +195,6 @@ class Robot:
         Raises:
             ClosureError: If the loops stay open.
         """
-
         data = self.model.createData()
 
         def evaluate(passive: Array) -> tuple[Array, Array]:

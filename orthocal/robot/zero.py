@@ -111,17 +111,17 @@ def _explain_open_loops(robot: Robot, best: Closing, movable: Indices) -> str:
     turns = closure_turns(robot)
     owners = [closure.name for closure in robot.closures for _ in closure.rows]
     worst = int(np.abs(closure_row_units(robot) * best.residual).argmax())
-    own = [owner == owners[worst] for owner in owners]
-    opening = describe_opening(best.residual[own], turns[own])
+    own = np.array([owner == owners[worst] for owner in owners])
+    # lengths of the two vectors, which are the same in the axes of any frame
+    lengths = [float(np.linalg.norm(best.residual[own & part])) for part in (~turns, turns)]
+    opening = describe_opening(lengths, [False, True])
     closure = robot.closures[list(dict.fromkeys(owners)).index(owners[worst])]
     moved = ", with its drives moved too," if movable.size else ""
-    keys = ["orthocal.passive_start"]
-    if movable.size:
-        keys.insert(0, "orthocal.drives.<motor>.zero_mm (or zero_deg)")
     return (
         f"its loops do not close in any posture that was found{moved} within the limits of its "
         f"joints: the best leaves '{closure.frame_a}' and '{closure.frame_b}' apart by {opening}; "
-        f"set {' and '.join(keys)} near a posture that closes"
+        "set orthocal.drives.<motor>.zero_mm (or zero_deg) and orthocal.passive_start near a "
+        "posture that closes"
     )
 
 

@@ -57,10 +57,11 @@ NOTHING = 1e-9
 """Deviations below this are none, [m]."""
 
 FREE_REACH = 0.3
-"""How far a drive without limits is moved when a robot is shown, [rad] or characteristic lengths."""
+"""How far a drive without limits could go, for a robot that is shown, [rad] or characteristic
+lengths."""
 
 LARGEST_REACH = 1.0
-"""How far any drive is, at most."""
+"""How far any drive could, at most."""
 
 MACHINE = "Machine"
 GHOST = "Machine, nominal (ghost)"
