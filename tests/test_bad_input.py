@@ -436,8 +436,8 @@ SESSION_SENSE_CASES = [
         "direction-along-leg",
         XY,
         XY.replace("direction: x", "direction: -y"),
-        ": setups.xy.direction: '-y' is along leg y; a gauge measures across it; square to it: x, z, "
-        "-x, -z",
+        ": setups.xy.direction: '-y' is along leg y; a gauge measures across it; square to "
+        "it: x, z, -x, -z",
     ),
     session(
         "direction-unknown",
@@ -1234,8 +1234,8 @@ URDF_CASES = [
         "limit-below-the-lower-left-out",
         SWIVEL_LIMIT,
         SWIVEL_LIMIT.replace('lower="-1.3" upper="1.3"', 'upper="-1.3"'),
-        ":76: joint 'x_swivel': its lower limit is above its upper limit (lower is 0 where it is not "
-        "given)",
+        ":76: joint 'x_swivel': its lower limit is above its upper limit (lower is 0 where it is "
+        "not given)",
     ),
     urdf(
         "limit-without-effort",
@@ -1324,9 +1324,9 @@ URDF_CASES = [
     Case(
         "urdf-loops-do-not-close",
         "{tmp}/machine/orthoglide.yaml: its loops do not close in any posture that was found "
-        "within the limits of its joints: the best leaves 'z_crossbar_end' and 'z_rod_b_tip' apart "
-        "by # mm; set orthocal.drives.<motor>.zero_mm (or zero_deg) and orthocal.passive_start near "
-        "a posture that closes",
+        "within the limits of its joints: the best leaves 'z_crossbar_end' and 'z_rod_b_tip' "
+        "apart by # mm; set orthocal.drives.<motor>.zero_mm (or zero_deg) and "
+        "orthocal.passive_start near a posture that closes",
         (swap(URDF, 'xyz="0 0 -0.08"', 'xyz="0 0 -0.9"'),),
         base="machine",
     ),

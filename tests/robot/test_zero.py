@@ -89,7 +89,7 @@ def test_given_zeros_at_which_loops_stay_open_are_refused_with_how_far(tmp_path)
 
 
 def test_what_no_drive_can_close_is_refused(tmp_path):
-    """Motors 2 m apart; crank and rod of each reach 0.4: 1.2 m stay open, the nearest found more."""
+    """Motors 2 m apart; crank and rod of each reach 0.4: 1.2 m stay open."""
     folder = write_wide_linkage(tmp_path / "wide", half=1.0)
     with pytest.raises(RobotError, match=r"with its drives moved too.*apart by 12\d\d mm"):
         load_robot(folder)
