@@ -144,7 +144,7 @@ def _draw_robot(robot: Robot, posture: str | None) -> Scene:
         raise ParameterError("a robot alone has no postures; it takes a session", where="posture")
     stage = Stage(robot, f"{robot.name}: the nominal machine")
     stops = _tour(robot)
-    timeline = plan_motion([s.drives for s in stops])
+    timeline = plan_motion([s.drives for s in stops], count=_longest_tour(robot))
     poses = _follow(robot, nominal_assembly(robot), timeline, stage.frames, allow_free=True)
     stage.draw_links(MACHINE, poses)
     stage.look_at(poses)
@@ -198,16 +198,22 @@ def _tour(robot: Robot) -> list[Stop]:
     return stops
 
 
+def _longest_tour(robot: Robot) -> int:
+    """Stops of a robot all of whose drives move."""
+    return 1 + 4 * len(robot.drives)
+
+
 def _furthest(robot: Robot, drive: int, move: float) -> Array | None:
-    """Where a drive gets to by a move or a part of it, with loops that close all the way."""
-    zero, along = robot.drive_zero, np.eye(len(robot.drives))[drive]
+    """Where a drive gets to by a move or a part of it, with loops that close in every frame."""
+    zero = robot.drive_zero
     for part in (1.0, 0.5, 0.25):
-        way = zero + np.linspace(0.1, 1.0, 10)[:, None] * (part * move) * along
+        target = zero + part * move * np.eye(len(zero))[drive]
+        way = plan_motion([zero, target, zero], count=_longest_tour(robot)).drives
         try:
             nominal_assembly(robot).close(way, allow_free=True)
         except ClosureError:
             continue  # that far it does not go
-        return np.asarray(way[-1])
+        return target
     return None
 
 
