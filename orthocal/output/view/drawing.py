@@ -213,7 +213,7 @@ def _furthest(robot: Robot, drive: int, move: float) -> Array | None:
             nominal_assembly(robot).close(way, allow_free=True)
         except ClosureError:
             continue  # that far it does not go
-        return target
+        return np.asarray(target)
     return None
 
 
