@@ -104,10 +104,25 @@ def _search(robot: Robot, start: Array, movable: Indices) -> Array:
                 return found.coordinates
             tried.append(found)
     best = min(tried, key=lambda c: float(np.square(closure_row_units(robot) * c.residual).sum()))
-    raise RobotError(_explain_open_loops(robot, best, movable), where=str(robot.yaml))
+    beyond = _find_joints_beyond_limits(robot, start, free)
+    problem = _explain_open_loops(robot, best, movable, beyond)
+    raise RobotError(problem, where=str(robot.yaml))
 
 
-def _explain_open_loops(robot: Robot, best: Closing, movable: Indices) -> str:
+def _find_joints_beyond_limits(robot: Robot, start: Array, free: Indices) -> list[str]:
+    """Joints whose limits a posture breaks in which the loops close, where one is found."""
+    lower, upper = coordinate_limits(robot)
+    if not np.isfinite([lower[free], upper[free]]).any():
+        return []
+    tries = (_close(robot, a, free, limited=False) for a in _starts(robot, start, free))
+    x = next((found.coordinates for found in tries if found.closed), np.clip(start, lower, upper))
+    outside = np.flatnonzero((x < lower) | (x > upper))
+    model = robot.model
+    owners = {model.joints[i].idx_v: str(model.names[i]) for i in range(1, model.njoints)}
+    return [owners[k] for k in outside.tolist() if k in owners]
+
+
+def _explain_open_loops(robot: Robot, best: Closing, movable: Indices, beyond: list[str]) -> str:
     turns = closure_turns(robot)
     owners = [closure.name for closure in robot.closures for _ in closure.rows]
     worst = int(np.abs(closure_row_units(robot) * best.residual).argmax())
@@ -117,9 +132,11 @@ def _explain_open_loops(robot: Robot, best: Closing, movable: Indices) -> str:
     opening = describe_opening(lengths, [False, True])
     closure = robot.closures[list(dict.fromkeys(owners)).index(owners[worst])]
     moved = ", with its drives moved too," if movable.size else ""
+    broken = f" (one closes beyond the limits of {', '.join(beyond)})" if beyond else ""
     return (
         f"its loops do not close in any posture that was found{moved} within the limits of its "
-        f"joints: the best leaves '{closure.frame_a}' and '{closure.frame_b}' apart by {opening}; "
+        f"joints: the best leaves '{closure.frame_a}' and '{closure.frame_b}' apart by {opening}"
+        f"{broken}; "
         "set orthocal.drives.<motor>.zero_mm (or zero_deg) and orthocal.passive_start near a "
         "posture that closes"
     )
@@ -137,9 +154,11 @@ def _starts(robot: Robot, start: Array, free: Indices) -> Iterator[Array]:
         yield start + spread * shift
 
 
-def _close(robot: Robot, start: Array, free: Indices) -> Closing:
-    """Close by the free coordinates; the result has all of them."""
+def _close(robot: Robot, start: Array, free: Indices, *, limited: bool = True) -> Closing:
+    """Close by the free coordinates, within their limits or not; the result has all of them."""
     lower, upper = coordinate_limits(robot)
+    if not limited:
+        lower, upper = np.full(lower.shape, -np.inf), np.full(upper.shape, np.inf)
     data = robot.model.createData()
 
     def complete(part: Array) -> Array:

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from linkages import (
+    FREE,
     chain,
     joint,
     make_robot,
@@ -118,10 +119,22 @@ def test_the_limits_of_joints_hold_in_a_zero_that_is_found(tmp_path):
     wanted = "0.05" if angle <= 0.0 else "-3"
     limit = f'<limit lower="{wanted}" upper="{float(wanted) + 2.95}" effort="1" velocity="1"/>'
     head, tail = text[:start], text[start:]
-    urdf.write_text(head + tail.replace('<limit effort="1" velocity="1"/>', limit, 1))
+    urdf.write_text(head + tail.replace(FREE, limit, 1))
     other = load_robot(folder)
     assert float(wanted) <= other.zero[elbow] <= float(wanted) + 2.95
     assert gap(other, other.zero) < CLOSED
+
+
+def test_a_posture_beyond_the_limits_of_a_joint_names_it(tmp_path):
+    extra = "  drives: {motor_a: {zero_deg: 120}, motor_b: {zero_deg: -120}}\n"
+    folder = write_wide_linkage(tmp_path / "wide", extra)
+    urdf = folder / "wide.urdf"
+    head, start, tail = urdf.read_text().partition('<joint name="elbow_a"')
+    limit = '<limit lower="2.9" upper="3" effort="1" velocity="1"/>'
+    load_robot(folder)
+    urdf.write_text(head + start + tail.replace(FREE, limit, 1))
+    with pytest.raises(RobotError, match=r"apart by \S+ mm \(one closes beyond the limits of elb"):
+        load_robot(folder)
 
 
 def test_passive_joints_are_without_whole_turns(tmp_path):
