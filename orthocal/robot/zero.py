@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import RobotError
-from orthocal.robot.closing import MAX_STEPS, Closing, close_loops, describe_opening
+from orthocal.robot.closing import MAX_STEPS, NOTHING, Closing, close_loops, describe_opening
 from orthocal.robot.model import (
     Robot,
     closure_row_units,
@@ -116,7 +116,7 @@ def _find_joints_beyond_limits(robot: Robot, start: Array, free: Indices) -> lis
         return []
     tries = (_close(robot, a, free, limited=False) for a in _starts(robot, start, free))
     x = next((found.coordinates for found in tries if found.closed), np.clip(start, lower, upper))
-    outside = np.flatnonzero((x < lower) | (x > upper))
+    outside = np.flatnonzero((x < lower - NOTHING) | (x > upper + NOTHING))
     model = robot.model
     owners = {model.joints[i].idx_v: str(model.names[i]) for i in range(1, model.njoints)}
     return [owners[k] for k in outside.tolist() if k in owners]
