@@ -144,6 +144,7 @@ def _build_plan(file: Path, keys: SessionKeys) -> Session:
             f"'{robot.name}' has no legs for a gauge to touch; add orthocal.legs to {robot.yaml}",
             where=f"{file}: robot",
         )
+    _require_given_zero(robot, f"{file}: robot")
     offsets = _build_offsets(keys.controller, robot, f"{file}: controller")
     setups = {n: _build_setup(n, s, robot, f"{file}: setups.{n}") for n, s in keys.setups.items()}
     _check_planned_postures(file, keys)
@@ -166,6 +167,22 @@ def _build_plan(file: Path, keys: SessionKeys) -> Session:
         readings_path=None,
         sha256="",
     )
+
+
+def _require_given_zero(robot: Robot, where: str) -> None:
+    """Refuse a robot whose zero is one of many: legs, sections and offsets count from it."""
+    found = [
+        f"{d.name}.{'zero_mm' if d.unit == 'm' else 'zero_deg'} ({d.zero * factor:.6g} was found)"
+        for d in robot.drives
+        for factor in [1e3 if d.unit == "m" else 180.0 / np.pi]
+        if d.zero_found
+    ]
+    if found:
+        raise SessionError(
+            f"'{robot.name}' cannot stand with its drives at 0, and its mechanical zero is not "
+            f"given; add to orthocal.drives in {robot.yaml}: {', '.join(found)}",
+            where=where,
+        )
 
 
 def _build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Array | None:

@@ -27,11 +27,12 @@ MAX_STEPS = 150
 LARGEST_STEP = 0.5
 """Change of a coordinate in one step, [m or rad]."""
 
-_MAX_HALVINGS = 10
+_MAX_TRIALS = 10
+"""Of a step, each more damped than the one before."""
 _FIRST_DAMPING = 1e-3
 """Of the squared residual: the damping vanishes with it, so that the end is Newton's."""
 _PATIENCE = 12
-_LEAST_GAIN = 0.02
+_LEAST_GAIN = 0.1
 """Share of the residual that so many steps have to take off while it is far from closed."""
 _RANK = 1e-10
 """Singular values below this share of the largest are none."""
@@ -92,7 +93,7 @@ def close_loops(
         downhill = -(weights * residual) @ slopes
         slopes[:, ((x <= lower) & (downhill < 0.0)) | ((x >= upper) & (downhill > 0.0))] = 0.0
         direction = _Directions(weights * residual, slopes)
-        for _ in range(_MAX_HALVINGS):
+        for _ in range(_MAX_TRIALS):
             step = direction.step(damping * size) / scale
             step *= min(1.0, LARGEST_STEP / max(largest(step), 1e-300))
             trial = np.clip(x + step, lower, upper)

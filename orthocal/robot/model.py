@@ -316,12 +316,12 @@ def closure_row_units(robot: Robot) -> Array:
 
 def coordinate_units(robot: Robot) -> Array:
     """Displacement that one unit of each joint coordinate amounts to, shape (nv,), [m or m/rad]."""
-    model = robot.model
+    model, length = robot.model, robot.characteristic_length
     units = np.ones(model.nv)
     for i in range(1, model.njoints):
         joint = model.joints[i]
         if joint.nv == 1 and np.any(joint_axis(model, i)[3:]):
-            units[joint.idx_v] = robot.characteristic_length
+            units[joint.idx_v] = length
     return units
 
 

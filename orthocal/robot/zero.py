@@ -35,7 +35,7 @@ always alike."""
 SPREAD = 0.3
 """How far apart these are, [rad] or characteristic lengths."""
 
-WORK = 5e8
+WORK = 2e8
 """Products of numbers that the tries may take, roughly: large robots get fewer tries."""
 
 RANK = 1e-9

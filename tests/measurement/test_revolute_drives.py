@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from linkages import joint, write_robot
+from linkages import joint, write_robot, write_wide_linkage
 from tolerances import KINEMATICS, TRUTH_BACK
 
 from orthocal import calibrate, load_plan, load_session, write_session
@@ -180,6 +180,18 @@ def test_mm_do_not_fit_revolute_drives(tmp_path, robot):
     message = "offsets_mm: rails has no prismatic drive; expected offsets_deg or offsets_mrad"
     with pytest.raises(SessionError, match=message):
         load_plan(plan)
+
+
+def test_a_session_needs_a_zero_that_is_given(tmp_path):
+    """What a view may choose, legs and offsets may not count from: the found one can be adopted."""
+    legs = "  legs: {a: {root: elbow_a, tip: end_a}}\n"
+    folder = write_wide_linkage(tmp_path / "wide", legs)
+    message = (
+        r"robot: 'wide' cannot stand with its drives at 0, and its mechanical zero is not given; "
+        r"add to orthocal.drives in .*wide.yaml: motor_a.zero_deg \(-?\d+\.\d+ was found\), motor_b"
+    )
+    with pytest.raises(SessionError, match=message):
+        load_plan(write_plan(tmp_path / "plan", folder))
 
 
 # ---- gauges are square to the leg

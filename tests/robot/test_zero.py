@@ -78,6 +78,14 @@ def test_a_given_zero_is_kept(tmp_path):
     assert gap(robot, robot.zero) < CLOSED
 
 
+def test_a_drive_that_cannot_be_at_0_stands_at_its_nearest_limit(tmp_path):
+    limit = '<limit lower="0.12" upper="0.39" effort="1" velocity="1"/>'
+    slide = joint("slide", "base", (0, 0, 0), "x", kind="prismatic", limit=limit)
+    robot = make_robot(tmp_path / "s", slide, "closed_loop: []\ntype: []\nname_mot: [slide]\n")
+    assert robot.drives[0].zero == 0.12
+    assert robot.drives[0].zero_found
+
+
 def test_given_zeros_at_which_loops_stay_open_are_refused_with_how_far(tmp_path):
     extra = "  drives: {motor_a: {zero_deg: 0}, motor_b: {zero_deg: 0}}\n"
     folder = write_wide_linkage(tmp_path / "wide", extra)

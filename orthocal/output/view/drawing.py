@@ -172,7 +172,9 @@ def _state_zero(robot: Robot) -> list[str]:
     facts = [f"Mechanical zero: {drives}."]
     found = [d.name for d in robot.drives if d.zero_found]
     if found:
-        facts.append(f"Found by closing the loops, not given: the zero of {', '.join(found)}.")
+        facts.append(
+            f"Found when the loops were closed, not given: the zero of {', '.join(found)}."
+        )
     free = count_free_motions(robot)
     if free:
         loose = counted(free, "passive motion")
