@@ -18,13 +18,7 @@ from orthocal.documents import parse_number, read_csv_rows, read_yaml, validate
 from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.files import is_folder
 from orthocal.measurement.gauge import locate_contacts
-from orthocal.measurement.schema import (
-    OFFSET_KEYS,
-    ControllerKeys,
-    SectionKeys,
-    SessionKeys,
-    SetupKeys,
-)
+from orthocal.measurement.schema import SectionKeys, SessionKeys, SetupKeys
 from orthocal.measurement.session import (
     DIRECTIONS,
     Gauge,
@@ -35,19 +29,16 @@ from orthocal.measurement.session import (
     Setup,
     section_plane,
 )
+from orthocal.measurement.session_robot import build_offsets, check_direction, require_given_zero
 from orthocal.robot.assembly import nominal_assembly
 from orthocal.robot.loading import load_robot
-from orthocal.robot.model import Leg, Robot, read_only
+from orthocal.robot.model import Robot, read_only
 
 Array = NDArray[np.float64]
 
 
 OTHER_KINDS = (".csv", ".json", ".urdf")
 """What the names of files of other kinds end with."""
-
-LARGEST_OBLIQUITY_DEG = 1.0
-"""How far a measured direction may be from square to the leg; the nominal leg, in the mechanical
-zero."""
 
 
 def load_session(path: str | Path) -> Session:
@@ -144,8 +135,8 @@ def _build_plan(file: Path, keys: SessionKeys) -> Session:
             f"'{robot.name}' has no legs for a gauge to touch; add orthocal.legs to {robot.yaml}",
             where=f"{file}: robot",
         )
-    _require_given_zero(robot, f"{file}: robot")
-    offsets = _build_offsets(keys.controller, robot, f"{file}: controller")
+    require_given_zero(robot, f"{file}: robot")
+    offsets = build_offsets(keys.controller, robot, f"{file}: controller")
     setups = {n: _build_setup(n, s, robot, f"{file}: setups.{n}") for n, s in keys.setups.items()}
     _check_planned_postures(file, keys)
     g = keys.gauge
@@ -167,55 +158,6 @@ def _build_plan(file: Path, keys: SessionKeys) -> Session:
         readings_path=None,
         sha256="",
     )
-
-
-def _require_given_zero(robot: Robot, where: str) -> None:
-    """Refuse a robot whose zero is one of many: legs, sections and offsets count from it."""
-    found = [
-        f"{d.name}.{'zero_mm' if d.unit == 'm' else 'zero_deg'} ({d.zero * factor:.6g} was found)"
-        for d in robot.drives
-        for factor in [1e3 if d.unit == "m" else 180.0 / np.pi]
-        if d.zero_found
-    ]
-    if found:
-        raise SessionError(
-            f"'{robot.name}' cannot stand with its drives at 0, and its mechanical zero is not "
-            f"given; add to orthocal.drives in {robot.yaml}: {', '.join(found)}",
-            where=where,
-        )
-
-
-def _build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Array | None:
-    """Offsets of all drives, shape (n_drives,), [m, rad]; each key has those of its unit."""
-    if keys is None:
-        return None
-    offsets = np.zeros(len(robot.drives))
-    units: set[str] = set()
-    for key in keys.stated:
-        values, (unit, factor) = getattr(keys, key), OFFSET_KEYS[key]
-        drives = [i for i, d in enumerate(robot.drives) if d.unit == unit]
-        kind = "prismatic" if unit == "m" else "revolute"
-        if not drives:
-            fitting = "offsets_deg or offsets_mrad" if unit == "m" else "offsets_mm"
-            raise SessionError(
-                f"{robot.name} has no {kind} drive; expected {fitting}", where=f"{where}.{key}"
-            )
-        if len(values) != len(drives):
-            names = ", ".join(robot.drives[i].name for i in drives)
-            one = "drive" if len(drives) == len(robot.drives) else f"{kind} drive"
-            raise SessionError(
-                f"has {len(values)} numbers; expected {len(drives)}, one a {one}: {names}",
-                where=f"{where}.{key}",
-            )
-        offsets[drives] = np.array(values) * factor
-        units.add(unit)
-    for drive in robot.drives:
-        if drive.unit not in units:
-            expected = " or ".join(k for k, (unit, _) in OFFSET_KEYS.items() if unit == drive.unit)
-            raise SessionError(
-                f"states no offset of {drive.name}; expected {expected}, too", where=where
-            )
-    return read_only(offsets)
 
 
 def _check_planned_postures(file: Path, keys: SessionKeys) -> None:
@@ -244,7 +186,7 @@ def _build_setup(name: str, keys: SetupKeys, robot: Robot, where: str) -> Setup:
             f"found '{keys.direction}'; expected one of {', '.join(DIRECTIONS)}",
             where=f"{where}.direction",
         )
-    _check_direction(keys.direction, robot.legs[keys.leg], where=f"{where}.direction")
+    check_direction(keys.direction, robot.legs[keys.leg], where=f"{where}.direction")
     setup = Setup(name, keys.leg, keys.direction, _build_section(keys.section))
     if setup.section.form == "fraction" and not 0.0 <= setup.section.value <= 1.0:
         raise SessionError(
@@ -253,30 +195,6 @@ def _build_setup(name: str, keys: SetupKeys, robot: Robot, where: str) -> Setup:
         )
     section_plane(robot, setup, where=f"{where}.section")
     return setup
-
-
-def _check_direction(direction: str, leg: Leg, *, where: str) -> None:
-    """Refuse a gauge that does not measure square to the leg, as its model takes for granted.
-
-    An oblique plunger also sees how far the leg moves along itself.
-    """
-    angles = {
-        name: float(np.degrees(np.arccos(np.clip(np.dot(axis, leg.axis), -1.0, 1.0))))
-        for name, axis in DIRECTIONS.items()
-    }
-    if abs(angles[direction] - 90.0) <= LARGEST_OBLIQUITY_DEG:
-        return
-    square = [n for n, a in angles.items() if abs(a - 90.0) <= LARGEST_OBLIQUITY_DEG]
-    choice = f"; square to it: {', '.join(square)}" if square else ""
-    found = min(angles[direction], 180.0 - angles[direction])
-    if found < LARGEST_OBLIQUITY_DEG:
-        problem = f"'{direction}' is along leg {leg.name}; a gauge measures across it{choice}"
-    else:
-        problem = (
-            f"'{direction}' is at {found:.1f}° to leg {leg.name} in the mechanical zero; expected "
-            f"a direction square to the leg, to within {LARGEST_OBLIQUITY_DEG:g}°{choice}"
-        )
-    raise SessionError(problem, where=where)
 
 
 def _build_section(keys: SectionKeys) -> Section:
