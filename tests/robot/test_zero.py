@@ -58,7 +58,7 @@ def test_the_same_zero_is_found_every_time(tmp_path):
 
 
 def test_drives_without_a_zero_are_moved_until_the_loops_close(tmp_path):
-    """No further than half way on from where the rods first meet, and alike on both sides."""
+    """Not much further than to where the rods first meet, and clear of that singular posture."""
     robot = load_robot(write_wide_linkage(tmp_path / "wide"))
     assert gap(robot, robot.zero) < CLOSED
     assert all(d.zero_found for d in robot.drives)
