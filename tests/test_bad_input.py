@@ -436,7 +436,8 @@ SESSION_SENSE_CASES = [
         "direction-along-leg",
         XY,
         XY.replace("direction: x", "direction: -y"),
-        ": setups.xy.direction: '-y' is along leg y; a gauge measures across it",
+        ": setups.xy.direction: '-y' is along leg y; a gauge measures across it; square to "
+        "it: x, z, -x, -z",
     ),
     session(
         "direction-unknown",
@@ -543,6 +544,24 @@ SESSION_SENSE_CASES = [
         OFFSETS,
         "controller: {offsets_mm: [0, 0]}\n",
         f": controller.offsets_mm: has 2 numbers; expected 3, one a drive: {DRIVES}",
+    ),
+    session(
+        "offsets-none",
+        OFFSETS,
+        "controller: {}\n",
+        ": controller: found none; expected offsets_mm, offsets_deg, offsets_mrad",
+    ),
+    session(
+        "offsets-in-degrees",
+        OFFSETS,
+        "controller: {offsets_deg: [0, 0, 0]}\n",
+        ": controller.offsets_deg: orthoglide has no revolute drive; expected offsets_mm",
+    ),
+    session(
+        "offsets-in-degrees-and-mrad",
+        OFFSETS,
+        "controller: {offsets_mm: [0, 0, 0], offsets_deg: [0], offsets_mrad: [0]}\n",
+        ": controller: found offsets_deg and offsets_mrad; expected one of them",
     ),
     session(
         "offsets-beyond-travel",
@@ -889,7 +908,8 @@ ROBOT_CASES = [
         "key-unknown",
         "name_mot:",
         "motors:",
-        ": motors: unknown key; known keys: closed_loop, type, name_mot, orthocal",
+        ": motors: unknown key; known keys: closed_loop, type, name_mot, joint_name, joint_type, "
+        "orthocal",
     ),
     robot(
         "key-unknown-in-tcp",
@@ -944,6 +964,12 @@ ROBOT_CASES = [
         MOTORS,
         "name_mot: [x_slide, y_slide, y_slide]",
         ": name_mot names a motor twice",
+    ),
+    robot(
+        "joint-name-unknown",
+        MOTORS,
+        f"{MOTORS}\njoint_name: [x_swivle]\njoint_type: [FIXED]",
+        ": joint_name: the URDF has no moving joint 'x_swivle'; did you mean x_swivel?",
     ),
     robot("motor-none", MOTORS, "name_mot: []", ": name_mot: found '[]'; expected at least 1 item"),
     robot(
@@ -1205,10 +1231,11 @@ URDF_CASES = [
         ":71: joint 'x_swivel' of type revolute has no <limit>",
     ),
     urdf(
-        "limit-without-lower",
+        "limit-below-the-lower-left-out",
         SWIVEL_LIMIT,
-        SWIVEL_LIMIT.replace('lower="-1.3" ', ""),
-        ":76: joint 'x_swivel': its <limit> has no lower",
+        SWIVEL_LIMIT.replace('lower="-1.3" upper="1.3"', 'upper="-1.3"'),
+        ":76: joint 'x_swivel': its lower limit is above its upper limit (lower is 0 where it is "
+        "not given)",
     ),
     urdf(
         "limit-without-effort",
@@ -1296,9 +1323,10 @@ URDF_CASES = [
     ),
     Case(
         "urdf-loops-do-not-close",
-        "{tmp}/machine/orthoglide.yaml: posture 'mechanical zero' does not close: a residual of "
-        "# m remains; set orthocal.drives.<motor>.zero_mm (or zero_deg) and orthocal.passive_start "
-        "near a posture that closes",
+        "{tmp}/machine/orthoglide.yaml: its loops do not close in any posture that was found "
+        "within the limits of its joints: the best leaves 'z_crossbar_end' and 'z_rod_b_tip' "
+        "apart by # mm; set orthocal.drives.<motor>.zero_mm (or zero_deg) and "
+        "orthocal.passive_start near a posture that closes",
         (swap(URDF, 'xyz="0 0 -0.08"', 'xyz="0 0 -0.9"'),),
         base="machine",
     ),
@@ -1934,9 +1962,9 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 def without_digits(message: str) -> str:
     """A message without what others say in it: a residual in vain, the words of a mesh reader."""
-    message = re.sub(r"stay open by \S+ mm, \d+%", "stay open by # mm, #%", message)
+    message = re.sub(r"stay open by \S+ mm( and \S+ mrad)?, \d+%", "stay open by # mm, #%", message)
     message = re.sub(r"(visuals cannot be loaded: ).*\n", r"\1#\n", message)
-    return re.sub(r"a residual of \S+ m", "a residual of # m", message)
+    return re.sub(r"apart by \S+ mm( and \S+ mrad)?;", "apart by # mm;", message)
 
 
 def check_message(case: Case, stderr: str, folder: Path) -> None:

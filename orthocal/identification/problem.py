@@ -38,10 +38,10 @@ from orthocal.measurement.gauge import (
 from orthocal.measurement.session import Session
 from orthocal.robot.assembly import Assembly
 from orthocal.robot.batch import BatchFunction
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Robot, closure_row_units, coordinate_units
 from orthocal.robot.parameters import AXES
 from orthocal.robot.slopes import SharedPlacements
-from orthocal.robot.symbolic import SymbolicRobot, closure_row_units, coordinate_units
+from orthocal.robot.symbolic import SymbolicRobot
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from orthocal.documents import Number, PositiveNumber
+from orthocal.robot.parameters import Unit
 
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^,;\s\"]+$")]
 Vector = Annotated[list[Number], Field(min_length=1, max_length=12)]
+
+
+OFFSET_KEYS: dict[str, tuple[Unit, float]] = {
+    "offsets_mm": ("m", 1e-3),
+    "offsets_deg": ("rad", math.pi / 180.0),
+    "offsets_mrad": ("rad", 1e-3),
+}
+"""Keys of `controller` to the unit of the drives they are of, and the factor to it."""
 
 
 class _Keys(BaseModel):
@@ -74,9 +84,27 @@ class SetupKeys(_Keys):
 
 
 class ControllerKeys(_Keys):
-    """What the controller already corrects."""
+    """What the controller already corrects: one number a drive of the kind, in their order."""
 
-    offsets_mm: Vector
+    offsets_mm: Vector | None = None
+    """Of prismatic drives."""
+    offsets_deg: Vector | None = None
+    """Of revolute drives."""
+    offsets_mrad: Vector | None = None
+    """The same."""
+
+    @property
+    def stated(self) -> list[str]:
+        """The keys that are given."""
+        return [key for key in OFFSET_KEYS if getattr(self, key) is not None]
+
+    @model_validator(mode="after")
+    def _one_form_a_kind(self) -> ControllerKeys:
+        if not self.stated:
+            raise ValueError(f"found none; expected {', '.join(OFFSET_KEYS)}")
+        if {"offsets_deg", "offsets_mrad"} <= set(self.stated):
+            raise ValueError("found offsets_deg and offsets_mrad; expected one of them")
+        return self
 
 
 class SessionKeys(_Keys):

@@ -29,6 +29,7 @@ from orthocal.measurement.session import (
     Setup,
     section_plane,
 )
+from orthocal.measurement.session_robot import build_offsets, check_direction, require_given_zero
 from orthocal.robot.assembly import nominal_assembly
 from orthocal.robot.loading import load_robot
 from orthocal.robot.model import Robot, read_only
@@ -134,13 +135,8 @@ def _build_plan(file: Path, keys: SessionKeys) -> Session:
             f"'{robot.name}' has no legs for a gauge to touch; add orthocal.legs to {robot.yaml}",
             where=f"{file}: robot",
         )
-    offsets = None
-    if keys.controller is not None:
-        where = f"{file}: controller.offsets_mm"
-        _check_count(keys.controller.offsets_mm, robot, where)
-        if any(d.unit != "m" for d in robot.drives):
-            raise SessionError("the robot has revolute drives; mm do not fit", where=where)
-        offsets = read_only(np.array(keys.controller.offsets_mm) * 1e-3)
+    require_given_zero(robot, f"{file}: robot")
+    offsets = build_offsets(keys.controller, robot, f"{file}: controller")
     setups = {n: _build_setup(n, s, robot, f"{file}: setups.{n}") for n, s in keys.setups.items()}
     _check_planned_postures(file, keys)
     g = keys.gauge
@@ -190,12 +186,7 @@ def _build_setup(name: str, keys: SetupKeys, robot: Robot, where: str) -> Setup:
             f"found '{keys.direction}'; expected one of {', '.join(DIRECTIONS)}",
             where=f"{where}.direction",
         )
-    along = abs(float(np.dot(DIRECTIONS[keys.direction], robot.legs[keys.leg].axis)))
-    if along > 1.0 - 1e-6:
-        raise SessionError(
-            f"'{keys.direction}' is along leg {keys.leg}; a gauge measures across it",
-            where=f"{where}.direction",
-        )
+    check_direction(keys.direction, robot.legs[keys.leg], where=f"{where}.direction")
     setup = Setup(name, keys.leg, keys.direction, _build_section(keys.section))
     if setup.section.form == "fraction" and not 0.0 <= setup.section.value <= 1.0:
         raise SessionError(
@@ -229,6 +220,7 @@ def _build_postures(
     """Commanded drive coordinates of all postures, through the nominal inverse kinematics."""
     assembly = nominal_assembly(robot)
     active = np.zeros(len(robot.drives)) if offsets is None else offsets
+    stated = [] if keys.controller is None else keys.controller.stated
     nominal: dict[str, Array] = {}
     given: dict[str, tuple[Any, Array]] = {}
     targets: dict[str, Array] = {}
@@ -268,7 +260,7 @@ def _build_postures(
         nominal.update(zip(targets, joints, strict=True))
     for name in keys.postures:
         _check_travel(robot, nominal[name], where=f"{file}: postures.{name}")
-        where = f"{file}: controller.offsets_mm: in posture '{name}'"
+        where = f"{file}: controller.{' and '.join(stated)}: in posture '{name}'"
         _check_travel(robot, nominal[name] - active, where=where, joiner=" ")
     try:
         assembly.close(np.array([nominal[n] for n in keys.postures]), names=list(keys.postures))

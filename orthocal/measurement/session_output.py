@@ -42,7 +42,7 @@ def session_document(session: Session, *, readings: str = "readings.csv") -> dic
         for p in session.postures.values()
     }
     if session.controller_offsets is not None:
-        document["controller"] = {"offsets_mm": [to_mm(v) for v in session.controller_offsets]}
+        document["controller"] = _offsets_document(session)
     document["setups"] = {
         s.name: {
             "leg": s.leg,
@@ -56,6 +56,15 @@ def session_document(session: Session, *, readings: str = "readings.csv") -> dic
         for s in session.setups.values()
     }
     document["readings"] = readings
+    return document
+
+
+def _offsets_document(session: Session) -> dict[str, list[float]]:
+    """Offsets of prismatic drives in mm, of revolute ones in mrad."""
+    document: dict[str, list[float]] = {}
+    for drive, offset in zip(session.robot.drives, session.active_offsets, strict=True):
+        key = "offsets_mm" if drive.unit == "m" else "offsets_mrad"
+        document.setdefault(key, []).append(_tidy(float(offset) * 1e3))
     return document
 
 

@@ -17,8 +17,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError, RobotError
 from orthocal.robot.batch import BatchFunction
-from orthocal.robot.model import Robot, Tcp
-from orthocal.robot.symbolic import SymbolicRobot, closure_row_units, coordinate_units
+from orthocal.robot.closing import describe_opening
+from orthocal.robot.model import (
+    Robot,
+    Tcp,
+    closure_row_units,
+    closure_turns,
+    coordinate_limits,
+    coordinate_units,
+)
+from orthocal.robot.symbolic import SymbolicRobot
 
 Array = NDArray[np.float64]
 
@@ -29,6 +37,9 @@ SINGULAR_BELOW = 1e-5
 """Ratio of smallest to largest singular value below which a posture counts as singular. Near a
 singular posture Newton stops where the residual, quadratic in the distance, is below CLOSED: a
 smaller ratio would not be seen. The Orthoglide has 1/20 to 1/60."""
+
+TOO_FAR = 1e3
+"""A Newton step that goes farther comes from rows that depend on each other, [m or rad]."""
 
 MAX_NEWTON_STEPS = 30
 SMALLEST_CONTINUATION_STEP = 1.0 / 512.0
@@ -57,6 +68,10 @@ class _System:
     """Bounds of x, shape (n_x,)."""
     names: tuple[str, ...]
     """Joint of each x."""
+    row_units: Array
+    """Metres that one unit of each row amounts to, by which it was multiplied, shape (n_rows,)."""
+    turns: NDArray[np.bool_]
+    """Which rows are rotations, shape (n_rows,)."""
 
     def __call__(self, x: Array, p: Array, theta: Array) -> tuple[Array, Array]:
         """Residuals, shape (K, n_rows), and Jacobians, shape (K, n_rows, n_x)."""
@@ -67,11 +82,23 @@ class _System:
         """Newton steps, shape (K, n_x); least squares where rows depend on each other."""
         if self.n_rows == self.n_x:
             try:
-                return np.asarray(np.linalg.solve(jacobians, -residuals[..., None])[..., 0])
+                steps = np.asarray(np.linalg.solve(jacobians, -residuals[..., None])[..., 0])
             except np.linalg.LinAlgError:
-                pass
+                return self._shortest_step(residuals, jacobians)
+            lost = ~(np.abs(steps).max(axis=1, initial=0.0) < TOO_FAR)
+            if lost.any():
+                steps[lost] = self._shortest_step(residuals[lost], jacobians[lost])
+            return steps
+        return self._shortest_step(residuals, jacobians)
+
+    def _shortest_step(self, residuals: Array, jacobians: Array) -> Array:
         inverse = np.linalg.pinv(jacobians, rcond=1e-10)
         return np.asarray(-(inverse @ residuals[..., None])[..., 0])
+
+    def describe(self, x: Array, p: Array, theta: Array) -> str:
+        """By how much the rows of one posture are open, in words."""
+        residuals, _ = self(x[None], p[None], theta)
+        return describe_opening(residuals[0] / self.row_units, self.turns)
 
     def within_limits(self, x: Array) -> NDArray[np.bool_]:
         """Whether each posture keeps its joints within their limits, shape (K,)."""
@@ -117,6 +144,7 @@ class Assembly:
         theta: ArrayLike | None = None,
         start: ArrayLike | None = None,
         names: Sequence[str] | None = None,
+        allow_free: bool = False,
     ) -> Array:
         """Passive coordinates that close the loops, g(q, θ) = 0.
 
@@ -126,19 +154,22 @@ class Assembly:
             start: Passive coordinates to start from, shape (n_passive,) or (K, n_passive); the
                 mechanical zero by default.
             names: Names of the postures, for messages.
+            allow_free: Whether the loops may leave passive motions free, as those of a robot that
+                is only looked at: they then move as little as closes the loops.
 
         Returns:
             Shape (K, n_passive), or (n_passive,) for one posture.
 
         Raises:
             ClosureError: If a posture cannot be reached, is outside the limits of a passive joint
-                or singular; names the posture and the residual.
+                or, unless free motions are allowed, singular; names the posture and the residual.
         """
         d = np.asarray(drives, dtype=np.float64)
         single = d.ndim == 1
         d = np.atleast_2d(d)
         passive = self._solve(self._closing, d, self._theta(theta), start, names)
-        self._refuse_singular(d, passive, self._theta(theta), names)
+        if not allow_free:
+            self._refuse_singular(d, passive, self._theta(theta), names)
         return passive[0] if single else passive
 
     def forward(
@@ -226,7 +257,7 @@ class Assembly:
         robot = self.robot
         residual = self._symbolic.closure_residual() * closure_row_units(robot)
         units = coordinate_units(robot)[robot.passive_index]
-        lower, upper = _limits(robot)
+        lower, upper = coordinate_limits(robot)
         return _System(
             evaluate=_residual_function("closing", passive, drives, theta, residual),
             n_rows=residual.numel(),
@@ -237,6 +268,8 @@ class Assembly:
             lower=lower[robot.passive_index],
             upper=upper[robot.passive_index],
             names=_joint_names(robot, robot.passive_index),
+            row_units=closure_row_units(robot),
+            turns=closure_turns(robot),
         )
 
     def _build_inverting(self) -> _System:
@@ -255,7 +288,7 @@ class Assembly:
         residual = ca.vertcat(closing, reached - target)
         x = ca.vertcat(drives, passive)
         index = np.concatenate([robot.drive_index, robot.passive_index])
-        lower, upper = _limits(robot)
+        lower, upper = coordinate_limits(robot)
         zero_passive = robot.zero[robot.passive_index]
         origin = nominal_assembly(robot).tcp(robot.drive_zero, zero_passive)[list(tcp.coordinates)]
         return _System(
@@ -268,6 +301,8 @@ class Assembly:
             lower=lower[index],
             upper=upper[index],
             names=_joint_names(robot, index),
+            row_units=np.append(closure_row_units(robot), np.ones(len(tcp.coordinates))),
+            turns=np.append(closure_turns(robot), np.zeros(len(tcp.coordinates), dtype=np.bool_)),
         )
 
     def _solve(
@@ -309,7 +344,7 @@ class Assembly:
             fresh[pending] = False
             step[pending[~good]] *= 0.5
             for i in pending[~good & (step[pending] < SMALLEST_CONTINUATION_STEP)].tolist():
-                _, final = _newton(system, x[[i]], targets[[i]], theta, tolerance)
+                last, final = _newton(system, x[[i]], targets[[i]], theta, tolerance)
                 if final[0] < tolerance:
                     raise ClosureError(
                         "cannot be reached from the mechanical zero without changing the way in "
@@ -319,7 +354,8 @@ class Assembly:
                     )
                 raise ClosureError(
                     "cannot be reached: the loops stay open by "
-                    f"{final[0] * 1e3:.3g} mm, {done[i]:.0%} of the way from the mechanical zero",
+                    f"{system.describe(last[0], targets[i], theta)}, {done[i]:.0%} of the way from "
+                    "the mechanical zero",
                     posture=labels[i],
                     residual=float(final[0]),
                 )
@@ -412,21 +448,6 @@ def _newton(
         active = active[moved]
         active = active[worst[active] >= tolerance]
     return x, worst
-
-
-def _limits(robot: Robot) -> tuple[Array, Array]:
-    """Bounds of the joint coordinates, shape (nv,); infinite for unbounded revolute joints."""
-    model = robot.model
-    lower, upper = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
-    for joint in list(model.joints)[1:]:
-        if joint.nq == joint.nv:
-            lower[joint.idx_v : joint.idx_v + joint.nv] = model.lowerPositionLimit[
-                joint.idx_q : joint.idx_q + joint.nq
-            ]
-            upper[joint.idx_v : joint.idx_v + joint.nv] = model.upperPositionLimit[
-                joint.idx_q : joint.idx_q + joint.nq
-            ]
-    return lower, upper
 
 
 def _joint_names(robot: Robot, index: NDArray[np.int64]) -> tuple[str, ...]:

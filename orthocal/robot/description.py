@@ -1,6 +1,6 @@
 """The YAML beside a robot's URDF, validated.
 
-The first three keys are those of the Gepetto "extended URDF"; all else stands under `orthocal`.
+The keys at the top are those of the Gepetto "extended URDF"; all else stands under `orthocal`.
 """
 
 from __future__ import annotations
@@ -8,14 +8,23 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from orthocal.documents import Number, PositiveNumber, read_yaml, validate
 from orthocal.errors import RobotError
+from orthocal.robot.joint_types import JOINT_TYPES
 
 Row = Literal["x", "y", "z", "rx", "ry", "rz"]
 Coordinate = Literal["x", "y", "z"]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
+
+
+def _in_small_letters(value: object) -> object:
+    return value.lower() if isinstance(value, str) else value
+
+
+ClosureKind = Annotated[Literal["3d", "6d"], BeforeValidator(_in_small_letters)]
+"""Gepetto's robots write it in capitals, too."""
 
 
 class _Keys(BaseModel):
@@ -70,7 +79,7 @@ class ToleranceKeys(_Keys):
 
 
 class OrthocalKeys(_Keys):
-    """Everything that is not in Gepetto's three keys."""
+    """Everything that is not in Gepetto's keys."""
 
     closures: dict[Name, ClosureKeys] | None = None
     drives: dict[Name, DriveKeys] = {}
@@ -90,10 +99,14 @@ class RobotKeys(_Keys):
 
     closed_loop: list[Annotated[list[Name], Field(min_length=2, max_length=2)]]
     """Pairs of frames that coincide."""
-    type: list[Literal["3d", "6d"]]
+    type: list[ClosureKind]
     """Whether a pair shares its origin only, or its axes too."""
     name_mot: Annotated[list[Name], Field(min_length=1)]
     """The actuated joints."""
+    joint_name: list[Name] = []
+    """Joints that are of another type than the URDF says."""
+    joint_type: list[str] = []
+    """Of each of them: SPHERICAL, UJOINT_XY (about x, then y; other axes alike) or FIXED."""
     orthocal: OrthocalKeys = OrthocalKeys()
 
     @model_validator(mode="after")
@@ -109,6 +122,7 @@ class RobotKeys(_Keys):
             )
         if len(set(self.name_mot)) != len(self.name_mot):
             raise ValueError("name_mot names a motor twice")
+        self._check_joint_types()
         for motor in self.orthocal.drives:
             if motor not in self.name_mot:
                 raise ValueError(
@@ -126,6 +140,27 @@ class RobotKeys(_Keys):
                     f"orthocal.closures.{name}.rows holds a rotation; a 3d closure has x, y, z"
                 )
         return self
+
+    def _check_joint_types(self) -> None:
+        if len(self.joint_name) != len(self.joint_type):
+            raise ValueError(
+                f"joint_type has {len(self.joint_type)} entries; joint_name has "
+                f"{len(self.joint_name)}"
+            )
+        if len(set(self.joint_name)) != len(self.joint_name):
+            raise ValueError("joint_name names a joint twice")
+        for name, declared in zip(self.joint_name, self.joint_type, strict=True):
+            if declared not in JOINT_TYPES:
+                raise ValueError(
+                    f"joint_type of '{name}': found '{declared}'; expected {', '.join(JOINT_TYPES)}"
+                )
+            if name in self.name_mot:
+                raise ValueError(f"joint_name: '{name}' is a motor, which stays what the URDF says")
+
+    @property
+    def joint_types(self) -> dict[str, str]:
+        """Joint to the type that it is declared to be of."""
+        return dict(zip(self.joint_name, self.joint_type, strict=True))
 
 
 def load_description(path: Path) -> RobotKeys:

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from orthocal.errors import ClosureError, ParameterError, RobotError
+from orthocal.errors import ParameterError, RobotError
 from orthocal.files import is_folder
 from orthocal.robot.description import RobotKeys, load_description
 from orthocal.robot.model import (
@@ -36,6 +36,7 @@ from orthocal.robot.parameters import (
     split_unit,
 )
 from orthocal.robot.urdf import load_urdf
+from orthocal.robot.zero import stand_at_zero
 
 Array = NDArray[np.float64]
 
@@ -74,8 +75,8 @@ def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
 def _load_folder(folder: Path) -> Robot:
     yaml_path, urdf_path = _find_files(folder)
     keys = load_description(yaml_path)
-    model = load_urdf(urdf_path)
     where = str(yaml_path)
+    model = load_urdf(urdf_path, joint_types=keys.joint_types, declared_in=where)
     digest = hashlib.sha256(urdf_path.read_bytes() + b"\0" + yaml_path.read_bytes()).hexdigest()
 
     drives = _build_drives(model, keys, where)
@@ -105,17 +106,8 @@ def _load_folder(folder: Path) -> Robot:
         zero=read_only(np.zeros(model.nv)),
         drive_gain=read_only(np.ones(len(drives))),
     )
-    start = _passive_start(robot, keys, where)
-    try:
-        passive = robot.close_with_pinocchio(robot.drive_zero, start, posture="mechanical zero")
-    except ClosureError as e:
-        raise RobotError(
-            f"{e}; set orthocal.drives.<motor>.zero_mm (or zero_deg) and "
-            "orthocal.passive_start near a posture that closes",
-            where=where,
-        ) from None
-    zero = read_only(robot.joint_coordinates(robot.drive_zero, passive))
-    robot = replace(robot, zero=zero)
+    given = [_is_zero_given(keys, d.name) for d in drives]
+    robot = stand_at_zero(robot, _passive_start(robot, keys, where), given=given)
     return replace(robot, legs=_build_legs(robot, keys, where))
 
 
@@ -133,6 +125,11 @@ def _find_files(folder: Path) -> tuple[Path, Path]:
             )
         found.append(files[0])
     return found[0], found[1]
+
+
+def _is_zero_given(keys: RobotKeys, motor: str) -> bool:
+    entry = keys.orthocal.drives.get(motor)
+    return entry is not None and (entry.zero_mm is not None or entry.zero_deg is not None)
 
 
 def _build_drives(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Drive, ...]:
@@ -165,7 +162,7 @@ def _build_drives(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Drive,
         bounded = joint.nq == 1
         lower = float(model.lowerPositionLimit[joint.idx_q]) if bounded else -np.inf
         upper = float(model.upperPositionLimit[joint.idx_q]) if bounded else np.inf
-        if entry is not None and not lower <= zero <= upper:
+        if _is_zero_given(keys, motor) and not lower <= zero <= upper:
             factor, unit = (1e3, "mm") if prismatic else (180.0 / np.pi, "deg")
             raise RobotError(
                 f"the zero, {zero * factor:g} {unit}, is outside the joint's limits "

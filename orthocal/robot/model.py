@@ -11,6 +11,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError, RobotError
+from orthocal.robot.closing import close_loops, describe_opening
 from orthocal.robot.parameters import (
     InUnit,
     ParameterSet,
@@ -18,9 +19,6 @@ from orthocal.robot.parameters import (
 )
 
 Array = NDArray[np.float64]
-
-CLOSED = 1e-12
-"""Largest closure residual of closed loops, [m or rad]."""
 
 
 def read_only(values: ArrayLike) -> Array:
@@ -42,7 +40,9 @@ class Drive(InUnit):
     lower: float
     """Least coordinate, [unit]; -inf where the URDF gives none."""
     upper: float
-    """Largest coordinate, [unit]."""
+    """Largest coordinate, [unit]; inf where the URDF gives none."""
+    zero_found: bool = False
+    """Whether the zero was found by closing the loops, and is not the one that was given."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,7 +179,7 @@ class Robot:
     def close_with_pinocchio(
         self, drives: ArrayLike, start: ArrayLike, *, posture: str = "posture"
     ) -> Array:
-        """Passive coordinates that close the loops, by Newton on Pinocchio's constraint models.
+        """Passive coordinates that close the loops, by damped least squares on Pinocchio's models.
 
         One posture, from a near start; the independent check of `assembly`, which is the way to
         close many postures from afar.
@@ -193,23 +193,29 @@ class Robot:
             Shape (n_passive,), [m, rad].
 
         Raises:
-            ClosureError: If Newton's method does not converge.
+            ClosureError: If the loops stay open.
         """
-        passive = np.array(start, dtype=np.float64)
-        residual, jacobian = self.evaluate_constraints(drives, passive)
-        for _ in range(60):
-            if not residual.size or np.abs(residual).max() < CLOSED:
-                return passive
-            step = np.linalg.lstsq(jacobian[:, self.passive_index], -residual, rcond=1e-10)[0]
-            step *= min(1.0, 0.5 / max(float(np.abs(step).max()), 1e-300))
-            passive = passive + step
-            residual, jacobian = self.evaluate_constraints(drives, passive)
-        worst = float(np.abs(residual).max())
-        raise ClosureError(
-            f"does not close: a residual of {worst:.3g} m remains",
-            posture=posture,
-            residual=worst,
+        data = self.model.createData()
+
+        def evaluate(passive: Array) -> tuple[Array, Array]:
+            coordinates = self.joint_coordinates(drives, passive)
+            residual, jacobian = self.evaluate_constraints_at(coordinates, data=data)
+            return residual, jacobian[:, self.passive_index]
+
+        row_units = closure_row_units(self)
+        found = close_loops(
+            evaluate,
+            start,
+            row_units=row_units,
+            units=coordinate_units(self)[self.passive_index],
         )
+        if not found.closed:
+            raise ClosureError(
+                f"does not close: open by {describe_opening(found.residual, closure_turns(self))}",
+                posture=posture,
+                residual=float(np.abs(row_units * found.residual).max()),
+            )
+        return found.coordinates
 
     def evaluate_constraints(self, drives: ArrayLike, passive: ArrayLike) -> tuple[Array, Array]:
         """Closure residual and its Jacobian by Pinocchio, rows that count.
@@ -222,9 +228,14 @@ class Robot:
             Residual, shape (closure_rows,), [m, rad], and its derivative by the joint
             coordinates, shape (closure_rows, nv).
         """
-        data = self.model.createData()
-        q = self.configuration(self.joint_coordinates(drives, passive))
-        pin.computeJointJacobians(self.model, data, q)
+        return self.evaluate_constraints_at(self.joint_coordinates(drives, passive))
+
+    def evaluate_constraints_at(
+        self, coordinates: ArrayLike, *, data: pin.Data | None = None
+    ) -> tuple[Array, Array]:
+        """The same at joint coordinates, shape (nv,), [m, rad]; Pinocchio's data may be reused."""
+        data = self.model.createData() if data is None else data
+        pin.computeJointJacobians(self.model, data, self.configuration(coordinates))
         residuals, jacobians = [np.zeros(0)], [np.zeros((0, self.model.nv))]
         for closure, constraint in zip(self.closures, self.constraints, strict=True):
             cdata = constraint.createData()
@@ -288,6 +299,49 @@ def joint_axis(model: pin.Model, joint: int) -> Array:
     joint_data = joint_model.createData()
     joint_model.calc(joint_data, pin.neutral(model))
     return np.asarray(joint_data.S, dtype=np.float64).reshape(-1)
+
+
+def closure_turns(robot: Robot) -> NDArray[np.bool_]:
+    """Which closure rows are rotations, shape (closure_rows,)."""
+    return np.array([row >= 3 for c in robot.closures for row in c.rows], dtype=np.bool_)
+
+
+def closure_row_units(robot: Robot) -> Array:
+    """Displacement that one unit of each closure row amounts to, shape (closure_rows,).
+
+    1 for translations, the characteristic length for rotations: residual × this is in [m].
+    """
+    return np.where(closure_turns(robot), robot.characteristic_length, 1.0)
+
+
+def coordinate_units(robot: Robot) -> Array:
+    """Displacement that one unit of each joint coordinate amounts to, shape (nv,), [m or m/rad]."""
+    model, length = robot.model, robot.characteristic_length
+    units = np.ones(model.nv)
+    for i in range(1, model.njoints):
+        joint = model.joints[i]
+        if joint.nv == 1 and np.any(joint_axis(model, i)[3:]):
+            units[joint.idx_v] = length
+    return units
+
+
+def coordinate_limits(robot: Robot) -> tuple[Array, Array]:
+    """Bounds of the joint coordinates, shape (nv,); infinite for unbounded revolute joints."""
+    model = robot.model
+    lower, upper = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
+    for joint in list(model.joints)[1:]:
+        if joint.nq == joint.nv:
+            own = slice(joint.idx_v, joint.idx_v + joint.nv)
+            place = slice(joint.idx_q, joint.idx_q + joint.nq)
+            lower[own] = model.lowerPositionLimit[place]
+            upper[own] = model.upperPositionLimit[place]
+    return lower, upper
+
+
+def joint_turns(model: pin.Model, joint: int) -> bool:
+    """Whether a joint turns, and does not slide: revolute, bounded or not."""
+    axis = joint_axis(model, joint) if model.joints[joint].nv == 1 else np.zeros(6)
+    return bool(np.any(axis[3:]) and not np.any(axis[:3]))
 
 
 def find_frame(model: pin.Model, name: str, *, where: str) -> int:

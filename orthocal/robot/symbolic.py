@@ -353,23 +353,3 @@ def erroneous_placements(
         for i, twist in expressions.frame_twists.items()
     }
     return joints, frames
-
-
-def closure_row_units(robot: Robot) -> NDArray[np.float64]:
-    """Displacement that one unit of each closure row amounts to, shape (closure_rows,).
-
-    1 for translations, the characteristic length for rotations: residual × this is in [m].
-    """
-    length = robot.characteristic_length
-    return np.array([1.0 if row < 3 else length for c in robot.closures for row in c.rows])
-
-
-def coordinate_units(robot: Robot) -> NDArray[np.float64]:
-    """Displacement that one unit of each joint coordinate amounts to, shape (nv,), [m or m/rad]."""
-    model = robot.model
-    units = np.ones(model.nv)
-    for i in range(1, model.njoints):
-        joint = model.joints[i]
-        if joint.nv == 1 and np.any(joint_axis(model, i)[3:]):
-            units[joint.idx_v] = robot.characteristic_length
-    return units

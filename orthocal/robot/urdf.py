@@ -8,19 +8,24 @@ import math
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pinocchio as pin
 from lxml import etree
 
 from orthocal.documents import read_text
 from orthocal.errors import RobotError
+from orthocal.robot.joint_types import retype_joints
 
 MOVING = ("revolute", "continuous", "prismatic")
 """Joint types that a robot may have besides `fixed`."""
+
+LIMITED = ("revolute", "prismatic")
+"""Those that have a <limit>."""
 
 
 _NUMBERS: dict[str, dict[str, int]] = {
@@ -36,8 +41,19 @@ _NUMBERS: dict[str, dict[str, int]] = {
 """Elements and how many numbers each of their attributes holds."""
 
 
-def load_urdf(path: Path) -> pin.Model:
+def load_urdf(
+    path: Path, *, joint_types: Mapping[str, str] | None = None, declared_in: str = ""
+) -> pin.Model:
     """Pinocchio's model of a URDF file, after the file was checked.
+
+    A joint whose <limit> has neither `lower` nor `upper` is not limited. URDF gives both a default
+    of 0, by which such a joint could not move at all: who means that makes it fixed. Where one of
+    the two is given, the other is 0.
+
+    Args:
+        path: The file.
+        joint_types: Joint to the type that it is declared to be of (see `retype_joints`).
+        declared_in: File of these declarations, for messages.
 
     Raises:
         RobotError: Naming file and line, or file and joint.
@@ -45,14 +61,40 @@ def load_urdf(path: Path) -> pin.Model:
     text = read_text(path, error=RobotError)
     root = _parse_xml(text, path)
     _check_elements(root, path)
-    _validate_with_yourdfpy(text, path)
+    unlimited = _complete_limits(root)
+    _validate_with_yourdfpy(etree.tostring(root, encoding="unicode"), path)
+    retyped = retype_joints(root, joint_types or {}, where=declared_in)
     with _captured_stderr() as messages:
         try:
             model = pin.buildModelFromXML(etree.tostring(root, encoding="unicode"))
         except (ValueError, RuntimeError) as e:
             reason = " ".join((messages() or str(e)).split())
             raise RobotError(f"Pinocchio cannot load it: {reason}", where=str(path)) from None
+    for name in (*unlimited, *retyped):
+        if model.existJointName(name):
+            place = model.joints[model.getJointId(name)].idx_q
+            model.lowerPositionLimit[place] = -np.inf
+            model.upperPositionLimit[place] = np.inf
     return model
+
+
+def _complete_limits(root: Any) -> list[str]:  # noqa: ANN401 - lxml has no types
+    """Write URDF's default of 0 where a <limit> leaves it out, which yourdfpy does not know.
+
+    Returns:
+        The joints that have neither `lower` nor `upper`.
+    """
+    unlimited = []
+    for joint in root.findall("joint"):
+        if joint.get("type") not in LIMITED:
+            continue
+        limit = joint.find("limit")
+        absent = [bound for bound in ("lower", "upper") if limit.get(bound) is None]
+        if len(absent) == 2:
+            unlimited.append(joint.get("name"))
+        for bound in absent:
+            limit.set(bound, "0")
+    return unlimited
 
 
 def _parse_xml(text: str, path: Path) -> Any:  # noqa: ANN401 - lxml has no types
@@ -145,17 +187,20 @@ def _check_elements(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has n
             if math.hypot(*vector) < 1e-9:
                 raise RobotError(f"joint '{name}' has a zero axis", where=at(axis))
         limit = joint.find("limit")
-        if kind in ("revolute", "prismatic"):
+        if kind in LIMITED:
             if limit is None:
                 raise RobotError(f"joint '{name}' of type {kind} has no <limit>", where=at(joint))
             for bound in ("lower", "upper", "effort", "velocity"):
                 _numbers(limit, bound, 1, at(limit))
-            for bound in ("lower", "upper", "effort", "velocity"):
+            for bound in ("effort", "velocity"):
                 if limit.get(bound) is None:
                     raise RobotError(f"joint '{name}': its <limit> has no {bound}", where=at(limit))
-            if float(limit.get("lower")) > float(limit.get("upper")):
+            if float(limit.get("lower", "0")) > float(limit.get("upper", "0")):
+                absent = [b for b in ("lower", "upper") if limit.get(b) is None]
                 raise RobotError(
-                    f"joint '{name}': its lower limit is above its upper limit", where=at(limit)
+                    f"joint '{name}': its lower limit is above its upper limit"
+                    + (f" ({absent[0]} is 0 where it is not given)" if absent else ""),
+                    where=at(limit),
                 )
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:

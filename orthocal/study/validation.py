@@ -249,7 +249,7 @@ def _require_offsets(calibration: Calibration, session: Session) -> None:
                 f"{entry.drive} has {stated * factor:g} {unit}; the calibration identified "
                 f"{entry.enter * factor:.3f} {unit}. A validation needs the identified offsets "
                 "active",
-                where=f"{session.path or 'session'}: controller.offsets_mm",
+                where=f"{session.path or 'session'}: controller.offsets_{unit}",
             )
 
 

@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
 from orthocal.measurement.session import DIRECTIONS, Session, section_plane
-from orthocal.robot.model import CLOSED, Robot
+from orthocal.robot.closing import CLOSED
+from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
 

@@ -68,7 +68,7 @@ def test_closures_hold_at_the_solution(orthoglide):
 
 
 def test_the_zero_posture_is_as_well_conditioned_as_designed(orthoglide):
-    from orthocal.robot.symbolic import closure_row_units
+    from orthocal.robot.model import closure_row_units
 
     passive = orthoglide.zero[orthoglide.passive_index]
     _, jacobian = orthoglide.evaluate_constraints(orthoglide.drive_zero, passive)

@@ -40,7 +40,8 @@ from orthocal.output.view.shapes import Colour, css
 from orthocal.output.view.stage import GHOST_COLOUR, LINE_COLOUR, LINES, Stage
 from orthocal.output.view.tool_errors import draw_tool_errors
 from orthocal.robot.assembly import Assembly, nominal_assembly
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Robot, coordinate_units
+from orthocal.robot.zero import count_free_motions
 from orthocal.study.entering import find_entries
 
 Array = NDArray[np.float64]
@@ -55,6 +56,13 @@ FURTHEST = 1.0
 
 NOTHING = 1e-9
 """Deviations below this are none, [m]."""
+
+FREE_REACH = 0.3
+"""How far a drive without limits could go, for a robot that is shown, [rad] or characteristic
+lengths."""
+
+LARGEST_REACH = 1.0
+"""How far any drive could, at most."""
 
 MACHINE = "Machine"
 GHOST = "Machine, nominal (ghost)"
@@ -137,8 +145,8 @@ def _draw_robot(robot: Robot, posture: str | None) -> Scene:
         raise ParameterError("a robot alone has no postures; it takes a session", where="posture")
     stage = Stage(robot, f"{robot.name}: the nominal machine")
     stops = _tour(robot)
-    timeline = plan_motion([s.drives for s in stops])
-    poses = _follow(robot, nominal_assembly(robot), timeline, stage.frames)
+    timeline = plan_motion([s.drives for s in stops], count=_longest_tour(robot))
+    poses = _follow(robot, nominal_assembly(robot), timeline, stage.frames, allow_free=True)
     stage.draw_links(MACHINE, poses)
     stage.look_at(poses)
     stage.scene.explain(LegendEntry("Machine", (MACHINE,), css(SOLID_COLOUR), "solid"))
@@ -150,33 +158,66 @@ def _draw_robot(robot: Robot, posture: str | None) -> Scene:
     stage.move_leg_lines(film, timeline.times, poses)
     write_steps(stage.scene, stops, timeline, [f"{s.name}" for s in stops])
     stage.scene.animate(film.animation)
-    drives = ", ".join(
-        f"{d.name} {d.zero * (1e3 if d.unit == 'm' else 1.0):g} {'mm' if d.unit == 'm' else 'rad'}"
-        for d in robot.drives
-    )
-    stage.scene.facts.insert(0, f"Mechanical zero: {drives}.")
+    stage.scene.facts[:0] = _state_zero(robot)
     loops = counted(len(robot.closures), "closed loop")
     stage.scene.headline = f"{counted(len(robot.drives), 'drive')}, {loops}"
     return stage.scene
 
 
+def _state_zero(robot: Robot) -> list[str]:
+    """Where the machine stands, who says so, and what its loops leave free there."""
+    drives = ", ".join(
+        f"{d.name} {d.zero * (1e3 if d.unit == 'm' else 1.0):g} {'mm' if d.unit == 'm' else 'rad'}"
+        for d in robot.drives
+    )
+    facts = [f"Mechanical zero: {drives}."]
+    found = [d.name for d in robot.drives if d.zero_found]
+    if found:
+        facts.append(
+            f"Found when the loops were closed, not given: the zero of {', '.join(found)}."
+        )
+    free = count_free_motions(robot)
+    if free:
+        loose = counted(free, "passive motion")
+        facts.append(f"The loops leave {loose} free; where they stand is a choice.")
+    return facts
+
+
 def _tour(robot: Robot) -> list[Stop]:
     """The zero, and every drive moved some way to either end of its travel, if it can."""
     zero = robot.drive_zero
+    reaches = np.where(coordinate_units(robot) == 1.0, robot.characteristic_length, 1.0)
     stops = [Stop("mechanical zero", zero, ())]
     for i, drive in enumerate(robot.drives):
+        unit = float(reaches[robot.drive_index[i]])
         for end, word in ((drive.lower, "down"), (drive.upper, "up")):
             reach = end - drive.zero
             if not math.isfinite(reach):
-                reach = math.copysign(0.3, end)
-            target = np.array(zero)
-            target[i] += 0.4 * reach
-            try:
-                nominal_assembly(robot).close(target)
-            except ClosureError:
-                continue  # that far it does not go
-            stops += [Stop(f"{drive.name} {word}", target, ()), stops[0]]
+                reach = math.copysign(FREE_REACH * unit, end)
+            reach = math.copysign(min(abs(reach), LARGEST_REACH * unit), reach)
+            target = _furthest(robot, i, 0.4 * reach)
+            if target is not None:
+                stops += [Stop(f"{drive.name} {word}", target, ()), stops[0]]
     return stops
+
+
+def _longest_tour(robot: Robot) -> int:
+    """Stops of a robot all of whose drives move."""
+    return 1 + 4 * len(robot.drives)
+
+
+def _furthest(robot: Robot, drive: int, move: float) -> Array | None:
+    """Where a drive gets to by a move or a part of it, with loops that close in every frame."""
+    zero = robot.drive_zero
+    for part in (1.0, 0.5, 0.25):
+        target = zero + part * move * np.eye(len(zero))[drive]
+        way = plan_motion([zero, target, zero], count=_longest_tour(robot)).drives
+        try:
+            nominal_assembly(robot).close(way, allow_free=True)
+        except ClosureError:
+            continue  # that far it does not go
+        return np.asarray(target)
+    return None
 
 
 # ---- a session
@@ -315,10 +356,15 @@ def _explain_lines(scene: Scene) -> None:
 
 
 def _follow(
-    robot: Robot, assembly: Assembly, timeline: Timeline, frames: Sequence[str]
+    robot: Robot,
+    assembly: Assembly,
+    timeline: Timeline,
+    frames: Sequence[str],
+    *,
+    allow_free: bool = False,
 ) -> dict[str, Array]:
     """Poses of frames in all frames of a motion, loops closed."""
-    passive = assembly.close(timeline.drives)
+    passive = assembly.close(timeline.drives, allow_free=allow_free)
     return place_frames(robot, timeline.drives, passive, frames)
 
 

@@ -40,14 +40,15 @@ class Timeline:
         return self.times[first] / FRAMES_A_SECOND, self.times[last] / FRAMES_A_SECOND
 
 
-def plan_motion(stops: ArrayLike) -> Timeline:
+def plan_motion(stops: ArrayLike, *, count: int | None = None) -> Timeline:
     """Frames of a machine that goes from stop to stop, gently; the more stops, the faster.
 
     Args:
         stops: Drive coordinates of the stops, shape (S, n_drives), [m, rad].
+        count: How many stops to be as fast as for; by default as many as there are.
     """
     points = np.atleast_2d(np.asarray(stops, dtype=np.float64))
-    count = len(points)
+    count = len(points) if count is None else count
     hold, move, between = (45, 24, 8) if count <= 12 else (24, 15, 4) if count <= 40 else (12, 9, 2)
     drives: list[Array] = []
     times: list[float] = []
@@ -58,7 +59,7 @@ def plan_motion(stops: ArrayLike) -> Timeline:
         drives += [point, point]
         times += [now, now + hold]
         now += hold
-        if i + 1 < count:
+        if i + 1 < len(points):
             share = np.arange(1, between + 1) / (between + 1)
             eased = share**2 * (3.0 - 2.0 * share)
             drives += list(point + eased[:, None] * (points[i + 1] - point))
