@@ -177,7 +177,7 @@ def assemble_calibration(
     diagnostics = diagnose_readings(fit)
     residuals = _residual_rows(fit, diagnostics, nominal)
     factor = np.sqrt(2.0) if session.only_differences else 1.0
-    return Calibration(
+    calibration = Calibration(
         robot_record=_robot_record(session),
         session=_session_record(session),
         model=problem.selection.label,
@@ -218,6 +218,8 @@ def assemble_calibration(
         setups=_setup_records(fit),
         version=__version__,
     )
+    calibration.remember("robot", lambda: session.robot)  # no need to load it again
+    return calibration
 
 
 def _fit_base(
@@ -338,7 +340,14 @@ def _robot_record(session: Session) -> RobotRecord:
     robot = session.robot
     packaged = packaged_robots().get(session.robot_reference)
     folder = None if packaged is not None else str(robot.folder.resolve())
-    return RobotRecord(robot.name, session.robot_reference, folder, robot.sha256)
+    return RobotRecord(
+        name=robot.name,
+        reference=session.robot_reference,
+        folder=folder,
+        sha256=robot.sha256,
+        legs=tuple((name, leg.length) for name, leg in robot.legs.items()),
+        travel=tuple((d.name, d.unit, _bound(d.lower), _bound(d.upper)) for d in robot.drives),
+    )
 
 
 def _session_record(session: Session) -> SessionRecord:

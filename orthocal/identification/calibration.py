@@ -45,7 +45,7 @@ Array = NDArray[np.float64]
 
 Found = TypeVar("Found")
 
-SCHEMA = "orthocal/calibration/1"
+SCHEMA = "orthocal/calibration/2"
 
 FEW = 12
 """Parameters up to which a notebook lists all."""

@@ -46,6 +46,8 @@ class _RobotKeys(_Keys):
     reference: str
     folder: str | None
     sha256: str
+    legs: list[tuple[str, PositiveNumber]]
+    travel: list[tuple[str, Literal["m", "rad"], Number | None, Number | None]]
 
 
 class _SessionKeys(_Keys):
@@ -167,7 +169,7 @@ class _IdentifiabilityKeys(_Keys):
 
 
 class _CalibrationKeys(_Keys):
-    schema_: Annotated[Literal["orthocal/calibration/1"], Field(alias="schema")]
+    schema_: Annotated[Literal["orthocal/calibration/2"], Field(alias="schema")]
     orthocal: str
     robot: _RobotKeys
     session: _SessionKeys
@@ -239,7 +241,13 @@ def load_calibration(path: str | Path) -> Calibration:
     if not keys.residuals:
         raise CalibrationFileError("is empty", where=f"{file}: residuals")
     return Calibration(
-        robot_record=RobotRecord(**keys.robot.model_dump()),
+        robot_record=RobotRecord(
+            **{
+                **keys.robot.model_dump(),
+                "legs": tuple(keys.robot.legs),
+                "travel": tuple(keys.robot.travel),
+            }
+        ),
         session=SessionRecord(
             **{
                 **keys.session.model_dump(),

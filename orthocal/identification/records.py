@@ -24,6 +24,10 @@ class RobotRecord:
     """Folder of a robot that does not come with orthocal."""
     sha256: str
     """Of its URDF and YAML."""
+    legs: tuple[tuple[str, float], ...]
+    """Legs and their nominal lengths, [m]."""
+    travel: tuple[tuple[str, Unit, float | None, float | None], ...]
+    """Drives, their units, and the ends of their travel, [unit]; None where there is none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -37,10 +37,10 @@ def render_comparison(comparison: Comparison, *, all_rows: bool = False) -> Rend
         Text(
             f"{c.independent} independent readings; noise of one {mm(c.noise.sigma)} mm, {source}"
         ),
+        section("Verdict", bullets(list(c.verdict.reasons))),
         section("Models side by side", _scores(c)),
         section("Estimates", _estimates(c, all_rows)),
         section("What each leaves of the readings", _residuals(c, all_rows)),
-        section("Verdict", bullets(list(c.verdict.reasons))),
     ]
     return Group(*parts)
 
@@ -50,28 +50,34 @@ def _scores(comparison: Comparison) -> RenderableType:
     table = table_of("model", "", *sizes, "unseen [mm]", "tool [µm]", left=2)
     for result in comparison.results:
         after = None if result.tool is None else result.tool.after
+        checked = comparison.verdict.standing(result.model) != "no check"
         for score in (result.linearised, result.exact):
             first = score.method == "linearised"
-            add_row(
-                table,
-                result.model if first else "",
-                "linear" if first else "exact",
-                str(result.n_free) if first else "",
-                f"{result.effective:.1f}" if first else "",
+            # what can take up every reading is not judged by what it leaves of them
+            fits = (
                 plain(score.rms * 1e3, 4),
                 _short(score.chi_square),
                 f"{score.dof:.1f}",
                 _short(score.aicc),
                 _short(score.bic),
                 plain(score.unseen_rms * 1e3, 4),
+            )
+            add_row(
+                table,
+                result.model if first else "",
+                "linear" if first else "exact",
+                str(result.n_free) if first else "",
+                f"{result.effective:.1f}" if first else "",
+                *(fits if checked else ("–",) * len(fits)),
                 "" if after is None or first else um(after.sizes.headline.rms),
             )
     for u in comparison.undetermined:
         add_row(table, u.model, "", str(u.n_free), "", "not determined", *([""] * 6))
     return Group(
         table,
+        Text("–: not comparable: no reading is left to check that model, or too few to spare"),
         Text("told: effective parameters, those that the readings determine beside tolerances"),
-        Text("AICc, BIC: the lower the better; – with too few readings to spare"),
+        Text("AICc, BIC: the lower the better"),
         Text("unseen: error in predicting the readings of each setup from all others, r.m.s."),
         Text(
             "tool: what is not known of its position over the workspace, shift and rotation taken "
@@ -90,6 +96,12 @@ def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
     shown = [n for n in names if all_rows or n in named or n.endswith(".offset")]
     table = table_of("parameter", "model", "linear", "exact", "± σ", "unit", left=2)
     parameters = results[0].calibration.robot.parameters
+    spreads = {
+        r.model: dict(
+            zip([p.name for p in r.calibration.free], r.calibration.total_std, strict=True)
+        )
+        for r in results
+    }
     for name in shown:
         p, first = parameters[name], True
         for r in results:
@@ -97,7 +109,7 @@ def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
                 continue
             linear, exact = (s.estimates[name] for s in (r.linearised, r.exact))
             numbers = [signed(v * p.edge_factor) for v in (linear, exact)]
-            std = plain(r.calibration[name].std * p.edge_factor)
+            std = plain(spreads[r.model][name] * p.edge_factor)
             add_row(table, name if first else "", r.model, *numbers, std, p.edge_unit)
             first = False
     lines: list[RenderableType] = [table]

@@ -10,6 +10,7 @@ from orthocal.identification.uncertainty import BY_CHANCE, confidence_factor
 from orthocal.output.layout import mm, plain, signed
 from orthocal.study.accuracy import find_excess
 from orthocal.study.entering import find_entries
+from orthocal.study.plausibility import find_doubts
 
 WORST_SUSPICIOUS = 5
 """Suspicious readings that are named."""
@@ -37,11 +38,16 @@ def advise(calibration: Calibration) -> str:
             f"sign. As they are, they differ from what all others say by {mm(turned.as_read)} mm "
             f"(r.m.s.); with the sign turned by {mm(turned.turned)} mm."
         )
+    doubts = find_doubts(calibration)
+    if doubts and doubts[0].kind == "postures":
+        return f"Do not enter these. {doubts[0].words}"
     if excess > FAR_BEYOND:
         return (
             f"Do not enter these yet: what remains is {excess:.1f} times what a machine within its "
             f"tolerances would leave.{_worst_setup(calibration)}"
         )
+    if doubts:
+        return f"Before you enter these make sure of this. {doubts[0].words}"
     if 0 < suspicious <= MANY_SUSPICIOUS * len(calibration.residuals):
         word = "reading contradicts" if suspicious == 1 else "readings contradict"
         return f"Before you enter these read again: {suspicious} {word} all others."
@@ -142,6 +148,7 @@ def explain_fit(calibration: Calibration) -> list[str]:
             else "but they scatter by more than the gauge explains."
         )
         sentences.append(f"What remains is what repeated cycles scatter by: {fits}")
+    sentences += [doubt.words for doubt in find_doubts(calibration)]
     sentences += _explain_cycles(calibration)
     sentences += _explain_check(calibration)
     sentences += _explain_suspicious(calibration)
@@ -257,10 +264,16 @@ def _explain_cycles(calibration: Calibration) -> list[str]:
     if not worst or gauge is None:
         return []
     shown = ", ".join(f"{signed(r.measured * 1e3)} in cycle {r.cycle}" for r in worst[:6])
+    odd = _odd_one_out(worst)
     return [
         f"Repeated readings scatter by {mm(calibration.noise.cycles_sigma)} mm, more than the "
-        f"gauge's {mm(gauge)} mm explain. They differ most at {worst[0].label} "
-        f"({calibration.where(worst[0])}): {shown} mm. Check these for a wrong sign or row before "
+        f"gauge's {mm(gauge)} mm explain. They differ most at {worst[0].label}: {shown} mm; "
+        + (
+            f"the one that stands apart is in {calibration.where(odd)}."
+            if odd is not None
+            else f"see {' and '.join(calibration.where(r) for r in worst)}."
+        )
+        + " Check these for a wrong sign or row before "
         "anything is entered."
     ]
 
@@ -278,6 +291,21 @@ def _find_scattered(calibration: Calibration) -> list[ResidualRow]:
         return max(r.measured for r in rows) - min(r.measured for r in rows)
 
     return max(groups.values(), key=spread)
+
+
+def _odd_one_out(rows: list[ResidualRow]) -> ResidualRow | None:
+    """The repeated reading that differs from all others, which agree; None where none does."""
+    if len(rows) < 3:
+        return None
+    ordered = sorted(rows, key=lambda r: r.measured)
+    values = [r.measured for r in ordered]
+    below, above = values[1] - values[0], values[-1] - values[-2]
+    odd, gap, rest = (
+        (ordered[-1], above, values[-2] - values[0])
+        if above > below
+        else (ordered[0], below, values[-1] - values[1])
+    )
+    return odd if gap > rest else None
 
 
 def _times(ratio: float) -> str:

@@ -15,6 +15,7 @@ from orthocal.output.explanation import advise
 from orthocal.output.layout import add_row, choose_rows, counted, mm, plain, signed, table_of
 from orthocal.study.accuracy import assess_tool
 from orthocal.study.entering import find_entries
+from orthocal.study.plausibility import describe_machine
 
 MANY_PARAMETERS = 12
 """Parameters above which only those that the readings tell are listed."""
@@ -56,6 +57,7 @@ def render_heading(calibration: Calibration, *, effort: bool = True) -> Renderab
     used = {r.posture for r in calibration.residuals} | {
         r.minus for r in calibration.residuals if r.minus
     }
+    lines.append(Text(f"Machine: {describe_machine(calibration)}"))
     lines.append(
         Text(
             f"Measured: {counted(len(calibration.residuals), kind)} in "

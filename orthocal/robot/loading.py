@@ -40,6 +40,9 @@ from orthocal.robot.zero import stand_at_zero
 
 Array = NDArray[np.float64]
 
+LONGEST_LEG = 20.0
+"""A leg beyond this has its length in mm, [m]."""
+
 
 def packaged_robots() -> dict[str, Path]:
     """Name to folder of the robots that come with orthocal."""
@@ -305,6 +308,12 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
         ids = [find_frame(model, f, where=f"{here}") for f in (entry.root, entry.tip)]
         root, tip = (np.array(data.oMf[i].translation) for i in ids)
         length = float(np.linalg.norm(tip - root))
+        if length > LONGEST_LEG:
+            raise RobotError(
+                f"is {length:g} m long; expected at most {LONGEST_LEG:g} m: lengths in a URDF are "
+                "in metres",
+                where=here,
+            )
         if length < 1e-6:
             raise RobotError(
                 f"root '{entry.root}' and tip '{entry.tip}' are at the same place", where=here

@@ -17,7 +17,7 @@ from orthocal.measurement.session import Session
 from orthocal.study.accuracy import ErrorSize
 from orthocal.study.repetition import Repetition, measure_repetition
 from orthocal.study.scores import ModelResult, Score, Undetermined, score_model
-from orthocal.study.verdict import KnownNoise, Verdict, choose_model, give_verdict
+from orthocal.study.verdict import KnownNoise, Verdict, give_verdict, judge_models
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +46,7 @@ class Comparison:
     def to_json(self) -> str:
         """As JSON, SI units."""
         document = {
-            "schema": "orthocal/comparison/1",
+            "schema": "orthocal/comparison/2",
             "title": self.title,
             "noise": _number(self.noise.sigma),
             "noise_source": self.noise.source,
@@ -62,6 +62,10 @@ class Comparison:
                 "model_error": self.verdict.model_error,
                 "exit_code": self.verdict.exit_code,
                 "reasons": list(self.verdict.reasons),
+                "models": {
+                    j.model: {"standing": j.standing, "reason": j.reason}
+                    for j in self.verdict.judgements
+                },
             },
         }
         return json.dumps(document, indent=1, allow_nan=False) + "\n"
@@ -111,10 +115,17 @@ def compare_models(
         problem = build_problem(session, model=model, tolerances=own)
         try:
             results.append(score_model(problem, noise=noise.sigma, options=options))
-        except NotIdentifiableError as e:
-            undetermined.append(Undetermined(model, problem.n_free, e.problem))
+        except NotIdentifiableError:
+            # larger models have a prior: a small one shall not be worse off for having none
+            held = build_problem(session, model=model, tolerances=own, prior=True)
+            try:
+                results.append(
+                    score_model(held, noise=noise.sigma, by_choice=False, options=options)
+                )
+            except NotIdentifiableError as e:
+                undetermined.append(Undetermined(model, problem.n_free, e.problem))
     results.sort(key=lambda r: r.n_free)
-    best, _ = choose_model(results, undetermined)
+    best, _ = judge_models(results, undetermined)
     repetition = None
     if best is not None and repeat is not None:
         again = repeat_calibration(best.calibration, repeat)

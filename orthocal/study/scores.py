@@ -67,6 +67,10 @@ class ModelResult:
     """Independent readings (repeated ones once) less the rank: what is left to check it."""
     effective: float
     """Parameters that the readings determine, beside the prior."""
+    prior: bool
+    """Whether tolerances act as a prior."""
+    by_choice: bool
+    """Whether that is so by choice, not because the readings alone leave the model open."""
     linearised: Score
     exact: Score
     calibration: Calibration
@@ -86,13 +90,19 @@ class Undetermined:
 
 
 def score_model(
-    problem: CalibrationProblem, *, noise: float, options: SolverOptions | None = None
+    problem: CalibrationProblem,
+    *,
+    noise: float,
+    by_choice: bool = True,
+    options: SolverOptions | None = None,
 ) -> ModelResult:
     """Identify one model both ways and score it.
 
     Args:
         problem: The session with the model's parameters free.
         noise: Standard deviation of a reading that residuals are held against, [m]; NaN if unknown.
+        by_choice: Whether its prior, or that it has none, is as it should be; else it has one
+            because the readings leave it open.
         options: How Ipopt is run.
 
     Raises:
@@ -111,6 +121,8 @@ def score_model(
         rank=rank,
         spare=fit.independent_readings - rank,
         effective=_effective(fit),
+        prior=problem.prior,
+        by_choice=by_choice,
         linearised=_score(fit, linearisation, "linearised", noise),
         exact=_score(fit, linearisation, "exact", noise),
         calibration=calibration,

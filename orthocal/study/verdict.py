@@ -19,6 +19,14 @@ from orthocal.study.accuracy import assess_excess, find_excess
 from orthocal.study.repetition import Repetition
 from orthocal.study.scores import ModelResult, Undetermined
 
+Standing = Literal[
+    "supported", "no check", "tells no more", "no better", "does not carry over", "not determined"
+]
+
+NOT_ALONE = (
+    " The readings alone do not determine it: what they leave open is held by the tolerances."
+)
+
 NoiseKind = Literal["cycles", "gauge", "unknown"]
 
 TELLING = 0.5
@@ -39,6 +47,25 @@ class KnownNoise:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Judgement:
+    """How a model stands, and why."""
+
+    model: str
+    standing: Standing
+    reason: str
+
+    @property
+    def words(self) -> str:
+        """Standing and reason in a sentence or two."""
+        if self.standing in ("tells no more", "no better"):
+            return self.reason
+        word = "supported" if self.standing == "supported" else "not supported"
+        if self.standing == "not determined":
+            word = self.standing
+        return f"{word}. {self.reason}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
     """Which model to believe, and why."""
 
@@ -47,6 +74,12 @@ class Verdict:
     model_error: bool | None
     """Whether what it leaves is error of the model, not noise; None if nothing tells."""
     reasons: tuple[str, ...]
+    judgements: tuple[Judgement, ...]
+    """Of every model, those that the readings leave open first."""
+
+    def standing(self, model: str) -> Standing:
+        """How a model stands."""
+        return next(j.standing for j in self.judgements if j.model == model)
 
     @property
     def exit_code(self) -> int:
@@ -71,47 +104,59 @@ def give_verdict(
         noise: What residuals are held against.
         repetition: Residuals of the supported model held against those of another session.
     """
-    best, reasons = choose_model(results, undetermined)
+    best, judgements = judge_models(results, undetermined)
+    reasons = [f"{j.model}: {j.words}" for j in judgements]
     if best is None:
-        return Verdict(None, None, ("These readings support none of the models.", *reasons))
+        headline = "These readings support none of the models."
+        return Verdict(None, None, (headline, *reasons), judgements)
     model_error, excess, words = _explain_remainder(best, noise)
     reasons += words
     if repetition is not None:
         words, model_error = _explain_repetition(*repetition, model_error)
         reasons += words
     reasons += _explain_tool(best, excess)
-    return Verdict(best.model, model_error, (_headline(best, results, undetermined), *reasons))
+    headline = _headline(best, results, undetermined)
+    return Verdict(best.model, model_error, (headline, *reasons), judgements)
 
 
-def choose_model(
+def judge_models(
     results: Sequence[ModelResult], undetermined: Sequence[Undetermined]
-) -> tuple[ModelResult | None, list[str]]:
+) -> tuple[ModelResult | None, tuple[Judgement, ...]]:
     """The largest model that earns its parameters, and why the others do not."""
     best: ModelResult | None = None
-    reasons = [f"{u.model}: not determined. {u.reason}." for u in undetermined]
+    found = [Judgement(u.model, "not determined", f"{u.reason}.") for u in undetermined]
+
+    def judge(result: ModelResult, standing: Standing, reason: str) -> None:
+        found.append(Judgement(result.model, standing, reason))
+
     for result in results:
         total = result.rank + result.spare
-        prior = result.calibration.prior
         if result.spare < 1:
-            reasons.append(
-                f"{result.model}: not supported. Its {result.n_free} parameters can take up all "
-                f"{total} independent readings: "
-                + ("what remains is decided by the tolerances, and " if prior else "")
-                + "no reading is left to check it."
+            judge(
+                result,
+                "no check",
+                f"Its {result.n_free} parameters can take up all {total} independent readings: "
+                + ("what remains is decided by the tolerances, and " if result.prior else "")
+                + "no reading is left to check it. Small residuals say nothing of it.",
             )
             continue
         if best is None:
             best = result
-            reasons.append(
-                f"{result.model}: supported. It leaves {_count(result.spare)} of "
-                f"{_count(total)} independent readings to check it."
+            held = "" if result.by_choice else NOT_ALONE
+            judge(
+                result,
+                "supported",
+                f"It leaves {_count(result.spare)} of {_count(total)} independent readings to "
+                f"check it.{held}",
             )
             continue
         if result.effective < best.effective + TELLING:
-            reasons.append(
-                f"{result.model}: no more than {best.model}. Beside the tolerances the readings "
-                f"tell {result.effective:.1f} of its {result.n_free} parameters, as many as of "
-                f"{best.model}: what it adds stays where the tolerances put it."
+            judge(
+                result,
+                "tells no more",
+                f"No more than {best.model}. Beside the tolerances the readings tell "
+                f"{result.effective:.1f} of its {result.n_free} parameters, as many as of "
+                f"{best.model}: what it adds stays where the tolerances put it.",
             )
             continue
         gain = best.exact.aicc - result.exact.aicc
@@ -119,22 +164,28 @@ def choose_model(
         predicts = not new >= old  # unknown counts for the model
         words = f"unseen setups are predicted to {new * 1e3:.4f} mm instead of {old * 1e3:.4f} mm"
         if gain > WORTHWHILE and predicts:
-            reasons.append(
-                f"{result.model}: supported. It describes the readings better than {best.model} "
-                f"by more than its parameters buy (AICc lower by {gain:.0f}), and {words}."
+            judge(
+                result,
+                "supported",
+                f"It describes the readings better than {best.model} by more than its parameters "
+                f"buy (AICc lower by {gain:.0f}), and {words}.",
             )
             best = result
         elif gain > WORTHWHILE:
-            reasons.append(
-                f"{result.model}: not supported. It describes these readings better than "
-                f"{best.model}, but {words}: it learns what does not carry over."
+            judge(
+                result,
+                "does not carry over",
+                f"It describes these readings better than {best.model}, but {words}: it learns "
+                "what does not carry over.",
             )
         else:
-            reasons.append(
-                f"{result.model}: no better than {best.model}. AICc is "
-                f"{'higher' if gain < 0 else 'lower'} by {abs(gain):.1f}, and {words}."
+            judge(
+                result,
+                "no better",
+                f"No better than {best.model}. AICc is {'higher' if gain < 0 else 'lower'} by "
+                f"{abs(gain):.1f}, and {words}.",
             )
-    return best, reasons
+    return best, tuple(found)
 
 
 def _headline(

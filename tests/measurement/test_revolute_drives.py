@@ -10,6 +10,7 @@ from tolerances import KINEMATICS, TRUTH_BACK
 from orthocal import calibrate, load_plan, load_session, write_session
 from orthocal.errors import SessionError
 from orthocal.measurement.synthetic import simulate_session
+from orthocal.study.entering import find_entries
 from orthocal.study.validation import validate_calibration
 
 OFFSETS = {"motor_a.offset": 8e-3, "motor_b.offset": -5e-3}
@@ -89,7 +90,7 @@ def test_offsets_in_the_controller_lead_to_the_same_truth(tmp_path, robot, unit)
     for name, value in OFFSETS.items():
         assert abs(one.errors[name] - value) < TRUTH_BACK
         assert abs(other.errors[name] - value) < TRUTH_BACK
-    changes = [e.change for e in other.controller_entries()]
+    changes = [e.change for e in find_entries(other)]
     assert np.abs(np.array(changes) - (np.array([*OFFSETS.values()]) - ACTIVE)).max() < TRUTH_BACK
 
 
@@ -111,7 +112,7 @@ def test_what_was_identified_is_validated(tmp_path, robot):
     found = calibrate(
         simulate_session(load_plan(write_plan(tmp_path / "a", robot)), OFFSETS, seed=1).session
     )
-    entered = [round(e.enter * 1e3, 4) for e in found.controller_entries()]
+    entered = [round(e.enter * 1e3, 4) for e in find_entries(found)]
     plan = load_plan(write_plan(tmp_path / "b", robot, f"{{offsets_mrad: {entered}}}"))
     new = simulate_session(plan, OFFSETS, seed=2).session
     assert validate_calibration(found, new).confirmed

@@ -1,0 +1,161 @@
+"""What is odd about a session, whatever the fit is like: units, sizes, numbers too good."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from scipy import special
+
+from orthocal.identification.calibration import Calibration
+from orthocal.identification.records import ResidualRow, root_mean_square, rows_by_setup
+
+FINER = 1e-3
+"""Part of a step of the gauge by which a reading may miss it: rounding of numbers."""
+
+BY_CHANCE = 1e-3
+"""Probability below which residuals are too small for readings that were rounded."""
+
+UNSUITED = 3.0
+"""Times what the gauge saw that a nominal machine would have to show it in these postures, for them
+to be another machine's. Errors of the machine add to what is seen, they do not take it away."""
+
+LEAST_UNSUITED = 1e-3
+"""Deviations below this are those of a machine, [m]."""
+
+DIFFERENT = 5.0
+"""Tolerances of a length by which legs of one machine may differ by intent."""
+
+Oddity = Literal["finer", "smooth", "postures", "legs"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Doubt:
+    """Something that may be wrong with the session or with the robot's description."""
+
+    kind: Oddity
+    words: str
+    """What was found, and what it may mean; a sentence or two."""
+
+
+def find_doubts(calibration: Calibration) -> tuple[Doubt, ...]:
+    """What is odd, the gravest first."""
+    found = (_postures(calibration), _finer(calibration), _smooth(calibration), _legs(calibration))
+    return tuple(doubt for doubt in found if doubt is not None)
+
+
+def _postures(calibration: Calibration) -> Doubt | None:
+    """Postures that would be another machine's: there the nominal one would show far more."""
+    seen = []
+    for rows in rows_by_setup(calibration.residuals).values():
+        raw = [r.measured for r in rows if r.minus is None]
+        mean = sum(raw) / len(raw) if raw else 0.0
+        seen += [r.measured - mean for r in rows if r.minus is None]
+        seen += [r.measured for r in rows if r.minus is not None]
+    measured, deviation = root_mean_square(seen), calibration.rms_before
+    if deviation < LEAST_UNSUITED or deviation < UNSUITED * measured:
+        return None
+    lengths = _leg_words(calibration.robot_record.legs)
+    return Doubt(
+        "postures",
+        f"In these postures the robot with {lengths} would have shown the gauge "
+        f"{deviation * 1e3:.1f} mm (r.m.s.) that it did not see: the postures are those of a "
+        "machine of another size, or the robot is. Check `robot` and the joint coordinates.",
+    )
+
+
+def _finer(calibration: Calibration) -> Doubt | None:
+    """Readings between the steps of the gauge: another unit, or another gauge."""
+    step = calibration.session.gauge_resolution
+    if not step:
+        return None
+
+    def between(row: ResidualRow) -> bool:
+        steps = row.measured / step
+        return abs(steps - round(steps)) > FINER
+
+    finer = [r for r in calibration.residuals if between(r)]
+    if len(finer) * 2 < len(calibration.residuals):
+        return None
+    first = finer[0]
+    return Doubt(
+        "finer",
+        f"{len(finer)} of {len(calibration.residuals)} readings are finer than the gauge's "
+        f"resolution of {step * 1e3:g} mm, the first in {calibration.where(first)} "
+        f"({first.measured * 1e3:.6g} mm): are they in mm, not in inches, and is the resolution "
+        "right?",
+    )
+
+
+def _smooth(calibration: Calibration) -> Doubt | None:
+    """Residuals that are smaller than rounding to the gauge's steps leaves."""
+    step, noise = calibration.session.gauge_resolution, calibration.noise
+    if not step or not noise.residual_dof > 0.5:
+        return None
+    total = len(calibration.residuals)
+    zeros = len({r.setup for r in calibration.residuals if r.minus is None})
+    used = total - zeros - noise.residual_dof
+    # repeated readings may have been rounded alike: each counts once
+    dof = calibration.identifiability.n_readings - used
+    least = step / math.sqrt(12.0)
+    if dof < 1.0 or not math.isfinite(noise.residual_sigma):
+        return None
+    chance = float(special.chdtr(dof, dof * (noise.residual_sigma / least) ** 2))
+    if chance > BY_CHANCE:
+        return None
+    return Doubt(
+        "smooth",
+        f"What remains, {noise.residual_sigma * 1e6:.2g} µm, is less than rounding to the gauge's "
+        f"resolution of {step * 1e3:g} mm leaves ({least * 1e6:.2g} µm): the readings are in "
+        "another unit than mm, were computed, or the dial did not move.",
+    )
+
+
+def _legs(calibration: Calibration) -> Doubt | None:
+    """Legs that are not of one length, on a machine whose drives are all alike."""
+    legs = calibration.robot_record.legs
+    drives = {(d.unit, d.zero, d.lower, d.upper) for d in calibration.robot.drives}
+    if len(legs) < 2 or len(drives) > 1:
+        return None
+    lengths = [length for _, length in legs]
+    tolerance = _length_tolerance(calibration)
+    if max(lengths) - min(lengths) < DIFFERENT * tolerance:
+        return None
+    return Doubt(
+        "legs",
+        f"The machine's legs are not of one length ({_leg_words(legs)}): was its size changed in "
+        "every place of the URDF?",
+    )
+
+
+def _length_tolerance(calibration: Calibration) -> float:
+    """What the workshop can be trusted with in a length, [m]."""
+    found = [
+        e.name for e in calibration.robot.parameters.elementary.values() if e.kind == "translation"
+    ]
+    return max((calibration.robot.parameters[n].tolerance for n in found), default=0.0)
+
+
+def _leg_words(legs: tuple[tuple[str, float], ...]) -> str:
+    shown = {name: f"{length * 1e3:g}" for name, length in legs}
+    if len(set(shown.values())) == 1:
+        return f"legs of {next(iter(shown.values()))} mm"
+    return f"legs of {', '.join(f'{n} {v}' for n, v in shown.items())} mm"
+
+
+def describe_machine(calibration: Calibration) -> str:
+    """The machine's size: legs and travel, in words."""
+    travel = {}
+    for name, unit, *ends in calibration.robot_record.travel:
+        factor, word = (1e3, "mm") if unit == "m" else (180.0 / math.pi, "°")
+        low, high = ("∞" if v is None else f"{v * factor:g}" for v in ends)
+        travel[name] = f"{low} … {high} {word}".replace("∞ …", "−∞ …")
+    words = []
+    if calibration.robot_record.legs:
+        words.append(_leg_words(calibration.robot_record.legs))
+    if len(set(travel.values())) == 1:
+        words.append(f"travel {next(iter(travel.values()))}")
+    else:
+        words.append(f"travel {', '.join(f'{n} {t}' for n, t in travel.items())}")
+    return ", ".join(words)
