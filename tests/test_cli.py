@@ -168,7 +168,7 @@ def test_what_is_free_known_and_bounded_by_option(orthocal, experiment, root):
         "calibrate", root / "examples/sweep", "--json",
         "--model", "lengths", "--free", "x_coupler.rz,!z_leg.length",
         "--known", "y_leg.length_mm=0.05±0.01", "--known", "z_slide.offset_mm=0.2",
-        "--tolerance", "*.offset_mm=2", "--bound", "x_slide.offset_mm=-1:0.5",
+        "--tolerance", "*.offset_mm=2", "--bound", "x_slide.offset_mm=-1:-0.5",
         "--profile", "y_leg.length",
     )  # fmt: skip
     assert code == 0

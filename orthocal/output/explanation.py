@@ -21,6 +21,9 @@ MANY_SUSPICIOUS = 0.2
 FAR_BEYOND = 4.0
 """Times the tolerances beyond which it is readings or description that are wrong."""
 
+CLEARLY_FURTHER = 1.5
+"""Times the residual of another that one of two repeated readings must have to be the wrong one."""
+
 STANDSTILL = 1e-6
 """Part of a tolerance by which a parameter must move to have moved."""
 
@@ -294,18 +297,19 @@ def _find_scattered(calibration: Calibration) -> list[ResidualRow]:
 
 
 def _odd_one_out(rows: list[ResidualRow]) -> ResidualRow | None:
-    """The repeated reading that differs from all others, which agree; None where none does."""
-    if len(rows) < 3:
-        return None
+    """The repeated reading that is wrong: it differs from the others, which agree.
+
+    Of two the one that is further from what the model says; None where neither is clearly.
+    """
+    if len(rows) == 2:
+        right, wrong = sorted(rows, key=lambda r: abs(r.residual))
+        return wrong if abs(wrong.residual) > CLEARLY_FURTHER * abs(right.residual) else None
     ordered = sorted(rows, key=lambda r: r.measured)
     values = [r.measured for r in ordered]
     below, above = values[1] - values[0], values[-1] - values[-2]
-    odd, gap, rest = (
-        (ordered[-1], above, values[-2] - values[0])
-        if above > below
-        else (ordered[0], below, values[-1] - values[1])
-    )
-    return odd if gap > rest else None
+    if above > below:
+        return ordered[-1] if above > values[-2] - values[0] else None
+    return ordered[0] if below > values[-1] - values[1] else None
 
 
 def _times(ratio: float) -> str:

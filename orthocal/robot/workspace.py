@@ -75,15 +75,12 @@ class Workspace:
         motions[:, :, :3] = np.eye(3)
         for k in range(3):
             motions[:, :, 3 + k] = np.cross(np.eye(3)[k], arms)
-        root = np.sqrt(np.repeat(self.weights, 3))[:, None]
         size = max(float(np.abs(arms).max()), 1e-300)
-        basis = root * motions.reshape(-1, 6) / np.array([1.0] * 3 + [size] * 3)
-        flat = root * field.reshape(3 * len(field), -1)
-        left, sizes, _ = np.linalg.svd(basis, full_matrices=False)
-        span = left[:, sizes > 1e-9 * sizes[0]]
-        with np.errstate(invalid="ignore"):
-            kept = (flat - span @ (span.T @ flat)) / root
-        return np.asarray(kept.reshape(field.shape))
+        basis = motions.reshape(-1, 6) / np.array([1.0] * 3 + [size] * 3)
+        root = np.sqrt(np.repeat(self.weights, 3))[:, None]
+        flat = field.reshape(3 * len(field), -1)
+        motion = np.linalg.lstsq(root * basis, root * flat, rcond=1e-9)[0]
+        return np.asarray((flat - basis @ motion).reshape(field.shape))
 
 
 def cube(
@@ -121,7 +118,7 @@ def tool_at_zero(robot: Robot) -> Array:
     passive = robot.zero[robot.passive_index]
     position = nominal_assembly(robot).tcp(robot.drive_zero, passive)
     coordinates = () if robot.tcp is None else robot.tcp.coordinates
-    return np.asarray(position[list(coordinates)])
+    return np.asarray(np.round(position[list(coordinates)], 12) + 0.0)  # the zero without rounding
 
 
 def largest_cube(robot: Robot, reach: Callable[[Array], object]) -> Workspace | None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.errors import ClosureError
+from orthocal.errors import ClosureError, RobotError
 from orthocal.identification.calibration import Calibration
 from orthocal.robot.model import read_only
 from orthocal.robot.workspace import FEWEST_ALIGNED, Workspace
@@ -197,6 +197,15 @@ def assess_tool(
 
 def _assess_largest_cube(calibration: Calibration) -> ToolAccuracy:
     tool = find_tool(calibration)
+    robot = calibration.robot
+    if robot.tcp is None:
+        raise RobotError("has no tool centre point; add orthocal.tcp", where=str(robot.yaml))
+    if len(robot.tcp.coordinates) != len(robot.drives):
+        raise RobotError(
+            f"orthocal.tcp.coordinates names {len(robot.tcp.coordinates)} coordinates for "
+            f"{len(robot.drives)} drives: they do not command it",
+            where=str(robot.yaml),
+        )
     if tool is None:
         raise ClosureError(
             "cannot be reached: there is no cube around it, not even of a millimetre, that the "

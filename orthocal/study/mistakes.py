@@ -23,7 +23,8 @@ MULTIPLES: Mapping[Mistake, float] = {"not entered": 1.0, "wrong sign": 2.0, "en
 """What of the change that was asked for is missing in the controller."""
 
 EXPLAINED = 0.5
-"""Part of the deviations that a mistake may leave at most, r.m.s., to be taken for their reason."""
+"""Part of what offsets can explain that a mistake may leave of it at most, r.m.s., to be taken for
+the reason."""
 
 AS_GOOD = 1.05
 """Times what the best of the mistakes leaves up to which fewer of the drives are held to be it:
@@ -65,7 +66,8 @@ def find_mistake(
         names: Of the drives.
         rounding: Changes that are none, shape (n_drives,), [m, rad].
     """
-    as_it_is = _rms(deviations)
+    # what offsets have no part in is error of the model, and stays whatever is entered
+    shown = slopes @ np.linalg.lstsq(slopes, deviations, rcond=None)[0]
     moved = [i for i in range(change.size) if abs(change[i]) > rounding[i]]
     found: list[tuple[float, int, Mistake, tuple[int, ...]]] = []
     for kind, multiple in MULTIPLES.items():
@@ -73,13 +75,13 @@ def find_mistake(
             for drives in combinations(moved, count):
                 missing = np.zeros_like(change)
                 missing[list(drives)] = multiple * change[list(drives)]
-                found.append((_rms(deviations - slopes @ missing), count, kind, drives))
+                found.append((_rms(shown - slopes @ missing), count, kind, drives))
     if not found:
         return None
     least = min(f[0] for f in found)
-    if not least < EXPLAINED * as_it_is:
+    if not least < EXPLAINED * _rms(shown):
         return None
-    rms, _, kind, drives = min(
+    _, _, kind, drives = min(
         (f for f in found if f[0] <= AS_GOOD * least), key=lambda f: (f[1], f[0])
     )
     missing = np.zeros_like(change)
@@ -89,7 +91,7 @@ def find_mistake(
         drives=tuple(names[i] for i in drives),
         all_drives=len(drives) == len(moved),
         active=entered - missing,
-        rms=rms,
+        rms=_rms(deviations - slopes @ missing),
     )
 
 

@@ -154,7 +154,7 @@ def judge_models(
             judge(
                 result,
                 "tells no more",
-                f"No more than {best.model}. Beside the tolerances the readings tell "
+                f"no more than {best.model}. Beside the tolerances the readings tell "
                 f"{result.effective:.1f} of its {result.n_free} parameters, as many as of "
                 f"{best.model}: what it adds stays where the tolerances put it.",
             )
@@ -182,7 +182,7 @@ def judge_models(
             judge(
                 result,
                 "no better",
-                f"No better than {best.model}. AICc is {'higher' if gain < 0 else 'lower'} by "
+                f"no better than {best.model}. AICc is {'higher' if gain < 0 else 'lower'} by "
                 f"{abs(gain):.1f}, and {words}.",
             )
     return best, tuple(found)

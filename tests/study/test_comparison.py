@@ -140,8 +140,9 @@ def test_readings_that_leave_an_offset_open_support_nothing(raw_cycles):
     found = compare_models(replace(raw_cycles, readings=rows), models=["offsets"])
     assert found.verdict.supported is None
     assert found.verdict.exit_code == 4
-    assert found.results == ()
-    assert "not determined" in " ".join(found.verdict.reasons)
+    (result,) = found.results  # held by the tolerances, as larger models are
+    assert (result.prior, result.by_choice, result.spare) == (True, False, 0)
+    assert "no reading is left to check it" in " ".join(found.verdict.reasons)
     assert "support none of the models" in summarize(found)
     json.loads(found.to_json())
 
@@ -167,12 +168,33 @@ def test_an_unknown_model_is_refused(experiment_2):
         compare_models(experiment_2, models=["all"])
 
 
+def test_a_small_model_is_not_worse_off_for_having_no_prior(raw_cycles):
+    """Without leg z its offset is open; what holds it in larger models holds it in this one."""
+    rows = tuple(r for r in raw_cycles.readings if r.setup in ("yx", "xy"))
+    found = compare_models(replace(raw_cycles, readings=rows), models=["offsets", "lengths"])
+    assert found.undetermined == ()
+    assert found.verdict.supported == "offsets"
+    assert "do not determine it: what they leave open is held by the tolerances" in " ".join(
+        found.verdict.reasons
+    )
+
+
+def test_the_reasons_stand_before_the_criteria_and_what_cannot_be_compared_is_left_out(table1):
+    text = summarize(table1)
+    assert text.index("Verdict") < text.index("Models side by side")
+    rows = text[text.index("Models side by side") : text.index("Estimates")].splitlines()
+    full = next(i for i, row in enumerate(rows) if row.strip().startswith("full"))
+    assert rows[full].split()[4:] == ["–"] * 6
+    assert rows[full + 1].split()[1:7] == ["–"] * 6
+    assert json.loads(table1.to_json())["verdict"]["models"]["full"]["standing"] == "no check"
+
+
 def test_the_summary_shows_all_that_was_promised(table1):
     text = summarize(table1)
     for words in ("linear", "exact", "χ²", "AICc", "BIC", "unseen", "tool", "Verdict"):
         assert words in text
     row = next(line for line in text.splitlines() if line.strip().startswith("x_slide.offset"))
-    assert row.split() == ["x_slide.offset", "offsets", "-0.522", "-0.527", "0.387", "mm"]
+    assert row.split() == ["x_slide.offset", "offsets", "-0.522", "-0.527", "0.511", "mm"]
     assert max(len(line) for line in text.splitlines()) <= 100
     document = json.loads(table1.to_json())
     assert document["verdict"]["supported"] == "offsets"

@@ -68,7 +68,7 @@ def test_offsets_that_were_entered_with_their_sign_turned_are_found_out(plan):
     assert result.as_expected is False
     assert not result.nothing_to_change
     text = " ".join(summarize(result).split())
-    assert "Check the signs of the offsets" in text
+    assert "they were entered with the wrong sign" in text
     assert "looks like noise" not in text
 
 
@@ -104,7 +104,7 @@ def test_offsets_that_were_not_identified_need_not_be_the_controllers(table1):
 
 def test_json_is_plain(table1):
     document = json.loads(validate_calibration(calibrate(table1[2]), table1[3]).to_json())
-    assert document["schema"] == "orthocal/validation/1"
+    assert document["schema"] == "orthocal/validation/2"
     assert document["nothing_to_change"] is True
 
 

@@ -70,9 +70,8 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
         (TOOL_LEFT, fields[1], LEFT_COLOUR),
     ):
         _draw_deviations(scene, node, found.targets[chosen], deviations[chosen], colour, width)
-    scene.facts.append("Errors of the tool: shift and rotation of the whole region taken out.")
     drawn = f"× {scene.tool_scale:g}"
-    text = f"Tool now, over {region}: up to {um(now)} µm off ({drawn})"
+    text = f"Tool now, over {region}, aligned: up to {um(now)} µm off ({drawn})"
     scene.explain(LegendEntry(text, (TOOL_NOW,), css(NOW_COLOUR), "arrow", shown))
     if left > VANISHING:
         text = f"Tool with the offsets entered: up to {um(left)} µm off ({drawn})"
@@ -82,7 +81,10 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
         worse = f", errors {excess:.1f} × tolerances" if excess > 1.0 else ""
         text = f"Tool, all that was found corrected: one σ, up to {um(spread)} µm{worse} ({drawn})"
         scene.explain(LegendEntry(text, (TOOL_UNKNOWN,), css(UNKNOWN_COLOUR), "ball", shown))
-    headline = f"The tool is up to {um(now)} µm off where it is sent, over {region}."
+    headline = (
+        f"The tool is up to {um(now)} µm off where it is sent, over {region}, shift and rotation "
+        "out."
+    )
     if after is not None:
         headline += f" Corrected, it is known to {um(spread)} µm or better (one σ)."
     return headline

@@ -472,7 +472,7 @@ def test_few_parameters_of_one_unit_are_in_that(table1):
     x, _ = line(axes, "estimate")
     np.testing.assert_allclose(x, [p.value * 1e3 for p in table1.free], atol=UNIT)
     ends, y = segments(axes)
-    intervals = np.array([table1.interval(p) for p in table1.free]) * 1e3
+    intervals = np.array(table1.intervals) * 1e3
     np.testing.assert_allclose(ends, intervals, atol=UNIT)
     np.testing.assert_array_equal(y, np.arange(3))
     assert not axes.containers
@@ -494,7 +494,8 @@ def test_many_parameters_are_in_tolerances_what_is_told_best_first(sweep):
     scale = np.array([1.0 / sweep[n].tolerance for n in names])
     np.testing.assert_allclose(x, [sweep[n].value for n in names] * scale, atol=UNIT)
     ends, _ = segments(axes)
-    intervals = np.array([sweep.interval(sweep[n]) for n in names]) * scale[:, None]
+    own = dict(zip([p.name for p in sweep.free], sweep.intervals, strict=True))
+    intervals = np.array([own[n] for n in names]) * scale[:, None]
     np.testing.assert_allclose(ends, intervals, atol=UNIT)
     (band,) = axes.containers
     assert [(b.get_x(), b.get_width()) for b in band] == [(-1.0, 2.0)] * 30

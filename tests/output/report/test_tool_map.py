@@ -14,14 +14,9 @@ from orthocal import calibrate, load_plan, simulate_session
 from orthocal.output.report import figure as style
 from orthocal.output.report import tool_map
 from orthocal.robot.model import Tcp
-from orthocal.study.accuracy import (
-    Workspace,
-    assess_tool,
-    cube,
-    error_covariance,
-    find_excess,
-    measure_uncertainty,
-)
+from orthocal.robot.workspace import Workspace, cube
+from orthocal.study.accuracy import assess_tool, find_excess, measure_uncertainty
+from orthocal.study.tool import error_covariance
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -125,8 +120,8 @@ def test_sizes_are_those_of_the_error_in_question(table1, accuracy):
     def sizes(which):
         return np.linalg.norm(tool_map._error_parts(table1, accuracy, which), axis=1)
 
-    found = (accuracy.relative_deviation, accuracy.relative_left)
-    deviation, left = (np.linalg.norm(v, axis=1) for v in found)
+    found = (accuracy.deviation, accuracy.error_after_offsets)
+    deviation, left = (np.linalg.norm(accuracy.align(v), axis=1) for v in found)
     np.testing.assert_allclose(sizes("now"), deviation * 1e6, rtol=GRID)
     np.testing.assert_allclose(sizes("left"), left * 1e6, rtol=GRID)
 
@@ -134,22 +129,22 @@ def test_sizes_are_those_of_the_error_in_question(table1, accuracy):
 def test_without_an_excess_what_is_not_known_is_that_at_tolerances(planar):
     accuracy = assess_tool(planar)
     assert find_excess(planar) == 1.0
-    variance = np.trace(accuracy.after.relative_covariance, axis1=1, axis2=2)
+    variance = np.trace(accuracy.after.aligned_covariance, axis1=1, axis2=2)
     sizes = tool_map._error_parts(planar, accuracy, "unknown")[:, 0]
     np.testing.assert_allclose(sizes, np.sqrt(variance) * 1e6, rtol=GRID)
 
 
 def test_a_machine_worse_than_its_tolerances_is_known_less_well(experiment_2):
-    """What remains of the paper's readings is 2.2 times what errors at tolerances would leave."""
+    """What remains of the paper's readings is 2.1 times what errors at tolerances would leave."""
     calibration = calibrate(experiment_2)
     accuracy, excess = assess_tool(calibration), find_excess(calibration)
     covariance = error_covariance(calibration, excess=excess)
-    worse = measure_uncertainty(accuracy.jacobian, covariance, accuracy.workspace)
-    variance = np.trace(worse.relative_covariance, axis1=1, axis2=2)
+    worse = measure_uncertainty(accuracy.jacobian, covariance, accuracy.workspace, accuracy.targets)
+    variance = np.trace(worse.aligned_covariance, axis1=1, axis2=2)
     sizes = tool_map._error_parts(calibration, accuracy, "unknown")[:, 0]
     np.testing.assert_allclose(sizes, np.sqrt(variance) * 1e6, rtol=GRID)
     shown = texts(tool_map.plot_tool_map(calibration, accuracy, which="unknown"))
-    assert "standard deviation in space [µm], errors at 2.2 × their tolerances" in shown
+    assert "standard deviation in space [µm], errors at 2.1 × their tolerances" in shown
 
 
 def test_the_map_goes_through_the_points_of_the_grid(table1, accuracy):
@@ -253,7 +248,8 @@ def test_a_planar_robot_has_one_plane(planar):
 def test_axes_are_the_coordinates_that_the_drives_control(planar):
     accuracy = assess_tool(planar, cube(planar.robot, half_side=0.02))
     turned = replace(planar.robot, tcp=Tcp(planar.robot.tcp.frame, (1, 0)))
-    calibration = replace(planar, _robot=[turned])
+    calibration = replace(planar)
+    calibration.remember("robot", lambda: turned)
     error = with_error(accuracy, lambda x, y, z: (0.0 * x, 5.0, 0.0))
     panel, _ = draw(calibration, error, "now").axes
     assert (panel.get_xlabel(), panel.get_ylabel()) == ("y [mm]", "x [mm]")

@@ -21,13 +21,9 @@ from orthocal.output.view.deviations import measure_deviations
 from orthocal.output.view.motion import FRAMES_A_SECOND
 from orthocal.output.view.scene import round_scale
 from orthocal.output.view.shapes import arrow_parts, head_length
-from orthocal.study.accuracy import (
-    assess_tool,
-    cube,
-    error_covariance,
-    find_excess,
-    measure_uncertainty,
-)
+from orthocal.study.accuracy import assess_tool, find_excess, measure_uncertainty
+from orthocal.study.entering import find_entries
+from orthocal.study.tool import error_covariance
 
 
 @pytest.fixture(scope="module")
@@ -257,8 +253,8 @@ def test_labels_say_setup_millimetres_and_postures(scene, calibration):
 
 def test_scene_says_which_offsets_were_found(scene, calibration):
     """The leg that leans most, x, is not the one whose drive is most off, z."""
-    fact = next(f for f in scene.facts if f.startswith("Offsets found"))
-    for entry in calibration.controller_entries():
+    fact = next(f for f in scene.facts if f.startswith("Offsets to enter"))
+    for entry in find_entries(calibration):
         assert f"{entry.drive} {entry.enter * 1e3:+.3f}".replace("-", "−") + " mm" in fact
 
 
@@ -384,14 +380,17 @@ def test_no_joint_leaps_between_two_frames(scene):
 
 def test_errors_of_the_tool_are_those_of_the_calibration(full):
     scene = draw_scene(full, show="tool")
-    found = assess_tool(full, cube(full.robot, points_a_side=3))
+    whole = assess_tool(full)  # what is taken out is taken out of the whole region
+    middles = np.isin(np.round(whole.workspace.points, 9), [-0.06, 0.0, 0.06]).all(axis=1)
+    corners = np.flatnonzero(middles)
+    targets = whole.targets[corners]
     for node, deviation in (
-        (tool_errors.TOOL_NOW, found.deviation),
-        (tool_errors.TOOL_LEFT, found.left),
+        (tool_errors.TOOL_NOW, whole.align(whole.deviation)[corners]),
+        (tool_errors.TOOL_LEFT, whole.align(whole.error_after_offsets)[corners]),
     ):
         for i in (0, 13, 26):
             pose = scene.pose(f"{node}/point {i + 1}")
-            assert pose[:3, 3] == pytest.approx(found.targets[i], abs=KINEMATICS)
+            assert pose[:3, 3] == pytest.approx(targets[i], abs=KINEMATICS)
             size = np.linalg.norm(deviation[i])
             assert pose[:3, 2] == pytest.approx(deviation[i] / size, abs=1e-9)
             head = scene.pose(f"{node}/point {i + 1}/head")
@@ -404,7 +403,7 @@ def test_errors_of_the_tool_are_those_of_the_calibration(full):
     assert scene.steps[0].caption == "Overview at the zero"  # no gauge is there
     ball = scene.pose(f"{tool_errors.TOOL_UNKNOWN}/point 5")[:3, :3]
     assert ball @ ball.T == pytest.approx(
-        scene.tool_scale**2 * found.after.covariance[4], rel=1e-6, abs=1e-16
+        scene.tool_scale**2 * whole.after.aligned_covariance[corners[4]], rel=1e-6, abs=1e-16
     )
 
 
@@ -494,15 +493,16 @@ def test_arrows_do_not_reach_through_the_ground(calibration, posture):
 def test_a_scene_of_the_tool_says_how_far_it_is_off(calibration):
     scene = draw_scene(calibration, show="tool")
     found = assess_tool(calibration)
-    largest = np.linalg.norm(found.deviation, axis=1).max() * 1e6
+    largest = np.linalg.norm(found.align(found.deviation), axis=1).max() * 1e6
     assert scene.headline.startswith(f"The tool is up to {largest:.0f} µm off where it is sent")
     # with errors as far beyond their tolerances as what remains of the readings says
     covariance = error_covariance(calibration, excess=find_excess(calibration))
-    known = measure_uncertainty(found.jacobian, covariance, found.workspace).absolute.largest
-    assert known > 1.4 * found.after.absolute.largest
+    known = measure_uncertainty(found.jacobian, covariance, found.workspace, found.targets)
+    known = known.sizes.aligned.largest
+    assert known > 1.2 * found.after.sizes.aligned.largest
     assert f"known to {known * 1e6:.0f} µm or better" in scene.headline
     (told,) = (e.text for e in scene.legend if e.nodes == (tool_errors.TOOL_UNKNOWN,))
-    assert "errors 2.2 × tolerances" in told
+    assert "errors 2.1 × tolerances" in told
 
 
 def test_only_machines_sessions_and_calibrations_are_drawn():
