@@ -5,7 +5,7 @@ Imports of anything slow stand inside the commands: help answers at once.
 
 from __future__ import annotations
 
-import io
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import orthocal
+from orthocal.characters import printable
 from orthocal.errors import OrthocalError, ParameterError, SessionError
+from orthocal.streams import ReaderGoneError, guarded_streams
 
 if TYPE_CHECKING:
     from orthocal.output.view.scene import Scene
@@ -49,32 +51,45 @@ AllRows = Annotated[
 def main() -> None:
     """Run the command line; no traceback ever reaches a user.
 
-    Exit codes: 0 done, 1 a solve did not converge, 2 bad input, 70 a bug of ours; `compare` has
-    more.
+    Exit codes: 0 done, 1 a solve did not converge or an output cannot be written, 2 bad input,
+    3 some rows of a table cannot be reached, 70 a bug of ours, 130 Ctrl-C; `compare` has more.
     """
-    import os
-
     # small matrices only: more threads would but get in each other's way
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for stream in (sys.stdout, sys.stderr):  # a terminal without ± prints a question mark
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
+    with guarded_streams():
+        code = _run()
+    sys.exit(code)
+
+
+def _run() -> int | str | None:
+    """Run the command; its exit code."""
+    code: int | str | None = 0
     try:
-        app()
+        try:
+            app()
+        except SystemExit as e:
+            code = e.code
+        sys.stdout.flush()
+    except ReaderGoneError:
+        pass
     except OrthocalError as e:
         _note(f"orthocal: {e}")
-        sys.exit(e.exit_code)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
+        code = e.exit_code
+    except KeyboardInterrupt:
+        code = 130
+    except MemoryError:
+        _note("orthocal: there is not enough memory for an input of this size")
+        code = 1
     except Exception as e:
         if os.environ.get("ORTHOCAL_DEBUG"):
             raise
         _note(
-            f"orthocal: this is a bug of orthocal, not of your input: {type(e).__name__}: {e}\n"
+            "orthocal: this is a bug of orthocal, not of your input: "
+            f"{printable(f'{type(e).__name__}: {e}')}\n"
             "Set ORTHOCAL_DEBUG=1 to see where, and report it."
         )
-        sys.exit(70)
+        code = 70
+    return code
 
 
 @app.callback(invoke_without_command=True)
@@ -187,8 +202,7 @@ def calibrate(
     if out is not None:
         from orthocal.output.report.page import build_report
 
-        # the report first: both are there, or none
-        files = {"report.html": build_report(result), "calibration.json": result.to_json()}
+        files = {"calibration.json": result.to_json(), "report.html": build_report(result)}
         write_files(out, files)
         _note(f"Wrote {out / 'calibration.json'} and {out / 'report.html'}")
 
@@ -517,7 +531,6 @@ def _serve(scene: Scene, port: int | None, browse: bool) -> None:
 
     with LiveScene(scene, port=port) as live:
         _out(live.url)
-        sys.stdout.flush()
         _note("Open this in a browser on this machine; Ctrl-C ends.")
         if browse:
             import webbrowser
@@ -528,10 +541,11 @@ def _serve(scene: Scene, port: int | None, browse: bool) -> None:
 
 def _out(text: str) -> None:
     sys.stdout.write(text + "\n")
+    sys.stdout.flush()
 
 
 def _note(text: str) -> None:
-    sys.stderr.write(text + "\n")
+    sys.stderr.write(printable(text, keep="\n") + "\n")
 
 
 if __name__ == "__main__":

@@ -7,9 +7,9 @@ every message names the file and what was found in it.
 from __future__ import annotations
 
 import csv
+import io
 import json
 import re
-import unicodedata
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin
@@ -18,7 +18,9 @@ import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
+from orthocal.characters import control_character
 from orthocal.errors import OrthocalError
+from orthocal.files import read_file
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -59,28 +61,81 @@ Number = Annotated[
 PositiveNumber = Annotated[Number, Field(gt=0.0), AfterValidator(_refuse_tiny)]
 """A number of sane size above 0."""
 
-LARGEST_FILE = 64 * 2**20
-"""Files above this size are refused, [bytes]."""
+LARGEST_YAML = 2 * 2**20
+"""YAML files above this size are refused, [bytes]: PyYAML reads about one MiB a second."""
+
+MOST_YAML_VALUES = 50_000
+"""Keys and values of a YAML file; a posture has seven, and PyYAML reads as many in 2 s."""
+
+MOST_JSON_VALUES = 3_000_000
+"""Keys and values of a JSON file, for its memory; a calibration has forty a reading."""
+
+MOST_CSV_ROWS = 1_000_000
+"""Rows of a CSV file, for its memory."""
+
+DEEPEST = 20
+"""Lists and mappings within each other; no document of ours has more than seven."""
+
+LONGEST_NUMBER = 100
+"""Characters of a number; a float needs 25."""
+
+LONGEST_SHOWN = 58
+"""Characters of a value in a message."""
+
+MOST_SHOWN = 20
+"""Items of a list or mapping up to which it is written out in a message."""
+
+_YAML = "tag:yaml.org,2002:"
+
+_TAGS: dict[type[yaml.Event], frozenset[str]] = {
+    yaml.ScalarEvent: frozenset(
+        {"!", *(_YAML + t for t in ("str", "int", "float", "bool", "null"))}
+    ),
+    yaml.SequenceStartEvent: frozenset({"!", f"{_YAML}seq"}),
+    yaml.MappingStartEvent: frozenset({"!", f"{_YAML}map"}),
+}
+"""Tags that a value of each kind may be given: those that it would have without any."""
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """SafeLoader that also refuses duplicate keys, aliases and keys that are no scalars."""
+    """SafeLoader for documents of a sane size: text, numbers, lists and mappings with text as keys.
+
+    It also refuses duplicate keys, aliases, keys that are no scalars and tags of other kinds.
+    """
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._count = self._depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            event = self.peek_event()  # type: ignore[no-untyped-call] # PyYAML's stub
-            raise yaml.MarkedYAMLError(
-                problem="aliases (*name) are not allowed here", problem_mark=event.start_mark
-            )
-        return super().compose_node(parent, index)
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call] # PyYAML's stub
+        problem = None
+        if isinstance(event, yaml.AliasEvent):
+            problem = "aliases (*name) are not allowed here"
+        elif event.tag is not None and event.tag not in _TAGS[type(event)]:
+            problem = f"could not determine a constructor for the tag '{shorten(event.tag)}'"
+        self._count += 1
+        if self._count > MOST_YAML_VALUES:
+            problem = f"holds more than {MOST_YAML_VALUES} keys and values"
+        if self._depth >= DEEPEST:
+            problem = f"lists and mappings stand more than {DEEPEST} deep in each other"
+        if problem:
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:  # noqa: ANN401 - any value
         try:
+            if node.tag in (f"{_YAML}int", f"{_YAML}float") and len(node.value) > LONGEST_NUMBER:
+                raise ValueError
             value = super().construct_object(node, deep)
         except (ValueError, KeyError, IndexError, AttributeError, TypeError, OverflowError):
-            tag = str(node.tag).replace("tag:yaml.org,2002:", "!!")
+            tag = str(node.tag).replace(_YAML, "!!")
             raise yaml.MarkedYAMLError(
-                problem=f"'{node.value}' does not fit its tag {tag}", problem_mark=node.start_mark
+                problem=f"'{shorten(str(node.value))}' does not fit its tag {tag}",
+                problem_mark=node.start_mark,
             ) from None
         problem = _text_problem(value)
         if problem:
@@ -88,6 +143,10 @@ class _StrictLoader(yaml.SafeLoader):
         return value
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        if not isinstance(node, yaml.MappingNode):
+            raise yaml.MarkedYAMLError(
+                problem="expected keys and values", problem_mark=node.start_mark
+            )
         seen: set[str] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
@@ -109,42 +168,59 @@ def _text_problem(value: object) -> str | None:
         return None
     if any("\ud800" <= c <= "\udfff" for c in value):
         return "half of a surrogate pair is not a character"
-    if any(unicodedata.category(c) == "Cc" and c not in "\n\t" for c in value):
+    if control_character(value.replace("\n", "").replace("\t", "")):
         return "a text holds a control character"
     return None
 
 
-def read_text(path: Path, *, error: type[OrthocalError]) -> str:
+def shorten(text: str) -> str:
+    """A value as it can stand in a message."""
+    return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 3]}..."
+
+
+def read_text(
+    path: Path,
+    *,
+    error: type[OrthocalError],
+    content: bytes | None = None,
+    largest: int | None = None,
+) -> str:
     """Text of a UTF-8 file, with a byte order mark taken off.
+
+    Args:
+        path: The file.
+        error: Kind of error to raise.
+        content: What it holds, where it was read already.
+        largest: Size above which it is refused, [bytes]; that of any file by default.
 
     Raises:
         OrthocalError: Of the kind given, if the file is missing, too large or not text.
     """
+    if content is None:
+        content = read_file(path, error=error)
+    if largest is not None and len(content) > largest:
+        raise error(
+            f"has {len(content) / 2**20:.1f} MiB; expected at most {largest / 2**20:g} MiB",
+            where=str(path),
+        )
     try:
-        size = path.stat().st_size
-        if size > LARGEST_FILE:
-            raise error(
-                f"has {size / 2**20:.0f} MiB; expected at most {LARGEST_FILE // 2**20} MiB",
-                where=str(path),
-            )
-        return path.read_bytes().decode("utf-8-sig")
-    except FileNotFoundError:
-        raise error("there is no such file", where=str(path)) from None
-    except IsADirectoryError:
-        raise error("is a folder; expected a file", where=str(path)) from None
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as e:
         raise error(f"is not UTF-8 text (byte {e.start})", where=str(path)) from None
-    except OSError as e:
-        raise error(f"cannot be read: {e.strerror}", where=str(path)) from None
 
 
-def read_yaml(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401 - any document
-    """Content of a YAML file; duplicate keys and aliases are errors.
+def read_yaml(path: Path, *, error: type[OrthocalError], content: bytes | None = None) -> Any:  # noqa: ANN401 - any document
+    """Content of a YAML file; duplicate keys, aliases and tags of other kinds are errors.
+
+    Args:
+        path: The file.
+        error: Kind of error to raise.
+        content: What it holds, where it was read already.
 
     Raises:
         OrthocalError: Of the kind given, naming file and line.
     """
-    text = read_text(path, error=error)
+    text = read_text(path, error=error, content=content, largest=LARGEST_YAML)
     try:
         return yaml.load(text, Loader=_StrictLoader)
     except yaml.MarkedYAMLError as e:
@@ -167,23 +243,60 @@ def read_json(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
     """
     text = read_text(path, error=error)
 
+    commas_and_brackets = sum(text.count(c) for c in ",[{")
+    if commas_and_brackets > MOST_JSON_VALUES:
+        raise error(
+            f"holds about {commas_and_brackets} values; expected at most {MOST_JSON_VALUES}",
+            where=str(path),
+        )
+
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        keys = [key for key, _ in pairs]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise ValueError(f"the key '{key}' stands twice")
+        found: dict[str, Any] = {}
         for key, value in pairs:
-            problem = _text_problem(key) or _text_problem(value)
-            if problem:
-                raise ValueError(problem)
-        return dict(pairs)
+            if key in found:
+                raise ValueError(f"the key '{shorten(key)}' stands twice")
+            found[key] = value
+        return found
+
+    def number(read: type[int] | type[float], digits: str) -> float:
+        if len(digits) > LONGEST_NUMBER:
+            raise ValueError(f"the number {shorten(digits)} has {len(digits)} digits")
+        return read(digits)
 
     try:
-        return json.loads(text, object_pairs_hook=unique)
+        document = json.loads(
+            text,
+            object_pairs_hook=unique,
+            parse_int=lambda digits: number(int, digits),
+            parse_float=lambda digits: number(float, digits),
+        )
+        _check_texts(document)
+        return document
     except json.JSONDecodeError as e:
         raise error(f"is not valid JSON: {e.msg}", where=f"{path}:{e.lineno}") from None
     except (ValueError, RecursionError) as e:
         raise error(f"is not valid JSON: {e or type(e).__name__}", where=str(path)) from None
+
+
+def _check_texts(document: object) -> None:
+    """Refuse a document with characters that are none, wherever in it.
+
+    Raises:
+        ValueError: In words.
+    """
+    pending = [(document, 0)]
+    while pending:
+        value, depth = pending.pop()
+        if depth > DEEPEST:
+            raise ValueError(f"lists and objects stand more than {DEEPEST} deep in each other")
+        if isinstance(value, dict):
+            pending += [(inner, depth + 1) for pair in value.items() for inner in pair]
+        elif isinstance(value, list):
+            pending += [(inner, depth + 1) for inner in value]
+        else:
+            problem = _text_problem(value)
+            if problem:
+                raise ValueError(problem)
 
 
 def read_csv_rows(
@@ -192,27 +305,36 @@ def read_csv_rows(
     required: tuple[str, ...],
     optional: tuple[str, ...] = (),
     error: type[OrthocalError],
+    content: bytes | None = None,
 ) -> Iterator[tuple[int, dict[str, str]]]:
     """Rows of a CSV file with a header, as (line number, column to text); blank lines skipped.
 
     Semicolons are taken as separators where the header has no comma.
 
+    Args:
+        path: The file.
+        required: Columns that it must have.
+        optional: Columns that it may have.
+        error: Kind of error to raise.
+        content: What it holds, where it was read already.
+
     Raises:
         OrthocalError: Of the kind given, naming file and line.
     """
-    text = read_text(path, error=error)
-    lines = text.splitlines()
-    if not lines or not lines[0].strip():
-        found = "is blank" if any(line.strip() for line in lines) else "is empty"
+    text = read_text(path, error=error, content=content)
+    first = text.splitlines()[0] if text else ""
+    if not first.strip():
+        found = "is blank" if text.strip() else "is empty"
         raise error(f"{found}; expected a header: {','.join(required)}", where=f"{path}:1")
-    delimiter = ";" if "," not in lines[0] and ";" in lines[0] else ","
+    delimiter = ";" if "," not in first and ";" in first else ","
+    lines = io.StringIO(text, newline=None)
     reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
     try:
         header = [name.strip() for name in next(reader)]
         for name in header:
             if name not in required and name not in optional:
                 raise error(
-                    f"unknown column '{name}'; expected {', '.join(required)}"
+                    f"unknown column '{shorten(name)}'; expected {', '.join(required)}"
                     + (f" and optionally {', '.join(optional)}" if optional else ""),
                     where=f"{path}:1",
                 )
@@ -221,11 +343,13 @@ def read_csv_rows(
         for name in required:
             if name not in header:
                 raise error(
-                    f"the column '{name}' is missing; found {', '.join(header)}",
+                    f"the column '{name}' is missing; found {shorten(', '.join(header))}",
                     where=f"{path}:1",
                 )
         for row in reader:
             line = reader.line_num
+            if line > MOST_CSV_ROWS:
+                raise error(f"has more than {MOST_CSV_ROWS} rows", where=str(path))
             if not any(cell.strip() for cell in row):
                 continue
             if len(row) != len(header):
@@ -251,12 +375,12 @@ def parse_number(text: str, *, where: str, name: str, error: type[OrthocalError]
         OrthocalError: Of the kind given, for text, NaN, infinity or a decimal comma.
     """
     try:
-        if not _DECIMAL.fullmatch(text):
+        if len(text) > LONGEST_NUMBER or not _DECIMAL.fullmatch(text):
             raise ValueError
         value = float(text)
     except ValueError:
         hint = " (a decimal comma? write a point)" if "," in text else ""
-        raise error(f"{name} is '{text}'; expected a number{hint}", where=where) from None
+        raise error(f"{name} is '{shorten(text)}'; expected a number{hint}", where=where) from None
     if value - value != 0.0:
         raise error(f"{name} is '{text}'; expected a finite number", where=where)
     if abs(value) > LARGEST_NUMBER:
@@ -294,12 +418,14 @@ def explain_validation_error(
 ) -> tuple[str, str]:
     """Key and plain words for the first finding of a pydantic ValidationError."""
     # an unknown key explains a missing one: name it first
-    findings = sorted(exception.errors(), key=lambda f: f["type"] != "extra_forbidden")
+    findings = sorted(
+        exception.errors(include_url=False), key=lambda f: f["type"] != "extra_forbidden"
+    )
     first = findings[0]
     path = [part for part in first["loc"] if not _is_pydantic_tag(part)]
     found, kind = first.get("input"), first["type"]
     if "[key]" in first["loc"] and not isinstance(found, str):
-        return _join(path[:-1]), f"found the key {found}; expected text: put it in quotes"
+        return _join(path[:-1]), f"found the key {_show(found)}; expected text: put it in quotes"
     key = _join(path)
     if kind == "extra_forbidden":
         known = _keys_at(schema, path[:-1])
@@ -312,10 +438,15 @@ def explain_validation_error(
         # a validator over several keys begins its message with the one that it is about
         inner, separator, rest = words.partition("|")
         return (_join([*path, inner]), rest) if separator else (key, words)
-    shown = "nothing" if found is None else f"'{found}'"
-    if len(shown) > 60:
-        shown = shown[:56] + "...'"
+    shown = "nothing" if found is None else f"'{_show(found)}'"
     return key, f"found {shown}; expected {_expectation(kind, words, first.get('ctx') or {})}"
+
+
+def _show(value: object) -> str:
+    """A value from a document, as it can stand in a message."""
+    if isinstance(value, list | dict) and len(value) > MOST_SHOWN:
+        return f"{'a list' if isinstance(value, list) else 'a mapping'} of {len(value)} items"
+    return shorten(str(value))
 
 
 def _expectation(kind: str, words: str, context: Mapping[str, Any]) -> str:

@@ -12,7 +12,7 @@ from conftest import ROOT
 import orthocal
 
 STAGES = [
-    *("errors", "files", "documents", "markup"),
+    *("characters", "errors", "interrupts", "streams", "files", "documents", "markup"),
     *("robot", "measurement", "identification", "study", "output", "cli"),
 ]
 

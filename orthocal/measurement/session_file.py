@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.documents import parse_number, read_csv_rows, read_yaml, validate
+from orthocal.documents import parse_number, read_csv_rows, read_yaml, shorten, validate
 from orthocal.errors import ClosureError, RobotError, SessionError
-from orthocal.files import is_folder
+from orthocal.files import is_folder, read_file
 from orthocal.measurement.gauge import locate_contacts
 from orthocal.measurement.schema import SectionKeys, SessionKeys, SetupKeys
 from orthocal.measurement.session import (
@@ -50,7 +50,11 @@ def load_session(path: str | Path) -> Session:
         SessionError: Naming file and line or key, what was found and what was expected.
         RobotError: If the robot does not load.
     """
-    file, keys = _read_keys(Path(path))
+    file, content, keys = _read_keys(Path(path))
+    return _load_session(file, content, keys)
+
+
+def _load_session(file: Path, content: bytes, keys: SessionKeys) -> Session:
     if keys.readings is None:
         raise SessionError("is missing; expected the name of a CSV file", where=f"{file}: readings")
     plan = _build_plan(file, keys)
@@ -59,8 +63,9 @@ def load_session(path: str | Path) -> Session:
             f"found {keys.readings!r}; expected the name of a CSV file", where=f"{file}: readings"
         )
     readings_path = file.parent / keys.readings
-    readings = _read_readings(readings_path, plan)
-    digest = hashlib.sha256(file.read_bytes() + b"\0" + readings_path.read_bytes()).hexdigest()
+    table = read_file(readings_path, error=SessionError)
+    readings = _read_readings(readings_path, table, plan)
+    digest = hashlib.sha256(content + b"\0" + table).hexdigest()
     session = replace(plan, readings=readings, readings_path=readings_path, sha256=digest)
     check_contacts(session)
     return session
@@ -76,9 +81,9 @@ def load_plan(path: str | Path) -> Session:
         SessionError: Naming file and key.
         RobotError: If the robot does not load.
     """
-    file, keys = _read_keys(Path(path))
+    file, content, keys = _read_keys(Path(path))
     if keys.readings is not None:
-        return load_session(file)
+        return _load_session(file, content, keys)
     plan = _build_plan(file, keys)
     readings = []
     for name, setup in keys.setups.items():
@@ -113,12 +118,13 @@ def _where(path: Path | None, key: str) -> str:
     return key if path is None else f"{path}: {key}"
 
 
-def _read_keys(path: Path) -> tuple[Path, SessionKeys]:
+def _read_keys(path: Path) -> tuple[Path, bytes, SessionKeys]:
     file = path / "session.yaml" if is_folder(path) else path
     if file.suffix.lower() in OTHER_KINDS:
         raise SessionError("is no session.yaml", where=str(file))
-    data = read_yaml(file, error=SessionError)
-    return file, validate(SessionKeys, data, where=str(file), error=SessionError)
+    content = read_file(file, error=SessionError)
+    data = read_yaml(file, error=SessionError, content=content)
+    return file, content, validate(SessionKeys, data, where=str(file), error=SessionError)
 
 
 def _build_plan(file: Path, keys: SessionKeys) -> Session:
@@ -295,7 +301,7 @@ def _check_travel(robot: Robot, drives: Array, *, where: str, joiner: str = ": "
             raise SessionError(problem, where=file)
 
 
-def _read_readings(path: Path, plan: Session) -> tuple[Reading, ...]:
+def _read_readings(path: Path, content: bytes, plan: Session) -> tuple[Reading, ...]:
     readings: list[Reading] = []
     seen: dict[tuple[Any, ...], int] = {}
     raw: dict[tuple[str, int], int] = {}
@@ -305,6 +311,7 @@ def _read_readings(path: Path, plan: Session) -> tuple[Reading, ...]:
         required=("setup", "posture", "reading_mm"),
         optional=("minus", "cycle"),
         error=SessionError,
+        content=content,
     ):
         where = f"{path}:{line}"
         setup, posture, minus = row["setup"], row["posture"], row.get("minus", "")
@@ -343,7 +350,7 @@ def _parse_cycle(text: str, where: str) -> int:
     if not text:
         return 1
     if not (text.isascii() and text.isdigit() and len(text) < 10 and int(text) >= 1):
-        raise SessionError(f"cycle is '{text}'; expected 1, 2, 3 ...", where=where)
+        raise SessionError(f"cycle is '{shorten(text)}'; expected 1, 2, 3 ...", where=where)
     return int(text)
 
 

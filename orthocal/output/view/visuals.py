@@ -13,10 +13,11 @@ import pinocchio as pin
 from lxml import etree
 from numpy.typing import NDArray
 
-from orthocal.documents import read_text
 from orthocal.errors import RobotError
+from orthocal.files import exists, require_file
 from orthocal.output.view.shapes import Colour, cylinder, pose_along
 from orthocal.robot.model import Robot
+from orthocal.robot.urdf import parse_urdf
 
 Array = NDArray[np.float64]
 
@@ -58,10 +59,7 @@ def load_visuals(robot: Robot) -> tuple[Visual, ...]:
 
 def _with_absolute_meshes(robot: Robot) -> str:
     """Text of the URDF with the paths of its meshes resolved within the robot's folder."""
-    text = read_text(robot.urdf, error=RobotError)
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
-    root = etree.fromstring(text.encode(), parser=parser)
-    etree.strip_tags(root, etree.Comment)
+    root = parse_urdf(robot.urdf)
     folder = robot.folder.resolve()
     for mesh in root.iter("mesh"):
         name = mesh.get("filename") or ""
@@ -71,8 +69,9 @@ def _with_absolute_meshes(robot: Robot) -> str:
             raise RobotError(f"the mesh '{name}' lies outside of the robot's folder", where=where)
         if path.suffix.lower() not in MESH_FORMATS:
             raise RobotError(f"the mesh '{name}' is none of {', '.join(MESH_FORMATS)}", where=where)
-        if not path.is_file():
+        if not exists(path):
             raise RobotError(f"there is no mesh file {path}", where=where)
+        require_file(path, error=RobotError)
         mesh.set("filename", str(path))
     return str(etree.tostring(root, encoding="unicode"))
 

@@ -1,0 +1,48 @@
+"""Characters as they can be shown: what steers a terminal or turns a line about is escaped."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+_ESCAPED = frozenset({"Cc", "Cf", "Co", "Cs", "Zl", "Zp"})
+"""Unicode categories of control, format, private and surrogate characters and of line
+and paragraph separators. A terminal obeys the first, and the second change the order of others."""
+
+_ORDINARY = re.compile(r"[ -~]*")
+
+
+def printable(text: str, *, keep: str = "") -> str:
+    r"""A text with every character that is not one to be seen written as its escape, such as \x1b.
+
+    Bytes of a path that are no UTF-8 come as lone surrogates, and are shown as the bytes that they
+    are.
+
+    Args:
+        text: From a file, a path or a command line.
+        keep: Characters that stay as they are, such as a newline between lines of our own.
+    """
+    if _ORDINARY.fullmatch(text):
+        return text
+    return "".join(c if c in keep or not _is_escaped(c) else _escape(c) for c in text)
+
+
+def control_character(text: str) -> str | None:
+    """The first control character or half of a surrogate pair in a text, escaped; else None."""
+    found = (c for c in text if unicodedata.category(c) in ("Cc", "Cs"))
+    return next((_escape(c) for c in found), None)
+
+
+def _is_escaped(character: str) -> bool:
+    return unicodedata.category(character) in _ESCAPED
+
+
+def _escape(character: str) -> str:
+    code = ord(character)
+    if character in "\n\r\t":
+        return {"\n": "\\n", "\r": "\\r", "\t": "\\t"}[character]
+    if 0xDC80 <= code <= 0xDCFF:  # a byte that os.fsdecode could not decode
+        return f"\\x{code - 0xDC00:02x}"
+    if code <= 0xFF:
+        return f"\\x{code:02x}"
+    return f"\\u{code:04x}" if code <= 0xFFFF else f"\\U{code:08x}"
