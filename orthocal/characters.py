@@ -10,6 +10,7 @@ _ESCAPED = frozenset({"Cc", "Cf", "Co", "Cs", "Zl", "Zp"})
 and paragraph separators. A terminal obeys the first, and the second change the order of others."""
 
 _ORDINARY = re.compile(r"[ -~]*")
+_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 def printable(text: str, *, keep: str = "") -> str:
@@ -29,8 +30,8 @@ def printable(text: str, *, keep: str = "") -> str:
 
 def control_character(text: str) -> str | None:
     """The first control character or half of a surrogate pair in a text, escaped; else None."""
-    found = (c for c in text if unicodedata.category(c) in ("Cc", "Cs"))
-    return next((_escape(c) for c in found), None)
+    found = _CONTROL.search(text)
+    return _escape(found[0]) if found else None
 
 
 def _is_escaped(character: str) -> bool:

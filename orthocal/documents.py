@@ -18,7 +18,6 @@ import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
-from orthocal.characters import control_character
 from orthocal.errors import OrthocalError
 from orthocal.files import read_file
 
@@ -58,16 +57,22 @@ Number = Annotated[
 ]
 """A number of sane size; YAML's yes and no are not numbers."""
 
+Count = Annotated[int, Field(ge=0, le=10**9)]
+"""A whole number of sane size."""
+
+Finite = Annotated[float, BeforeValidator(_refuse_truth_values), Field(allow_inf_nan=False)]
+"""A number of any size: one that follows from others and is not computed with."""
+
 PositiveNumber = Annotated[Number, Field(gt=0.0), AfterValidator(_refuse_tiny)]
 """A number of sane size above 0."""
 
-LARGEST_YAML = 2 * 2**20
+LARGEST_YAML = 2**20
 """YAML files above this size are refused, [bytes]: PyYAML reads about one MiB a second."""
 
 MOST_YAML_VALUES = 50_000
 """Keys and values of a YAML file; a posture has seven, and PyYAML reads as many in 2 s."""
 
-MOST_JSON_VALUES = 3_000_000
+MOST_JSON_VALUES = 2_000_000
 """Keys and values of a JSON file, for its memory; a calibration has forty a reading."""
 
 MOST_CSV_ROWS = 1_000_000
@@ -78,6 +83,11 @@ DEEPEST = 20
 
 LONGEST_NUMBER = 100
 """Characters of a number; a float needs 25."""
+
+_LONG_NUMBER = re.compile(rf"[-+.eE0-9]{{{LONGEST_NUMBER + 1}}}")
+
+_NO_TEXT = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+"""Control characters but newline and tabulator, and halves of surrogate pairs."""
 
 LONGEST_SHOWN = 58
 """Characters of a value in a message."""
@@ -166,11 +176,12 @@ def _text_problem(value: object) -> str | None:
     """What is wrong with the characters of a text, if anything."""
     if not isinstance(value, str):
         return None
-    if any("\ud800" <= c <= "\udfff" for c in value):
+    found = _NO_TEXT.search(value)
+    if not found:
+        return None
+    if "\ud800" <= found[0] <= "\udfff":
         return "half of a surrogate pair is not a character"
-    if control_character(value.replace("\n", "").replace("\t", "")):
-        return "a text holds a control character"
-    return None
+    return "a text holds a control character"
 
 
 def shorten(text: str) -> str:
@@ -258,18 +269,16 @@ def read_json(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
             found[key] = value
         return found
 
-    def number(read: type[int] | type[float], digits: str) -> float:
+    def short(digits: str) -> str:
         if len(digits) > LONGEST_NUMBER:
-            raise ValueError(f"the number {shorten(digits)} has {len(digits)} digits")
-        return read(digits)
+            raise ValueError(f"the number {shorten(digits)} has {len(digits)} characters")
+        return digits
 
+    readers: dict[str, Any] = {}
+    if _LONG_NUMBER.search(text):  # only then: they take their time
+        readers = {"parse_int": lambda d: int(short(d)), "parse_float": lambda d: float(short(d))}
     try:
-        document = json.loads(
-            text,
-            object_pairs_hook=unique,
-            parse_int=lambda digits: number(int, digits),
-            parse_float=lambda digits: number(float, digits),
-        )
+        document = json.loads(text, object_pairs_hook=unique, **readers)
         _check_texts(document)
         return document
     except json.JSONDecodeError as e:
@@ -284,19 +293,18 @@ def _check_texts(document: object) -> None:
     Raises:
         ValueError: In words.
     """
-    pending = [(document, 0)]
+    pending: list[tuple[Any, int]] = [([document], 0)]
     while pending:
         value, depth = pending.pop()
         if depth > DEEPEST:
             raise ValueError(f"lists and objects stand more than {DEEPEST} deep in each other")
-        if isinstance(value, dict):
-            pending += [(inner, depth + 1) for pair in value.items() for inner in pair]
-        elif isinstance(value, list):
-            pending += [(inner, depth + 1) for inner in value]
-        else:
-            problem = _text_problem(value)
-            if problem:
-                raise ValueError(problem)
+        for inner in value if isinstance(value, list) else (*value, *value.values()):
+            if isinstance(inner, list | dict):
+                pending.append((inner, depth + 1))
+            elif isinstance(inner, str):
+                problem = _text_problem(inner)
+                if problem:
+                    raise ValueError(problem)
 
 
 def read_csv_rows(

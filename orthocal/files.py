@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
+from orthocal.characters import control_character
 from orthocal.errors import OrthocalError, OutputError
 from orthocal.interrupts import postponed_interrupt
 
@@ -95,6 +96,20 @@ def _open_regular(path: Path, error: type[OrthocalError]) -> int:
         found = "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
         raise error(f"is {found}; expected a file", where=str(path))
     return descriptor
+
+
+def require_plain_name(path: Path, *, error: type[OrthocalError] = OrthocalError) -> None:
+    """Refuse a path that a document cannot name: it is written into what is made from it.
+
+    Raises:
+        OrthocalError: Of the kind given, for control characters and bytes that are no UTF-8.
+    """
+    found = control_character(str(path))
+    if found:
+        raise error(
+            f"the path holds '{found}', which no document can name; rename the file or folder",
+            where=str(path),
+        )
 
 
 def is_folder(path: Path) -> bool:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal import __version__
 from orthocal.errors import ClosureError, NotIdentifiableError, ParameterError
 from orthocal.identification.calibration import Calibration
+from orthocal.identification.calibration_file import require_loadable
 from orthocal.identification.cross_validation import predict_unseen
 from orthocal.identification.diagnostics import Diagnostics, diagnose_readings
 from orthocal.identification.fit import Fit, first_sigma, fit_problem
@@ -159,13 +160,16 @@ def assemble_calibration(
         intervals: Profile-likelihood intervals by name, [SI].
         nominal: Free parameters of the machine that readings are held against, shape (n_free,),
             [SI]; what the controller already corrects by default.
+
+    Raises:
+        SolverError: If the result makes no sense.
     """
     problem, noise, loss = fit.problem, fit.noise, fit.loss
     session = problem.session
     diagnostics = diagnose_readings(fit)
     covariance = fit.covariance()
     factor = np.sqrt(2.0) if session.only_differences else 1.0
-    return Calibration(
+    calibration = Calibration(
         robot_record=_robot_record(session),
         session=_session_record(session),
         model=problem.selection.label,
@@ -205,6 +209,8 @@ def assemble_calibration(
         setups=_setup_records(fit),
         version=__version__,
     )
+    require_loadable(calibration)
+    return calibration
 
 
 def _fit_base(

@@ -23,6 +23,7 @@ from orthocal.identification.loss import SQUARES, Loss
 from orthocal.identification.pieces import ReadingPiece
 from orthocal.identification.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.identification.sparse import SparseSum
+from orthocal.interrupts import noticed_interrupt
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -139,6 +140,7 @@ class NonlinearProgram:
         Raises:
             SolverError: If Ipopt does not converge.
             ClosureError: If the machine cannot reach a posture with the start values.
+            KeyboardInterrupt: At Ctrl-C, which CasADi would swallow.
         """
         problem = self.problem
         lower, upper = (self._bounds(side, held or {}) for side in ("lower", "upper"))
@@ -162,14 +164,15 @@ class NonlinearProgram:
             ]
         )
         began = time.perf_counter()
-        answer = self._solver(
-            x0=x0,
-            p=self.pack(sigma=sigma, values=y, left_out=left_out),
-            lbx=lower,
-            ubx=upper,
-            lbg=0.0,
-            ubg=0.0,
-        )
+        with noticed_interrupt():
+            answer = self._solver(
+                x0=x0,
+                p=self.pack(sigma=sigma, values=y, left_out=left_out),
+                lbx=lower,
+                ubx=upper,
+                lbg=0.0,
+                ubg=0.0,
+            )
         seconds = time.perf_counter() - began
         stats = self._solver.stats()
         status, iterations = str(stats["return_status"]), int(stats["iter_count"])

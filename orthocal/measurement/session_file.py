@@ -16,9 +16,15 @@ from numpy.typing import NDArray
 
 from orthocal.documents import parse_number, read_csv_rows, read_yaml, shorten, validate
 from orthocal.errors import ClosureError, RobotError, SessionError
-from orthocal.files import is_folder, read_file
+from orthocal.files import is_folder, read_file, require_plain_name
 from orthocal.measurement.gauge import locate_contacts
-from orthocal.measurement.schema import SectionKeys, SessionKeys, SetupKeys
+from orthocal.measurement.schema import (
+    LARGEST_READING_MM,
+    MOST_READINGS,
+    SectionKeys,
+    SessionKeys,
+    SetupKeys,
+)
 from orthocal.measurement.session import (
     DIRECTIONS,
     Gauge,
@@ -57,6 +63,7 @@ def load_session(path: str | Path) -> Session:
 def _load_session(file: Path, content: bytes, keys: SessionKeys) -> Session:
     if keys.readings is None:
         raise SessionError("is missing; expected the name of a CSV file", where=f"{file}: readings")
+    require_plain_name(file, error=SessionError)
     plan = _build_plan(file, keys)
     if not keys.readings.strip() or "\0" in keys.readings:
         raise SessionError(
@@ -84,6 +91,13 @@ def load_plan(path: str | Path) -> Session:
     file, content, keys = _read_keys(Path(path))
     if keys.readings is not None:
         return _load_session(file, content, keys)
+    count = keys.cycles * sum(len(s.postures or keys.postures) for s in keys.setups.values())
+    if count > MOST_READINGS:
+        raise SessionError(
+            f"plans {count} readings, {keys.cycles} times those of all setups; expected at most "
+            f"{MOST_READINGS}",
+            where=f"{file}: cycles",
+        )
     plan = _build_plan(file, keys)
     readings = []
     for name, setup in keys.setups.items():
@@ -338,6 +352,8 @@ def _read_readings(path: Path, content: bytes, plan: Session) -> tuple[Reading, 
                 where=where,
             )
         seen[key] = line
+        if len(readings) >= MOST_READINGS:
+            raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(path))
         _check_range(value, plan.gauge, bool(minus), where)
         _check_form(reading, raw, joined, where)
         readings.append(reading)
@@ -355,6 +371,12 @@ def _parse_cycle(text: str, where: str) -> int:
 
 
 def _check_range(value_mm: float, gauge: Gauge, difference: bool, where: str) -> None:
+    if abs(value_mm) > LARGEST_READING_MM:
+        raise SessionError(
+            f"reading_mm is {value_mm:g}; expected a number within ±{LARGEST_READING_MM:g}: no "
+            "indicator reaches further",
+            where=where,
+        )
     if gauge.range is None:
         return
     lowest, highest = (v * 1e3 for v in gauge.range)
@@ -383,8 +405,9 @@ def _check_form(
         leader = joined.setdefault(group, {})
 
         def find(name: str) -> str:
-            while leader.get(name, name) != name:
-                name = leader[name]
+            while (above := leader.get(name, name)) != name:
+                leader[name] = leader.get(above, above)  # half the way next time
+                name = above
             return name
 
         first, second = find(reading.posture), find(reading.minus)

@@ -346,11 +346,12 @@ class Assembly:
         _, jacobians = system(passive, drives, theta)
         values = np.linalg.svd(jacobians / system.units, compute_uv=False)
         smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
-        ratio = np.broadcast_to(smallest / np.maximum(values[:, 0], 1e-300), len(drives))
+        largest = values.max(axis=1, initial=0.0)  # without closures there are no values
+        ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), len(drives))
         i = int(ratio.argmin())
         if ratio[i] < SINGULAR_BELOW:
             name = names[i] if names is not None else f"posture {i + 1}"
-            free = int((values[i] > SINGULAR_BELOW * values[i, 0]).sum())
+            free = int((values[i] > SINGULAR_BELOW * largest[i]).sum())
             raise ClosureError(
                 f"is singular: the drives leave {system.n_x - free} of "
                 f"{system.n_x} passive motions free",

@@ -13,7 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError, ParameterError, RobotError
-from orthocal.files import is_folder, read_file
+from orthocal.files import is_folder, read_file, require_plain_name
 from orthocal.robot.description import RobotKeys, load_description
 from orthocal.robot.model import (
     Closure,
@@ -72,6 +72,7 @@ def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
 
 
 def _load_folder(folder: Path) -> Robot:
+    require_plain_name(folder.resolve(), error=RobotError)
     yaml_path, urdf_path = _find_files(folder)
     urdf, description = (read_file(p, error=RobotError) for p in (urdf_path, yaml_path))
     keys = load_description(yaml_path, content=description)

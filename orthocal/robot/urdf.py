@@ -117,6 +117,7 @@ def parse_urdf(path: Path, *, content: bytes | None = None) -> Any:  # noqa: ANN
         )
     if not root.get("name"):
         raise RobotError("<robot> has no name", where=f"{path}:{root.sourceline}")
+    _check_counts(root, path)
     count = sum(1 for _ in root.iter())
     if count > MOST_ELEMENTS:
         raise RobotError(f"has {count} elements; expected at most {MOST_ELEMENTS}", where=str(path))
@@ -127,7 +128,6 @@ def parse_urdf(path: Path, *, content: bytes | None = None) -> Any:  # noqa: ANN
 
 def _check_elements(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has no types
     """Names, references and numbers that yourdfpy and urdfdom take or reject without a word."""
-    _check_counts(root, path)
     links: dict[str, int] = {}
     joints: dict[str, int] = {}
     parents: dict[str, str] = {}
