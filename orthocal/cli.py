@@ -15,6 +15,7 @@ import typer
 import orthocal
 from orthocal.characters import printable
 from orthocal.errors import OrthocalError, ParameterError, SessionError
+from orthocal.interrupts import INTERRUPTED, ending_at_interrupt
 from orthocal.streams import ReaderGoneError, guarded_streams
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def main() -> None:
     """
     # small matrices only: more threads would but get in each other's way
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    with guarded_streams():
+    with guarded_streams(), ending_at_interrupt():
         code = _run()
     sys.exit(code)
 
@@ -76,7 +77,7 @@ def _run() -> int | str | None:
         _note(f"orthocal: {e}")
         code = e.exit_code
     except KeyboardInterrupt:
-        code = 130
+        code = INTERRUPTED
     except MemoryError:
         _note("orthocal: there is not enough memory for an input of this size")
         code = 1

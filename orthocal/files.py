@@ -13,7 +13,7 @@ from pathlib import Path
 
 from orthocal.characters import control_character
 from orthocal.errors import OrthocalError, OutputError
-from orthocal.interrupts import postponed_interrupt
+from orthocal.interrupts import postponed_interrupt, raised_interrupt
 
 LARGEST_FILE = 64 * 2**20
 """Files above this size are refused, [bytes]."""
@@ -222,6 +222,17 @@ def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
         OutputError: If they cannot be written.
     """
     require_writable(folder, files)
+    try:
+        with raised_interrupt():
+            _write(folder, files)
+    except FileExistsError:
+        raise OrthocalError("is a file; expected a folder", where=str(folder)) from None
+    except (OSError, ValueError) as e:
+        raise _refusal(e, folder) from None
+
+
+def _write(folder: Path, files: Mapping[str, str | bytes]) -> None:
+    """Stage all files, and put them in place; what was staged is taken away whatever happens."""
     staged: dict[Path, Path] = {}
     aside: dict[Path, Path] = {}
     try:
@@ -234,10 +245,6 @@ def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
             _stage(staged[target], data, like=target)
         with postponed_interrupt():
             _put_in_place(staged, aside)
-    except FileExistsError:
-        raise OrthocalError("is a file; expected a folder", where=str(folder)) from None
-    except (OSError, ValueError) as e:
-        raise _refusal(e, folder) from None
     finally:
         for temporary in (*staged.values(), *aside.values()):
             temporary.unlink(missing_ok=True)

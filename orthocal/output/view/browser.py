@@ -10,6 +10,7 @@ from pathlib import Path
 
 from orthocal.errors import OrthocalError
 from orthocal.files import write_file
+from orthocal.interrupts import raised_interrupt
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 
@@ -72,7 +73,14 @@ def take_picture(page: str, path: str | Path, *, width: int = 1400, height: int 
     Raises:
         OrthocalError: If there is no Chromium, or it takes no picture.
     """
-    chromium = find_chromium()
+    with raised_interrupt():
+        data = _photograph(find_chromium(), page, Path(path), width, height)
+    write_file(Path(path), data)
+    return Path(path)
+
+
+def _photograph(chromium: str, page: str, path: Path, width: int, height: int) -> bytes:
+    """A picture of a page, as PNG; the path is for messages."""
     with tempfile.TemporaryDirectory(prefix="orthocal-", ignore_cleanup_errors=True) as folder:
         source, picture = Path(folder) / "page.html", Path(folder) / "page.png"
         source.write_text(page, encoding="utf-8")
@@ -98,8 +106,7 @@ def take_picture(page: str, path: str | Path, *, width: int = 1400, height: int 
             words = done.stderr.decode(errors="replace").strip().splitlines()
             reason = f": {words[-1]}" if words else ""
             raise OrthocalError(f"{chromium} took no picture{reason}", where=str(path))
-    write_file(Path(path), data)
-    return Path(path)
+    return data
 
 
 def parse_size(text: str) -> tuple[int, int]:
