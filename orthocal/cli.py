@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,6 +22,7 @@ from orthocal.streams import ReaderGoneError, guarded_streams
 
 if TYPE_CHECKING:
     from orthocal.output.view.scene import Scene
+    from orthocal.study.rows import Chunk
 
 app = typer.Typer(
     add_completion=False,
@@ -262,11 +265,18 @@ def accuracy(
     """Where the tool really is, and how well that is known: over a cube, or at points.
 
     With points CSV on stdout: by how much the tool is off each, and one standard deviation of that.
+    Exit code 3: some cannot be reached; they are named, and their cells are empty.
     """
     from orthocal.identification.calibration_file import load_calibration
     from orthocal.measurement.table import closures_named_by_row, read_points
-    from orthocal.output.accuracy import accuracy_json, format_points, print_accuracy
-    from orthocal.study.accuracy import Workspace, assess_tool, cube
+    from orthocal.output.accuracy import (
+        POINT_COLUMNS,
+        accuracy_json,
+        format_points,
+        print_accuracy,
+    )
+    from orthocal.study.accuracy import MOST_POINTS, Workspace, assess_tool, cube
+    from orthocal.study.rows import accuracy_rows
 
     result = load_calibration(calibration)
     names = None
@@ -275,16 +285,22 @@ def accuracy(
         region = f"a cube of ±{half_side_mm:g} mm around the zero"
     else:
         names, given = read_points(points, result.robot)
+        if not json:
+            _print_rows(POINT_COLUMNS, format_points, accuracy_rows(result, given, names=names))
+            return
+        if len(given) > MOST_POINTS:
+            raise SessionError(
+                f"holds {len(given)} points; expected at most {MOST_POINTS} with --json, which "
+                "looks at all of them together",
+                where=str(points),
+            )
         workspace = Workspace.even(given)
-        region = f"the {len(given)} points of {points}"
     with closures_named_by_row():
         found = assess_tool(result, workspace, names=names)
     if json:
         _out(accuracy_json(result, found).rstrip("\n"))
-    elif points is None:
-        print_accuracy(result, found, region=region)
     else:
-        _out(format_points(found))
+        print_accuracy(result, found, region=region)
 
 
 @app.command()
@@ -328,20 +344,17 @@ def forward(
     """Where the calibrated machine's tool is, for drive coordinates: CSV on stdout, mm.
 
     Drive coordinates are those of the encoders, without any offset of the controller.
+
+    Exit code 3: some rows cannot be reached; they are named, and their cells are empty.
     """
     from orthocal.identification.calibration_file import load_calibration
-    from orthocal.measurement.table import (
-        TOOL_COLUMNS,
-        closures_named_by_row,
-        format_table,
-        read_joints,
-    )
+    from orthocal.measurement.table import TOOL_COLUMNS, format_rows, read_joints
+    from orthocal.study.rows import forward_rows
 
     result = load_calibration(calibration)
     names, values = read_joints(joints, result.robot)
-    with closures_named_by_row():
-        points = result.forward(values, names=names)
-    _out(format_table(TOOL_COLUMNS, points))
+    form = partial(format_rows, TOOL_COLUMNS)
+    _print_rows(TOOL_COLUMNS, form, forward_rows(result, values, names=names))
 
 
 @app.command()
@@ -355,20 +368,18 @@ def inverse(
     """Drive coordinates that bring the calibrated machine's tool to points: CSV on stdout.
 
     Drive coordinates are those of the encoders, without any offset of the controller.
+
+    Exit code 3: some rows cannot be reached; they are named, and their cells are empty.
     """
     from orthocal.identification.calibration_file import load_calibration
-    from orthocal.measurement.table import (
-        closures_named_by_row,
-        drive_columns,
-        format_table,
-        read_points,
-    )
+    from orthocal.measurement.table import drive_columns, format_rows, read_points
+    from orthocal.study.rows import inverse_rows
 
     result = load_calibration(calibration)
     names, points = read_points(targets, result.robot)
-    with closures_named_by_row():
-        drives = result.inverse(points, names=names)
-    _out(format_table(drive_columns(result.robot), drives))
+    columns = drive_columns(result.robot)
+    form = partial(format_rows, columns)
+    _print_rows(columns, form, inverse_rows(result, points, names=names))
 
 
 @app.command()
@@ -524,6 +535,39 @@ def simulate(
 def _globs(texts: list[str] | None) -> list[str]:
     """Globs of repeated options, each with commas between."""
     return [glob.strip() for text in texts or [] for glob in text.split(",") if glob.strip()]
+
+
+def _print_rows(
+    columns: Iterable[str], form: Callable[[Any], str], chunks: Iterable[Chunk]
+) -> None:
+    """Print a table as it is evaluated; rows that are refused are named, and their cells empty.
+
+    Raises:
+        SessionError: If the machine can be at none of the rows.
+        typer.Exit: With code 3 if it cannot be at some.
+    """
+    refused: list[str] = []
+    count, begun, rest = 0, False, ""
+    first: tuple[str, str] | None = None
+    for chunk in chunks:
+        count += len(chunk.refused)
+        for e in chunk.refused.values():
+            first = first or (e.posture, e.reason)
+            refused.append(f"orthocal: {e.posture}: {e.reason}")
+        rest += form(chunk.values)
+        if not begun and len(chunk.refused) == len(chunk.values):
+            continue  # there may be none to be served at all
+        text, rest = rest if begun else ",".join(columns) + "\n" + rest, ""
+        begun = True
+        _out(text.removesuffix("\n"))
+        for line in refused:
+            _note(line)
+        refused.clear()
+    if first is not None and not begun:
+        raise SessionError(first[1], where=first[0])
+    if count:
+        _note(f"orthocal: {count} of the rows cannot be reached; their cells are empty")
+        raise typer.Exit(3)
 
 
 def _serve(scene: Scene, port: int | None, browse: bool) -> None:

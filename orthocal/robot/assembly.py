@@ -21,6 +21,8 @@ from orthocal.robot.model import Robot, Tcp
 from orthocal.robot.symbolic import SymbolicRobot, closure_row_units, coordinate_units
 
 Array = NDArray[np.float64]
+Failures = dict[int, ClosureError]
+"""Index of a posture to why it cannot be reached."""
 
 CLOSED = 1e-12
 """Largest scaled residual of closed loops, relative to max(1 m, characteristic length), [m]."""
@@ -117,6 +119,7 @@ class Assembly:
         theta: ArrayLike | None = None,
         start: ArrayLike | None = None,
         names: Sequence[str] | None = None,
+        failures: Failures | None = None,
     ) -> Array:
         """Passive coordinates that close the loops, g(q, θ) = 0.
 
@@ -126,6 +129,8 @@ class Assembly:
             start: Passive coordinates to start from, shape (n_passive,) or (K, n_passive); the
                 mechanical zero by default.
             names: Names of the postures, for messages.
+            failures: Filled with the postures that cannot be reached, which are NaN then; by
+                default the first of them raises.
 
         Returns:
             Shape (K, n_passive), or (n_passive,) for one posture.
@@ -134,11 +139,9 @@ class Assembly:
             ClosureError: If a posture cannot be reached, is outside the limits of a passive joint
                 or singular; names the posture and the residual.
         """
-        d = np.asarray(drives, dtype=np.float64)
-        single = d.ndim == 1
-        d = np.atleast_2d(d)
-        passive = self._solve(self._closing, d, self._theta(theta), start, names)
-        self._refuse_singular(d, passive, self._theta(theta), names)
+        d, single = as_rows(drives, len(self.robot.drives), "drive coordinates")
+        passive = self._solve(self._closing, d, self._theta(theta), start, names, failures)
+        self._refuse_singular(d, passive, self._theta(theta), names, failures)
         return passive[0] if single else passive
 
     def forward(
@@ -147,6 +150,7 @@ class Assembly:
         *,
         theta: ArrayLike | None = None,
         names: Sequence[str] | None = None,
+        failures: Failures | None = None,
     ) -> Array:
         """Tool centre point of commanded drive coordinates.
 
@@ -154,6 +158,7 @@ class Assembly:
             drives: Shape (K, n_drives) or (n_drives,), [m, rad].
             theta: Values of the free parameters, shape (n_free,); 0 by default.
             names: Names of the postures, for messages.
+            failures: As for `close`.
 
         Returns:
             Shape (K, 3) or (3,), [m].
@@ -163,7 +168,8 @@ class Assembly:
             RobotError: If the robot has no tool centre point.
         """
         d = np.asarray(drives, dtype=np.float64)
-        return self.tcp(d, self.close(d, theta=theta, names=names), theta=theta)
+        passive = self.close(d, theta=theta, names=names, failures=failures)
+        return self.tcp(d, passive, theta=theta)
 
     def inverse(
         self,
@@ -171,6 +177,7 @@ class Assembly:
         *,
         theta: ArrayLike | None = None,
         names: Sequence[str] | None = None,
+        failures: Failures | None = None,
     ) -> Array:
         """Drive coordinates that bring the tool centre point to given points.
 
@@ -179,6 +186,7 @@ class Assembly:
                 (n_drives,), [m].
             theta: Values of the free parameters, shape (n_free,); 0 by default.
             names: Names of the postures, for messages.
+            failures: As for `close`.
 
         Returns:
             Shape (K, n_drives) or (n_drives,), [m, rad].
@@ -187,12 +195,10 @@ class Assembly:
             ClosureError: If a point cannot be reached.
             RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
-        p = np.asarray(points, dtype=np.float64)
-        single = p.ndim == 1
-        p = np.atleast_2d(p)
+        p, single = as_rows(points, len(self._require_tcp().coordinates), "coordinates")
         if self._inverting is None:
             self._inverting = self._build_inverting()
-        x = self._solve(self._inverting, p, self._theta(theta), None, names)
+        x = self._solve(self._inverting, p, self._theta(theta), None, names, failures)
         drives = x[:, : len(self.robot.drives)]
         return drives[0] if single else drives
 
@@ -277,6 +283,7 @@ class Assembly:
         theta: Array,
         start: ArrayLike | None,
         names: Sequence[str] | None,
+        failures: Failures | None,
     ) -> Array:
         """Newton along the straight path from the origin (or a given start) to each target.
 
@@ -288,13 +295,22 @@ class Assembly:
 
         labels = names if names is not None else [f"posture {i + 1}" for i in range(count)]
 
+        lost_for_good = np.zeros(count, dtype=bool)
+
+        def refuse(i: int, reason: str, residual: float | None) -> None:
+            error = ClosureError(reason, posture=labels[i], residual=residual)
+            if failures is None:
+                raise error
+            failures.setdefault(i, error)
+            lost_for_good[i] = True
+
         for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)).tolist():
-            raise ClosureError("has coordinates that are not numbers", posture=labels[i])
+            refuse(i, "has coordinates that are not numbers", None)
         first = system.start if start is None else np.asarray(start, dtype=np.float64)
         x = np.array(np.broadcast_to(first, (count, system.n_x)))
         moves = np.where(system.units == 1.0, self.robot.characteristic_length, 1.0)
         done, step = np.zeros(count), np.ones(count)
-        pending = np.arange(count)
+        pending = np.flatnonzero(~lost_for_good)
         fresh = np.full(count, start is not None)
         while pending.size:
             reach = np.minimum(1.0, done[pending] + step[pending])
@@ -310,59 +326,78 @@ class Assembly:
             step[pending[~good]] *= 0.5
             for i in pending[~good & (step[pending] < SMALLEST_CONTINUATION_STEP)].tolist():
                 _, final = _newton(system, x[[i]], targets[[i]], theta, tolerance)
-                if final[0] < tolerance:
-                    raise ClosureError(
-                        "cannot be reached from the mechanical zero without changing the way in "
-                        f"which the loops are assembled, {done[i]:.0%} of the way",
-                        posture=labels[i],
-                        residual=float(final[0]),
-                    )
-                raise ClosureError(
-                    "cannot be reached: the loops stay open by "
-                    f"{final[0] * 1e3:.3g} mm, {done[i]:.0%} of the way from the mechanical zero",
-                    posture=labels[i],
-                    residual=float(final[0]),
+                reason = (
+                    "cannot be reached from the mechanical zero without changing the way in "
+                    f"which the loops are assembled, {done[i]:.0%} of the way"
+                    if final[0] < tolerance
+                    else "cannot be reached: the loops stay open by "
+                    f"{final[0] * 1e3:.3g} mm, {done[i]:.0%} of the way from the mechanical zero"
                 )
-            pending = pending[done[pending] < 1.0]
-        for i in np.flatnonzero(~system.within_limits(x)).tolist():
+                refuse(i, reason, float(final[0]))
+            pending = pending[(done[pending] < 1.0) & ~lost_for_good[pending]]
+        for i in np.flatnonzero(~system.within_limits(x) & ~lost_for_good).tolist():
             over = np.maximum(x[i] - system.upper, system.lower - x[i])
             j = int(over.argmax())
             unit, factor = ("mm", 1e3) if system.units[j] == 1.0 else ("deg", 180.0 / np.pi)
-            raise ClosureError(
+            reason = (
                 f"cannot be reached: joint '{system.names[j]}' would be at "
                 f"{x[i][j] * factor:.4g} {unit}, outside its limits "
-                f"{system.lower[j] * factor:g} ... {system.upper[j] * factor:g} {unit}",
-                posture=labels[i],
-                residual=0.0,
+                f"{system.lower[j] * factor:g} ... {system.upper[j] * factor:g} {unit}"
             )
+            refuse(i, reason, 0.0)
+        x[lost_for_good] = np.nan
         return x
 
     def _refuse_singular(
-        self, drives: Array, passive: Array, theta: Array, names: Sequence[str] | None
+        self,
+        drives: Array,
+        passive: Array,
+        theta: Array,
+        names: Sequence[str] | None,
+        failures: Failures | None,
     ) -> None:
         system = self._closing
         if system.n_x == 0:
             return
-        _, jacobians = system(passive, drives, theta)
+        solved = np.flatnonzero(np.isfinite(passive).all(axis=1))
+        _, jacobians = system(passive[solved], drives[solved], theta)
         values = np.linalg.svd(jacobians / system.units, compute_uv=False)
         smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
         largest = values.max(axis=1, initial=0.0)  # without closures there are no values
-        ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), len(drives))
-        i = int(ratio.argmin())
-        if ratio[i] < SINGULAR_BELOW:
-            name = names[i] if names is not None else f"posture {i + 1}"
-            free = int((values[i] > SINGULAR_BELOW * largest[i]).sum())
-            raise ClosureError(
+        ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), solved.shape)
+        for k in np.argsort(ratio)[: int((ratio < SINGULAR_BELOW).sum())].tolist():
+            i = int(solved[k])
+            free = int((values[k] > SINGULAR_BELOW * largest[k]).sum())
+            error = ClosureError(
                 f"is singular: the drives leave {system.n_x - free} of "
                 f"{system.n_x} passive motions free",
-                posture=name,
+                posture=names[i] if names is not None else f"posture {i + 1}",
             )
+            if failures is None:
+                raise error
+            failures[i] = error
+            passive[i] = np.nan
 
 
 @lru_cache(maxsize=4)
 def nominal_assembly(robot: Robot) -> Assembly:
     """The assembly of a robot without errors, built once."""
     return Assembly(robot)
+
+
+def as_rows(values: ArrayLike, n: int, what: str) -> tuple[Array, bool]:
+    """Numbers as an array of shape (K, n), and whether they were a single row.
+
+    Raises:
+        ValueError: If they are no numbers, or not so many a row.
+    """
+    try:
+        given = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"found {type(values).__name__}; expected {n} {what} a row") from None
+    if given.ndim not in (1, 2) or given.shape[-1] != n:
+        raise ValueError(f"found the shape {given.shape}; expected {n} {what} a row, (K, {n})")
+    return np.atleast_2d(given), given.ndim == 1
 
 
 def _residual_function(

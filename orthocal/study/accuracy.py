@@ -38,6 +38,9 @@ ROUNDING = 1e-9
 EXCESS = 1.5
 """Residuals by which errors must exceed their tolerances for the machine to be called worse."""
 
+MOST_POINTS = 5_000
+"""Points that are assessed together; each takes 40 kB. `rows.accuracy_rows` takes any number."""
+
 DRAWS = 500
 """Errors drawn to find how large 95 % of the position errors are at most."""
 
