@@ -12,7 +12,7 @@ from conftest import ROOT
 import orthocal
 
 STAGES = [
-    *("characters", "errors", "interrupts", "streams", "files", "documents", "markup"),
+    *("characters", "arguments", "errors", "interrupts", "streams", "files", "documents", "markup"),
     *("robot", "measurement", "identification", "study", "output", "cli"),
 ]
 

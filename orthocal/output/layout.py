@@ -38,6 +38,9 @@ SHORTEST_WORD = 12
 GAP = 3
 """Columns between those of a table."""
 
+TIGHT_GAP = 1
+"""The same where there is little room."""
+
 NEW_LINE = Segment("\n")
 
 
@@ -46,9 +49,11 @@ class NumberTable(Table):
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """As rich asks for it."""
-        if self._least_width() <= options.max_width:
-            yield from super().__rich_console__(console, options)
-            return
+        for gap, padding in ((GAP, (0, 1)), (TIGHT_GAP, (0, 0))):
+            if self._least_width(gap) <= options.max_width:
+                self.padding = padding
+                yield from super().__rich_console__(console, options)
+                return
         lead = max(1, next((i for i, c in enumerate(self.columns) if c.no_wrap), 1))
         cells = [[_plain(cell) for cell in column.cells] for column in self.columns]
         headers = [_plain(column.header) for column in self.columns]
@@ -63,9 +68,9 @@ class NumberTable(Table):
         """As rich asks for it; as narrow as its paragraphs are."""
         return super().__rich_measure__(console, options).with_maximum(options.max_width)
 
-    def _least_width(self) -> int:
+    def _least_width(self, gap: int) -> int:
         """Columns of the console below which a number would be cut."""
-        least = GAP * (len(self.columns) - 1)
+        least = gap * (len(self.columns) - 1)
         for column in self.columns:
             texts = [_plain(column.header), *(_plain(cell) for cell in column.cells)]
             if column.no_wrap:

@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.arguments import require_kind
 from orthocal.errors import ClosureError, RobotError
 from orthocal.robot.batch import BatchFunction
 from orthocal.robot.model import Robot, Tcp
@@ -97,6 +98,7 @@ class Assembly:
         free: Sequence[str] = (),
         fixed: Mapping[str, float] | None = None,
     ) -> None:
+        require_kind(robot, Robot, expected="a Robot, such as load_robot(...)")
         self.robot = robot
         self.free = tuple(free)
         drives = ca.SX.sym("drives", len(robot.drives))
@@ -167,9 +169,10 @@ class Assembly:
             ClosureError: As `close`.
             RobotError: If the robot has no tool centre point.
         """
-        d = np.asarray(drives, dtype=np.float64)
+        d, single = as_rows(drives, len(self.robot.drives), "drive coordinates")
         passive = self.close(d, theta=theta, names=names, failures=failures)
-        return self.tcp(d, passive, theta=theta)
+        points = self.tcp(d, passive, theta=theta)
+        return points[0] if single else points
 
     def inverse(
         self,
@@ -212,13 +215,20 @@ class Assembly:
                 "tcp", list(self._symbols), [position], ["drives", "passive", "theta"], ["position"]
             )
             self._tcp = BatchFunction(function, shared=["theta"])
-        d = np.atleast_2d(np.asarray(drives, dtype=np.float64))
-        q = np.atleast_2d(np.asarray(passive, dtype=np.float64))
+        d, _ = as_rows(drives, len(self.robot.drives), "drive coordinates")
+        q, _ = as_rows(passive, self.robot.passive_index.size, "passive coordinates")
+        if len(d) != len(q):
+            raise ValueError(f"found {len(d)} rows of drive and {len(q)} of passive coordinates")
         (points,) = self._tcp(d, q, self._theta(theta))
         return points[0] if np.ndim(drives) == 1 else points
 
     def _theta(self, theta: ArrayLike | None) -> Array:
-        return np.zeros(len(self.free)) if theta is None else np.asarray(theta, dtype=np.float64)
+        if theta is None:
+            return np.zeros(len(self.free))
+        values, single = as_rows(theta, len(self.free), "values of the free parameters")
+        if not single:
+            raise ValueError(f"found the shape {values.shape}; expected ({len(self.free)},)")
+        return np.asarray(values[0])
 
     def _require_tcp(self) -> Tcp:
         if self.robot.tcp is None:
@@ -294,6 +304,8 @@ class Assembly:
         count = len(targets)
 
         labels = names if names is not None else [f"posture {i + 1}" for i in range(count)]
+        if len(labels) != count:
+            raise ValueError(f"found {len(labels)} names for {count} rows")
 
         lost_for_good = np.zeros(count, dtype=bool)
 
@@ -306,7 +318,7 @@ class Assembly:
 
         for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)).tolist():
             refuse(i, "has coordinates that are not numbers", None)
-        first = system.start if start is None else np.asarray(start, dtype=np.float64)
+        first = system.start if start is None else as_rows(start, system.n_x, "start values")[0]
         x = np.array(np.broadcast_to(first, (count, system.n_x)))
         moves = np.where(system.units == 1.0, self.robot.characteristic_length, 1.0)
         done, step = np.zeros(count), np.ones(count)
@@ -331,7 +343,7 @@ class Assembly:
                     f"which the loops are assembled, {done[i]:.0%} of the way"
                     if final[0] < tolerance
                     else "cannot be reached: the loops stay open by "
-                    f"{final[0] * 1e3:.3g} mm, {done[i]:.0%} of the way from the mechanical zero"
+                    f"{float(final[0]) * 1e3:.3g} mm, {done[i]:.0%} of the way from the mechanical zero"
                 )
                 refuse(i, reason, float(final[0]))
             pending = pending[(done[pending] < 1.0) & ~lost_for_good[pending]]

@@ -18,6 +18,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.arguments import require_kind
 from orthocal.identification.calibration import Calibration
 from orthocal.robot.assembly import nominal_assembly
 from orthocal.robot.model import Robot, read_only
@@ -85,6 +86,8 @@ class Workspace:
     def even(cls, points: ArrayLike) -> Workspace:
         """Points that all count alike, shape (K, n_coordinates), [m]."""
         p = read_only(np.atleast_2d(np.asarray(points, dtype=np.float64)))
+        if p.ndim != 2 or not p.size:
+            raise ValueError(f"found the shape {p.shape}; expected points, (K, n_coordinates)")
         return cls(p, read_only(np.full(len(p), 1.0 / len(p))))
 
 
@@ -200,6 +203,7 @@ def assess_tool(
         RobotError: If the robot has no tool centre point.
         ClosureError: If the machine cannot reach a point.
     """
+    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     robot, values = calibration.robot, calibration.errors
     space = cube(robot) if workspace is None else workspace
     unmodelled = calibration.unmodelled

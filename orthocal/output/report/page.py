@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
+from orthocal.arguments import require_kind
 from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.files import write_file
 from orthocal.identification.calibration import Calibration
@@ -79,6 +80,7 @@ def build_report(calibration: Calibration) -> str:
     Raises:
         OrthocalError: If the robot cannot be found, or is not the one that was calibrated.
     """
+    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     title = f"Calibration of {calibration.robot_record.name}: {calibration.session.title}"
     sections = [
         ("verdict", "What to enter, and can it be believed?", _verdict(calibration)),

@@ -146,6 +146,8 @@ class LiveScene:
     def __init__(self, scene: Scene, *, port: int | None = None) -> None:
         if not isinstance(scene, Scene):
             raise TypeError(f"found a {type(scene).__name__}; expected a Scene: draw_scene(...)")
+        if port is not None and not (isinstance(port, int) and 0 <= port < 2**16):
+            raise ValueError(f"the port is {port!r}; expected 0 to 65535")
         self.scene = scene
         self._socket = _listen(port)
         self.port = int(self._socket.getsockname()[1])
