@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TextIO
 
@@ -25,6 +25,8 @@ class _Guarded(io.TextIOBase):
 
     def __init__(self, stream: TextIO | None) -> None:
         self._stream = stream
+        self._failure: Exception | None = None
+        """What went wrong first: it stays so, though somebody on the way may have swallowed it."""
 
     @property
     def encoding(self) -> str:  # type: ignore[override] # a property there, too, but in C
@@ -52,33 +54,26 @@ class _Guarded(io.TextIOBase):
             ReaderGoneError: If nobody reads it any more.
             OutputError: If it cannot be written.
         """
-        if self._stream is None:
-            return self._fail("it is closed", len(text))
-        try:
-            return self._stream.write(text)
-        except BrokenPipeError:
-            raise self._gone() from None
-        except OSError as e:
-            return self._fail(str(e.strerror), len(text))
+        if text and self._stream is None:
+            self._failure = _unwritable("it is closed")
+        self._try(lambda stream: stream.write(text))
+        return len(text)
 
     def flush(self) -> None:
         """Write what was kept so far; raises as `write` does."""
-        if self._stream is None:
-            return
+        self._try(lambda stream: stream.flush())
+
+    def _try(self, act: Callable[[TextIO], object]) -> None:
         try:
-            self._stream.flush()
+            if self._failure is None and self._stream is not None:
+                act(self._stream)
         except BrokenPipeError:
-            raise self._gone() from None
+            self._failure = ReaderGoneError()
         except OSError as e:
-            self._fail(str(e.strerror), 0)
-
-    def _gone(self) -> ReaderGoneError:
-        self._abandon()
-        return ReaderGoneError()
-
-    def _fail(self, reason: str, count: int) -> int:
-        self._abandon()
-        raise OutputError(f"cannot be written: {reason}", where="standard output")
+            self._failure = _unwritable(str(e.strerror))
+        if self._failure is not None:
+            self._abandon()
+            raise self._failure
 
     def _abandon(self) -> None:
         """Let what is still kept go nowhere: Python writes it when it ends."""
@@ -91,23 +86,13 @@ class _Guarded(io.TextIOBase):
 class _Silent(_Guarded):
     """The same for the stream of errors: where that cannot be written nothing else can be told."""
 
-    def _gone(self) -> ReaderGoneError:
-        return ReaderGoneError()
+    def _try(self, act: Callable[[TextIO], object]) -> None:
+        with suppress(ReaderGoneError, OutputError):
+            super()._try(act)
 
-    def _fail(self, reason: str, count: int) -> int:
-        return count
 
-    def write(self, text: str) -> int:
-        """Write a text, if that can be."""
-        try:
-            return super().write(text)
-        except ReaderGoneError:
-            return len(text)
-
-    def flush(self) -> None:
-        """Write what was kept so far, if that can be."""
-        with suppress(ReaderGoneError):
-            super().flush()
+def _unwritable(reason: str) -> OutputError:
+    return OutputError(f"cannot be written: {reason}", where="standard output")
 
 
 @contextmanager

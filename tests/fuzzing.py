@@ -295,7 +295,6 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     from orthocal.measurement.synthetic import load_errors, simulate_session, truth_document
     from orthocal.measurement.table import read_joints, read_points
     from orthocal.output.accuracy import format_points
-    from orthocal.output.report.page import build_report
     from orthocal.output.view.drawing import draw_scene
     from orthocal.robot.assembly import nominal_assembly
     from orthocal.study.rows import accuracy_rows, forward_rows, inverse_rows
@@ -309,8 +308,8 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
             found = load_calibration(path)
             assert found.to_document() == calibration.to_document()
             summarize(found)
-            if rng.random() < 0.1:
-                build_report(found)
+            if rng.random() < 0.05:
+                draw_scene(found).to_html()
     elif kind == "plan":
         plan = load_plan(folder / "plan.yaml")
         if deep:
@@ -334,8 +333,8 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
             list(inverse_rows(calibration, [[0.0, 0.0]]))
             for chunk in accuracy_rows(calibration, [[0.0, 0.0]]):
                 format_points(chunk.values)
-            if rng.random() < 0.3:
-                build_report(calibration)
+            if rng.random() < 0.1:
+                draw_scene(calibration).to_html()
     else:
         calibration = load_calibration(folder)
         if kind == "errors":

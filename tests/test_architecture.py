@@ -13,7 +13,7 @@ import orthocal
 
 STAGES = [
     *("characters", "arguments", "errors", "interrupts", "streams", "files", "documents", "markup"),
-    *("robot", "measurement", "identification", "study", "output", "cli"),
+    *("robot", "measurement", "identification", "study", "output", "cli", "__main__"),
 ]
 
 MODULES = sorted((ROOT / "orthocal").rglob("*.py"))

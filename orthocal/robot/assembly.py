@@ -343,7 +343,8 @@ class Assembly:
                     f"which the loops are assembled, {done[i]:.0%} of the way"
                     if final[0] < tolerance
                     else "cannot be reached: the loops stay open by "
-                    f"{float(final[0]) * 1e3:.3g} mm, {done[i]:.0%} of the way from the mechanical zero"
+                    f"{float(final[0]) * 1e3:.3g} mm, {done[i]:.0%} of the way from the "
+                    "mechanical zero"
                 )
                 refuse(i, reason, float(final[0]))
             pending = pending[(done[pending] < 1.0) & ~lost_for_good[pending]]
