@@ -275,7 +275,7 @@ def require_loadable(calibration: Calibration) -> None:
         SolverError: Naming the number that cannot be.
     """
     try:
-        _check_document(calibration.to_document(), "")
+        _check_document(calibration.to_document(), "calibration.json")
     except CalibrationFileError as e:
         raise SolverError(
             f"the result makes no sense ({e}); look for readings, a σ, tolerances or bounds that "

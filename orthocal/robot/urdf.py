@@ -71,7 +71,7 @@ def load_urdf(path: Path, *, content: bytes | None = None) -> pin.Model:
     # as it was understood here, whatever encoding it claims to be in
     text = str(etree.tostring(root, encoding="unicode"))
     _validate_with_yourdfpy(text, path)
-    with _captured_stderr() as messages:
+    with captured_stderr() as messages:
         try:
             model = pin.buildModelFromXML(text)
         except (ValueError, RuntimeError) as e:
@@ -281,7 +281,7 @@ def _validate_with_yourdfpy(text: str, path: Path) -> None:
 
 
 @contextmanager
-def _captured_stderr() -> Iterator[Any]:
+def captured_stderr() -> Iterator[Any]:
     """Catch what C++ code writes to the error stream; yields a function that returns it."""
     with _sink() as sink:
         sys.stderr.flush()
