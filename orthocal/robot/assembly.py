@@ -420,7 +420,7 @@ def _residual_function(
     function = ca.Function(
         name, [x, p, theta], [residual, jacobian], ["x", "p", "theta"], ["residual", "jacobian"]
     )
-    return BatchFunction(function, shared=["theta"])
+    return BatchFunction(function, shared=["theta"], matrices=["jacobian"])
 
 
 def _newton(
