@@ -454,7 +454,8 @@ class _Worker:
         command = [sys.executable, __file__, "--worker", str(self.folder), "--seed", str(self.seed)]
         command += ["--first", str(self.next), "--count", str(self.last)]
         command += ["--thorough", str(self.thorough)]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "ORTHOCAL_FUZZ_WORKER": "1"}
+        path = os.pathsep.join([os.environ.get("ORTHOCAL_FUZZ_PATH", ""), str(ROOT)])
+        environment = {**os.environ, "PYTHONPATH": path, "ORTHOCAL_FUZZ_WORKER": "1"}
         with self._output.open("wb") as stream:
             self._process = subprocess.Popen(
                 command, stdout=stream, stderr=subprocess.DEVNULL, env=environment
@@ -487,6 +488,7 @@ class _Worker:
             self._start()
         self.done = self.next >= self.last
         if self.done:
+            self._process.wait()
             self._output.unlink(missing_ok=True)
         return found
 
