@@ -235,6 +235,7 @@ def _write(folder: Path, files: Mapping[str, str | bytes]) -> None:
     """Stage all files, and put them in place; what was staged is taken away whatever happens."""
     staged: dict[Path, Path] = {}
     aside: dict[Path, Path] = {}
+    made = [f for f in (folder, *folder.parents) if not f.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
@@ -248,6 +249,9 @@ def _write(folder: Path, files: Mapping[str, str | bytes]) -> None:
     finally:
         for temporary in (*staged.values(), *aside.values()):
             temporary.unlink(missing_ok=True)
+        for empty in made:  # nothing was written: as if it had never been tried
+            with suppress(OSError):
+                empty.rmdir()
 
 
 def _put_in_place(staged: Mapping[Path, Path], aside: dict[Path, Path]) -> None:

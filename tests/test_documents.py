@@ -148,8 +148,13 @@ def change(document, keys, value):
 @pytest.mark.parametrize(
     ("keys", "value", "message"),
     [
-        (["session", "gauge_sigma"], 0, "session.gauge_sigma: found '0'; expected greater than 0"),
-        (["session", "gauge_sigma"], 0.0, "expected greater than 0"),
+        (
+            ["session", "gauge_sigma"],
+            0,
+            "session.gauge_sigma: found '0'; expected greater than or equal",
+        ),
+        (["session", "gauge_sigma"], 1e-300, "expected greater than or equal to 1e-16"),
+        (["noise", "residual_sigma"], -1.0, "expected greater than or equal to 0"),
         (["identifiability", "n_postures"], 10**30, "expected less than or equal to 1000000000"),
         (["identifiability", "n_readings"], 10**400, "has 401 characters"),
         (["solver", "iterations"], 10**30, "expected less than or equal to 1000000000"),
@@ -161,7 +166,7 @@ def change(document, keys, value):
         (["identifiability", "singular_values", 0], 0.0, "the largest first"),
         (["identifiability", "rank"], 4, "identifiability.rank: found 4"),
         (["covariance"], [], "covariance: expected 3 × 3 numbers"),
-        (["parameters", 0, "tolerance"], 0, "expected greater than 0"),
+        (["parameters", 0, "tolerance"], 0, "expected greater than or equal to 1e-16"),
         (["robot", "folder"], "a\x00b", "a text holds a control character"),
         (["robot", "folder"], "x" * 300, "is neither a robot of orthocal"),
         (["session", "title"], "\ud800", "half of a surrogate pair"),

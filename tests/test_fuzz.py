@@ -5,6 +5,7 @@ What a longer run found stands below as tests of their own.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -14,7 +15,8 @@ import numpy as np
 import pytest
 from fuzzing import KINDS, lay_out, make_case, run
 
-from orthocal import load_robot
+from orthocal import calibrate, load_calibration, load_robot
+from orthocal.errors import CalibrationFileError
 from orthocal.robot.assembly import nominal_assembly
 
 COUNT = 2000
@@ -73,6 +75,15 @@ def test_what_must_not_be_is_seen(spoil, seen, good, tmp_path, monkeypatch):
 
 
 # ---- finds
+
+
+def test_a_noise_whose_square_is_no_number(experiment_2, tmp_path):
+    """Quotients by a σ of 1e-308 overflow when they are squared: seed 10, case 27478."""
+    document = calibrate(experiment_2).to_document()
+    document["session"]["gauge_sigma"] = 1e-308
+    (tmp_path / "calibration.json").write_text(json.dumps(document))
+    with pytest.raises(CalibrationFileError, match="session.gauge_sigma: found '1e-308'"):
+        load_calibration(tmp_path)
 
 
 def test_a_machine_with_one_passive_joint(root, tmp_path):

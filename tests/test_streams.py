@@ -206,5 +206,6 @@ def test_ctrl_c_while_files_are_staged_leaves_none(tmp_path):
         "with ending_at_interrupt():\n"
         "    files.write_files(Path(sys.argv[1]), {'a': 'x', 'b': 'y'})\n"
     )
-    subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, check=False)
-    assert list(Path(tmp_path).iterdir()) == []
+    folder = tmp_path / "new/folder"
+    subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, check=False)
+    assert list(tmp_path.iterdir()) == []

@@ -41,8 +41,12 @@ Item = TypeVar("Item")
 Many = Annotated[list[Item], Field(fail_fast=True)]
 """A list of which one wrong item is told, however many there are."""
 
-Positive = Annotated[Number, Field(gt=0.0)]
-"""A number above 0: in SI, so that a file's smallest in mm is one."""
+SMALLEST = 1e-16
+"""Of what is above 0, [SI]: a thousandth of the smallest that a session or a robot can state in mm
+or ppm; squares of quotients by it are numbers."""
+
+Positive = Annotated[Number, Field(ge=SMALLEST)]
+"""A number above 0, in SI."""
 
 Terms = Annotated[Many[tuple[str, Number]], Field(min_length=1)]
 
@@ -97,9 +101,9 @@ class _ParameterKeys(_Keys):
 class _NoiseKeys(_Keys):
     reading_sigma: Annotated[Number, Field(ge=0.0)] | None
     source: Literal["cycles", "residuals", "gauge", "unknown"]
-    cycles_sigma: Number | None
+    cycles_sigma: Annotated[Number, Field(ge=0.0)] | None
     cycles_dof: Count
-    residual_sigma: Number | None
+    residual_sigma: Annotated[Number, Field(ge=0.0)] | None
     residual_dof: Annotated[Number, Field(ge=0.0)]
 
 

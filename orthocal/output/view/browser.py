@@ -8,7 +8,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from orthocal.errors import OrthocalError
+from orthocal.errors import OrthocalError, OutputError
 from orthocal.files import write_file
 from orthocal.interrupts import raised_interrupt
 
@@ -72,9 +72,13 @@ def take_picture(page: str, path: str | Path, *, width: int = 1400, height: int 
 
     Raises:
         OrthocalError: If there is no Chromium, or it takes no picture.
+        OutputError: If it, or the page that it is taken of, cannot be written.
     """
     with raised_interrupt():
-        data = _photograph(find_chromium(), page, Path(path), width, height)
+        try:
+            data = _photograph(find_chromium(), page, Path(path), width, height)
+        except OSError as e:
+            raise OutputError(f"no page can be written for Chromium: {e}", where="--png") from None
     write_file(Path(path), data)
     return Path(path)
 
