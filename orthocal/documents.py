@@ -43,9 +43,14 @@ def _refuse_huge(value: float) -> float:
     return value
 
 
-def _refuse_tiny(value: float) -> float:
-    if value < SMALLEST_POSITIVE:
-        raise PydanticCustomError("tiny", f"Input should be at least {SMALLEST_POSITIVE:g}")
+SMALLEST_IN_SI = 1e-16
+"""The same in SI units, below the smallest part per million; squares of quotients by it are still
+numbers."""
+
+
+def _refuse_tiny(value: float, smallest: float = SMALLEST_POSITIVE) -> float:
+    if value < smallest:
+        raise PydanticCustomError("tiny", f"Input should be at least {smallest:g}")
     return value
 
 
@@ -65,6 +70,11 @@ Finite = Annotated[float, BeforeValidator(_refuse_truth_values), Field(allow_inf
 
 PositiveNumber = Annotated[Number, Field(gt=0.0), AfterValidator(_refuse_tiny)]
 """A number of sane size above 0."""
+
+PositiveInSI = Annotated[
+    Number, Field(gt=0.0), AfterValidator(lambda v: _refuse_tiny(v, SMALLEST_IN_SI))
+]
+"""The same in SI units, where it was one in mm, mrad or ppm."""
 
 LARGEST_YAML = 2**20
 """YAML files above this size are refused, [bytes]: PyYAML reads about one MiB a second."""

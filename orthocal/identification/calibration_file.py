@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from orthocal.documents import Count, Finite, Number, read_json, validate
+from orthocal.documents import Count, Finite, Number, PositiveInSI, read_json, validate
 from orthocal.errors import CalibrationFileError, SolverError
 from orthocal.files import exists, is_folder
 from orthocal.identification.calibration import SCHEMA, Calibration
@@ -41,13 +41,6 @@ Item = TypeVar("Item")
 Many = Annotated[list[Item], Field(fail_fast=True)]
 """A list of which one wrong item is told, however many there are."""
 
-SMALLEST = 1e-16
-"""Of what is above 0, [SI]: a thousandth of the smallest that a session or a robot can state in mm
-or ppm; squares of quotients by it are numbers."""
-
-Positive = Annotated[Number, Field(ge=SMALLEST)]
-"""A number above 0, in SI."""
-
 Terms = Annotated[Many[tuple[str, Number]], Field(min_length=1)]
 
 
@@ -64,8 +57,8 @@ class _SessionKeys(_Keys):
     title: str
     source: str
     sha256: str
-    gauge_sigma: Positive | None
-    gauge_resolution: Positive | None
+    gauge_sigma: PositiveInSI | None
+    gauge_resolution: PositiveInSI | None
     controller_offsets: Many[Number] | None
 
 
@@ -77,7 +70,7 @@ class _SolverKeys(_Keys):
     seconds_solve: Number
     hessian: str
     loss: Literal["squares", "huber"]
-    loss_width: Positive
+    loss_width: PositiveInSI
 
 
 class _ParameterKeys(_Keys):
@@ -86,7 +79,7 @@ class _ParameterKeys(_Keys):
     value: Number
     linear: Number
     std: Annotated[Number, Field(ge=0.0)] | None
-    tolerance: Positive
+    tolerance: PositiveInSI
     free: bool
     identifiable: bool
     start: Number
@@ -141,7 +134,7 @@ class _SetupKeys(_Keys):
 
 class _UnmodelledKeys(_Keys):
     names: Many[str]
-    tolerances: Many[Positive]
+    tolerances: Many[PositiveInSI]
     leakage: Many[Many[Number]]
     residual_rms: Number
 
