@@ -82,7 +82,7 @@ def test_a_noise_whose_square_is_no_number(experiment_2, tmp_path):
     document = calibrate(experiment_2).to_document()
     document["session"]["gauge_sigma"] = 1e-308
     (tmp_path / "calibration.json").write_text(json.dumps(document))
-    with pytest.raises(CalibrationFileError, match="session.gauge_sigma: found '1e-308'"):
+    with pytest.raises(CalibrationFileError, match=r"session.gauge_sigma: found '1e-308'"):
         load_calibration(tmp_path)
 
 
