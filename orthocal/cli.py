@@ -557,7 +557,7 @@ def _print_rows(
         rest += form(chunk.values)
         if not begun and len(chunk.refused) == len(chunk.values):
             continue  # there may be none to be served at all
-        text, rest = rest if begun else ",".join(columns) + "\n" + rest, ""
+        text, rest = rest if begun else printable(",".join(columns)) + "\n" + rest, ""
         begun = True
         _out(text.removesuffix("\n"))
         for line in refused:

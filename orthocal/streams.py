@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TextIO
 
+from orthocal.characters import printable
 from orthocal.errors import OutputError
 
 
@@ -84,7 +85,15 @@ class _Guarded(io.TextIOBase):
 
 
 class _Silent(_Guarded):
-    """The same for the stream of errors: where that cannot be written nothing else can be told."""
+    """The same for the stream of errors: where that cannot be written nothing else can be told.
+
+    Whatever is written to it, by whichever library, steers no terminal.
+    """
+
+    def write(self, text: str) -> int:
+        """Write a text, its control characters as escapes."""
+        super().write(printable(text, keep="\n\t"))
+        return len(text)
 
     def _try(self, act: Callable[[TextIO], object]) -> None:
         with suppress(ReaderGoneError, OutputError):

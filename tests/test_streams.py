@@ -128,6 +128,16 @@ def test_a_robots_folder_that_no_document_can_name_is_refused(root, tmp_path):
         load_robot(odd / "biglide")
 
 
+def test_words_of_the_command_line_steer_no_terminal_either(folder):
+    odd = "a\x1b[31m\u202e"
+    for words in (["calibrate", odd], [odd], ["calibrate", ".", "--model", odd]):
+        done = subprocess.run([*COMMAND, *words], cwd=folder, capture_output=True, check=False)
+        err = done.stderr.decode()
+        assert done.returncode == 2
+        assert r"a\x1b[31m\u202e" in err
+        assert "\x1b" not in err
+
+
 # ---- Ctrl-C
 
 
