@@ -249,6 +249,10 @@ def change_xml(rng: random.Random, data: bytes) -> bytes:
     return bytes(etree.tostring(root))
 
 
+NO_DOCUMENT = (yaml.YAMLError, etree.XMLSyntaxError)
+"""What says that a file is spoilt so far that it has no structure left."""
+
+
 def mutate(rng: random.Random, kind: str, data: bytes) -> bytes:
     """One file, spoilt in one to three ways."""
     for _ in range(rng.choice((1, 1, 1, 1, 2, 3))):
@@ -257,7 +261,7 @@ def mutate(rng: random.Random, kind: str, data: bytes) -> bytes:
             continue
         try:
             data = mutate_structure(rng, kind, data)
-        except (ValueError, TypeError, yaml.YAMLError, etree.XMLSyntaxError, RecursionError):
+        except (ValueError, TypeError, OverflowError, RecursionError, *NO_DOCUMENT):
             data = change_bytes(rng, data)
     return data
 
