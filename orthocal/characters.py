@@ -13,6 +13,13 @@ _ORDINARY = re.compile(r"[ -~]*")
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
+_NO_TEXT = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+"""Control characters but newline and tabulator, and halves of surrogate pairs."""
+
+LONGEST_SHOWN = 58
+"""Characters of a value in a message."""
+
+
 def printable(text: str, *, keep: str = "") -> str:
     r"""A text with every character that is not one to be seen written as its escape, such as \x1b.
 
@@ -32,6 +39,23 @@ def control_character(text: str) -> str | None:
     """The first control character or half of a surrogate pair in a text, escaped; else None."""
     found = _CONTROL.search(text)
     return _escape(found[0]) if found else None
+
+
+def text_problem(value: object) -> str | None:
+    """What is wrong with the characters of a text, if anything."""
+    if not isinstance(value, str):
+        return None
+    found = _NO_TEXT.search(value)
+    if not found:
+        return None
+    if "\ud800" <= found[0] <= "\udfff":
+        return "half of a surrogate pair is not a character"
+    return "a text holds a control character"
+
+
+def shorten(text: str) -> str:
+    """A value as it can stand in a message."""
+    return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 3]}..."
 
 
 def _is_escaped(character: str) -> bool:

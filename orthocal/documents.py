@@ -18,8 +18,10 @@ import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
+from orthocal.characters import shorten, text_problem
 from orthocal.errors import OrthocalError
 from orthocal.files import read_file
+from orthocal.strict_yaml import DEEPEST, LARGEST_YAML, LONGEST_NUMBER, StrictLoader
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -76,127 +78,16 @@ PositiveInSI = Annotated[
 ]
 """The same in SI units, where it was one in mm, mrad or ppm."""
 
-LARGEST_YAML = 2**20
-"""YAML files above this size are refused, [bytes]: PyYAML reads about one MiB a second."""
-
-MOST_YAML_VALUES = 50_000
-"""Keys and values of a YAML file; a posture has seven, and PyYAML reads as many in 2 s."""
-
 MOST_JSON_VALUES = 2_000_000
 """Keys and values of a JSON file, for its memory; a calibration has forty a reading."""
 
 MOST_CSV_ROWS = 1_000_000
 """Rows of a CSV file, for its memory."""
 
-DEEPEST = 20
-"""Lists and mappings within each other; no document of ours has more than seven."""
-
-LONGEST_NUMBER = 100
-"""Characters of a number; a float needs 25."""
-
 _LONG_NUMBER = re.compile(rf"[-+.eE0-9]{{{LONGEST_NUMBER + 1}}}")
-
-_NO_TEXT = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
-"""Control characters but newline and tabulator, and halves of surrogate pairs."""
-
-LONGEST_SHOWN = 58
-"""Characters of a value in a message."""
 
 MOST_SHOWN = 20
 """Items of a list or mapping up to which it is written out in a message."""
-
-_YAML = "tag:yaml.org,2002:"
-
-_TAGS: dict[type[yaml.Event], frozenset[str]] = {
-    yaml.ScalarEvent: frozenset(
-        {"!", *(_YAML + t for t in ("str", "int", "float", "bool", "null"))}
-    ),
-    yaml.SequenceStartEvent: frozenset({"!", f"{_YAML}seq"}),
-    yaml.MappingStartEvent: frozenset({"!", f"{_YAML}map"}),
-}
-"""Tags that a value of each kind may be given: those that it would have without any."""
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """SafeLoader for documents of a sane size: text, numbers, lists and mappings with text as keys.
-
-    It also refuses duplicate keys, aliases, keys that are no scalars and tags of other kinds.
-    """
-
-    def __init__(self, stream: str) -> None:
-        super().__init__(stream)
-        self._count = self._depth = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        event: Any = self.peek_event()  # type: ignore[no-untyped-call] # PyYAML's stub
-        problem = None
-        if isinstance(event, yaml.AliasEvent):
-            problem = "aliases (*name) are not allowed here"
-        elif event.tag is not None and event.tag not in _TAGS[type(event)]:
-            problem = f"could not determine a constructor for the tag '{shorten(event.tag)}'"
-        self._count += 1
-        if self._count > MOST_YAML_VALUES:
-            problem = f"holds more than {MOST_YAML_VALUES} keys and values"
-        if self._depth >= DEEPEST:
-            problem = f"lists and mappings stand more than {DEEPEST} deep in each other"
-        if problem:
-            raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
-        self._depth += 1
-        node = super().compose_node(parent, index)
-        self._depth -= 1
-        return node
-
-    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:  # noqa: ANN401 - any value
-        try:
-            if node.tag in (f"{_YAML}int", f"{_YAML}float") and len(node.value) > LONGEST_NUMBER:
-                raise ValueError
-            value = super().construct_object(node, deep)
-        except (ValueError, KeyError, IndexError, AttributeError, TypeError, OverflowError):
-            tag = str(node.tag).replace(_YAML, "!!")
-            raise yaml.MarkedYAMLError(
-                problem=f"'{shorten(str(node.value))}' does not fit its tag {tag}",
-                problem_mark=node.start_mark,
-            ) from None
-        problem = _text_problem(value)
-        if problem:
-            raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
-        return value
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        if not isinstance(node, yaml.MappingNode):
-            raise yaml.MarkedYAMLError(
-                problem="expected keys and values", problem_mark=node.start_mark
-            )
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                raise yaml.MarkedYAMLError(
-                    problem="a key is a list or a mapping; expected text",
-                    problem_mark=key.start_mark,
-                )
-            if key.value in seen:
-                raise yaml.MarkedYAMLError(
-                    problem=f"the key '{key.value}' stands twice", problem_mark=key.start_mark
-                )
-            seen.add(key.value)
-        return dict(super().construct_mapping(node, deep))
-
-
-def _text_problem(value: object) -> str | None:
-    """What is wrong with the characters of a text, if anything."""
-    if not isinstance(value, str):
-        return None
-    found = _NO_TEXT.search(value)
-    if not found:
-        return None
-    if "\ud800" <= found[0] <= "\udfff":
-        return "half of a surrogate pair is not a character"
-    return "a text holds a control character"
-
-
-def shorten(text: str) -> str:
-    """A value as it can stand in a message."""
-    return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 3]}..."
 
 
 def read_text(
@@ -243,7 +134,7 @@ def read_yaml(path: Path, *, error: type[OrthocalError], content: bytes | None =
     """
     text = read_text(path, error=error, content=content, largest=LARGEST_YAML)
     try:
-        return yaml.load(text, Loader=_StrictLoader)
+        return yaml.load(text, Loader=StrictLoader)
     except yaml.MarkedYAMLError as e:
         mark = e.problem_mark or e.context_mark
         line = "" if mark is None else f":{mark.line + 1}"
@@ -312,7 +203,7 @@ def _check_texts(document: object) -> None:
             if isinstance(inner, list | dict):
                 pending.append((inner, depth + 1))
             elif isinstance(inner, str):
-                problem = _text_problem(inner)
+                problem = text_problem(inner)
                 if problem:
                     raise ValueError(problem)
 

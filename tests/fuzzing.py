@@ -43,7 +43,7 @@ LONGEST = 5.0
 LARGEST = 500
 """Memory of a worker, [MiB]; the libraries alone take 200."""
 
-HANGS = 60.0
+HANGS = 240.0
 """Time without a sign of life after which a worker is killed, [s]."""
 
 SESSION = """

@@ -12,7 +12,8 @@ from conftest import ROOT
 import orthocal
 
 STAGES = [
-    *("characters", "arguments", "errors", "interrupts", "streams", "files", "documents", "markup"),
+    *("characters", "arguments", "errors", "interrupts", "streams"),
+    *("files", "strict_yaml", "documents", "markup"),
     *("robot", "measurement", "identification", "study", "output", "cli", "__main__"),
 ]
 

@@ -11,7 +11,6 @@ import pytest
 
 from orthocal import calibrate, load_calibration, load_session
 from orthocal.documents import (
-    LARGEST_YAML,
     MOST_CSV_ROWS,
     MOST_JSON_VALUES,
     read_csv_rows,
@@ -19,6 +18,7 @@ from orthocal.documents import (
     read_yaml,
 )
 from orthocal.errors import OrthocalError, SessionError, SolverError
+from orthocal.strict_yaml import LARGEST_YAML
 
 PROMPT = 5.0
 """Processor time that no refusal may take, [s]."""

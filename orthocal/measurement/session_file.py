@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.documents import parse_number, read_csv_rows, read_yaml, shorten, validate
+from orthocal.characters import shorten
+from orthocal.documents import parse_number, read_csv_rows, read_yaml, validate
 from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.files import is_folder, read_file, require_plain_name
 from orthocal.measurement.gauge import locate_contacts
