@@ -261,7 +261,7 @@ def mutate(rng: random.Random, kind: str, data: bytes) -> bytes:
             continue
         try:
             data = mutate_structure(rng, kind, data)
-        except (ValueError, TypeError, OverflowError, RecursionError, *NO_DOCUMENT):
+        except (ValueError, TypeError, LookupError, ArithmeticError, RecursionError, *NO_DOCUMENT):
             data = change_bytes(rng, data)
     return data
 
