@@ -5,18 +5,24 @@ Imports of anything slow stand inside the commands: help answers at once.
 
 from __future__ import annotations
 
-import io
+import os
 import sys
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import orthocal
+from orthocal.characters import printable
 from orthocal.errors import OrthocalError, ParameterError, SessionError
+from orthocal.interrupts import INTERRUPTED, ending_at_interrupt
+from orthocal.streams import ReaderGoneError, guarded_streams
 
 if TYPE_CHECKING:
     from orthocal.output.view.scene import Scene
+    from orthocal.study.rows import Chunk
 
 app = typer.Typer(
     add_completion=False,
@@ -49,32 +55,45 @@ AllRows = Annotated[
 def main() -> None:
     """Run the command line; no traceback ever reaches a user.
 
-    Exit codes: 0 done, 1 a solve did not converge, 2 bad input, 70 a bug of ours; `compare` has
-    more.
+    Exit codes: 0 done, 1 a solve did not converge or an output cannot be written, 2 bad input,
+    3 some rows of a table cannot be reached, 70 a bug of ours, 130 Ctrl-C; `compare` has more.
     """
-    import os
-
     # small matrices only: more threads would but get in each other's way
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for stream in (sys.stdout, sys.stderr):  # a terminal without ± prints a question mark
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
+    with guarded_streams(), ending_at_interrupt():
+        code = _run()
+    sys.exit(code)
+
+
+def _run() -> int | str | None:
+    """Run the command; its exit code."""
+    code: int | str | None = 0
     try:
-        app()
+        try:
+            app()
+        except SystemExit as e:
+            code = e.code
+        sys.stdout.flush()
+    except ReaderGoneError:
+        pass
     except OrthocalError as e:
         _note(f"orthocal: {e}")
-        sys.exit(e.exit_code)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
+        code = e.exit_code
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    except MemoryError:
+        _note("orthocal: there is not enough memory for an input of this size")
+        code = 1
     except Exception as e:
         if os.environ.get("ORTHOCAL_DEBUG"):
             raise
         _note(
-            f"orthocal: this is a bug of orthocal, not of your input: {type(e).__name__}: {e}\n"
+            "orthocal: this is a bug of orthocal, not of your input: "
+            f"{printable(f'{type(e).__name__}: {e}')}\n"
             "Set ORTHOCAL_DEBUG=1 to see where, and report it."
         )
-        sys.exit(70)
+        code = 70
+    return code
 
 
 @app.callback(invoke_without_command=True)
@@ -187,8 +206,7 @@ def calibrate(
     if out is not None:
         from orthocal.output.report.page import build_report
 
-        # the report first: both are there, or none
-        files = {"report.html": build_report(result), "calibration.json": result.to_json()}
+        files = {"calibration.json": result.to_json(), "report.html": build_report(result)}
         write_files(out, files)
         _note(f"Wrote {out / 'calibration.json'} and {out / 'report.html'}")
 
@@ -253,17 +271,33 @@ def accuracy(
     """Where the tool really is, and how well that is known: over a cube, or at points.
 
     With points CSV on stdout: by how much the tool is off each, and one standard deviation of that.
+    Exit code 3: some cannot be reached; they are named, and their cells are empty.
     """
     from orthocal.identification.calibration_file import load_calibration
     from orthocal.measurement.table import closures_named_by_row, read_points
-    from orthocal.output.accuracy import accuracy_json, format_points, print_accuracy
+    from orthocal.output.accuracy import (
+        POINT_COLUMNS,
+        accuracy_json,
+        format_points,
+        print_accuracy,
+    )
     from orthocal.robot.workspace import Workspace, cube
-    from orthocal.study.accuracy import assess_tool
+    from orthocal.study.accuracy import MOST_POINTS, assess_tool
+    from orthocal.study.rows import accuracy_rows
 
     result = load_calibration(calibration)
     names, workspace = None, None
     if points is not None:
         names, given = read_points(points, result.robot)
+        if not json:
+            _print_rows(POINT_COLUMNS, format_points, accuracy_rows(result, given, names=names))
+            return
+        if len(given) > MOST_POINTS:
+            raise SessionError(
+                f"holds {len(given)} points; expected at most {MOST_POINTS} with --json, which "
+                "looks at all of them together",
+                where=str(points),
+            )
         workspace = Workspace.even(given)
     elif half_side_mm is not None:
         workspace = cube(result.robot, half_side=half_side_mm * 1e-3)
@@ -271,10 +305,8 @@ def accuracy(
         found = assess_tool(result, workspace, names=names)
     if json:
         _out(accuracy_json(result, found).rstrip("\n"))
-    elif points is None:
-        print_accuracy(result, found)
     else:
-        _out(format_points(found))
+        print_accuracy(result, found)
 
 
 @app.command()
@@ -318,20 +350,17 @@ def forward(
     """Where the calibrated machine's tool is, for drive coordinates: CSV on stdout, mm.
 
     Drive coordinates are those of the encoders, without any offset of the controller.
+
+    Exit code 3: some rows cannot be reached; they are named, and their cells are empty.
     """
     from orthocal.identification.calibration_file import load_calibration
-    from orthocal.measurement.table import (
-        TOOL_COLUMNS,
-        closures_named_by_row,
-        format_table,
-        read_joints,
-    )
+    from orthocal.measurement.table import TOOL_COLUMNS, format_rows, read_joints
+    from orthocal.study.rows import forward_rows
 
     result = load_calibration(calibration)
     names, values = read_joints(joints, result.robot)
-    with closures_named_by_row():
-        points = result.forward(values, names=names)
-    _out(format_table(TOOL_COLUMNS, points))
+    form = partial(format_rows, TOOL_COLUMNS)
+    _print_rows(TOOL_COLUMNS, form, forward_rows(result, values, names=names))
 
 
 @app.command()
@@ -345,20 +374,18 @@ def inverse(
     """Drive coordinates that bring the calibrated machine's tool to points: CSV on stdout.
 
     Drive coordinates are those of the encoders, without any offset of the controller.
+
+    Exit code 3: some rows cannot be reached; they are named, and their cells are empty.
     """
     from orthocal.identification.calibration_file import load_calibration
-    from orthocal.measurement.table import (
-        closures_named_by_row,
-        drive_columns,
-        format_table,
-        read_points,
-    )
+    from orthocal.measurement.table import drive_columns, format_rows, read_points
+    from orthocal.study.rows import inverse_rows
 
     result = load_calibration(calibration)
     names, points = read_points(targets, result.robot)
-    with closures_named_by_row():
-        drives = result.inverse(points, names=names)
-    _out(format_table(drive_columns(result.robot), drives))
+    columns = drive_columns(result.robot)
+    form = partial(format_rows, columns)
+    _print_rows(columns, form, inverse_rows(result, points, names=names))
 
 
 @app.command()
@@ -516,13 +543,45 @@ def _globs(texts: list[str] | None) -> list[str]:
     return [glob.strip() for text in texts or [] for glob in text.split(",") if glob.strip()]
 
 
+def _print_rows(
+    columns: Iterable[str], form: Callable[[Any], str], chunks: Iterable[Chunk]
+) -> None:
+    """Print a table as it is evaluated; rows that are refused are named, and their cells empty.
+
+    Raises:
+        SessionError: If the machine can be at none of the rows.
+        typer.Exit: With code 3 if it cannot be at some.
+    """
+    refused: list[str] = []
+    count, begun, rest = 0, False, ""
+    first: tuple[str, str] | None = None
+    for chunk in chunks:
+        count += len(chunk.refused)
+        for e in chunk.refused.values():
+            first = first or (e.posture, e.reason)
+            refused.append(f"orthocal: {e.posture}: {e.reason}")
+        rest += form(chunk.values)
+        if not begun and len(chunk.refused) == len(chunk.values):
+            continue  # there may be none to be served at all
+        text, rest = rest if begun else printable(",".join(columns)) + "\n" + rest, ""
+        begun = True
+        _out(text.removesuffix("\n"))
+        for line in refused:
+            _note(line)
+        refused.clear()
+    if first is not None and not begun:
+        raise SessionError(first[1], where=first[0])
+    if count:
+        _note(f"orthocal: {count} of the rows cannot be reached; their cells are empty")
+        raise typer.Exit(3)
+
+
 def _serve(scene: Scene, port: int | None, browse: bool) -> None:
     """Show a scene until Ctrl-C."""
     from orthocal.output.view.live import LiveScene
 
     with LiveScene(scene, port=port) as live:
         _out(live.url)
-        sys.stdout.flush()
         _note("Open this in a browser on this machine; Ctrl-C ends.")
         if browse:
             import webbrowser
@@ -533,10 +592,11 @@ def _serve(scene: Scene, port: int | None, browse: bool) -> None:
 
 def _out(text: str) -> None:
     sys.stdout.write(text + "\n")
+    sys.stdout.flush()
 
 
 def _note(text: str) -> None:
-    sys.stderr.write(text + "\n")
+    sys.stderr.write(printable(text, keep="\n") + "\n")
 
 
 if __name__ == "__main__":

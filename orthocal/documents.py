@@ -7,9 +7,9 @@ every message names the file and what was found in it.
 from __future__ import annotations
 
 import csv
+import io
 import json
 import re
-import unicodedata
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin
@@ -18,7 +18,10 @@ import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
+from orthocal.characters import shorten, text_problem
 from orthocal.errors import OrthocalError
+from orthocal.files import read_file
+from orthocal.strict_yaml import DEEPEST, LARGEST_YAML, LONGEST_NUMBER, StrictLoader
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -42,9 +45,14 @@ def _refuse_huge(value: float) -> float:
     return value
 
 
-def _refuse_tiny(value: float) -> float:
-    if value < SMALLEST_POSITIVE:
-        raise PydanticCustomError("tiny", f"Input should be at least {SMALLEST_POSITIVE:g}")
+SMALLEST_IN_SI = 1e-16
+"""The same in SI units, below the smallest part per million; squares of quotients by it are still
+numbers."""
+
+
+def _refuse_tiny(value: float, smallest: float = SMALLEST_POSITIVE) -> float:
+    if value < smallest:
+        raise PydanticCustomError("tiny", f"Input should be at least {smallest:g}")
     return value
 
 
@@ -56,97 +64,77 @@ Number = Annotated[
 ]
 """A number of sane size; YAML's yes and no are not numbers."""
 
+Count = Annotated[int, Field(ge=0, le=10**9)]
+"""A whole number of sane size."""
+
+Finite = Annotated[float, BeforeValidator(_refuse_truth_values), Field(allow_inf_nan=False)]
+"""A number of any size: one that follows from others and is not computed with."""
+
 PositiveNumber = Annotated[Number, Field(gt=0.0), AfterValidator(_refuse_tiny)]
 """A number of sane size above 0."""
 
-LARGEST_FILE = 64 * 2**20
-"""Files above this size are refused, [bytes]."""
+PositiveInSI = Annotated[
+    Number, Field(gt=0.0), AfterValidator(lambda v: _refuse_tiny(v, SMALLEST_IN_SI))
+]
+"""The same in SI units, where it was one in mm, mrad or ppm."""
+
+MOST_JSON_VALUES = 2_000_000
+"""Keys and values of a JSON file, for its memory; a calibration has forty a reading."""
+
+MOST_CSV_ROWS = 1_000_000
+"""Rows of a CSV file, for its memory."""
+
+_LONG_NUMBER = re.compile(rf"[-+.eE0-9]{{{LONGEST_NUMBER + 1}}}")
+
+MOST_SHOWN = 20
+"""Items of a list or mapping up to which it is written out in a message."""
 
 
-class _StrictLoader(yaml.SafeLoader):
-    """SafeLoader that also refuses duplicate keys, aliases and keys that are no scalars."""
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            event = self.peek_event()  # type: ignore[no-untyped-call] # PyYAML's stub
-            raise yaml.MarkedYAMLError(
-                problem="aliases (*name) are not allowed here", problem_mark=event.start_mark
-            )
-        return super().compose_node(parent, index)
-
-    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:  # noqa: ANN401 - any value
-        try:
-            value = super().construct_object(node, deep)
-        except (ValueError, KeyError, IndexError, AttributeError, TypeError, OverflowError):
-            tag = str(node.tag).replace("tag:yaml.org,2002:", "!!")
-            raise yaml.MarkedYAMLError(
-                problem=f"'{node.value}' does not fit its tag {tag}", problem_mark=node.start_mark
-            ) from None
-        problem = _text_problem(value)
-        if problem:
-            raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
-        return value
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                raise yaml.MarkedYAMLError(
-                    problem="a key is a list or a mapping; expected text",
-                    problem_mark=key.start_mark,
-                )
-            if key.value in seen:
-                raise yaml.MarkedYAMLError(
-                    problem=f"the key '{key.value}' stands twice", problem_mark=key.start_mark
-                )
-            seen.add(key.value)
-        return dict(super().construct_mapping(node, deep))
-
-
-def _text_problem(value: object) -> str | None:
-    """What is wrong with the characters of a text, if anything."""
-    if not isinstance(value, str):
-        return None
-    if any("\ud800" <= c <= "\udfff" for c in value):
-        return "half of a surrogate pair is not a character"
-    if any(unicodedata.category(c) == "Cc" and c not in "\n\t" for c in value):
-        return "a text holds a control character"
-    return None
-
-
-def read_text(path: Path, *, error: type[OrthocalError]) -> str:
+def read_text(
+    path: Path,
+    *,
+    error: type[OrthocalError],
+    content: bytes | None = None,
+    largest: int | None = None,
+) -> str:
     """Text of a UTF-8 file, with a byte order mark taken off.
+
+    Args:
+        path: The file.
+        error: Kind of error to raise.
+        content: What it holds, where it was read already.
+        largest: Size above which it is refused, [bytes]; that of any file by default.
 
     Raises:
         OrthocalError: Of the kind given, if the file is missing, too large or not text.
     """
+    if content is None:
+        content = read_file(path, error=error)
+    if largest is not None and len(content) > largest:
+        raise error(
+            f"has {len(content) / 2**20:.1f} MiB; expected at most {largest / 2**20:g} MiB",
+            where=str(path),
+        )
     try:
-        size = path.stat().st_size
-        if size > LARGEST_FILE:
-            raise error(
-                f"has {size / 2**20:.0f} MiB; expected at most {LARGEST_FILE // 2**20} MiB",
-                where=str(path),
-            )
-        return path.read_bytes().decode("utf-8-sig")
-    except FileNotFoundError:
-        raise error("there is no such file", where=str(path)) from None
-    except IsADirectoryError:
-        raise error("is a folder; expected a file", where=str(path)) from None
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as e:
         raise error(f"is not UTF-8 text (byte {e.start})", where=str(path)) from None
-    except OSError as e:
-        raise error(f"cannot be read: {e.strerror}", where=str(path)) from None
 
 
-def read_yaml(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401 - any document
-    """Content of a YAML file; duplicate keys and aliases are errors.
+def read_yaml(path: Path, *, error: type[OrthocalError], content: bytes | None = None) -> Any:  # noqa: ANN401 - any document
+    """Content of a YAML file; duplicate keys, aliases and tags of other kinds are errors.
+
+    Args:
+        path: The file.
+        error: Kind of error to raise.
+        content: What it holds, where it was read already.
 
     Raises:
         OrthocalError: Of the kind given, naming file and line.
     """
-    text = read_text(path, error=error)
+    text = read_text(path, error=error, content=content, largest=LARGEST_YAML)
     try:
-        return yaml.load(text, Loader=_StrictLoader)
+        return yaml.load(text, Loader=StrictLoader)
     except yaml.MarkedYAMLError as e:
         mark = e.problem_mark or e.context_mark
         line = "" if mark is None else f":{mark.line + 1}"
@@ -167,23 +155,57 @@ def read_json(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
     """
     text = read_text(path, error=error)
 
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        keys = [key for key, _ in pairs]
-        for key in keys:
-            if keys.count(key) > 1:
-                raise ValueError(f"the key '{key}' stands twice")
-        for key, value in pairs:
-            problem = _text_problem(key) or _text_problem(value)
-            if problem:
-                raise ValueError(problem)
-        return dict(pairs)
+    commas_and_brackets = sum(text.count(c) for c in ",[{")
+    if commas_and_brackets > MOST_JSON_VALUES:
+        raise error(
+            f"holds about {commas_and_brackets} values; expected at most {MOST_JSON_VALUES}",
+            where=str(path),
+        )
 
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in found:
+                raise ValueError(f"the key '{shorten(key)}' stands twice")
+            found[key] = value
+        return found
+
+    def short(digits: str) -> str:
+        if len(digits) > LONGEST_NUMBER:
+            raise ValueError(f"the number {shorten(digits)} has {len(digits)} characters")
+        return digits
+
+    readers: dict[str, Any] = {}
+    if _LONG_NUMBER.search(text):  # only then: they take their time
+        readers = {"parse_int": lambda d: int(short(d)), "parse_float": lambda d: float(short(d))}
     try:
-        return json.loads(text, object_pairs_hook=unique)
+        document = json.loads(text, object_pairs_hook=unique, **readers)
+        _check_texts(document)
+        return document
     except json.JSONDecodeError as e:
         raise error(f"is not valid JSON: {e.msg}", where=f"{path}:{e.lineno}") from None
     except (ValueError, RecursionError) as e:
         raise error(f"is not valid JSON: {e or type(e).__name__}", where=str(path)) from None
+
+
+def _check_texts(document: object) -> None:
+    """Refuse a document with characters that are none, wherever in it.
+
+    Raises:
+        ValueError: In words.
+    """
+    pending: list[tuple[Any, int]] = [([document], 0)]
+    while pending:
+        value, depth = pending.pop()
+        if depth > DEEPEST:
+            raise ValueError(f"lists and objects stand more than {DEEPEST} deep in each other")
+        for inner in value if isinstance(value, list) else (*value, *value.values()):
+            if isinstance(inner, list | dict):
+                pending.append((inner, depth + 1))
+            elif isinstance(inner, str):
+                problem = text_problem(inner)
+                if problem:
+                    raise ValueError(problem)
 
 
 def read_csv_rows(
@@ -192,27 +214,36 @@ def read_csv_rows(
     required: tuple[str, ...],
     optional: tuple[str, ...] = (),
     error: type[OrthocalError],
+    content: bytes | None = None,
 ) -> Iterator[tuple[int, dict[str, str]]]:
     """Rows of a CSV file with a header, as (line number, column to text); blank lines skipped.
 
     Semicolons are taken as separators where the header has no comma.
 
+    Args:
+        path: The file.
+        required: Columns that it must have.
+        optional: Columns that it may have.
+        error: Kind of error to raise.
+        content: What it holds, where it was read already.
+
     Raises:
         OrthocalError: Of the kind given, naming file and line.
     """
-    text = read_text(path, error=error)
-    lines = text.splitlines()
-    if not lines or not lines[0].strip():
-        found = "is blank" if any(line.strip() for line in lines) else "is empty"
+    text = read_text(path, error=error, content=content)
+    first = text.splitlines()[0] if text else ""
+    if not first.strip():
+        found = "is blank" if text.strip() else "is empty"
         raise error(f"{found}; expected a header: {','.join(required)}", where=f"{path}:1")
-    delimiter = ";" if "," not in lines[0] and ";" in lines[0] else ","
+    delimiter = ";" if "," not in first and ";" in first else ","
+    lines = io.StringIO(text, newline=None)
     reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
     try:
         header = [name.strip() for name in next(reader)]
         for name in header:
             if name not in required and name not in optional:
                 raise error(
-                    f"unknown column '{name}'; expected {', '.join(required)}"
+                    f"unknown column '{shorten(name)}'; expected {', '.join(required)}"
                     + (f" and optionally {', '.join(optional)}" if optional else ""),
                     where=f"{path}:1",
                 )
@@ -221,11 +252,13 @@ def read_csv_rows(
         for name in required:
             if name not in header:
                 raise error(
-                    f"the column '{name}' is missing; found {', '.join(header)}",
+                    f"the column '{name}' is missing; found {shorten(', '.join(header))}",
                     where=f"{path}:1",
                 )
         for row in reader:
             line = reader.line_num
+            if line > MOST_CSV_ROWS:
+                raise error(f"has more than {MOST_CSV_ROWS} rows", where=str(path))
             if not any(cell.strip() for cell in row):
                 continue
             if len(row) != len(header):
@@ -251,12 +284,12 @@ def parse_number(text: str, *, where: str, name: str, error: type[OrthocalError]
         OrthocalError: Of the kind given, for text, NaN, infinity or a decimal comma.
     """
     try:
-        if not _DECIMAL.fullmatch(text):
+        if len(text) > LONGEST_NUMBER or not _DECIMAL.fullmatch(text):
             raise ValueError
         value = float(text)
     except ValueError:
         hint = " (a decimal comma? write a point)" if "," in text else ""
-        raise error(f"{name} is '{text}'; expected a number{hint}", where=where) from None
+        raise error(f"{name} is '{shorten(text)}'; expected a number{hint}", where=where) from None
     if value - value != 0.0:
         raise error(f"{name} is '{text}'; expected a finite number", where=where)
     if abs(value) > LARGEST_NUMBER:
@@ -294,12 +327,14 @@ def explain_validation_error(
 ) -> tuple[str, str]:
     """Key and plain words for the first finding of a pydantic ValidationError."""
     # an unknown key explains a missing one: name it first
-    findings = sorted(exception.errors(), key=lambda f: f["type"] != "extra_forbidden")
+    findings = sorted(
+        exception.errors(include_url=False), key=lambda f: f["type"] != "extra_forbidden"
+    )
     first = findings[0]
     path = [part for part in first["loc"] if not _is_pydantic_tag(part)]
     found, kind = first.get("input"), first["type"]
     if "[key]" in first["loc"] and not isinstance(found, str):
-        return _join(path[:-1]), f"found the key {found}; expected text: put it in quotes"
+        return _join(path[:-1]), f"found the key {_show(found)}; expected text: put it in quotes"
     key = _join(path)
     if kind == "extra_forbidden":
         known = _keys_at(schema, path[:-1])
@@ -312,10 +347,15 @@ def explain_validation_error(
         # a validator over several keys begins its message with the one that it is about
         inner, separator, rest = words.partition("|")
         return (_join([*path, inner]), rest) if separator else (key, words)
-    shown = "nothing" if found is None else f"'{found}'"
-    if len(shown) > 60:
-        shown = shown[:56] + "...'"
+    shown = "nothing" if found is None else f"'{_show(found)}'"
     return key, f"found {shown}; expected {_expectation(kind, words, first.get('ctx') or {})}"
+
+
+def _show(value: object) -> str:
+    """A value from a document, as it can stand in a message."""
+    if isinstance(value, list | dict) and len(value) > MOST_SHOWN:
+        return f"{'a list' if isinstance(value, list) else 'a mapping'} of {len(value)} items"
+    return shorten(str(value))
 
 
 def _expectation(kind: str, words: str, context: Mapping[str, Any]) -> str:

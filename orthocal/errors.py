@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+from orthocal.characters import printable
+
+LONGEST_MESSAGE = 2000
+"""Characters of an error's message; the middle of a longer one is left out."""
+
 
 class OrthocalError(Exception):
     """Base of all errors of orthocal.
+
+    Its words can be shown anywhere: what comes from files and paths is escaped in them.
 
     Attributes:
         where: File and line or key that the error is about, or None.
@@ -14,9 +21,23 @@ class OrthocalError(Exception):
     exit_code = 2
 
     def __init__(self, problem: str, *, where: str | None = None) -> None:
-        self.where = where
-        self.problem = problem
-        super().__init__(problem if where is None else f"{where}: {problem}")
+        self.where = None if where is None else printable(where)
+        self.problem = _shorten(printable(problem))
+        super().__init__(self.problem if where is None else f"{self.where}: {self.problem}")
+
+
+def _shorten(problem: str) -> str:
+    """A message that nobody has to scroll for, whatever a file holds."""
+    half = LONGEST_MESSAGE // 2
+    if len(problem) <= LONGEST_MESSAGE:
+        return problem
+    return f"{problem[:half]} … {problem[-half:]}"
+
+
+class OutputError(OrthocalError):
+    """A file or a stream cannot be written, though its name is one: no room, no right, closed."""
+
+    exit_code = 1
 
 
 class RobotError(OrthocalError):
@@ -46,7 +67,7 @@ class ClosureError(OrthocalError):
 
     def __init__(self, reason: str, *, posture: str, residual: float | None = None) -> None:
         self.posture = posture
-        self.reason = reason
+        self.reason = _shorten(printable(reason))
         self.residual = residual
         super().__init__(f"posture '{posture}' {reason}")
 

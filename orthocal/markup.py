@@ -5,20 +5,27 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable, Sequence
 
+from orthocal.characters import printable
+
+
+def escape(text: str) -> str:
+    """A text as HTML that shows it: no markup, and no character that turns others about."""
+    return html.escape(printable(text, keep="\n"))
+
 
 def paragraph(text: str, *, kind: str = "") -> str:
     """A paragraph; `kind` is a class."""
-    return f"<p{_class(kind)}>{html.escape(text)}</p>"
+    return f"<p{_class(kind)}>{escape(text)}</p>"
 
 
 def heading(text: str, *, level: int = 2) -> str:
     """A heading of a level from 1 to 6."""
-    return f"<h{level}>{html.escape(text)}</h{level}>"
+    return f"<h{level}>{escape(text)}</h{level}>"
 
 
 def items(texts: Iterable[str]) -> str:
     """A list with bullets."""
-    return "<ul>" + "".join(f"<li>{html.escape(t)}</li>" for t in texts) + "</ul>"
+    return "<ul>" + "".join(f"<li>{escape(t)}</li>" for t in texts) + "</ul>"
 
 
 def table(headers: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 1) -> str:
@@ -33,7 +40,7 @@ def table(headers: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 
 
     def cells(tag: str, texts: Sequence[str]) -> str:
         return "".join(
-            f"<{tag}{_class('' if word else 'number')}>{html.escape(text)}</{tag}>"
+            f"<{tag}{_class('' if word else 'number')}>{escape(text)}</{tag}>"
             for text, word in zip(texts, words, strict=True)
         )
 
@@ -43,4 +50,4 @@ def table(headers: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 
 
 
 def _class(name: str) -> str:
-    return f' class="{html.escape(name)}"' if name else ""
+    return f' class="{escape(name)}"' if name else ""

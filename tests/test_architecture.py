@@ -12,8 +12,9 @@ from conftest import ROOT
 import orthocal
 
 STAGES = [
-    *("errors", "files", "documents", "markup"),
-    *("robot", "measurement", "identification", "study", "output", "cli"),
+    *("characters", "arguments", "errors", "interrupts", "streams"),
+    *("files", "strict_yaml", "documents", "markup"),
+    *("robot", "measurement", "identification", "study", "output", "cli", "__main__"),
 ]
 
 MODULES = sorted((ROOT / "orthocal").rglob("*.py"))

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal import __version__
+from orthocal.arguments import require_kind, require_names, require_numbers
 from orthocal.errors import ClosureError, NotIdentifiableError, ParameterError
 from orthocal.identification.calibration import Calibration
+from orthocal.identification.calibration_file import require_loadable
 from orthocal.identification.cross_validation import predict_unseen
 from orthocal.identification.diagnostics import Diagnostics, diagnose_readings
 from orthocal.identification.fit import Fit, first_sigma, fit_problem
@@ -46,6 +48,7 @@ from orthocal.identification.uncertainty import (
 from orthocal.identification.unmodelled import find_other_errors, measure_unmodelled
 from orthocal.measurement.session import Session
 from orthocal.measurement.session_file import load_session
+from orthocal.robot.assembly import as_rows
 from orthocal.robot.loading import packaged_robots
 from orthocal.robot.model import read_only
 from orthocal.robot.parameters import Parameter
@@ -93,9 +96,21 @@ def calibrate(
         SolverError: If Ipopt does not converge.
         ClosureError: If the machine cannot reach a posture.
         ParameterError: If the model or a name is unknown.
+        TypeError: If an argument is of another kind.
+        ValueError: If there are not as many free parameters to start from as there are.
     """
     if not isinstance(session, Session):
+        require_kind(session, (str, Path), expected="a Session, or the path to one")
         session = load_session(session)
+    require_names(free, argument="free")
+    require_names(profile, argument="profile")
+    require_numbers(known or {}, argument="known", counts=(1, 2))
+    require_numbers(tolerances or {}, argument="tolerances")
+    require_numbers(bounds or {}, argument="bounds", counts=(2,))
+    require_kind(options, (SolverOptions, type(None)), expected="SolverOptions(...)")
+    require_kind(model, (str, type(None)), expected="the name of a model")
+    for value in (prior, base):
+        require_kind(value, (bool, type(None)), expected="True or False as prior or base")
     problem = build_problem(
         session,
         model=model,
@@ -105,6 +120,11 @@ def calibrate(
         tolerances=tolerances,
         bounds=bounds,
     )
+    if start is not None:
+        start, _ = as_rows(start, problem.n_free, "free parameters to start from")
+        if start.shape != (1, problem.n_free) or not np.isfinite(start).all():
+            raise ValueError(f"expected {problem.n_free} finite numbers to start from")
+        start = start[0]
     whole = None
     if base:
         own = [n for n, v in (known or {}).items() if isinstance(v, tuple)]
@@ -168,6 +188,9 @@ def assemble_calibration(
         intervals: Profile-likelihood intervals by name, [SI].
         nominal: Free parameters of the machine that readings are held against, shape (n_free,),
             [SI]; what the controller already corrects by default.
+
+    Raises:
+        SolverError: If the result makes no sense.
     """
     problem, noise, loss = fit.problem, fit.noise, fit.loss
     session = problem.session
@@ -218,6 +241,7 @@ def assemble_calibration(
         setups=_setup_records(fit),
         version=__version__,
     )
+    require_loadable(calibration)
     calibration.remember("robot", lambda: session.robot)  # no need to load it again
     return calibration
 

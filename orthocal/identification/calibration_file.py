@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from orthocal.documents import Number, PositiveNumber, read_json, validate
-from orthocal.errors import CalibrationFileError
+from orthocal.documents import Count, Finite, Number, PositiveInSI, read_json, validate
+from orthocal.errors import CalibrationFileError, SolverError
 from orthocal.files import exists, is_folder
 from orthocal.identification.calibration import SCHEMA, Calibration
 from orthocal.identification.identifiability import Combination, Identifiability
@@ -38,7 +38,11 @@ class _Keys(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-Terms = Annotated[list[tuple[str, Number]], Field(min_length=1)]
+Item = TypeVar("Item")
+Many = Annotated[list[Item], Field(fail_fast=True)]
+"""A list of which one wrong item is told, however many there are."""
+
+Terms = Annotated[Many[tuple[str, Number]], Field(min_length=1)]
 
 
 class _RobotKeys(_Keys):
@@ -46,8 +50,8 @@ class _RobotKeys(_Keys):
     reference: str
     folder: str | None
     sha256: str
-    legs: list[tuple[str, PositiveNumber]]
-    travel: list[tuple[str, Literal["m", "rad"], Number | None, Number | None]]
+    legs: Many[tuple[str, PositiveInSI]]
+    travel: Many[tuple[str, Literal["m", "rad"], Number | None, Number | None]]
 
 
 class _SessionKeys(_Keys):
@@ -56,20 +60,20 @@ class _SessionKeys(_Keys):
     title: str
     source: str
     sha256: str
-    gauge_sigma: Number | None
-    gauge_resolution: Number | None
-    controller_offsets: list[Number] | None
+    gauge_sigma: PositiveInSI | None
+    gauge_resolution: PositiveInSI | None
+    controller_offsets: Many[Number] | None
 
 
 class _SolverKeys(_Keys):
     name: str
     status: str
-    iterations: int
+    iterations: Count
     seconds_build: Number
     seconds_solve: Number
     hessian: str
     loss: Literal["squares", "huber"]
-    loss_width: PositiveNumber
+    loss_width: PositiveInSI
 
 
 class _ParameterKeys(_Keys):
@@ -78,7 +82,7 @@ class _ParameterKeys(_Keys):
     value: Number
     linear: Number
     std: Annotated[Number, Field(ge=0.0)] | None
-    tolerance: PositiveNumber
+    tolerance: PositiveInSI
     free: bool
     identifiable: bool
     start: Number
@@ -93,22 +97,22 @@ class _ParameterKeys(_Keys):
 class _NoiseKeys(_Keys):
     reading_sigma: Annotated[Number, Field(ge=0.0)] | None
     source: Literal["cycles", "residuals", "gauge", "unknown"]
-    cycles_sigma: Number | None
-    cycles_dof: int
-    residual_sigma: Number | None
+    cycles_sigma: Annotated[Number, Field(ge=0.0)] | None
+    cycles_dof: Count
+    residual_sigma: Annotated[Number, Field(ge=0.0)] | None
     residual_dof: Annotated[Number, Field(ge=0.0)]
 
 
 class _ResidualKeys(_Keys):
     setup: str
     posture: str
-    minus: str | None
-    cycle: int
+    minus: Annotated[str, Field(min_length=1)] | None
+    cycle: Count
     measured: Number
     nominal: Number
     linear: Number | None
     predicted: Number
-    line: int | None
+    line: Count | None
     studentised: Number | None
     influence: Number
     influenced: str
@@ -118,8 +122,8 @@ class _ResidualKeys(_Keys):
 
 class _PostureKeys(_Keys):
     name: str
-    drives: list[Number]
-    passive: list[Number]
+    drives: Many[Number]
+    passive: Many[Number]
 
 
 class _SetupKeys(_Keys):
@@ -139,9 +143,9 @@ class _TurnedKeys(_Keys):
 
 
 class _UnmodelledKeys(_Keys):
-    names: list[str]
-    tolerances: list[PositiveNumber]
-    leakage: list[list[Number]]
+    names: Many[str]
+    tolerances: Many[PositiveInSI]
+    leakage: Many[Many[Number]]
     residual_rms: Number
 
 
@@ -154,18 +158,18 @@ class _ObservabilityKeys(_Keys):
 
 
 class _IdentifiabilityKeys(_Keys):
-    singular_values: Annotated[list[Number], Field(min_length=1)]
+    singular_values: Annotated[Many[Number], Field(min_length=1)]
     threshold: Number
-    rank: Annotated[int, Field(ge=0)]
-    structural_rank: Annotated[int, Field(ge=0)]
-    condition: Number | None
+    rank: Count
+    structural_rank: Count
+    condition: Finite | None
     observability: _ObservabilityKeys
-    n_postures: Annotated[int, Field(ge=1)]
-    n_readings: Annotated[int, Field(ge=0)]
-    unseen: list[str]
-    told: list[str]
-    alike: list[Terms]
-    base: list[Terms]
+    n_postures: Annotated[Count, Field(ge=1)]
+    n_readings: Count
+    unseen: Many[str]
+    told: Many[str]
+    alike: Many[Terms]
+    base: Many[Terms]
 
 
 class _CalibrationKeys(_Keys):
@@ -176,8 +180,8 @@ class _CalibrationKeys(_Keys):
     model: str
     prior: bool
     solver: _SolverKeys
-    parameters: Annotated[list[_ParameterKeys], Field(min_length=1)]
-    covariance: list[list[Number | None]]
+    parameters: Annotated[Many[_ParameterKeys], Field(min_length=1)]
+    covariance: Many[Many[Number | None]]
     unmodelled: _UnmodelledKeys
     identifiability: _IdentifiabilityKeys
     base: bool
@@ -190,10 +194,10 @@ class _CalibrationKeys(_Keys):
     largest_before: Number
     largest_after: Number
     critical: Number | None
-    residuals: list[_ResidualKeys]
+    residuals: Many[_ResidualKeys]
     turned: _TurnedKeys | None
-    postures: list[_PostureKeys]
-    setups: list[_SetupKeys]
+    postures: Many[_PostureKeys]
+    setups: Many[_SetupKeys]
 
 
 MAKE_ONE = "`orthocal calibrate SESSION --out FOLDER` makes one"
@@ -222,24 +226,9 @@ def load_calibration(path: str | Path) -> Calibration:
         raise CalibrationFileError(
             f"schema is '{data.get('schema')}'; expected '{SCHEMA}'", where=str(file)
         )
-    keys = validate(_CalibrationKeys, data, where=str(file), error=CalibrationFileError)
+    keys = _check_document(data, str(file))
     free = [p for p in keys.parameters if p.free]
-    covariance = [[math.nan if v is None else v for v in row] for row in keys.covariance]
-    if len(covariance) != len(free) or any(len(row) != len(free) for row in covariance):
-        raise CalibrationFileError(
-            f"expected {len(free)} × {len(free)} numbers, as free parameters",
-            where=f"{file}: covariance",
-        )
-    _check_covariance(np.array(covariance, dtype=np.float64), file)
-    _check_unmodelled(keys.unmodelled, len(free), file)
-    names = [p.name for p in keys.parameters]
-    for i, name in enumerate(names):
-        if name in names[:i]:
-            raise CalibrationFileError(
-                f"'{name}' stands twice", where=f"{file}: parameters[{i}].name"
-            )
-    if not keys.residuals:
-        raise CalibrationFileError("is empty", where=f"{file}: residuals")
+    covariance = _covariance(keys)
     return Calibration(
         robot_record=RobotRecord(
             **{
@@ -262,7 +251,7 @@ def load_calibration(path: str | Path) -> Calibration:
         parameters=tuple(
             ParameterEstimate(**{**p.model_dump(), "std": _float(p.std)}) for p in keys.parameters
         ),
-        covariance=read_only(np.array(covariance).reshape(len(free), len(free))),
+        covariance=read_only(covariance),
         noise=NoiseRecord(
             reading_sigma=_float(keys.noise.reading_sigma),
             source=keys.noise.source,
@@ -294,7 +283,63 @@ def load_calibration(path: str | Path) -> Calibration:
     )
 
 
-def _check_covariance(covariance: Array, file: Path) -> None:
+def require_loadable(calibration: Calibration) -> None:
+    """Refuse a result that could not be read again once it is written: it makes no sense.
+
+    Raises:
+        SolverError: Naming the number that cannot be.
+    """
+    try:
+        _check_document(calibration.to_document(), "calibration.json")
+    except CalibrationFileError as e:
+        raise SolverError(
+            f"the result makes no sense ({e}); look for readings, a σ, tolerances or bounds that "
+            "cannot be",
+            status="absurd result",
+            iterations=calibration.solver.iterations,
+        ) from None
+
+
+def _check_document(data: Any, file: str) -> _CalibrationKeys:  # noqa: ANN401 - any document
+    """The keys of a calibration.json, held against each other.
+
+    Args:
+        data: The document.
+        file: Where it is from, for messages.
+
+    Raises:
+        CalibrationFileError: Naming the key.
+    """
+    keys = validate(_CalibrationKeys, data, where=file, error=CalibrationFileError)
+    n_free = sum(p.free for p in keys.parameters)
+    if not n_free:
+        raise CalibrationFileError("holds none that is free", where=f"{file}: parameters")
+    if len(keys.covariance) != n_free or any(len(row) != n_free for row in keys.covariance):
+        raise CalibrationFileError(
+            f"expected {n_free} × {n_free} numbers, as free parameters",
+            where=f"{file}: covariance",
+        )
+    _check_covariance(_covariance(keys), file)
+    _check_unmodelled(keys.unmodelled, n_free, file)
+    seen: set[str] = set()
+    for i, p in enumerate(keys.parameters):
+        if p.name in seen:
+            raise CalibrationFileError(
+                f"'{p.name}' stands twice", where=f"{file}: parameters[{i}].name"
+            )
+        seen.add(p.name)
+    _check_singular_values(keys.identifiability, file)
+    if not keys.residuals:
+        raise CalibrationFileError("is empty", where=f"{file}: residuals")
+    return keys
+
+
+def _covariance(keys: _CalibrationKeys) -> Array:
+    """Covariance with NaN for what is not known, shape (n_free, n_free)."""
+    return np.array([[_float(v) for v in row] for row in keys.covariance], dtype=np.float64)
+
+
+def _check_covariance(covariance: Array, file: str) -> None:
     """Refuse what cannot be a covariance: a file can be edited."""
     if not np.isfinite(covariance).all():
         return
@@ -309,7 +354,22 @@ def _check_covariance(covariance: Array, file: Path) -> None:
         )
 
 
-def _check_unmodelled(keys: _UnmodelledKeys, n_free: int, file: Path) -> None:
+def _check_singular_values(keys: _IdentifiabilityKeys, file: str) -> None:
+    """Refuse singular values that are none, or that count though they are 0."""
+    values = keys.singular_values
+    if min(values) < 0.0 or sorted(values, reverse=True) != values:
+        raise CalibrationFileError(
+            "expected positive numbers, the largest first",
+            where=f"{file}: identifiability.singular_values",
+        )
+    if keys.rank > len(values) or (keys.rank and values[keys.rank - 1] <= 0.0):
+        raise CalibrationFileError(
+            f"found {keys.rank}; only {sum(v > 0.0 for v in values)} singular values are above 0",
+            where=f"{file}: identifiability.rank",
+        )
+
+
+def _check_unmodelled(keys: _UnmodelledKeys, n_free: int, file: str) -> None:
     count = len(keys.names)
     if len(keys.tolerances) != count:
         raise CalibrationFileError(
@@ -327,7 +387,7 @@ def _identifiability(keys: _IdentifiabilityKeys) -> Identifiability:
     return Identifiability(
         singular_values=read_only(keys.singular_values),
         threshold=keys.threshold,
-        rank=min(keys.rank, len(keys.singular_values)),
+        rank=keys.rank,
         structural_rank=keys.structural_rank,
         n_postures=keys.n_postures,
         n_readings=keys.n_readings,

@@ -32,6 +32,9 @@ LEAST_REST = 1e-6
 SUSPICION = 0.01
 """Probability that any of the readings of a session that is sound is called suspicious."""
 
+LARGEST_CRITICAL = 1e6
+"""Studentised residuals that are never reached; a threshold beyond is none."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Diagnostics:
@@ -99,8 +102,17 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
         deleted=deleted,
         influence=np.nan_to_num(shifts[np.arange(count), influenced]),
         influenced=influenced,
-        critical=confidence_factor(dof, 1.0 - SUSPICION / count),
+        critical=_critical(dof, count),
     )
+
+
+def _critical(dof: float, count: int) -> float:
+    """Studentised residual beyond which one of so many readings is suspicious; infinite for none.
+
+    With hardly any degrees of freedom Student's distribution has no end: 1e28 is none either.
+    """
+    found = confidence_factor(dof, 1.0 - SUSPICION / count)
+    return found if found < LARGEST_CRITICAL else np.inf
 
 
 def _weighted_information(fit: Fit) -> Information:

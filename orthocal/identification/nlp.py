@@ -9,21 +9,24 @@ gradient, Jacobian and Hessian of the whole by index: building does not grow wit
 from __future__ import annotations
 
 import copy
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.arguments import require_kind
 from orthocal.errors import SolverError
 from orthocal.identification.loss import SQUARES, Loss
 from orthocal.identification.pieces import ReadingPiece
 from orthocal.identification.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.identification.sparse import SparseSum
+from orthocal.interrupts import noticed_interrupt
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -41,6 +44,8 @@ MOST_EXACT = 2_000
 
 LEFT_OUT = 1e-9
 """Weight of readings that are left out: next to nothing, and their gauge zeros stay determined."""
+
+MOST_ITERATIONS = 10**6
 
 CONVERGED = frozenset({"Solve_Succeeded"})
 """Ipopt's words for a solution; anything else is an error."""
@@ -69,6 +74,21 @@ class SolverOptions:
     """Ipopt's own printing, 0 (none) to 12."""
     loss: Loss = SQUARES
     """What a residual costs."""
+
+    def __post_init__(self) -> None:
+        require_kind(self.loss, Loss, expected="Loss(...)")
+        for name in ("tolerance", "closure_tolerance"):
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and 0.0 < value < math.inf):
+                raise ValueError(f"{name} is {value!r}; expected a number above 0")
+        for name in ("max_iterations", "print_level"):
+            value = getattr(self, name)
+            if not (isinstance(value, int) and 0 <= value <= MOST_ITERATIONS):
+                raise ValueError(f"{name} is {value!r}; expected a whole number of at least 0")
+        if self.hessian not in get_args(Hessian):
+            raise ValueError(
+                f"the Hessian is {self.hessian!r}; expected one of {', '.join(get_args(Hessian))}"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,6 +167,7 @@ class NonlinearProgram:
         Raises:
             SolverError: If Ipopt does not converge.
             ClosureError: If the machine cannot reach a posture with the start values.
+            KeyboardInterrupt: At Ctrl-C, which CasADi would swallow.
         """
         problem = self.problem
         lower, upper = (self._bounds(side, held or {}) for side in ("lower", "upper"))
@@ -170,14 +191,15 @@ class NonlinearProgram:
             ]
         )
         began = time.perf_counter()
-        answer = self._solver(
-            x0=x0,
-            p=self.pack(sigma=sigma, values=y, left_out=left_out),
-            lbx=lower,
-            ubx=upper,
-            lbg=0.0,
-            ubg=0.0,
-        )
+        with noticed_interrupt():
+            answer = self._solver(
+                x0=x0,
+                p=self.pack(sigma=sigma, values=y, left_out=left_out),
+                lbx=lower,
+                ubx=upper,
+                lbg=0.0,
+                ubg=0.0,
+            )
         seconds = time.perf_counter() - began
         stats = self._solver.stats()
         status, iterations = str(stats["return_status"]), int(stats["iter_count"])

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from orthocal.errors import CalibrationFileError, ParameterError, RobotError
+from orthocal.files import is_folder
 from orthocal.identification.records import (
     ParameterEstimate,
     PostureRecord,
@@ -42,7 +43,7 @@ def load_recorded_robot(record: RobotRecord, *, file: Path | None) -> Robot:
         robot = load_robot(record.name)
     else:
         folder = Path(record.folder)
-        if not folder.is_dir() and file is not None:
+        if not is_folder(folder) and file is not None:
             folder = file.parent / record.reference
         try:
             robot = load_robot(folder)

@@ -150,8 +150,9 @@ def _difference_groups(session: Session) -> dict[tuple[str, int, str], str]:
     leader: dict[tuple[str, int, str], tuple[str, int, str]] = {}
 
     def find(node: tuple[str, int, str]) -> tuple[str, int, str]:
-        while leader.setdefault(node, node) != node:
-            node = leader[node]
+        while (above := leader.setdefault(node, node)) != node:
+            leader[node] = leader.setdefault(above, above)  # half the way next time
+            node = above
         return node
 
     for r in session.readings:
@@ -285,16 +286,16 @@ def locate_contacts(session: Session) -> dict[tuple[str, str], float]:
     (along,) = function(nominal, passive)
     postures = {name: i for i, name in enumerate(session.postures)}
     legs = {name: i for i, name in enumerate(robot.legs)}
+    read: dict[str, set[str]] = {name: set() for name in session.setups}
+    for reading in session.readings:
+        read[reading.setup].update(p for p in (reading.posture, reading.minus) if p is not None)
     result = {}
     for setup in session.setups.values():
         plane, from_root = section_plane(robot, setup)
         leg = robot.legs[setup.leg]
         if from_root:
             plane += float(leg.axis @ leg.zero_root)
-        for reading in session.readings:
-            if reading.setup == setup.name:
-                for name in (reading.posture, reading.minus):
-                    if name is not None:
-                        root, tip = along[postures[name], 2 * legs[leg.name] :][:2]
-                        result[setup.name, name] = float((plane - root) / (tip - root))
+        for name in sorted(read[setup.name], key=postures.__getitem__):
+            root, tip = along[postures[name], 2 * legs[leg.name] :][:2]
+            result[setup.name, name] = float((plane - root) / (tip - root))
     return result

@@ -13,6 +13,25 @@ from orthocal.robot.parameters import Unit
 Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^,;\s\"]+$")]
 Vector = Annotated[list[Number], Field(min_length=1, max_length=12)]
 
+LARGEST_READING_MM = 300.0
+"""No indicator reaches further, and no leg is as far from parallel: it is a wrong unit."""
+
+COARSEST_MM = 10.0
+"""No resolution and no standard deviation of an indicator is larger; a ruler's is 1 mm."""
+
+MOST_POSTURES = 5_000
+"""Postures of a session; each takes a closing of the loops and its variables in the program."""
+
+MOST_SETUPS = 1_000
+"""Setups of a session; each has an unknown zero of its own."""
+
+MOST_READINGS = 50_000
+"""Readings of a session or a plan: four times the largest that was tried, by hand a month's work.
+A calibration takes 10 kB for each."""
+
+GaugeLength = Annotated[PositiveNumber, Field(le=COARSEST_MM)]
+GaugeEnd = Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)]
+
 
 OFFSET_KEYS: dict[str, tuple[Unit, float]] = {
     "offsets_mm": ("m", 1e-3),
@@ -29,9 +48,9 @@ class _Keys(BaseModel):
 class GaugeKeys(_Keys):
     """The indicator."""
 
-    sigma_mm: PositiveNumber | None = None
-    resolution_mm: PositiveNumber | None = None
-    range_mm: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = None
+    sigma_mm: GaugeLength | None = None
+    resolution_mm: GaugeLength | None = None
+    range_mm: Annotated[list[GaugeEnd], Field(min_length=2, max_length=2)] | None = None
 
     @model_validator(mode="after")
     def _range_rises(self) -> GaugeKeys:
@@ -114,9 +133,9 @@ class SessionKeys(_Keys):
     title: str = ""
     source: str = ""
     gauge: GaugeKeys = GaugeKeys()
-    postures: Annotated[dict[Name, PostureKeys], Field(min_length=1)]
+    postures: Annotated[dict[Name, PostureKeys], Field(min_length=1, max_length=MOST_POSTURES)]
     controller: ControllerKeys | None = None
-    setups: Annotated[dict[Name, SetupKeys], Field(min_length=1)]
+    setups: Annotated[dict[Name, SetupKeys], Field(min_length=1, max_length=MOST_SETUPS)]
     cycles: Annotated[int, Field(ge=1, le=1000)] = 1
     """In a plan: how often the postures are gone through."""
     readings: str | None = None

@@ -14,11 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.characters import shorten
 from orthocal.documents import parse_number, read_csv_rows, read_yaml, validate
 from orthocal.errors import ClosureError, RobotError, SessionError
-from orthocal.files import is_folder
+from orthocal.files import is_folder, read_file, require_plain_name
 from orthocal.measurement.gauge import locate_contacts
-from orthocal.measurement.schema import SectionKeys, SessionKeys, SetupKeys
+from orthocal.measurement.schema import (
+    LARGEST_READING_MM,
+    MOST_READINGS,
+    SectionKeys,
+    SessionKeys,
+    SetupKeys,
+)
 from orthocal.measurement.session import (
     DIRECTIONS,
     Gauge,
@@ -51,17 +58,23 @@ def load_session(path: str | Path) -> Session:
         SessionError: Naming file and line or key, what was found and what was expected.
         RobotError: If the robot does not load.
     """
-    file, keys = _read_keys(Path(path))
+    file, content, keys = _read_keys(Path(path))
+    return _load_session(file, content, keys)
+
+
+def _load_session(file: Path, content: bytes, keys: SessionKeys) -> Session:
     if keys.readings is None:
         raise SessionError("is missing; expected the name of a CSV file", where=f"{file}: readings")
+    require_plain_name(file, error=SessionError)
     plan = _build_plan(file, keys)
     if not keys.readings.strip() or "\0" in keys.readings:
         raise SessionError(
             f"found {keys.readings!r}; expected the name of a CSV file", where=f"{file}: readings"
         )
     readings_path = file.parent / keys.readings
-    readings = _read_readings(readings_path, plan)
-    digest = hashlib.sha256(file.read_bytes() + b"\0" + readings_path.read_bytes()).hexdigest()
+    table = read_file(readings_path, error=SessionError)
+    readings = _read_readings(readings_path, table, plan)
+    digest = hashlib.sha256(content + b"\0" + table).hexdigest()
     session = replace(plan, readings=readings, readings_path=readings_path, sha256=digest)
     check_contacts(session)
     return session
@@ -77,9 +90,16 @@ def load_plan(path: str | Path) -> Session:
         SessionError: Naming file and key.
         RobotError: If the robot does not load.
     """
-    file, keys = _read_keys(Path(path))
+    file, content, keys = _read_keys(Path(path))
     if keys.readings is not None:
-        return load_session(file)
+        return _load_session(file, content, keys)
+    count = keys.cycles * sum(len(s.postures or keys.postures) for s in keys.setups.values())
+    if count > MOST_READINGS:
+        raise SessionError(
+            f"plans {count} readings, {keys.cycles} times those of all setups; expected at most "
+            f"{MOST_READINGS}",
+            where=f"{file}: cycles",
+        )
     plan = _build_plan(file, keys)
     readings = []
     for name, setup in keys.setups.items():
@@ -114,12 +134,13 @@ def _where(path: Path | None, key: str) -> str:
     return key if path is None else f"{path}: {key}"
 
 
-def _read_keys(path: Path) -> tuple[Path, SessionKeys]:
+def _read_keys(path: Path) -> tuple[Path, bytes, SessionKeys]:
     file = path / "session.yaml" if is_folder(path) else path
     if file.suffix.lower() in OTHER_KINDS:
         raise SessionError("is no session.yaml", where=str(file))
-    data = read_yaml(file, error=SessionError)
-    return file, validate(SessionKeys, data, where=str(file), error=SessionError)
+    content = read_file(file, error=SessionError)
+    data = read_yaml(file, error=SessionError, content=content)
+    return file, content, validate(SessionKeys, data, where=str(file), error=SessionError)
 
 
 def _build_plan(file: Path, keys: SessionKeys) -> Session:
@@ -287,7 +308,7 @@ def _check_travel(robot: Robot, drives: Array, *, where: str, joiner: str = ": "
             raise SessionError(problem, where=file)
 
 
-def _read_readings(path: Path, plan: Session) -> tuple[Reading, ...]:
+def _read_readings(path: Path, content: bytes, plan: Session) -> tuple[Reading, ...]:
     readings: list[Reading] = []
     seen: dict[tuple[Any, ...], int] = {}
     raw: dict[tuple[str, int], int] = {}
@@ -297,6 +318,7 @@ def _read_readings(path: Path, plan: Session) -> tuple[Reading, ...]:
         required=("setup", "posture", "reading_mm"),
         optional=("minus", "cycle"),
         error=SessionError,
+        content=content,
     ):
         where = f"{path}:{line}"
         setup, posture, minus = row["setup"], row["posture"], row.get("minus", "")
@@ -323,6 +345,8 @@ def _read_readings(path: Path, plan: Session) -> tuple[Reading, ...]:
                 where=where,
             )
         seen[key] = line
+        if len(readings) >= MOST_READINGS:
+            raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(path))
         _check_range(value, plan.gauge, bool(minus), where)
         _check_form(reading, raw, joined, where)
         readings.append(reading)
@@ -335,11 +359,17 @@ def _parse_cycle(text: str, where: str) -> int:
     if not text:
         return 1
     if not (text.isascii() and text.isdigit() and len(text) < 10 and int(text) >= 1):
-        raise SessionError(f"cycle is '{text}'; expected 1, 2, 3 ...", where=where)
+        raise SessionError(f"cycle is '{shorten(text)}'; expected 1, 2, 3 ...", where=where)
     return int(text)
 
 
 def _check_range(value_mm: float, gauge: Gauge, difference: bool, where: str) -> None:
+    if abs(value_mm) > LARGEST_READING_MM:
+        raise SessionError(
+            f"reading_mm is {value_mm:g}; expected a number within ±{LARGEST_READING_MM:g}: no "
+            "indicator reaches further",
+            where=where,
+        )
     if gauge.range is None:
         return
     lowest, highest = (v * 1e3 for v in gauge.range)
@@ -368,8 +398,9 @@ def _check_form(
         leader = joined.setdefault(group, {})
 
         def find(name: str) -> str:
-            while leader.get(name, name) != name:
-                name = leader[name]
+            while (above := leader.get(name, name)) != name:
+                leader[name] = leader.get(above, above)  # half the way next time
+                name = above
             return name
 
         first, second = find(reading.posture), find(reading.minus)

@@ -12,6 +12,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from orthocal.arguments import require_kind, require_numbers
 from orthocal.documents import Number, parse_number, read_yaml, validate
 from orthocal.errors import ParameterError, SessionError
 from orthocal.measurement.gauge import build_observations, predict_entries
@@ -84,6 +85,8 @@ def simulate_session(
         SessionError: If the noise is not known, or a reading leaves the gauge's range.
         ClosureError: If the machine cannot reach a posture.
     """
+    require_kind(plan, Session, expected="a Session, such as load_plan(...)")
+    require_numbers(errors, argument="errors")
     rng = np.random.default_rng(seed)
     observations = build_observations(plan)
     entries = predict_entries(plan, observations, errors)

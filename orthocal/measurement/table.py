@@ -37,19 +37,9 @@ def read_joints(path: Path, robot: Robot) -> tuple[list[str], Array]:
         Names of the rows for messages, and values, shape (K, n_drives), [m, rad].
 
     Raises:
-        SessionError: Naming file and line; also for coordinates beyond a drive's travel.
+        SessionError: Naming file and line.
     """
-    columns = drive_columns(robot)
-    names, values = _read(path, columns)
-    for name, row in zip(names, values, strict=True):
-        for drive, value, (column, factor) in zip(robot.drives, row, columns.items(), strict=True):
-            if not drive.lower <= value <= drive.upper:
-                raise SessionError(
-                    f"{column} is {value / factor:g}; the drive reaches from "
-                    f"{drive.lower / factor:g} to {drive.upper / factor:g}",
-                    where=name,
-                )
-    return names, values
+    return _read(path, drive_columns(robot))
 
 
 def read_points(path: Path, robot: Robot) -> tuple[list[str], Array]:
@@ -67,12 +57,14 @@ def read_points(path: Path, robot: Robot) -> tuple[list[str], Array]:
     return _read(path, columns, ignored=others)
 
 
-def format_table(columns: dict[str, float], values: Array) -> str:
-    """Values in SI as CSV text with a header, in the units of the columns."""
-    lines = [",".join(columns)]
-    factors = np.array(list(columns.values()))
-    lines += [",".join(f"{v:.6f}" for v in row) for row in np.atleast_2d(values) / factors]
-    return "\n".join(lines)
+def format_rows(columns: dict[str, float], values: Array) -> str:
+    """Values in SI as lines of CSV in the units of the columns; rows with NaN are empty cells."""
+    scaled = values / np.array(list(columns.values()))
+    empty = "," * (len(columns) - 1)
+    return "".join(
+        (",".join(f"{v:.6f}" for v in row) if np.isfinite(row).all() else empty) + "\n"
+        for row in scaled
+    )
 
 
 @contextmanager

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.text import Text
 
@@ -30,6 +29,8 @@ THREE_WAYS = (
     "shift out: with the common shift alone taken out (r.m.s.); absolute (r.m.s.)."
 )
 """What the three forms of an error at the tool are."""
+
+Array = NDArray[np.float64]
 
 POINT_COLUMNS = (
     "x_mm",
@@ -128,21 +129,19 @@ def describe_remaining(calibration: Calibration, accuracy: ToolAccuracy) -> list
     return lines
 
 
-def format_points(accuracy: ToolAccuracy) -> str:
-    """Deviation and standard deviation at every point as CSV with POINT_COLUMNS, µm."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(POINT_COLUMNS)
-    count = len(accuracy.workspace.points)
-    if accuracy.after is None:
-        sigma = np.full((count, 3), np.nan)
-    else:
-        sigma = np.sqrt(np.diagonal(accuracy.after.covariance, axis1=1, axis2=2))
-    for point, deviation, spread in zip(accuracy.targets, accuracy.deviation, sigma, strict=True):
-        numbers = [f"{round(v * 1e3, 6) + 0.0:.9g}" for v in point]
-        numbers += [f"{v * 1e6:.3f}" for v in (*deviation, *spread)]
-        writer.writerow(["" if n == "nan" else n for n in numbers])
-    return stream.getvalue().rstrip("\n")
+def format_points(rows: Array) -> str:
+    """Deviation and standard deviation at points as lines of CSV with POINT_COLUMNS, µm.
+
+    Args:
+        rows: Commanded position, deviation and its standard deviation, shape (K, 9), [m]; NaN for
+            what is not known.
+    """
+    lines = []
+    for row in rows:
+        numbers = [f"{round(v * 1e3, 6) + 0.0:.9g}" for v in row[:3]]
+        numbers += [f"{v * 1e6:.3f}" for v in row[3:]]
+        lines.append(",".join("" if n == "nan" else n for n in numbers) + "\n")
+    return "".join(lines)
 
 
 def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:

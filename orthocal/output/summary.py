@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rich.console import Group, RenderableType
 
+from orthocal.arguments import require_kind
 from orthocal.identification.calibration import Calibration
 from orthocal.output.accuracy import render_tool
 from orthocal.output.comparison import render_comparison
@@ -40,6 +41,8 @@ def print_summary(result: Result, *, all_rows: bool = False) -> None:
 
 
 def _render(result: Result, all_rows: bool) -> RenderableType:
+    kinds = (Calibration, Comparison, Validation)
+    require_kind(result, kinds, expected="a Calibration, a Comparison or a Validation")
     if isinstance(result, Calibration):
         return render_calibration(result, all_rows=all_rows)
     if isinstance(result, Comparison):

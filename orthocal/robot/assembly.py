@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.arguments import require_kind
 from orthocal.errors import ClosureError, RobotError
 from orthocal.robot.batch import BatchFunction
 from orthocal.robot.closing import describe_opening
@@ -29,6 +30,8 @@ from orthocal.robot.model import (
 from orthocal.robot.symbolic import SymbolicRobot
 
 Array = NDArray[np.float64]
+Failures = dict[int, ClosureError]
+"""Index of a posture to why it cannot be reached."""
 
 CLOSED = 1e-12
 """Largest scaled residual of closed loops, relative to max(1 m, characteristic length), [m]."""
@@ -122,6 +125,7 @@ class Assembly:
         free: Sequence[str] = (),
         fixed: Mapping[str, float] | None = None,
     ) -> None:
+        require_kind(robot, Robot, expected="a Robot, such as load_robot(...)")
         self.robot = robot
         self.free = tuple(free)
         drives = ca.SX.sym("drives", len(robot.drives))
@@ -145,6 +149,7 @@ class Assembly:
         start: ArrayLike | None = None,
         names: Sequence[str] | None = None,
         allow_free: bool = False,
+        failures: Failures | None = None,
     ) -> Array:
         """Passive coordinates that close the loops, g(q, θ) = 0.
 
@@ -156,6 +161,8 @@ class Assembly:
             names: Names of the postures, for messages.
             allow_free: Whether the loops may leave passive motions free, as those of a robot that
                 is only looked at: they then move as little as closes the loops.
+            failures: Filled with the postures that cannot be reached, which are NaN then; by
+                default the first of them raises.
 
         Returns:
             Shape (K, n_passive), or (n_passive,) for one posture.
@@ -164,12 +171,10 @@ class Assembly:
             ClosureError: If a posture cannot be reached, is outside the limits of a passive joint
                 or, unless free motions are allowed, singular; names the posture and the residual.
         """
-        d = np.asarray(drives, dtype=np.float64)
-        single = d.ndim == 1
-        d = np.atleast_2d(d)
-        passive = self._solve(self._closing, d, self._theta(theta), start, names)
+        d, single = as_rows(drives, len(self.robot.drives), "drive coordinates")
+        passive = self._solve(self._closing, d, self._theta(theta), start, names, failures)
         if not allow_free:
-            self._refuse_singular(d, passive, self._theta(theta), names)
+            self._refuse_singular(d, passive, self._theta(theta), names, failures)
         return passive[0] if single else passive
 
     def forward(
@@ -178,6 +183,7 @@ class Assembly:
         *,
         theta: ArrayLike | None = None,
         names: Sequence[str] | None = None,
+        failures: Failures | None = None,
     ) -> Array:
         """Tool centre point of commanded drive coordinates.
 
@@ -185,6 +191,7 @@ class Assembly:
             drives: Shape (K, n_drives) or (n_drives,), [m, rad].
             theta: Values of the free parameters, shape (n_free,); 0 by default.
             names: Names of the postures, for messages.
+            failures: As for `close`.
 
         Returns:
             Shape (K, 3) or (3,), [m].
@@ -193,8 +200,10 @@ class Assembly:
             ClosureError: As `close`.
             RobotError: If the robot has no tool centre point.
         """
-        d = np.asarray(drives, dtype=np.float64)
-        return self.tcp(d, self.close(d, theta=theta, names=names), theta=theta)
+        d, single = as_rows(drives, len(self.robot.drives), "drive coordinates")
+        passive = self.close(d, theta=theta, names=names, failures=failures)
+        points = self.tcp(d, passive, theta=theta)
+        return points[0] if single else points
 
     def inverse(
         self,
@@ -202,6 +211,7 @@ class Assembly:
         *,
         theta: ArrayLike | None = None,
         names: Sequence[str] | None = None,
+        failures: Failures | None = None,
     ) -> Array:
         """Drive coordinates that bring the tool centre point to given points.
 
@@ -210,6 +220,7 @@ class Assembly:
                 (n_drives,), [m].
             theta: Values of the free parameters, shape (n_free,); 0 by default.
             names: Names of the postures, for messages.
+            failures: As for `close`.
 
         Returns:
             Shape (K, n_drives) or (n_drives,), [m, rad].
@@ -218,12 +229,10 @@ class Assembly:
             ClosureError: If a point cannot be reached.
             RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
-        p = np.asarray(points, dtype=np.float64)
-        single = p.ndim == 1
-        p = np.atleast_2d(p)
+        p, single = as_rows(points, len(self._require_tcp().coordinates), "coordinates")
         if self._inverting is None:
             self._inverting = self._build_inverting()
-        x = self._solve(self._inverting, p, self._theta(theta), None, names)
+        x = self._solve(self._inverting, p, self._theta(theta), None, names, failures)
         drives = x[:, : len(self.robot.drives)]
         return drives[0] if single else drives
 
@@ -237,13 +246,20 @@ class Assembly:
                 "tcp", list(self._symbols), [position], ["drives", "passive", "theta"], ["position"]
             )
             self._tcp = BatchFunction(function, shared=["theta"])
-        d = np.atleast_2d(np.asarray(drives, dtype=np.float64))
-        q = np.atleast_2d(np.asarray(passive, dtype=np.float64))
+        d, _ = as_rows(drives, len(self.robot.drives), "drive coordinates")
+        q, _ = as_rows(passive, self.robot.passive_index.size, "passive coordinates")
+        if len(d) != len(q):
+            raise ValueError(f"found {len(d)} rows of drive and {len(q)} of passive coordinates")
         (points,) = self._tcp(d, q, self._theta(theta))
         return points[0] if np.ndim(drives) == 1 else points
 
     def _theta(self, theta: ArrayLike | None) -> Array:
-        return np.zeros(len(self.free)) if theta is None else np.asarray(theta, dtype=np.float64)
+        if theta is None:
+            return np.zeros(len(self.free))
+        values, single = as_rows(theta, len(self.free), "values of the free parameters")
+        if not single:
+            raise ValueError(f"found the shape {values.shape}; expected ({len(self.free)},)")
+        return np.asarray(values[0])
 
     def _require_tcp(self) -> Tcp:
         if self.robot.tcp is None:
@@ -312,6 +328,7 @@ class Assembly:
         theta: Array,
         start: ArrayLike | None,
         names: Sequence[str] | None,
+        failures: Failures | None,
     ) -> Array:
         """Newton along the straight path from the origin (or a given start) to each target.
 
@@ -322,14 +339,25 @@ class Assembly:
         count = len(targets)
 
         labels = names if names is not None else [f"posture {i + 1}" for i in range(count)]
+        if len(labels) != count:
+            raise ValueError(f"found {len(labels)} names for {count} rows")
+
+        lost_for_good = np.zeros(count, dtype=bool)
+
+        def refuse(i: int, reason: str, residual: float | None) -> None:
+            error = ClosureError(reason, posture=labels[i], residual=residual)
+            if failures is None:
+                raise error
+            failures.setdefault(i, error)
+            lost_for_good[i] = True
 
         for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)).tolist():
-            raise ClosureError("has coordinates that are not numbers", posture=labels[i])
-        first = system.start if start is None else np.asarray(start, dtype=np.float64)
+            refuse(i, "has coordinates that are not numbers", None)
+        first = system.start if start is None else as_rows(start, system.n_x, "start values")[0]
         x = np.array(np.broadcast_to(first, (count, system.n_x)))
         moves = np.where(system.units == 1.0, self.robot.characteristic_length, 1.0)
         done, step = np.zeros(count), np.ones(count)
-        pending = np.arange(count)
+        pending = np.flatnonzero(~lost_for_good)
         fresh = np.full(count, start is not None)
         while pending.size:
             reach = np.minimum(1.0, done[pending] + step[pending])
@@ -345,59 +373,79 @@ class Assembly:
             step[pending[~good]] *= 0.5
             for i in pending[~good & (step[pending] < SMALLEST_CONTINUATION_STEP)].tolist():
                 last, final = _newton(system, x[[i]], targets[[i]], theta, tolerance)
-                if final[0] < tolerance:
-                    raise ClosureError(
-                        "cannot be reached from the mechanical zero without changing the way in "
-                        f"which the loops are assembled, {done[i]:.0%} of the way",
-                        posture=labels[i],
-                        residual=float(final[0]),
-                    )
-                raise ClosureError(
-                    "cannot be reached: the loops stay open by "
+                reason = (
+                    "cannot be reached from the mechanical zero without changing the way in "
+                    f"which the loops are assembled, {done[i]:.0%} of the way"
+                    if final[0] < tolerance
+                    else "cannot be reached: the loops stay open by "
                     f"{system.describe(last[0], targets[i], theta)}, {done[i]:.0%} of the way from "
-                    "the mechanical zero",
-                    posture=labels[i],
-                    residual=float(final[0]),
+                    "the mechanical zero"
                 )
-            pending = pending[done[pending] < 1.0]
-        for i in np.flatnonzero(~system.within_limits(x)).tolist():
+                refuse(i, reason, float(final[0]))
+            pending = pending[(done[pending] < 1.0) & ~lost_for_good[pending]]
+        for i in np.flatnonzero(~system.within_limits(x) & ~lost_for_good).tolist():
             over = np.maximum(x[i] - system.upper, system.lower - x[i])
             j = int(over.argmax())
             unit, factor = ("mm", 1e3) if system.units[j] == 1.0 else ("deg", 180.0 / np.pi)
-            raise ClosureError(
+            reason = (
                 f"cannot be reached: joint '{system.names[j]}' would be at "
                 f"{x[i][j] * factor:.4g} {unit}, outside its limits "
-                f"{system.lower[j] * factor:g} ... {system.upper[j] * factor:g} {unit}",
-                posture=labels[i],
-                residual=0.0,
+                f"{system.lower[j] * factor:g} ... {system.upper[j] * factor:g} {unit}"
             )
+            refuse(i, reason, 0.0)
+        x[lost_for_good] = np.nan
         return x
 
     def _refuse_singular(
-        self, drives: Array, passive: Array, theta: Array, names: Sequence[str] | None
+        self,
+        drives: Array,
+        passive: Array,
+        theta: Array,
+        names: Sequence[str] | None,
+        failures: Failures | None,
     ) -> None:
         system = self._closing
         if system.n_x == 0:
             return
-        _, jacobians = system(passive, drives, theta)
+        solved = np.flatnonzero(np.isfinite(passive).all(axis=1))
+        _, jacobians = system(passive[solved], drives[solved], theta)
         values = np.linalg.svd(jacobians / system.units, compute_uv=False)
         smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
-        ratio = np.broadcast_to(smallest / np.maximum(values[:, 0], 1e-300), len(drives))
-        i = int(ratio.argmin())
-        if ratio[i] < SINGULAR_BELOW:
-            name = names[i] if names is not None else f"posture {i + 1}"
-            free = int((values[i] > SINGULAR_BELOW * values[i, 0]).sum())
-            raise ClosureError(
+        largest = values.max(axis=1, initial=0.0)  # without closures there are no values
+        ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), solved.shape)
+        for k in np.argsort(ratio)[: int((ratio < SINGULAR_BELOW).sum())].tolist():
+            i = int(solved[k])
+            free = int((values[k] > SINGULAR_BELOW * largest[k]).sum())
+            error = ClosureError(
                 f"is singular: the drives leave {system.n_x - free} of "
                 f"{system.n_x} passive motions free",
-                posture=name,
+                posture=names[i] if names is not None else f"posture {i + 1}",
             )
+            if failures is None:
+                raise error
+            failures[i] = error
+            passive[i] = np.nan
 
 
 @lru_cache(maxsize=4)
 def nominal_assembly(robot: Robot) -> Assembly:
     """The assembly of a robot without errors, built once."""
     return Assembly(robot)
+
+
+def as_rows(values: ArrayLike, n: int, what: str) -> tuple[Array, bool]:
+    """Numbers as an array of shape (K, n), and whether they were a single row.
+
+    Raises:
+        ValueError: If they are no numbers, or not so many a row.
+    """
+    try:
+        given = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"found {type(values).__name__}; expected {n} {what} a row") from None
+    if given.ndim not in (1, 2) or given.shape[-1] != n:
+        raise ValueError(f"found the shape {given.shape}; expected {n} {what} a row, (K, {n})")
+    return np.atleast_2d(given), given.ndim == 1
 
 
 def _residual_function(
@@ -407,7 +455,7 @@ def _residual_function(
     function = ca.Function(
         name, [x, p, theta], [residual, jacobian], ["x", "p", "theta"], ["residual", "jacobian"]
     )
-    return BatchFunction(function, shared=["theta"])
+    return BatchFunction(function, shared=["theta"], matrices=["jacobian"])
 
 
 def _newton(

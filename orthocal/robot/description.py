@@ -163,11 +163,15 @@ class RobotKeys(_Keys):
         return dict(zip(self.joint_name, self.joint_type, strict=True))
 
 
-def load_description(path: Path) -> RobotKeys:
+def load_description(path: Path, *, content: bytes | None = None) -> RobotKeys:
     """Read and validate a robot's YAML.
+
+    Args:
+        path: The file.
+        content: What it holds, where it was read already.
 
     Raises:
         RobotError: Naming file and key.
     """
-    data = read_yaml(path, error=RobotError)
+    data = read_yaml(path, error=RobotError, content=content)
     return validate(RobotKeys, data, where=str(path), error=RobotError)

@@ -13,7 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from orthocal.errors import ParameterError, RobotError
-from orthocal.files import is_folder
+from orthocal.files import is_folder, read_file, require_plain_name
 from orthocal.robot.description import RobotKeys, load_description
 from orthocal.robot.model import (
     Closure,
@@ -76,11 +76,13 @@ def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
 
 
 def _load_folder(folder: Path) -> Robot:
+    require_plain_name(folder.resolve(), error=RobotError)
     yaml_path, urdf_path = _find_files(folder)
-    keys = load_description(yaml_path)
+    urdf, description = (read_file(p, error=RobotError) for p in (urdf_path, yaml_path))
+    keys = load_description(yaml_path, content=description)
     where = str(yaml_path)
-    model = load_urdf(urdf_path, joint_types=keys.joint_types, declared_in=where)
-    digest = hashlib.sha256(urdf_path.read_bytes() + b"\0" + yaml_path.read_bytes()).hexdigest()
+    model = load_urdf(urdf_path, content=urdf, joint_types=keys.joint_types, declared_in=where)
+    digest = hashlib.sha256(urdf + b"\0" + description).hexdigest()
 
     drives = _build_drives(model, keys, where)
     drive_index = [model.joints[model.getJointId(d.name)].idx_v for d in drives]

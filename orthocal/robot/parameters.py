@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Literal
 
+from orthocal.arguments import require_numbers
 from orthocal.errors import ParameterError
 
 Kind = Literal["offset", "scale", "translation", "rotation"]
@@ -177,6 +178,7 @@ class ParameterSet:
         Raises:
             ParameterError: If a name is unknown.
         """
+        require_numbers(values, argument="errors")
         total: dict[str, float] = {}
         for name, value in values.items():
             for term, coefficient in self[name].terms:

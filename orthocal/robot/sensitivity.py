@@ -68,12 +68,20 @@ class ToolSensitivity:
         )
         self._shared = [np.asarray(v.full()).reshape(-1) for v in shared.function(self.theta)]
 
-    def __call__(self, drives: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
+    def __call__(
+        self,
+        drives: ArrayLike,
+        *,
+        names: Sequence[str] | None = None,
+        passive: ArrayLike | None = None,
+    ) -> Array:
         """∂p/∂θ at commanded drive coordinates.
 
         Args:
             drives: Shape (K, n_drives), [m, rad].
             names: What to call the postures in messages.
+            passive: Passive coordinates that close the loops there, shape (K, n_passive), [m, rad],
+                if they are known.
 
         Returns:
             Shape (K, 3, n_free), [m per parameter unit].
@@ -82,7 +90,8 @@ class ToolSensitivity:
             ClosureError: If a posture cannot be reached.
         """
         d = np.atleast_2d(np.asarray(drives, dtype=np.float64))
-        passive = self.assembly.close(d, names=names)
+        if passive is None:
+            passive = self.assembly.close(d, names=names)
         p_q, p_theta, g_q, g_theta = self._function(d, passive, self.theta, *self._shared)
         if g_q.shape[1] == g_q.shape[2]:
             slopes = np.linalg.solve(g_q, g_theta)

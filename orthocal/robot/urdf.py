@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pinocchio as pin
@@ -36,13 +36,37 @@ _NUMBERS: dict[str, dict[str, int]] = {
     "box": {"size": 3},
     "cylinder": {"radius": 1, "length": 1},
     "sphere": {"radius": 1},
+    "mesh": {"scale": 3},
     "color": {"rgba": 4},
 }
 """Elements and how many numbers each of their attributes holds."""
 
+_BOUNDED = frozenset({"xyz", "rpy", "size", "radius", "length", "scale", "rgba"})
+"""Attributes that say where and how large something is."""
+
+LARGEST_PLACE = 1e4
+"""No length [m], angle [rad] or scale is larger: loops of metres must close to nanometres."""
+
+LARGEST_URDF = 16 * 2**20
+"""URDF files above this size are refused, [bytes]."""
+
+MOST_ELEMENTS = 20_000
+"""XML elements of a URDF; a humanoid with its hands has some thousands."""
+
+MOST_JOINTS = 1_000
+"""Joints, fixed ones too: urdfdom calls itself for every one in a chain, until its stack ends."""
+
+MOST_MOVING = 120
+"""Moving joints: their symbolic derivatives grow with the square. A humanoid with its hands has
+about 80."""
+
 
 def load_urdf(
-    path: Path, *, joint_types: Mapping[str, str] | None = None, declared_in: str = ""
+    path: Path,
+    *,
+    content: bytes | None = None,
+    joint_types: Mapping[str, str] | None = None,
+    declared_in: str = "",
 ) -> pin.Model:
     """Pinocchio's model of a URDF file, after the file was checked.
 
@@ -52,21 +76,23 @@ def load_urdf(
 
     Args:
         path: The file.
+        content: What it holds, where it was read already.
         joint_types: Joint to the type that it is declared to be of (see `retype_joints`).
         declared_in: File of these declarations, for messages.
 
     Raises:
         RobotError: Naming file and line, or file and joint.
     """
-    text = read_text(path, error=RobotError)
-    root = _parse_xml(text, path)
+    root = parse_urdf(path, content=content)
     _check_elements(root, path)
     unlimited = _complete_limits(root)
-    _validate_with_yourdfpy(etree.tostring(root, encoding="unicode"), path)
+    # as it was understood here, whatever encoding it claims to be in
+    _validate_with_yourdfpy(str(etree.tostring(root, encoding="unicode")), path)
     retyped = retype_joints(root, joint_types or {}, where=declared_in)
-    with _captured_stderr() as messages:
+    text = str(etree.tostring(root, encoding="unicode"))
+    with captured_stderr() as messages:
         try:
-            model = pin.buildModelFromXML(etree.tostring(root, encoding="unicode"))
+            model = pin.buildModelFromXML(text)
         except (ValueError, RuntimeError) as e:
             reason = " ".join((messages() or str(e)).split())
             raise RobotError(f"Pinocchio cannot load it: {reason}", where=str(path)) from None
@@ -97,9 +123,23 @@ def _complete_limits(root: Any) -> list[str]:  # noqa: ANN401 - lxml has no type
     return unlimited
 
 
-def _parse_xml(text: str, path: Path) -> Any:  # noqa: ANN401 - lxml has no types
+def parse_urdf(path: Path, *, content: bytes | None = None) -> Any:  # noqa: ANN401 - lxml has no types
+    """The outermost element of a URDF of a sane size, without comments.
+
+    Args:
+        path: The file.
+        content: What it holds, where it was read already.
+
+    Raises:
+        RobotError: Naming file and line.
+    """
+    text = read_text(path, error=RobotError, content=content, largest=LARGEST_URDF)
     parser = etree.XMLParser(
-        resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False
+        resolve_entities=False,
+        no_network=True,
+        load_dtd=False,
+        huge_tree=False,
+        encoding="utf-8",  # whatever the file claims: nothing hides from the checks below
     )
     try:
         root = etree.fromstring(text.encode(), parser=parser)
@@ -109,7 +149,7 @@ def _parse_xml(text: str, path: Path) -> Any:  # noqa: ANN401 - lxml has no type
             f"is not valid XML: {str(e.msg).splitlines()[0]}", where=f"{path}{line}"
         ) from None
     if root.getroottree().docinfo.doctype:
-        number = text[: text.upper().index("<!DOCTYPE")].count("\n") + 1
+        number = text[: text.find("<!DOCTYPE")].count("\n") + 1
         raise RobotError(
             "has a DOCTYPE; a URDF needs none, and it is refused", where=f"{path}:{number}"
         )
@@ -120,7 +160,12 @@ def _parse_xml(text: str, path: Path) -> Any:  # noqa: ANN401 - lxml has no type
         )
     if not root.get("name"):
         raise RobotError("<robot> has no name", where=f"{path}:{root.sourceline}")
+    _check_counts(root, path)
+    count = sum(1 for _ in root.iter())
+    if count > MOST_ELEMENTS:
+        raise RobotError(f"has {count} elements; expected at most {MOST_ELEMENTS}", where=str(path))
     etree.strip_tags(root, etree.Comment)
+    etree.strip_elements(root, etree.ProcessingInstruction, with_tail=False)
     return root
 
 
@@ -217,6 +262,16 @@ def _check_elements(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has n
                 raise RobotError(f"<{tag}> has no <geometry>", where=at(element))
 
 
+def _check_counts(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has no types
+    joints = root.findall("joint")
+    moving = [joint for joint in joints if joint.get("type") != "fixed"]
+    for found, most, kind in ((joints, MOST_JOINTS, ""), (moving, MOST_MOVING, "moving ")):
+        if len(found) > most:
+            raise RobotError(
+                f"has {len(found)} {kind}joints; expected at most {most}", where=str(path)
+            )
+
+
 def _check_connected(top: str, links: dict[str, int], root: Any, path: Path) -> None:  # noqa: ANN401
     """Refuse links that hang on each other in a ring, apart from the root."""
     children: dict[str, list[str]] = {}
@@ -247,6 +302,11 @@ def _numbers(element: Any, key: str, count: int, where: str) -> list[float] | No
     if len(values) != count or not all(math.isfinite(v) for v in values):
         kind = "a finite number" if count == 1 else f"{count} finite numbers"
         raise RobotError(f"{key} is '{text}'; expected {kind}", where=where)
+    if key in _BOUNDED and max(map(abs, values)) > LARGEST_PLACE:
+        kind = "a number" if count == 1 else "numbers"
+        raise RobotError(
+            f"{key} is '{text}'; expected {kind} within ±{LARGEST_PLACE:g}", where=where
+        )
     return values
 
 
@@ -267,9 +327,9 @@ def _validate_with_yourdfpy(text: str, path: Path) -> None:
 
 
 @contextmanager
-def _captured_stderr() -> Iterator[Any]:
+def captured_stderr() -> Iterator[Any]:
     """Catch what C++ code writes to the error stream; yields a function that returns it."""
-    with tempfile.TemporaryFile() as sink:
+    with _sink() as sink:
         sys.stderr.flush()
         saved = os.dup(2)
         os.dup2(sink.fileno(), 2)
@@ -291,3 +351,11 @@ def _captured_stderr() -> Iterator[Any]:
             yield messages
         finally:
             restore()
+
+
+def _sink() -> IO[bytes]:
+    """Where to catch it: without a folder for temporary files nowhere."""
+    try:
+        return tempfile.TemporaryFile()
+    except OSError:
+        return open(os.devnull, "w+b")

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arguments import require_kind
 from orthocal.errors import ClosureError, RobotError
 from orthocal.identification.calibration import Calibration
 from orthocal.robot.model import read_only
@@ -33,6 +34,9 @@ ROUNDING = 1e-9
 
 EXCESS = 1.5
 """Residuals by which errors must exceed their tolerances for the machine to be called worse."""
+
+MOST_POINTS = 5_000
+"""Points that are assessed together; each takes 40 kB. `rows.accuracy_rows` takes any number."""
 
 DRAWS = 500
 """Errors drawn to find how large 95 % of the position errors are at most."""
@@ -190,6 +194,7 @@ def assess_tool(
         RobotError: If the robot has no tool centre point, or its drives do not command it.
         ClosureError: If the machine cannot reach a point, or its tool hardly moves at all.
     """
+    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     if workspace is None:
         return calibration.remember("accuracy", lambda: _assess_largest_cube(calibration))
     return _assess(calibration, place_tool(calibration, workspace, names=names), names)

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from orthocal.arguments import require_kind, require_names
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.identification.calibrate import repeat_calibration
 from orthocal.identification.nlp import SolverOptions
@@ -94,6 +95,9 @@ def compare_models(
         SolverError: If Ipopt does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
+    require_kind(session, Session, expected="a Session, such as load_session(...)")
+    require_kind(repeat, (Session, type(None)), expected="a Session, such as load_session(...)")
+    require_names(models or (), argument="models")
     if repeat is not None and repeat.robot.sha256 != session.robot.sha256:
         raise SessionError(
             f"is of robot '{repeat.robot.name}'; the other session is of '{session.robot.name}', "

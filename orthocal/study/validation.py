@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from orthocal.arguments import require_kind
 from orthocal.errors import SessionError
 from orthocal.identification.calibrate import assemble_calibration, repeat_fit
 from orthocal.identification.calibration import Calibration
@@ -159,6 +160,8 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         NotIdentifiableError: If the session does not determine the parameters.
         SolverError: If a further fit does not converge.
     """
+    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    require_kind(session, Session, expected="a Session, such as load_session(...)")
     where = None if session.path is None else str(session.path)
     if session.robot.sha256 != calibration.robot_record.sha256:
         raise SessionError(

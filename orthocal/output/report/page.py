@@ -6,15 +6,15 @@ then the residuals and all the rest. Plots are drawn into the page, which asks n
 
 from __future__ import annotations
 
-import html
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
+from orthocal.arguments import require_kind
 from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.files import write_file
 from orthocal.identification.calibration import Calibration
-from orthocal.markup import heading, items, paragraph, table
+from orthocal.markup import escape, heading, items, paragraph, table
 from orthocal.output.accuracy import render_tool
 from orthocal.output.explanation import explain_fit
 from orthocal.output.layout import bullets, mm, plain, signed
@@ -81,6 +81,7 @@ def build_report(calibration: Calibration) -> str:
     Raises:
         OrthocalError: If the robot cannot be found, or is not the one that was calibrated.
     """
+    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     title = f"Calibration of {calibration.robot_record.name}: {calibration.session.title}"
     sections = [
         ("verdict", "What to enter, and can it be believed?", _verdict(calibration)),
@@ -94,7 +95,7 @@ def build_report(calibration: Calibration) -> str:
         ("provenance", "Where this is from", _provenance(calibration)),
         ("scene", "The machine", _scene(calibration)),
     ]
-    links = "".join(f'<a href="#{name}">{html.escape(words)}</a>' for name, words, _ in sections)
+    links = "".join(f'<a href="#{name}">{escape(words)}</a>' for name, words, _ in sections)
     body = "".join(
         f'<section id="{name}">{heading(words)}{content}</section>'
         for name, words, content in sections
@@ -105,7 +106,7 @@ def build_report(calibration: Calibration) -> str:
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
-        f'<title>{html.escape(title)}</title>\n<link rel="icon" href="data:,">\n'
+        f'<title>{escape(title)}</title>\n<link rel="icon" href="data:,">\n'
         f"<style>\n{style}</style>\n</head>\n<body>\n"
         f"<header>{heading('Calibration report', level=1)}{head}"
         f"<nav>{links}</nav></header>\n<main>{body}</main>\n</body>\n</html>\n"
@@ -308,10 +309,10 @@ def _scene(calibration: Calibration) -> str:
 def _figure(svg: str, caption: str) -> str:
     if not svg:
         return ""
-    words = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
+    words = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
     return f"<figure>{svg}{words}</figure>"
 
 
 def _details(words: str, content: str, *, shown: bool = False) -> str:
     opening = "<details open>" if shown else "<details>"
-    return f"{opening}<summary>{html.escape(words)}</summary>{content}</details>"
+    return f"{opening}<summary>{escape(words)}</summary>{content}</details>"

@@ -8,8 +8,9 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from orthocal.errors import OrthocalError
+from orthocal.errors import OrthocalError, OutputError
 from orthocal.files import write_file
+from orthocal.interrupts import raised_interrupt
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 
@@ -71,8 +72,19 @@ def take_picture(page: str, path: str | Path, *, width: int = 1400, height: int 
 
     Raises:
         OrthocalError: If there is no Chromium, or it takes no picture.
+        OutputError: If it, or the page that it is taken of, cannot be written.
     """
-    chromium = find_chromium()
+    with raised_interrupt():
+        try:
+            data = _photograph(find_chromium(), page, Path(path), width, height)
+        except OSError as e:
+            raise OutputError(f"no page can be written for Chromium: {e}", where="--png") from None
+    write_file(Path(path), data)
+    return Path(path)
+
+
+def _photograph(chromium: str, page: str, path: Path, width: int, height: int) -> bytes:
+    """A picture of a page, as PNG; the path is for messages."""
     with tempfile.TemporaryDirectory(prefix="orthocal-", ignore_cleanup_errors=True) as folder:
         source, picture = Path(folder) / "page.html", Path(folder) / "page.png"
         source.write_text(page, encoding="utf-8")
@@ -98,8 +110,7 @@ def take_picture(page: str, path: str | Path, *, width: int = 1400, height: int 
             words = done.stderr.decode(errors="replace").strip().splitlines()
             reason = f": {words[-1]}" if words else ""
             raise OrthocalError(f"{chromium} took no picture{reason}", where=str(path))
-    write_file(Path(path), data)
-    return Path(path)
+    return data
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -7,12 +7,14 @@ and answers only those who ask for it by that name: a page from elsewhere cannot
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import os
 import signal
 import socket
 import threading
-from importlib import resources
+import time
+from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
@@ -21,11 +23,16 @@ import tornado.web
 import tornado.websocket
 
 from orthocal.errors import OrthocalError
-from orthocal.output.view.scene import Scene
+from orthocal.output.view.scene import Scene, viewer_script
 
 ADDRESS = "127.0.0.1"
 FIRST_PORT = 7000
 PORTS_TRIED = 100
+
+PAUSE = 0.1
+"""Time until the next visitor is looked at where there is no descriptor for any, [s]."""
+
+_EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
 _HOSTS = r"(localhost|127\.0\.0\.1)"  # tornado takes the port off
 
@@ -40,6 +47,54 @@ class _Page(tornado.web.RequestHandler):
         self.set_header("Cache-Control", "no-store")
         self.set_header("X-Content-Type-Options", "nosniff")
         self.finish(self.scene.to_live_html())
+
+
+class _Viewer(tornado.web.RequestHandler):
+    """Meshcat's viewer, from memory: it opens no file that there may be no descriptor for."""
+
+    def get(self) -> None:
+        self.set_header("Content-Type", "text/javascript; charset=utf-8")
+        self.finish(viewer_script())
+
+
+class _Listener(socket.socket):
+    """A listening socket that turns visitors away where the process may open no more files.
+
+    Else the server would be told of the same visitor again and again, and say so each time.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:  # noqa: ANN401 - as the socket's
+        super().__init__(*args, **kwargs)
+        self._spare = os.open(os.devnull, os.O_RDONLY)
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """Take the next visitor in."""
+        try:
+            return super().accept()
+        except OSError as e:
+            if e.errno not in _EXHAUSTED:
+                raise
+        self._turn_away()
+        raise BlockingIOError  # as if there were nobody
+
+    def close(self) -> None:
+        """Close it, and what it kept in reserve."""
+        if self._spare >= 0:
+            os.close(self._spare)
+            self._spare = -1
+        super().close()
+
+    def _turn_away(self) -> None:
+        """Take a visitor in by the descriptor that was kept for this, and show the way out."""
+        if self._spare >= 0:
+            os.close(self._spare)
+            self._spare = -1
+        with suppress(OSError):
+            super().accept()[0].close()
+        try:
+            self._spare = os.open(os.devnull, os.O_RDONLY)
+        except OSError:
+            time.sleep(PAUSE)  # somebody else has taken it: not again at once
 
 
 class _Commands(tornado.websocket.WebSocketHandler):
@@ -91,6 +146,8 @@ class LiveScene:
     def __init__(self, scene: Scene, *, port: int | None = None) -> None:
         if not isinstance(scene, Scene):
             raise TypeError(f"found a {type(scene).__name__}; expected a Scene: draw_scene(...)")
+        if port is not None and not (isinstance(port, int) and 0 <= port < 2**16):
+            raise ValueError(f"the port is {port!r}; expected 0 to 65535")
         self.scene = scene
         self._socket = _listen(port)
         self.port = int(self._socket.getsockname()[1])
@@ -172,11 +229,10 @@ class LiveScene:
 
 
 def _application(scene: Scene, listeners: set[_Commands]) -> tornado.web.Application:
-    viewer = resources.files("meshcat") / "viewer" / "dist"
     handlers: list[Any] = [
         (r"/", _Page, {"scene": scene}),
         (r"/commands", _Commands, {"scene": scene, "listeners": listeners}),
-        (r"/(main\.min\.js)", tornado.web.StaticFileHandler, {"path": str(viewer)}),
+        (r"/main\.min\.js", _Viewer),
     ]
     application = tornado.web.Application(log_function=lambda _: None)
     application.add_handlers(_HOSTS, handlers)
@@ -189,7 +245,8 @@ def _listen(port: int | None) -> socket.socket:
     reason = ""
     for candidate in tried:
         try:
-            found = socket.create_server((ADDRESS, candidate), backlog=128)
+            made = socket.create_server((ADDRESS, candidate), backlog=128)
+            found = _Listener(fileno=made.detach())
         except OSError as e:
             reason = str(e.strerror)
             continue

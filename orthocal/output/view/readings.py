@@ -13,7 +13,7 @@ from orthocal.measurement.session import DIRECTIONS, Setup, section_plane
 from orthocal.output.layout import counted, short_name, typeset
 from orthocal.output.view.deviations import Deviation, Measurement, Stop, worst_of_setups
 from orthocal.output.view.motion import Film, Timeline
-from orthocal.output.view.scene import Label, LegendEntry, Scene, Step, round_scale
+from orthocal.output.view.scene import Label, LegendEntry, Scene, Step, node_name, round_scale
 from orthocal.output.view.shapes import (
     Colour,
     arrow_parts,
@@ -108,7 +108,7 @@ def draw_readings(
         rows = [next((r for r in s.rows if r.setup == setup.name), None) for s in stops]
         contact = _find_contact(stage, setup, poses)
         direction = np.array(DIRECTIONS[setup.direction])
-        gauge = f"{GAUGES}/{_node(setup.name)}"
+        gauge = f"{GAUGES}/{node_name(setup.name)}"
         draw_gauge(scene, gauge, contact, direction, _facing(direction), dial)
         tips = [contact for _ in rows]
         # arrows of gauges that touch at the same place stand beside each other
@@ -118,7 +118,7 @@ def draw_readings(
             away = kind.side * (FIRST_ARROW + NEXT_ARROW * beside) * dial
             foot = contact + away * stage.robot.legs[setup.leg].axis
             lengths = [kind.length(row) * scene.arrow_scale for row in rows]
-            path, width = f"{kind.node}/{_node(setup.name)}", arrow_width(dial)
+            path, width = f"{kind.node}/{node_name(setup.name)}", arrow_width(dial)
             draw_arrow(
                 scene,
                 path,
@@ -293,8 +293,3 @@ def write_steps(
 
 def _mm(value: float) -> str:
     return typeset(value * 1e3)
-
-
-def _node(name: str) -> str:
-    """A setup's name as a node's: a slash would be a level."""
-    return name.replace("/", "∕")

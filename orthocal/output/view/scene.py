@@ -25,6 +25,7 @@ from meshcat.animation import Animation
 from meshcat.geometry import Geometry, Material
 from numpy.typing import NDArray
 
+from orthocal.characters import printable
 from orthocal.files import write_file
 
 Array = NDArray[np.float64]
@@ -253,9 +254,10 @@ class Scene:
             "live": connect != "'none'",
         }
         # the only places where </script> could end: no "<" is left in the data
-        data = json.dumps(content, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+        shown = _printable(content)
+        data = json.dumps(shown, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
         parts = {
-            "TITLE": html.escape(self.title),
+            "TITLE": html.escape(printable(self.title)),
             "POLICY": policy,
             "STYLE": _read("scene.css"),
             "VIEWER": viewer,
@@ -265,6 +267,21 @@ class Scene:
         page = _read("scene.html")
         pieces = page.split("@@")  # text, name, text, name, ..., text
         return "".join(parts[p] if i % 2 else p for i, p in enumerate(pieces))
+
+
+_NAMES_OF_JAVASCRIPT = frozenset(
+    "constructor hasOwnProperty isPrototypeOf propertyIsEnumerable toLocaleString toString valueOf "
+    "__defineGetter__ __defineSetter__ __lookupGetter__ __lookupSetter__ __proto__ "
+    "<object>".split()
+)
+"""What the viewer's tables of nodes, which are plain objects, hold before there is any node; and
+its own name for the shape of a node."""
+
+
+def node_name(name: str) -> str:
+    """A name from a file as a node's: a slash would be a level, and some names are taken."""
+    shown = printable(name.replace("/", "∕"))
+    return f"{shown} (name)" if shown in _NAMES_OF_JAVASCRIPT else shown
 
 
 def frame_of(page: str, *, height: str) -> str:
@@ -288,6 +305,15 @@ def round_scale(value: float) -> float:
     power = 10.0 ** math.floor(math.log10(value))
     steps = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
     return max(s for s in steps if s * power <= value * (1.0 + 1e-12)) * power
+
+
+def _printable(value: Any) -> Any:  # noqa: ANN401 - a JSON-like tree
+    """The same with every text as it can be shown: none turns the order of others about."""
+    if isinstance(value, str):
+        return printable(value, keep="\n")
+    if isinstance(value, dict):
+        return {k: _printable(v) for k, v in value.items()}
+    return [_printable(v) for v in value] if isinstance(value, list | tuple) else value
 
 
 def _read(name: str) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.output.view.motion import Film, place_frames
-from orthocal.output.view.scene import Camera, Label, Scene
+from orthocal.output.view.scene import Camera, Label, Scene, node_name
 from orthocal.output.view.shapes import (
     Colour,
     cylinder,
@@ -108,14 +108,14 @@ class Stage:
             if ghost_of is not None and np.abs(poses[link] - ghost_of[link]).max() < SAME:
                 continue
             counts[link] = counts.get(link, 0) + 1
-            path = f"{node}/{link}/part {counts[link]}"
+            path = f"{node}/{node_name(link)}/part {counts[link]}"
             look = material(visual.colour, opacity=visual.opacity, shiny=True)
             if ghost_of is not None:
                 look = material(GHOST_COLOUR, opacity=GHOST_OPACITY)
             self.scene.add(path, visual.geometry, look)
             self.scene.place(path, visual.placement)
         for link in counts:
-            self.scene.place(f"{node}/{link}", poses[link][0])
+            self.scene.place(f"{node}/{node_name(link)}", poses[link][0])
 
     def draw_leg_lines(
         self, poses: Mapping[str, Array], stops: Sequence[int] | NDArray[np.int64]
@@ -127,7 +127,7 @@ class Stage:
             stops: Frames of the stops, at each of which the leg's name is by its root.
         """
         for name, leg in self.robot.legs.items():
-            path = f"{LINES}/leg {name}"
+            path = f"{LINES}/{node_name(f'leg {name}')}"
             self.scene.add(path, cylinder(1.0, 0.0025 * self.size), material(LINE_COLOUR))
             line, length = _line_poses(poses[leg.root], poses[leg.tip])
             self.scene.place(path, line[0] @ np.diag([1.0, 1.0, length[0], 1.0]))
@@ -172,16 +172,16 @@ class Stage:
         """Move what `draw_links` drew; frames of poses at times."""
         drawn = {path.split("/")[1] for path in self.scene.nodes if path.startswith(f"{node}/")}
         for link in self.links:
-            if link in drawn:
-                film.move(f"{node}/{link}", times, poses[link])
+            if node_name(link) in drawn:
+                film.move(f"{node}/{node_name(link)}", times, poses[link])
 
     def move_leg_lines(self, film: Film, times: Array, poses: Mapping[str, Array]) -> None:
         """Move what `draw_leg_lines` drew."""
         for name, leg in self.robot.legs.items():
             line, length = _line_poses(poses[leg.root], poses[leg.tip])
-            film.move(f"{LINES}/leg {name}", times, line)
+            film.move(f"{LINES}/{node_name(f'leg {name}')}", times, line)
             scale = np.column_stack([np.ones((len(length), 2)), length])
-            film.track(f"{LINES}/leg {name}", "scale", "vector3", times, scale)
+            film.track(f"{LINES}/{node_name(f'leg {name}')}", "scale", "vector3", times, scale)
 
 
 def _line_poses(root: Array, tip: Array) -> tuple[Array, Array]:

@@ -13,14 +13,18 @@ import pinocchio as pin
 from lxml import etree
 from numpy.typing import NDArray
 
-from orthocal.documents import read_text
 from orthocal.errors import RobotError
+from orthocal.files import exists, require_file
 from orthocal.output.view.shapes import Colour, cylinder, pose_along
 from orthocal.robot.model import Robot
+from orthocal.robot.urdf import LARGEST_PLACE, captured_stderr, parse_urdf
 
 Array = NDArray[np.float64]
 
 MESH_FORMATS = (".stl", ".obj", ".dae", ".ply")
+
+MOST_TRIANGLES = 300_000
+"""Of a mesh; a page holds each as text."""
 
 _STICK: Colour = (0.55, 0.58, 0.62)
 
@@ -47,7 +51,8 @@ def load_visuals(robot: Robot) -> tuple[Visual, ...]:
     """
     text = _with_absolute_meshes(robot)
     try:
-        geometry = pin.buildGeomFromUrdfString(robot.model, text, pin.GeometryType.VISUAL)
+        with captured_stderr():
+            geometry = pin.buildGeomFromUrdfString(robot.model, text, pin.GeometryType.VISUAL)
     except (ValueError, RuntimeError) as e:
         # without the place in its source, and a hint at a folder that was right
         reason = " ".join(str(e).split("message:")[-1].split("Hint:")[0].split())
@@ -58,10 +63,7 @@ def load_visuals(robot: Robot) -> tuple[Visual, ...]:
 
 def _with_absolute_meshes(robot: Robot) -> str:
     """Text of the URDF with the paths of its meshes resolved within the robot's folder."""
-    text = read_text(robot.urdf, error=RobotError)
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
-    root = etree.fromstring(text.encode(), parser=parser)
-    etree.strip_tags(root, etree.Comment)
+    root = parse_urdf(robot.urdf)
     folder = robot.folder.resolve()
     for mesh in root.iter("mesh"):
         name = mesh.get("filename") or ""
@@ -71,8 +73,9 @@ def _with_absolute_meshes(robot: Robot) -> str:
             raise RobotError(f"the mesh '{name}' lies outside of the robot's folder", where=where)
         if path.suffix.lower() not in MESH_FORMATS:
             raise RobotError(f"the mesh '{name}' is none of {', '.join(MESH_FORMATS)}", where=where)
-        if not path.is_file():
+        if not exists(path):
             raise RobotError(f"there is no mesh file {path}", where=where)
+        require_file(path, error=RobotError)
         mesh.set("filename", str(path))
     return str(etree.tostring(root, encoding="unicode"))
 
@@ -85,6 +88,7 @@ def _relative(name: str) -> Path:
 
 
 def _visual(robot: Robot, part: pin.GeometryObject) -> Visual:
+    geometry = _geometry(robot, part)
     frame = robot.model.frames[part.parentFrame]
     placement = frame.placement.inverse() * part.placement
     shape = part.geometry
@@ -97,7 +101,7 @@ def _visual(robot: Robot, part: pin.GeometryObject) -> Visual:
     return Visual(
         link=frame.name,
         placement=np.asarray(placement.homogeneous),
-        geometry=_geometry(robot, part),
+        geometry=geometry,
         colour=(float(colour[0]), float(colour[1]), float(colour[2])),
         opacity=float(colour[3]),
         corners=inside @ placement.rotation.T + placement.translation,
@@ -114,6 +118,7 @@ def _geometry(robot: Robot, part: pin.GeometryObject) -> g.Geometry:
         half = float(shape.halfLength)
         return cylinder(2.0 * half, float(shape.radius), start=-half)
     if isinstance(shape, coal.BVHModelBase):
+        _check_mesh(robot, part)
         faces = [shape.tri_indices(i) for i in range(shape.num_tris)]
         triangles = np.array([[f[0], f[1], f[2]] for f in faces], dtype=np.uint32)
         return g.TriangularMeshGeometry(np.asarray(shape.vertices()), triangles)
@@ -122,6 +127,18 @@ def _geometry(robot: Robot, part: pin.GeometryObject) -> g.Geometry:
         "sphere or a mesh",
         where=str(robot.urdf),
     )
+
+
+def _check_mesh(robot: Robot, part: pin.GeometryObject) -> None:
+    """Refuse a mesh that no picture can hold."""
+    vertices = np.asarray(part.geometry.vertices())
+    problem = None
+    if part.geometry.num_tris > MOST_TRIANGLES:
+        problem = f"has {part.geometry.num_tris} triangles; expected at most {MOST_TRIANGLES}"
+    elif not (np.isfinite(vertices).all() and np.abs(vertices).max(initial=0.0) <= LARGEST_PLACE):
+        problem = f"reaches beyond ±{LARGEST_PLACE:g} m"
+    if problem:
+        raise RobotError(f"the mesh '{part.meshPath}' {problem}", where=str(robot.urdf))
 
 
 def _sticks(robot: Robot) -> Iterator[Visual]:

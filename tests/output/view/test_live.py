@@ -34,6 +34,50 @@ def scene(orthoglide):
     return draw_scene(orthoglide)
 
 
+FEW_FILES = """
+import os, resource, sys
+from orthocal import LiveScene, draw_scene, load_robot
+with LiveScene(draw_scene(load_robot("orthoglide"))) as live:
+    opened = len(os.listdir("/proc/self/fd"))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (opened + 4, opened + 4))
+    print(live.port, flush=True)
+    sys.stdin.read()
+"""
+
+
+def processor_time(pid):
+    """User and system time of a process, [s]."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def test_a_server_that_can_open_no_more_turns_visitors_away_quietly():
+    """Else it is told of the same visitor again and again, as fast as it can."""
+    with subprocess.Popen(
+        [sys.executable, "-c", FEW_FILES],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        port = int(process.stdout.readline())
+        visitors = [socket.create_connection(("127.0.0.1", port), 20) for _ in range(30)]
+        time.sleep(0.5)
+        before = processor_time(process.pid)
+        time.sleep(2.0)
+        assert processor_time(process.pid) - before < 0.5
+        for visitor in visitors:
+            visitor.close()
+        time.sleep(0.5)
+        assert get(port)[0] == 200
+        assert len(get(port, "/main.min.js")[1]) > 100_000
+        process.stdin.close()
+        assert process.stderr.read() == ""
+
+
 def get(port, path="/", host="127.0.0.1"):
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
     connection.request("GET", path, headers={"Host": f"{host}:{port}"})

@@ -5,6 +5,8 @@ How many requests: one, for the file itself. What the console says: nothing.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from browser import SIZES, open_browser, require_browser, visit
@@ -70,6 +72,22 @@ def seek(found, time):
     seen = found.page.evaluate("Number(document.documentElement.dataset.rendered)")
     found.page.evaluate("viewer.set_dirty()")
     found.wait_until_drawn(times=seen)
+
+
+@pytest.mark.parametrize("name", ["constructor", "__proto__", "<object>"])
+def test_a_setup_with_any_name_is_drawn(name, browser, raw_cycles, tmp_path):
+    """The viewer keeps nodes in plain objects, which hold some names from the beginning."""
+    setups = {n.replace("yx", name): s for n, s in raw_cycles.setups.items()}
+    session = replace(
+        raw_cycles,
+        setups={n: replace(s, name=n) for n, s in setups.items()},
+        readings=tuple(replace(r, setup=r.setup.replace("yx", name)) for r in raw_cycles.readings),
+    )
+    path = draw_scene(session).save(tmp_path / "scene.html")
+    with visit(browser, path.as_uri(), size=SIZES[0]) as found:
+        found.wait_until_drawn()
+        assert found.messages == []
+        assert is_drawn(found.picture())
 
 
 @pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")

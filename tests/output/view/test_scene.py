@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from dataclasses import replace
 from itertools import pairwise
 
@@ -524,6 +526,45 @@ def test_the_page_is_what_meshcats_own_interface_gives(scene):
 def test_loaded_calibration_makes_the_same_scene(calibration, tmp_path):
     path = calibration.save(tmp_path / "calibration.json")
     assert draw_scene(load_calibration(path)).to_html() == draw_scene(calibration).to_html()
+
+
+def rename_setups(session, names):
+    """The session with other names of its setups."""
+    return replace(
+        session,
+        setups={
+            names.get(n, n): replace(s, name=names.get(n, n)) for n, s in session.setups.items()
+        },
+        readings=tuple(replace(r, setup=names.get(r.setup, r.setup)) for r in session.readings),
+    )
+
+
+TAKEN = ("constructor", "__proto__", "toString", "hasOwnProperty", "<object>")
+
+
+@pytest.mark.parametrize("name", TAKEN)
+def test_names_that_the_viewer_takes_for_itself_are_not_those_of_nodes(name, raw_cycles):
+    """Its tables are plain objects of JavaScript, which hold some names from the beginning."""
+    session = rename_setups(raw_cycles, {"yx": name})
+    scene = draw_scene(session)
+    parts = {part for path in scene.nodes for part in path.split("/")}
+    assert f"{name} (name)" in parts
+    assert not parts & set(TAKEN)
+    assert len(scene.nodes) == len(draw_scene(raw_cycles).nodes)
+
+
+def test_links_with_any_name_move(root, tmp_path):
+    """A link's name is a node's, drawn and moved under the same one."""
+    folder = tmp_path / "biglide"
+    shutil.copytree(root / "tests/robots/biglide", folder)
+    path = folder / "biglide.urdf"
+    text = path.read_text()
+    link = re.findall(r'<child link="([^"]+)"', text)[0]
+    path.write_text(text.replace(f'"{link}"', '"constructor"'))
+    scene = draw_scene(load_robot(folder))
+    paths = [*animation(scene), *scene.nodes]
+    assert any("/constructor (name)" in path for path in animation(scene))
+    assert not [path for path in paths if "constructor" in path.split("/")]
 
 
 def test_names_of_strangers_cannot_leave_the_data(raw_cycles):

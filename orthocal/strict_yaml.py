@@ -1,0 +1,100 @@
+"""YAML that comes from strangers: text, numbers, lists and mappings, within bounds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+from orthocal.characters import shorten, text_problem
+
+LARGEST_YAML = 2**20
+"""YAML files above this size are refused, [bytes]: PyYAML reads about one MiB a second."""
+
+MOST_YAML_VALUES = 50_000
+"""Keys and values of a YAML file; a posture has seven, and PyYAML reads as many in 2 s."""
+
+DEEPEST = 20
+"""Lists and mappings within each other; no document of ours has more than seven."""
+
+LONGEST_NUMBER = 100
+"""Characters of a number; a float needs 25."""
+
+_YAML = "tag:yaml.org,2002:"
+
+_TAGS: dict[type[yaml.Event], frozenset[str]] = {
+    yaml.ScalarEvent: frozenset(
+        {"!", *(_YAML + t for t in ("str", "int", "float", "bool", "null"))}
+    ),
+    yaml.SequenceStartEvent: frozenset({"!", f"{_YAML}seq"}),
+    yaml.MappingStartEvent: frozenset({"!", f"{_YAML}map"}),
+}
+"""Tags that a value of each kind may be given: those that it would have without any."""
+
+
+class StrictLoader(yaml.SafeLoader):
+    """SafeLoader for documents of a sane size: text, numbers, lists and mappings with text as keys.
+
+    It also refuses duplicate keys, aliases, keys that are no scalars and tags of other kinds.
+    """
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._count = self._depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """The next node, where it is one that is meant."""
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call] # PyYAML's stub
+        problem = None
+        if isinstance(event, yaml.AliasEvent):
+            problem = "aliases (*name) are not allowed here"
+        elif event.tag is not None and event.tag not in _TAGS[type(event)]:
+            problem = f"could not determine a constructor for the tag '{shorten(event.tag)}'"
+        self._count += 1
+        if self._count > MOST_YAML_VALUES:
+            problem = f"holds more than {MOST_YAML_VALUES} keys and values"
+        if self._depth >= DEEPEST:
+            problem = f"lists and mappings stand more than {DEEPEST} deep in each other"
+        if problem:
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:  # noqa: ANN401 - any value
+        """The value of a node."""
+        try:
+            if node.tag in (f"{_YAML}int", f"{_YAML}float") and len(node.value) > LONGEST_NUMBER:
+                raise ValueError
+            value = super().construct_object(node, deep)
+        except (ValueError, KeyError, IndexError, AttributeError, TypeError, OverflowError):
+            tag = str(node.tag).replace(_YAML, "!!")
+            raise yaml.MarkedYAMLError(
+                problem=f"'{shorten(str(node.value))}' does not fit its tag {tag}",
+                problem_mark=node.start_mark,
+            ) from None
+        problem = text_problem(value)
+        if problem:
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+        return value
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The value of a mapping, each key of which stands once."""
+        if not isinstance(node, yaml.MappingNode):
+            raise yaml.MarkedYAMLError(
+                problem="expected keys and values", problem_mark=node.start_mark
+            )
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise yaml.MarkedYAMLError(
+                    problem="a key is a list or a mapping; expected text",
+                    problem_mark=key.start_mark,
+                )
+            if key.value in seen:
+                raise yaml.MarkedYAMLError(
+                    problem=f"the key '{key.value}' stands twice", problem_mark=key.start_mark
+                )
+            seen.add(key.value)
+        return dict(super().construct_mapping(node, deep))

@@ -1,0 +1,537 @@
+"""Mutated files of all nine kinds, and what must hold of each: orthocal's errors, or none.
+
+Case i of a seed is always the same. Workers run cases in processes of their own, so that a crash or
+a blow-up of memory is seen, too. By hand:
+
+    python tests/fuzzing.py --count 50000 --keep /tmp/finds
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import itertools
+import json
+import os
+import random
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import unicodedata
+import warnings
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from lxml import etree
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+if os.environ.get("ORTHOCAL_FUZZ_WORKER"):
+    warnings.simplefilter("error", RuntimeWarning)  # a user would see it
+
+ROOT = Path(__file__).parents[1]
+
+LONGEST = 5.0
+"""Processor time of a case, [s]."""
+
+LARGEST = 500
+"""Memory of a worker, [MiB]; the libraries alone take 200."""
+
+HANGS = 240.0
+"""Time without a sign of life after which a worker is killed, [s]."""
+
+SESSION = """
+robot: machine
+title: A small machine
+gauge: {sigma_mm: 0.01, resolution_mm: 0.01, range_mm: [-60, 60]}
+postures:
+  zero: {tcp_mm: [0, 0]}
+  x_max: {tcp_mm: [40, 0]}
+  x_min: {tcp_mm: [-40, 0]}
+  y_max: {tcp_mm: [0, 40]}
+  y_min: {joints_mm: [200, 160]}
+controller: {offsets_mm: [0, 0.1]}
+setups:
+  xy: {leg: x, direction: y, section: {fraction: 0.5}}
+  yx: {leg: y, direction: -x, section: {from_root_mm: 100}}
+"""
+PLAN = "cycles: 2\n"
+ERRORS = "errors: {x_slide.offset_mm: 0.5, y_slide.offset_mm: -0.3}\nzeros_mm: {xy: 0.1}\n"
+JOINTS = "x_slide_mm,y_slide_mm\n200,200\n210,190\n190,205.5\n"
+POINTS = "x_mm,y_mm\n0,0\n20,-10\n-15.5,7\n"
+
+STEERING = ("Cc", "Cf", "Cs", "Co", "Zl", "Zp")
+"""Categories of characters that no message may hold."""
+
+KINDS = {
+    "session": "session.yaml",
+    "plan": "plan.yaml",
+    "readings": "readings.csv",
+    "robot": "machine/machine.yaml",
+    "urdf": "machine/machine.urdf",
+    "calibration": "calibration.json",
+    "errors": "errors.yaml",
+    "joints": "joints.csv",
+    "points": "points.csv",
+}
+
+
+def lay_out(folder: Path) -> None:
+    """Good files of every kind."""
+    from orthocal import calibrate, load_session
+    from orthocal.measurement.session_file import load_plan
+    from orthocal.measurement.session_output import write_session
+    from orthocal.measurement.synthetic import simulate_session
+
+    shutil.copytree(ROOT / "tests/robots/biglide", folder / "machine")
+    for suffix in ("yaml", "urdf"):
+        (folder / f"machine/biglide.{suffix}").rename(folder / f"machine/machine.{suffix}")
+    for name, text in (("plan.yaml", SESSION + PLAN), ("errors.yaml", ERRORS)):
+        (folder / name).write_text(text, encoding="utf-8")
+    (folder / "joints.csv").write_text(JOINTS, encoding="utf-8")
+    (folder / "points.csv").write_text(POINTS, encoding="utf-8")
+    simulated = simulate_session(load_plan(folder / "plan.yaml"), {"x_slide.offset": 5e-4})
+    write_session(simulated.session, folder)
+    calibrate(load_session(folder), model="full").save(folder / "calibration.json")
+
+
+# ---- mutation
+
+NUMBERS: list[Any] = [
+    *(0, -1, 1, 2, 7, 1e9, -1e9, 1e308, -1e308, 1e-308, 1e-12, 1e-9, 0.5, 1e3, 1e6, 300.0),
+    *(float("nan"), float("inf"), -float("inf"), 10**30, -(10**30), 10**400, True, False),
+]
+TEXTS = [
+    *("", " ", "0", "-", ".", "~", "null", "yes", "*", "!*", "[", "]", "a/b", "../x", "/dev/zero"),
+    *("constructor", "__proto__", "x_slide", "x", "machine", "zero", "<b>&", "%s{}", "$\\frac$"),
+    *("\x1b[31m", "\x00", "\x85", "\u202e", "\u2028", "e\u0301", "𝒳", "\ufeff", "\ud800", "\uffff"),
+    *("x" * 300, "9" * 4300, "y" * 100_000, "!!set {a}", "!!binary aGk=", "&a [*a]", "1:2:3"),
+]
+
+
+def odd(rng: random.Random) -> Any:
+    """A value that nobody expects."""
+    kind = rng.random()
+    if kind < 0.4:
+        return rng.choice(NUMBERS)
+    if kind < 0.75:
+        return rng.choice(TEXTS)
+    if kind < 0.8:
+        return None
+    if kind < 0.85:
+        return [odd(rng) for _ in range(rng.randrange(4))]
+    if kind < 0.9:
+        return {str(rng.choice(TEXTS)): odd(rng) for _ in range(rng.randrange(3))}
+    if kind < 0.95:
+        return [1] * rng.choice((12, 100, 30_000))
+    nested: Any = 1
+    for _ in range(rng.choice((5, 25, 150))):
+        nested = [nested]
+    return nested
+
+
+def places(document: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Where there is a value."""
+    inner = document.items() if isinstance(document, dict) else enumerate(document)
+    found: list[tuple[Any, ...]] = []
+    for key, value in inner:
+        found.append((*path, key))
+        if isinstance(value, dict | list):
+            found += places(value, (*path, key))
+    return found
+
+
+def change(rng: random.Random, document: Any) -> None:
+    """Spoil one value, key or item, in place."""
+    among = places(document)
+    if not among:
+        return
+    *path, last = rng.choice(among)
+    inner = document
+    for key in path:
+        inner = inner[key]
+    how = rng.randrange(10)
+    if how == 0:
+        del inner[last]
+    elif how == 1 and isinstance(inner, dict):
+        inner[rng.choice(TEXTS) if rng.random() < 0.7 else rng.choice(NUMBERS)] = inner.pop(last)
+    elif how == 2 and isinstance(inner, list):
+        inner.append(inner[last])
+    elif how in (3, 7, 8, 9) and isinstance(inner[last], int | float):
+        inner[last] *= rng.choice((-1, 0.0, 1e-3, 1e3, 1e6, 1e12, 1.0001, 0.9, 1.5, 10))
+    elif how == 4:
+        *other, end = rng.choice(among)
+        source = document
+        try:
+            for key in other:
+                source = source[key]
+            inner[last] = json.loads(json.dumps(source[end]))
+        except (KeyError, IndexError, TypeError, ValueError):
+            inner[last] = None
+    else:
+        inner[last] = odd(rng)
+
+
+def change_bytes(rng: random.Random, data: bytes) -> bytes:
+    """Spoil bytes."""
+    how, at = rng.randrange(7), rng.randrange(len(data) + 1)
+    to = min(len(data), at + rng.choice((1, 2, 5, 40, 400)))
+    if how == 0:
+        return data[:at]
+    if how == 1:
+        return data[:at] + data[to:]
+    if how == 2:
+        return data[:to] + data[at:]
+    if how == 3:
+        return data[:at] + bytes(rng.randrange(256) for _ in range(rng.choice((1, 3)))) + data[at:]
+    if how == 4 and data:
+        return data[: at - 1] + bytes([data[at - 1] ^ (1 << rng.randrange(8))]) + data[at:]
+    if how == 5:
+        new = str(rng.choice(NUMBERS + TEXTS) if rng.random() < 0.8 else "")
+        return data[:at] + new.encode(errors="surrogatepass") + data[to:]
+    other = rng.randrange(len(data) + 1)
+    return data[:at] + data[other : other + rng.choice((5, 50))] + data[at:]
+
+
+def change_table(rng: random.Random, text: str) -> str:
+    """Spoil the cells and rows of a CSV."""
+    rows = [line.split(",") for line in text.splitlines()]
+    row = rng.choice(rows)
+    how = rng.randrange(6)
+    if how == 0:
+        row[rng.randrange(len(row))] = str(odd(rng))
+    elif how == 1:
+        rows.insert(rng.randrange(len(rows)), list(row))
+    elif how == 2:
+        rows.remove(row)
+    elif how == 3:
+        row.insert(rng.randrange(len(row) + 1), str(odd(rng)))
+    elif how == 4:
+        column = rng.randrange(len(row))
+        row[column] = rng.choice([r[column] for r in rows if len(r) > column])
+    else:
+        number = rng.choice(("1e3", "-5000", "0.0001", "299", "1e-300", "0x10", "1_0", "١"))
+        row[-1] = number
+    return rng.choice(("\n", "\n", "\n", "\r\n", "\r")).join(",".join(r) for r in rows) + "\n"
+
+
+def change_xml(rng: random.Random, data: bytes) -> bytes:
+    """Spoil the elements and attributes of a URDF."""
+    root = etree.fromstring(data)
+    elements = list(root.iter(etree.Element))
+    element = rng.choice(elements)
+    parent = element.getparent()
+    how = rng.randrange(7)
+    with contextlib.suppress(ValueError, TypeError):
+        if how == 0 and parent is not None:
+            parent.remove(element)
+        elif how == 1 and parent is not None:
+            parent.append(etree.fromstring(etree.tostring(element)))
+        elif how == 2 and element.attrib:
+            del element.attrib[rng.choice(list(element.attrib))]
+        elif how == 3:
+            element.tag = rng.choice(("link", "joint", "box", "mimic", "origin", "sphere", "mesh"))
+        elif how == 4:
+            size = rng.choice(("1e308 0 0", "1 2", "nan 0 0", "0 0 0", "1e-300 1 1", "1e5 0 0"))
+            kind = rng.choice(("origin", "axis", "limit", "visual", "geometry", "inertial"))
+            etree.SubElement(element, kind, xyz=size, rpy=size, lower=size, upper="0")
+        elif element.attrib:
+            key = rng.choice(list(element.attrib))
+            values = [e.attrib[k] for e in elements for k in e.attrib]
+            given = rng.choice(values) if rng.random() < 0.5 else str(odd(rng))
+            element.attrib[key] = given
+    return bytes(etree.tostring(root))
+
+
+NO_DOCUMENT = (yaml.YAMLError, etree.XMLSyntaxError)
+"""What says that a file is spoilt so far that it has no structure left."""
+
+
+def mutate(rng: random.Random, kind: str, data: bytes) -> bytes:
+    """One file, spoilt in one to three ways."""
+    for _ in range(rng.choice((1, 1, 1, 1, 2, 3))):
+        if rng.random() < 0.2:
+            data = change_bytes(rng, data)
+            continue
+        try:
+            data = mutate_structure(rng, kind, data)
+        except (ValueError, TypeError, LookupError, ArithmeticError, RecursionError, *NO_DOCUMENT):
+            data = change_bytes(rng, data)
+    return data
+
+
+def mutate_structure(rng: random.Random, kind: str, data: bytes) -> bytes:
+    if kind in ("joints", "points", "readings"):
+        return change_table(rng, data.decode()).encode(errors="surrogatepass")
+    if kind == "urdf":
+        return change_xml(rng, data)
+    document = json.loads(data) if kind == "calibration" else yaml.safe_load(data)
+    if not isinstance(document, dict):
+        return change_bytes(rng, data)
+    change(rng, document)
+    if kind == "calibration":
+        return json.dumps(document).encode()
+    text = str(yaml.safe_dump(document, sort_keys=False, allow_unicode=rng.random() < 0.5))
+    return text.encode(errors="surrogatepass")
+
+
+def make_case(seed: int, index: int, good: dict[str, bytes]) -> tuple[str, bytes, random.Random]:
+    """Kind and content of a case, and the numbers that decide what is done with it."""
+    rng = random.Random(f"{seed}:{index}")
+    kind = rng.choice(list(KINDS))
+    return kind, mutate(rng, kind, good[kind]), rng
+
+
+# ---- what is done with a file
+
+
+def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None:
+    """Do with a file what the command line does; slow things with a probability of `thorough`."""
+    from orthocal import calibrate, load_calibration, load_robot, load_session, summarize
+    from orthocal.measurement.session_file import load_plan
+    from orthocal.measurement.session_output import write_session
+    from orthocal.measurement.synthetic import load_errors, simulate_session, truth_document
+    from orthocal.measurement.table import read_joints, read_points
+    from orthocal.output.accuracy import format_points
+    from orthocal.output.view.drawing import draw_scene
+    from orthocal.robot.assembly import nominal_assembly
+    from orthocal.study.rows import accuracy_rows, forward_rows, inverse_rows
+
+    deep = rng.random() < thorough
+    if kind in ("session", "readings"):
+        session = load_session(folder)
+        if deep:
+            calibration = calibrate(session, model=rng.choice((None, "full")))
+            path = calibration.save(folder / "out.json")
+            found = load_calibration(path)
+            assert found.to_document() == calibration.to_document()
+            summarize(found)
+            if rng.random() < 0.05:
+                draw_scene(found).to_html()
+    elif kind == "plan":
+        plan = load_plan(folder / "plan.yaml")
+        if deep:
+            simulated = simulate_session(plan, {"x_slide.offset": 3e-4})
+            truth = {"truth.yaml": truth_document(simulated)}
+            load_session(write_session(simulated.session, folder / "out", extra=truth))
+            load_errors(folder / "out/truth.yaml", plan.robot)
+    elif kind in ("robot", "urdf"):
+        robot = load_robot(folder / "machine")
+        if deep:
+            nominal_assembly(robot).close(robot.drive_zero)
+            draw_scene(robot).to_html()
+    elif kind == "calibration":
+        calibration = load_calibration(folder)
+        calibration.controller_entries()
+        if deep:
+            calibration.save(folder / "out.json")
+            assert load_calibration(folder / "out.json").to_document() == calibration.to_document()
+            summarize(calibration)
+            list(forward_rows(calibration, [[0.2, 0.2]]))
+            list(inverse_rows(calibration, [[0.0, 0.0]]))
+            for chunk in accuracy_rows(calibration, [[0.0, 0.0]]):
+                format_points(chunk.values)
+            if rng.random() < 0.1:
+                draw_scene(calibration).to_html()
+    else:
+        calibration = load_calibration(folder)
+        if kind == "errors":
+            errors = load_errors(folder / "errors.yaml", calibration.robot)
+            if deep:
+                simulate_session(load_plan(folder / "plan.yaml"), errors)
+        elif kind == "joints":
+            names, rows = read_joints(folder / "joints.csv", calibration.robot)
+            if deep:
+                list(forward_rows(calibration, rows, names=names))
+        else:
+            names, rows = read_points(folder / "points.csv", calibration.robot)
+            if deep:
+                list(inverse_rows(calibration, rows, names=names))
+                list(accuracy_rows(calibration, rows, names=names))
+
+
+def tell(line: str) -> None:
+    """Print a line at once: whoever watches wants to know where this ended."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+def work(good_folder: Path, seed: int, first: int, last: int, *, thorough: float) -> None:
+    """Run cases; a line for each on stdout: what began, and how it ended."""
+    from orthocal.errors import OrthocalError
+
+    resource.setrlimit(resource.RLIMIT_AS, (6 * 2**30, 6 * 2**30))
+    good = {kind: (good_folder / file).read_bytes() for kind, file in KINDS.items()}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shutil.copytree(good_folder, folder, dirs_exist_ok=True)
+        for kind in ("calibration", "urdf"):  # what is imported at first takes its time
+            use(kind, folder, random.Random(0), thorough=1.0)
+        for index in range(first, last):
+            kind, data, rng = make_case(seed, index, good)
+            tell(f"begin {index}")
+            (folder / KINDS[kind]).write_bytes(data)
+            before, outcome = time.process_time(), "loads"
+            try:
+                use(kind, folder, rng, thorough=thorough)
+            except OrthocalError as e:
+                steers = any(unicodedata.category(c) in STEERING for c in str(e))
+                outcome = "unprintable" if steers else "refused"
+            except BaseException as e:
+                place = e.__traceback__
+                while place is not None and place.tb_next is not None:
+                    place = place.tb_next
+                at = (
+                    ""
+                    if place is None
+                    else f"{place.tb_frame.f_code.co_filename}:{place.tb_lineno}"
+                )
+                outcome = f"{type(e).__name__} {at} {e}"[:300].replace("\n", " ")
+            took = time.process_time() - before
+            memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+            if took > LONGEST:
+                outcome = f"slow: {took:.1f} s, {outcome}"
+            if memory > LARGEST:
+                outcome = f"large: {memory:.0f} MiB, {outcome}"
+            (folder / KINDS[kind]).write_bytes(good[kind])
+            tell(f"end {index} {kind} {outcome}".encode("ascii", "replace").decode())
+            if memory > LARGEST:
+                return  # what follows would be blamed for it
+
+
+# ---- many workers
+
+
+@dataclass
+class Findings:
+    """How cases ended."""
+
+    outcomes: Counter[tuple[str, str]]
+    bad: list[tuple[int, str, str]]
+    """Index, kind, what happened."""
+
+
+def run(
+    good_folder: Path,
+    *,
+    seed: int,
+    count: int,
+    jobs: int = 2,
+    thorough: float = 1.0,
+    report: Callable[[str], object] = lambda _: None,
+) -> Findings:
+    """Run cases 0 to count in workers, which are begun anew where one dies."""
+    good = {kind: (good_folder / file).read_bytes() for kind, file in KINDS.items()}
+    findings = Findings(Counter(), [])
+    edges = [count * i // jobs for i in range(jobs + 1)]
+    workers = [_Worker(good_folder, seed, a, b, thorough) for a, b in itertools.pairwise(edges)]
+    while any(not w.done for w in workers):
+        for w in workers:
+            for index, kind, outcome in w.poll(good):
+                findings.outcomes[kind, outcome if outcome in ("loads", "refused") else "BAD"] += 1
+                if outcome not in ("loads", "refused"):
+                    findings.bad.append((index, kind, outcome))
+                    report(f"{index} {kind} {outcome}")
+        time.sleep(0.05)
+    return findings
+
+
+class _Worker:
+    def __init__(self, folder: Path, seed: int, first: int, last: int, thorough: float) -> None:
+        self.folder, self.seed, self.next, self.last = folder, seed, first, last
+        self.thorough = thorough
+        self.done = first >= last
+        self._output = Path(tempfile.mkstemp(prefix="orthocal-fuzz-")[1])
+        if not self.done:
+            self._start()
+
+    def _start(self) -> None:
+        self._read = 0
+        self._output.write_bytes(b"")
+        self._alive = time.monotonic()
+        command = [sys.executable, __file__, "--worker", str(self.folder), "--seed", str(self.seed)]
+        command += ["--first", str(self.next), "--count", str(self.last)]
+        command += ["--thorough", str(self.thorough)]
+        path = os.pathsep.join([os.environ.get("ORTHOCAL_FUZZ_PATH", ""), str(ROOT)])
+        environment = {**os.environ, "PYTHONPATH": path, "ORTHOCAL_FUZZ_WORKER": "1"}
+        with self._output.open("wb") as stream:
+            self._process = subprocess.Popen(
+                command, stdout=stream, stderr=subprocess.DEVNULL, env=environment
+            )
+
+    def poll(self, good: dict[str, bytes]) -> list[tuple[int, str, str]]:
+        """Cases that have ended since; begins anew after one that killed its worker."""
+        if self.done:
+            return []
+        ended = self._process.poll() is not None
+        text = self._output.read_bytes()[self._read :].decode()
+        lines = text[: text.rfind("\n") + 1].splitlines()
+        self._read += len(text[: text.rfind("\n") + 1].encode())
+        found = []
+        for line in lines:
+            self._alive = time.monotonic()
+            word, index, *rest = line.split(" ", 3)
+            if word == "end":
+                found.append((int(index), rest[0], rest[1]))
+                self.next = int(index) + 1
+        if not ended and time.monotonic() - self._alive > HANGS:
+            self._process.kill()
+            self._process.wait()
+            ended = True
+        if ended and self.next < self.last:
+            if self._process.returncode != 0:
+                kind, _, _ = make_case(self.seed, self.next, good)
+                found.append((self.next, kind, f"ended with {self._process.returncode}"))
+                self.next += 1
+            self._start()
+        self.done = self.next >= self.last
+        if self.done:
+            self._process.wait()
+            self._output.unlink(missing_ok=True)
+        return found
+
+
+def main() -> None:
+    """By hand."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--worker", type=Path)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--count", type=int, default=2000)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--thorough", type=float, default=1.0)
+    parser.add_argument("--keep", type=Path, help="Folder for what was found.")
+    given = parser.parse_args()
+    if given.worker:
+        work(given.worker, given.seed, given.first, given.count, thorough=given.thorough)
+        return
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        lay_out(folder)
+        good = {kind: (folder / file).read_bytes() for kind, file in KINDS.items()}
+        found = run(
+            folder,
+            seed=given.seed,
+            count=given.count,
+            jobs=given.jobs,
+            thorough=given.thorough,
+            report=tell,
+        )
+        if given.keep:
+            given.keep.mkdir(parents=True, exist_ok=True)
+            for index, kind, _ in found.bad:
+                data = make_case(given.seed, index, good)[1]
+                (given.keep / f"{index}-{Path(KINDS[kind]).name}").write_bytes(data)
+    for key, number in sorted(found.outcomes.items()):
+        tell(f"{' '.join(key)} {number}")
+    tell(f"{sum(found.outcomes.values())} cases, {len(found.bad)} bad")
+
+
+if __name__ == "__main__":
+    main()

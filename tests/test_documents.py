@@ -1,0 +1,235 @@
+"""Documents from strangers: only what is meant, and nothing that takes a machine down."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import replace
+
+import pytest
+
+from orthocal import calibrate, load_calibration, load_session
+from orthocal.documents import (
+    MOST_CSV_ROWS,
+    MOST_JSON_VALUES,
+    read_csv_rows,
+    read_json,
+    read_yaml,
+)
+from orthocal.errors import OrthocalError, SessionError, SolverError
+from orthocal.strict_yaml import LARGEST_YAML
+
+PROMPT = 5.0
+"""Processor time that no refusal may take, [s]."""
+
+
+@pytest.fixture
+def refused(tmp_path):
+    """Reads a document that must be refused; the message."""
+
+    def read(text, *, reader=read_yaml):
+        path = tmp_path / "file"
+        path.write_text(text, encoding="utf-8")
+        began = time.process_time()
+        with pytest.raises(OrthocalError) as caught:
+            reader(path, error=SessionError)
+        assert time.process_time() - began < PROMPT
+        assert caught.value.exit_code == 2
+        assert len(str(caught.value)) < 500
+        return str(caught.value)
+
+    return read
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        *("!!set {a, b}", "!!map [a]", "!!omap [a: 1]", "!!pairs [a: 1]", "!!binary aGVsbG8="),
+        *("!!str [1]", "!!seq {a: 1}", "!!timestamp 2020-01-01", "!<x> 1", "!!map 5", "!!set [a]"),
+    ],
+)
+def test_tags_of_other_kinds_are_refused(value, refused):
+    assert "is not valid YAML: could not determine a constructor for the tag" in refused(
+        f"title: {value}"
+    )
+
+
+def test_tags_that_a_value_has_anyhow_are_taken(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("{a: !!str 5, b: !!float 1, c: !!seq [!!int 2], d: !!map {e: ! 7}}")
+    found = read_yaml(path, error=SessionError)
+    assert found == {"a": "5", "b": 1.0, "c": [2], "d": {"e": 7}}
+
+
+@pytest.mark.parametrize("digits", [4000, 4301, 100_000])
+@pytest.mark.parametrize("form", ["{}", "-{}", "0x{}", "{}.5"])
+def test_numbers_of_thousands_of_digits_are_none(digits, form, refused):
+    assert "does not fit its tag" in refused(f"sigma: {form.format('9' * digits)}")
+
+
+@pytest.mark.parametrize("digits", [101, 4000, 4301, 100_000])
+def test_numbers_of_thousands_of_digits_are_none_in_json(digits, refused):
+    message = refused(f'{{"a": [{"9" * digits}]}}', reader=read_json)
+    assert f"has {digits} characters" in message
+
+
+def test_a_title_that_is_a_list_of_a_million(refused):
+    assert "holds more than 50000 keys and values" in refused("title: [" + "1," * 250_000 + "]")
+    assert "MiB; expected at most" in refused("title: [" + "1," * 1_000_000 + "]")
+    assert LARGEST_YAML == 2**20
+
+
+@pytest.mark.parametrize("depth", [50, 5000, 100_000])
+def test_lists_within_lists_within_lists(depth, refused):
+    nested = "[" * depth + "]" * depth
+    assert "more than 20 deep" in refused(f"a: {nested}")
+    message = refused(f'{{"a": {nested}}}', reader=read_json)
+    assert "more than 20 deep" in message or "recursion" in message
+
+
+def test_forty_thousand_keys_are_no_reason_to_wait(tmp_path, refused):
+    path = tmp_path / "good"
+    path.write_text(json.dumps({str(i): i for i in range(100_000)}))
+    began = time.process_time()
+    assert len(read_json(path, error=SessionError)) == 100_000
+    assert time.process_time() - began < PROMPT
+    twice = ",".join(f'"{i}": 0' for i in [*range(40_000), 39_999])
+    assert "the key '39999' stands twice" in refused(f"{{{twice}}}", reader=read_json)
+
+
+def test_a_json_of_empty_lists_is_counted_first(refused):
+    message = refused("[" + "[]," * MOST_JSON_VALUES + "[]]", reader=read_json)
+    assert f"expected at most {MOST_JSON_VALUES}" in message
+
+
+def test_a_csv_of_empty_lines_ends(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("a,b\n" + "1,2\n" * (MOST_CSV_ROWS + 1))
+    with pytest.raises(SessionError, match=f"has more than {MOST_CSV_ROWS} rows"):
+        for _ in read_csv_rows(path, required=("a", "b"), error=SessionError):
+            pass
+
+
+@pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
+def test_lines_of_a_csv_end_as_in_any_system(ending, tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(ending.join(["a,b", "1,2", "", "3,4", ""]).encode())
+    rows = list(read_csv_rows(path, required=("a", "b"), error=SessionError))
+    assert rows == [(2, {"a": "1", "b": "2"}), (4, {"a": "3", "b": "4"})]
+
+
+@pytest.mark.parametrize("where", ["key", "value", "item"])
+@pytest.mark.parametrize("text", ["\\ud800", "\\u001b", "\\u0085", "\\u0000"])
+def test_texts_of_a_json_are_texts_wherever_they_stand(where, text, refused):
+    document = {"key": f'{{"{text}": 1}}', "value": f'{{"a": "{text}"}}', "item": f'["{text}"]'}
+    message = refused(document[where], reader=read_json)
+    assert "half of a surrogate pair" in message or "control character" in message
+
+
+# ---- calibration.json
+
+
+@pytest.fixture(scope="module")
+def document(experiment_2):
+    return calibrate(experiment_2).to_document()
+
+
+def change(document, keys, value):
+    copy = json.loads(json.dumps(document))
+    *path, last = keys
+    inner = copy
+    for key in path:
+        inner = inner[key]
+    inner[last] = value
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "message"),
+    [
+        (
+            ["session", "gauge_sigma"],
+            0,
+            "session.gauge_sigma: found '0'; expected greater than 0",
+        ),
+        (["session", "gauge_sigma"], 1e-300, "expected at least 1e-16"),
+        (["noise", "residual_sigma"], -1.0, "expected greater than or equal to 0"),
+        (["identifiability", "n_postures"], 10**30, "expected less than or equal to 1000000000"),
+        (["identifiability", "n_readings"], 10**400, "has 401 characters"),
+        (["solver", "iterations"], 10**30, "expected less than or equal to 1000000000"),
+        (["noise", "cycles_dof"], -1, "expected greater than or equal to 0"),
+        (["residuals", 0, "minus"], "", "residuals[0].minus: found ''"),
+        (["residuals", 0, "line"], 10**30, "expected less than or equal to 1000000000"),
+        (["identifiability", "singular_values", 2], 0.0, "only 2 singular values are above 0"),
+        (["identifiability", "singular_values", 2], -1.0, "expected positive numbers"),
+        (["identifiability", "singular_values", 0], 0.0, "the largest first"),
+        (["identifiability", "rank"], 4, "identifiability.rank: found 4"),
+        (["covariance"], [], "covariance: expected 3 × 3 numbers"),
+        (["parameters", 0, "tolerance"], 0, "expected greater than 0"),
+        (["robot", "folder"], "a\x00b", "a text holds a control character"),
+        (["robot", "folder"], "x" * 300, "is neither a robot of orthocal"),
+        (["session", "title"], "\ud800", "half of a surrogate pair"),
+        (["residuals"], [0] * 300_000, "residuals[0]: found '0'; expected keys and values"),
+        (["covariance"], [["a"] * 3] * 100_000, "covariance[0][0]: found 'a'"),
+    ],
+    ids=lambda v: None if isinstance(v, list | str) and len(v) > 40 else str(v)[:40],
+)
+def test_numbers_of_a_calibration_that_cannot_be(keys, value, message, document, tmp_path):
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(change(document, keys, value)))
+    began = time.process_time()
+    with pytest.raises(OrthocalError) as caught:
+        load_calibration(path).controller_entries()
+    assert time.process_time() - began < PROMPT
+    assert message in str(caught.value)
+
+
+def test_a_calibration_of_nothing(document, tmp_path):
+    empty = change(document, ["covariance"], [])
+    empty["parameters"] = [{**p, "free": False} for p in empty["parameters"]]
+    empty["unmodelled"]["leakage"] = []
+    (tmp_path / "calibration.json").write_text(json.dumps(empty))
+    with pytest.raises(OrthocalError, match="parameters: holds none that is free"):
+        load_calibration(tmp_path)
+
+
+# ---- what is written loads again
+
+
+@pytest.mark.parametrize("model", ["offsets", "lengths", "full"])
+@pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles"])
+def test_every_calibration_that_is_written_is_read_as_the_same(model, name, root, tmp_path):
+    """18 readings beside 126 errors leave a hundredth of a degree of freedom, for example."""
+    calibration = calibrate(root / "examples" / name, model=model)
+    found = load_calibration(calibration.save(tmp_path / "calibration.json"))
+    assert found.to_document() == calibration.to_document()
+
+
+def test_the_smallest_numbers_that_a_session_takes_are_read_again(root, tmp_path):
+    source = root / "examples/table1/experiment-2"
+    text = (source / "session.yaml").read_text(encoding="utf-8")
+    (tmp_path / "readings.csv").write_bytes((source / "readings.csv").read_bytes())
+    small = text.replace("sigma_mm: 0.02", "sigma_mm: 1.0e-9", 1)
+    small = small.replace("resolution_mm: 0.01", "resolution_mm: 1.0e-9", 1)
+    assert small != text
+    (tmp_path / "session.yaml").write_text(small, encoding="utf-8")
+    calibration = calibrate(
+        load_session(tmp_path), tolerances={"*.offset": 1e-9}, model="offsets", prior=True
+    )
+    found = load_calibration(calibration.save(tmp_path / "calibration.json"))
+    assert found.to_document() == calibration.to_document()
+
+
+def test_a_result_that_makes_no_sense_is_refused_before_it_is_written(raw_cycles, monkeypatch):
+    module = sys.modules["orthocal.identification.calibrate"]
+    original = module._estimates
+
+    def absurd(*args, **kwargs):
+        return tuple(replace(p, value=2.6e15) for p in original(*args, **kwargs))
+
+    monkeypatch.setattr(module, "_estimates", absurd)
+    with pytest.raises(
+        SolverError, match=r"the result makes no sense \(calibration.json: parameters\[0\]"
+    ):
+        calibrate(raw_cycles)

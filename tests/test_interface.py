@@ -1,0 +1,161 @@
+"""The Python interface: what is of another kind or shape is refused in words, not from inside."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from orthocal import (
+    LiveScene,
+    SolverOptions,
+    assess_tool,
+    calibrate,
+    compare_models,
+    draw_scene,
+    load_calibration,
+    load_plan,
+    load_robot,
+    load_session,
+    simulate_session,
+    summarize,
+    validate_calibration,
+    write_report,
+)
+from orthocal.errors import OrthocalError
+from orthocal.robot.assembly import Assembly
+from orthocal.study.accuracy import Workspace
+
+
+@pytest.fixture(scope="module")
+def calibration(experiment_2):
+    return calibrate(experiment_2)
+
+
+@pytest.mark.parametrize("load", [load_session, load_plan, load_calibration, load_robot])
+@pytest.mark.parametrize("value", [5, None, 1.5, [], "", "a\0b", "x" * 300, "/dev/null", "\udcff"])
+def test_what_is_no_path_or_none_of_ours(load, value):
+    with pytest.raises((OrthocalError, TypeError)):
+        load(value)
+
+
+ARGUMENTS = [
+    ({"model": 5}, "found a int; expected the name of a model"),
+    ({"free": 5}, "free: found 5; expected a list of names or globs"),
+    ({"free": [5]}, "free: found [5]; expected a list of names or globs"),
+    ({"free": "x_slide.offset"}, "expected a list of names or globs"),
+    ({"known": 5}, "known: found a int; expected a mapping of names to numbers"),
+    ({"known": {"x_slide.offset": "a"}}, "expected a name and a number or 2 numbers"),
+    ({"known": {"x_slide.offset": (1, 2, 3)}}, "expected a name and a number or 2 numbers"),
+    ({"tolerances": 5}, "tolerances: found a int; expected a mapping"),
+    ({"tolerances": {"x_slide.offset": "a"}}, "expected a name and a number"),
+    ({"bounds": {"x_slide.offset": 5}}, "expected a name and 2 numbers"),
+    ({"bounds": {"x_slide.offset": (1, 2, 3)}}, "expected a name and 2 numbers"),
+    ({"bounds": {"x_slide.offset": ("a", "b")}}, "expected a name and 2 numbers"),
+    ({"profile": 5}, "profile: found 5; expected a list of names or globs"),
+    ({"options": 5}, "found a int; expected SolverOptions(...)"),
+    ({"options": {}}, "found a dict; expected SolverOptions(...)"),
+    ({"start": [1]}, "found the shape (1,); expected 3 free parameters to start from a row"),
+    ({"start": "a"}, "found str; expected 3 free parameters to start from a row"),
+    ({"start": [0.0, 0.0, np.nan]}, "expected 3 finite numbers to start from"),
+    ({"prior": "x"}, "found a str; expected True or False as prior or base"),
+    ({"base": "x"}, "found a str; expected True or False as prior or base"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), ARGUMENTS, ids=lambda v: str(v)[:40])
+def test_arguments_of_calibrate(arguments, message, experiment_2):
+    with pytest.raises((TypeError, ValueError), match=re.escape(message)):
+        calibrate(experiment_2, **arguments)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"hessian": "x"},
+        {"tolerance": 0},
+        {"tolerance": "a"},
+        {"closure_tolerance": float("nan")},
+        {"max_iterations": "a"},
+        {"max_iterations": -1},
+        {"print_level": 1.5},
+        {"loss": "huber"},
+    ],
+    ids=str,
+)
+def test_options_of_the_solver(options):
+    with pytest.raises((TypeError, ValueError), match="expected"):
+        SolverOptions(**options)
+
+
+SHAPES = [5, None, [1, 2], [[1, 2]], np.zeros((2, 2, 3)), [], "abc", {}, [1j, 0, 0], [["a"] * 3]]
+
+
+@pytest.mark.parametrize("value", SHAPES, ids=lambda v: str(v)[:20])
+def test_coordinates_of_other_shapes(value, calibration, orthoglide):
+    assembly = Assembly(orthoglide)
+    for act in (
+        calibration.forward,
+        calibration.inverse,
+        assembly.close,
+        assembly.forward,
+        assembly.inverse,
+        lambda v: assembly.tcp(v, v),
+    ):
+        with pytest.raises(ValueError, match=r"expected 3 .* a row"):
+            act(value)
+
+
+def test_nothing_is_nothing(calibration):
+    assert calibration.forward(np.zeros((0, 3))).shape == (0, 3)
+    assert calibration.inverse(np.zeros((0, 3))).shape == (0, 3)
+
+
+def test_names_theta_and_start_of_other_lengths(calibration, orthoglide):
+    zero = orthoglide.drive_zero
+    with pytest.raises(ValueError, match="found 1 names for 2 rows"):
+        calibration.forward([zero, zero], names=["a"])
+    with pytest.raises(ValueError, match="expected 1 values of the free parameters a row"):
+        Assembly(orthoglide, free=["x_slide.offset"]).close(zero, theta=[1.0, 2.0])
+    with pytest.raises(ValueError, match="expected 18 start values a row"):
+        Assembly(orthoglide).close(zero, start=[1.0, 2.0])
+    with pytest.raises(ValueError, match="expected 18 passive coordinates a row"):
+        Assembly(orthoglide).tcp(zero, [1.0])
+    with pytest.raises(TypeError, match="expected a Robot"):
+        Assembly(5)
+
+
+def test_points_far_beyond_all_numbers(calibration):
+    with pytest.raises(OrthocalError, match="cannot be reached"):
+        calibration.inverse([1e308, 0.0, 0.0])
+
+
+def test_other_things_than_calibrations_and_sessions(calibration, experiment_2, tmp_path):
+    for act, message in (
+        (lambda: calibrate(5), "expected a Session, or the path to one"),
+        (lambda: write_report(5, tmp_path / "x.html"), "expected a Calibration"),
+        (lambda: summarize(5), "expected a Calibration, a Comparison or a Validation"),
+        (lambda: validate_calibration(5, experiment_2), "expected a Calibration"),
+        (lambda: validate_calibration(calibration, 5), "expected a Session"),
+        (lambda: compare_models(5), "expected a Session"),
+        (lambda: compare_models(experiment_2, models=5), "models: found 5"),
+        (lambda: compare_models(experiment_2, models="full"), "expected a list of names"),
+        (lambda: assess_tool(5), "expected a Calibration"),
+        (lambda: simulate_session(5, {}), "expected a Session"),
+        (lambda: simulate_session(experiment_2, 5), "errors: found a int; expected a mapping"),
+        (lambda: simulate_session(experiment_2, {"x_slide.offset": "a"}), "expected a name and"),
+        (lambda: draw_scene("nonsense"), "expected a Calibration, a Session or a Robot"),
+        (lambda: LiveScene(5), "expected a Scene"),
+        (lambda: experiment_2.robot.with_errors(5), "errors: found a int; expected a mapping"),
+    ):
+        with pytest.raises(TypeError, match=re.escape(message)):
+            act()
+    for act, message in (
+        (lambda: Workspace.even(np.zeros((0, 3))), "found the shape (0, 3); expected points"),
+        (lambda: LiveScene(draw_scene(experiment_2), port=10**6), "expected 0 to 65535"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            act()
+    with pytest.raises(OrthocalError, match="no name of a file"):
+        calibration.save(tmp_path / "a\0b")

@@ -1,0 +1,221 @@
+"""Standard streams and signals of a real process: full, closed, not read, and Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from orthocal import calibrate, load_session
+from orthocal.errors import OrthocalError
+
+COMMAND = [sys.executable, "-m", "orthocal"]
+PATIENCE = 120.0
+
+
+@pytest.fixture(scope="module")
+def folder(root, tmp_path_factory):
+    """A calibration with a table of joints."""
+    folder = tmp_path_factory.mktemp("calibrated")
+    for name in ("session.yaml", "readings.csv"):
+        shutil.copy(root / "examples/table1/experiment-2" / name, folder)
+    calibrate(load_session(folder)).save(folder / "calibration.json")
+    rows = "310,310,310\n" * 3000
+    (folder / "joints.csv").write_text(f"x_slide_mm,y_slide_mm,z_slide_mm\n{rows}")
+    return folder
+
+
+def run(words, redirection="", **kwargs):
+    """Run the command line in a shell, for its redirections; exit code, stdout, stderr."""
+    command = " ".join([*COMMAND, *(f"'{w}'" for w in map(str, words)), redirection])
+    done = subprocess.run(
+        ["sh", "-c", command], capture_output=True, timeout=PATIENCE, check=False, **kwargs
+    )
+    err = done.stderr.decode(errors="replace")
+    assert "Traceback" not in err
+    assert "Exception ignored" not in err
+    return done.returncode, done.stdout.decode(errors="replace"), err
+
+
+WORDS = {
+    "--version": ["--version"],
+    "--help": ["--help"],
+    "forward": ["forward", "calibration.json", "joints.csv"],
+    "calibrate": ["calibrate", ".", "--out", "out"],
+    "calibrate --json": ["calibrate", ".", "--json", "--out", "out"],
+}
+
+
+@pytest.mark.parametrize("words", WORDS.values(), ids=WORDS.keys())
+@pytest.mark.parametrize("redirection", ["> /dev/full", ">&-"])
+def test_an_output_that_cannot_be_written_is_told_and_ends_with_1(words, redirection, folder):
+    code, _, err = run(words, redirection, cwd=folder)
+    assert code == 1
+    reason = {"> /dev/full": "No space left on device", ">&-": "it is closed"}[redirection]
+    assert err == f"orthocal: standard output: cannot be written: {reason}\n"
+    assert not (folder / "out").exists()
+
+
+@pytest.mark.parametrize("words", [WORDS["forward"], WORDS["--help"]])
+def test_a_reader_who_has_had_enough_is_no_error(words, folder):
+    with subprocess.Popen(
+        [*COMMAND, *words], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        line = process.stdout.readline()
+        process.stdout.close()
+        err = process.stderr.read()
+    assert line
+    assert process.returncode == 0
+    assert err == ""
+
+
+def test_nobody_listens_to_errors(folder):
+    assert run(["calibrate", "nothing"], "2>&-", cwd=folder)[0] == 2
+    assert run(["calibrate", "nothing"], "2> /dev/full", cwd=folder)[0] == 2
+    code, _, _ = run(["calibrate", ".", "--out", "silent"], "2>&-", cwd=folder)
+    assert code == 0
+    # the closed stream's number was not given to a file that was written
+    assert (folder / "silent/calibration.json").read_text().startswith("{")
+
+
+def test_no_folder_for_temporary_files_is_needed(folder):
+    """Pinocchio's messages are caught in a file, and there may be no room for any."""
+    code = (
+        "import tempfile\n"
+        "def none(*args, **kwargs): raise FileNotFoundError(2, 'No usable temporary directory')\n"
+        "tempfile.TemporaryFile = none\n"
+        "import sys; sys.argv = ['orthocal', 'calibrate', '.']\n"
+        "from orthocal.cli import main; main()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("name", [b"caf\xe9", b"a\x1b[31mb", b"a\nb"])
+def test_a_folder_that_no_document_can_name_is_refused_before_the_work(name, folder, tmp_path):
+    odd = os.fsencode(tmp_path) + b"/" + name
+    os.mkdir(odd)
+    for file in ("session.yaml", "readings.csv"):
+        shutil.copy(folder / file, os.path.join(odd, os.fsencode(file)))
+    done = subprocess.run(
+        [*COMMAND, "calibrate", odd, "--out", str(tmp_path / "out")],
+        capture_output=True,
+        check=False,
+    )
+    err = done.stderr.decode("ascii")
+    assert done.returncode == 2
+    assert "which no document can name; rename the file or folder" in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_robots_folder_that_no_document_can_name_is_refused(root, tmp_path):
+    from orthocal import load_robot
+
+    odd = tmp_path / "a\x1b[31mb"
+    shutil.copytree(root / "tests/robots/biglide", odd / "biglide")
+    with pytest.raises(OrthocalError, match=r"holds '\\x1b', which no document can name"):
+        load_robot(odd / "biglide")
+
+
+def test_words_of_the_command_line_steer_no_terminal_either(folder):
+    odd = "a\x1b[31m\u202e"
+    for words in (["calibrate", odd], [odd], ["calibrate", ".", "--model", odd]):
+        done = subprocess.run([*COMMAND, *words], cwd=folder, capture_output=True, check=False)
+        err = done.stderr.decode()
+        assert done.returncode == 2
+        assert r"a\x1b[31m\u202e" in err
+        assert "\x1b" not in err
+
+
+# ---- Ctrl-C
+
+
+def interrupt(words, delay, cwd):
+    """Begin, wait, press Ctrl-C: exit code or None if it was done, seconds, stderr."""
+    process = subprocess.Popen(
+        [*COMMAND, *map(str, words)], cwd=cwd, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
+    maps = Path(f"/proc/{process.pid}/maps")
+    while process.poll() is None and maps.exists() and "numpy" not in maps.read_text():
+        time.sleep(0.02)  # how long a start takes is the machine's affair
+    time.sleep(delay)
+    done = process.poll() is not None
+    began = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=PATIENCE)
+    return None if done else process.returncode, time.monotonic() - began, err.decode()
+
+
+@pytest.mark.parametrize("options", [["--model", "full"], ["--profile", "*.offset"]])
+def test_ctrl_c_ends_whatever_is_being_done(options, root, tmp_path):
+    """While libraries are loaded, functions built, Ipopt iterates or intervals are sought."""
+    out = tmp_path / "out"
+    words = ["calibrate", root / "examples/raw-cycles", *options, "--out", out]
+    interrupted = 0
+    for step in range(8):
+        code, seconds, err = interrupt(words, 0.4 * step, tmp_path)
+        if code is None:
+            break
+        interrupted += 1
+        assert code == 130
+        assert seconds < 1.0
+        assert err == ""
+        assert list(tmp_path.iterdir()) == []
+    assert interrupted >= 3
+
+
+RAISED = """
+import os, signal, sys
+from pathlib import Path
+from orthocal import calibrate, load_session
+import orthocal.identification.nlp as nlp
+session = load_session(sys.argv[1])
+original = nlp.NonlinearProgram.pack
+def pack(self, **kwargs):
+    signal.setitimer(signal.ITIMER_REAL, 0.001)  # once Ipopt runs
+    return original(self, **kwargs)
+nlp.NonlinearProgram.pack = pack
+signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
+try:
+    calibrate(session, model="full")
+except KeyboardInterrupt:
+    print("raised")
+"""
+
+
+def test_ctrl_c_within_ipopt_is_an_interrupt_for_scripts_too(root):
+    """CasADi makes a solve that did not converge of it, or goes on."""
+    done = subprocess.run(
+        [sys.executable, "-c", RAISED, str(root / "examples/raw-cycles")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == "raised\n", done.stderr
+
+
+def test_ctrl_c_while_files_are_staged_leaves_none(tmp_path):
+    code = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "import orthocal.files as files\n"
+        "from orthocal.interrupts import ending_at_interrupt\n"
+        "def fsync(_): os.kill(os.getpid(), signal.SIGINT)\n"
+        "os.fsync = fsync\n"
+        "with ending_at_interrupt():\n"
+        "    files.write_files(Path(sys.argv[1]), {'a': 'x', 'b': 'y'})\n"
+    )
+    folder = tmp_path / "new/folder"
+    subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, check=False)
+    assert list(tmp_path.iterdir()) == []
