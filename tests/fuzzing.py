@@ -301,6 +301,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     from orthocal.output.accuracy import format_points
     from orthocal.output.view.drawing import draw_scene
     from orthocal.robot.assembly import nominal_assembly
+    from orthocal.study.entering import find_entries
     from orthocal.study.rows import accuracy_rows, forward_rows, inverse_rows
 
     deep = rng.random() < thorough
@@ -328,7 +329,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
             draw_scene(robot).to_html()
     elif kind == "calibration":
         calibration = load_calibration(folder)
-        calibration.controller_entries()
+        find_entries(calibration)
         if deep:
             calibration.save(folder / "out.json")
             assert load_calibration(folder / "out.json").to_document() == calibration.to_document()

@@ -623,7 +623,8 @@ OPTION_CASES = [
         "--free *.offset,*_leg.length,*_fork.x --no-prior",
         "{tmp}/readings.csv: the readings do not determine x_slide.offset, y_slide.offset, "
         "z_slide.offset, x_fork.x, y_fork.x, z_fork.x and 3 more: 5 of 9 free parameters can be "
-        "told from them. Read the legs that are missing, in postures along their own axes; or use "
+        "told from them. No reading sees a change of these together: y_fork.x up, y_slide.offset "
+        "up. No reading sees a change of these together: z_fork.x up, z_slide.offset up. Or use "
         "tolerances as a prior (--prior), or identify base parameters (--base)",
     ),
     option(
@@ -840,9 +841,9 @@ READINGS_CASES = [
     ),
     readings(
         "out-of-range",
-        "yx,zero,1,-0.40",
-        "yx,zero,1,-5.40",
-        ":2: reading_mm is -5.4; the gauge's range allows a reading from -5 to 5",
+        "yx,x_min,1,0.19",
+        "yx,x_min,1,-5.40",
+        ":4: reading_mm is -5.4; the gauge's range allows a reading from -5 to 5",
         "cycles",
     ),
     readings(
@@ -883,9 +884,10 @@ READINGS_CASES = [
     Case(
         "readings-too-few",
         "{tmp}/readings.csv: the readings do not determine x_slide.offset, y_slide.offset, "
-        "z_slide.offset: 1 of 3 free parameters can be told from them. Read the legs that are "
-        "missing, in postures along their own axes; or use tolerances as a prior (--prior), or "
-        "identify base parameters (--base)",
+        "z_slide.offset: 1 of 3 free parameters can be told from them. No reading depends on "
+        "z_slide.offset: read the legs that are missing, in postures along their own axes. No "
+        "reading sees a change of these together: y_slide.offset up, x_slide.offset down. Or use "
+        "tolerances as a prior (--prior), or identify base parameters (--base)",
         (write("readings.csv", f"{HEADER}\nxy,y_max,y_min,-0.43\n"),),
     ),
 ]
@@ -1356,12 +1358,12 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "schema-other",
-        f"{CALIBRATION}: schema is 'orthocal/calibration/9'; expected 'orthocal/calibration/1'",
-        swap(FILE, "orthocal/calibration/1", "orthocal/calibration/9"),
+        f"{CALIBRATION}: schema is 'orthocal/calibration/9'; expected 'orthocal/calibration/2'",
+        swap(FILE, "orthocal/calibration/2", "orthocal/calibration/9"),
     ),
     calibration(
         "schema-missing",
-        f"{CALIBRATION}: schema: is missing; expected 'orthocal/calibration/1'",
+        f"{CALIBRATION}: schema: is missing; expected 'orthocal/calibration/2'",
         write(FILE, "{}"),
     ),
     calibration(
@@ -1508,12 +1510,12 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "unmodelled-too-few",
-        f"{CALIBRATION}: unmodelled.tolerances: has 1 numbers; expected 123, as names",
+        f"{CALIBRATION}: unmodelled.tolerances: has 1 numbers; expected 174, as names",
         put(FILE, "unmodelled.tolerances", [1e-4]),
     ),
     calibration(
         "leakage-too-small",
-        f"{CALIBRATION}: unmodelled.leakage: expected 3 × 123 numbers, free parameters by names",
+        f"{CALIBRATION}: unmodelled.leakage: expected 3 × 174 numbers, free parameters by names",
         put(FILE, "unmodelled.leakage", [[0.0]]),
     ),
     calibration(
@@ -1685,9 +1687,9 @@ SIMULATE_CASES = [
     ),
     simulate(
         "out-of-range",
-        " --exact --error x_slide.offset_mm=10",
-        "{tmp}/plan.yaml: gauge.range_mm: the simulated reading xy zero is 5.003 mm; the gauge's "
-        "range ends at 5 mm",
+        " --exact --error x_slide.offset_mm=25",
+        "{tmp}/plan.yaml: gauge.range_mm: the simulated reading xy y_min is -8.146 mm; the "
+        "gauge's range ends at -5 mm",
     ),
     simulate(
         "session-there",

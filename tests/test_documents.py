@@ -19,6 +19,7 @@ from orthocal.documents import (
 )
 from orthocal.errors import OrthocalError, SessionError, SolverError
 from orthocal.strict_yaml import LARGEST_YAML
+from orthocal.study.entering import find_entries
 
 PROMPT = 5.0
 """Processor time that no refusal may take, [s]."""
@@ -180,7 +181,7 @@ def test_numbers_of_a_calibration_that_cannot_be(keys, value, message, document,
     path.write_text(json.dumps(change(document, keys, value)))
     began = time.process_time()
     with pytest.raises(OrthocalError) as caught:
-        load_calibration(path).controller_entries()
+        find_entries(load_calibration(path))
     assert time.process_time() - began < PROMPT
     assert message in str(caught.value)
 

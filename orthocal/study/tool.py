@@ -92,7 +92,8 @@ def place_tool(
     known = calibration.remember("tool", lambda: _find_tool(calibration))
     if known is not None and np.array_equal(known.workspace.points, workspace.points):
         return known
-    return _place(calibration, workspace, _sensitivity(calibration), names)
+    named = names or [f"point {i + 1}" for i in range(len(workspace.points))]
+    return _place(calibration, workspace, _sensitivity(calibration), named)
 
 
 def _sensitivity(calibration: Calibration) -> ToolSensitivity:

@@ -108,7 +108,7 @@ def test_the_controller_is_told_the_whole_offset_and_the_change(root):
     postures = {n: replace(p, drives=p.drives - active) for n, p in plan.postures.items()}
     plan = replace(plan, postures=postures, controller_offsets=active)
     session = simulate_session(plan, TRUTH, exact=True).session
-    entries = calibrate(session).controller_entries()
+    entries = find_entries(calibrate(session))
     assert [e.active for e in entries] == pytest.approx(active)
     assert [e.enter for e in entries] == pytest.approx(list(TRUTH.values()), abs=1e-9)
     assert [e.change for e in entries] == pytest.approx(
@@ -117,7 +117,7 @@ def test_the_controller_is_told_the_whole_offset_and_the_change(root):
 
 
 def test_an_unknown_controller_is_told_what_to_add(root):
-    entries = calibrate(load_session(root / "examples/table1/experiment-3")).controller_entries()
+    entries = find_entries(calibrate(load_session(root / "examples/table1/experiment-3")))
     assert all(e.active is None for e in entries)
     assert entries[1].enter == entries[1].change
 
