@@ -96,7 +96,8 @@ class _System:
 
     def _shortest_step(self, residuals: Array, jacobians: Array) -> Array:
         inverse = np.linalg.pinv(jacobians, rcond=1e-10)
-        return np.asarray(-(inverse @ residuals[..., None])[..., 0])
+        with np.errstate(over="ignore"):  # steps without end are dropped by who asks
+            return np.asarray(-(inverse @ residuals[..., None])[..., 0])
 
     def describe(self, x: Array, p: Array, theta: Array) -> str:
         """By how much the rows of one posture are open, in words."""

@@ -47,6 +47,8 @@ class Workspace:
     def even(cls, points: ArrayLike) -> Workspace:
         """Points that all count alike, shape (K, n_coordinates), [m]."""
         p = read_only(np.atleast_2d(np.asarray(points, dtype=np.float64)))
+        if p.ndim != 2 or not p.size:
+            raise ValueError(f"found the shape {p.shape}; expected points, (K, n_coordinates)")
         return cls(p, read_only(np.full(len(p), 1.0 / len(p))))
 
     @property
