@@ -53,6 +53,11 @@ def text_problem(value: object) -> str | None:
     return "a text holds a control character"
 
 
+def composed(text: str) -> str:
+    """A name in the one form of those that look alike: é is one character, not e and an accent."""
+    return unicodedata.normalize("NFC", text)
+
+
 def shorten(text: str) -> str:
     """A value as it can stand in a message."""
     return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 3]}..."

@@ -18,7 +18,7 @@ import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
-from orthocal.characters import shorten, text_problem
+from orthocal.characters import composed, shorten, text_problem
 from orthocal.errors import OrthocalError
 from orthocal.files import read_file
 from orthocal.strict_yaml import DEEPEST, LARGEST_YAML, LONGEST_NUMBER, StrictLoader
@@ -239,7 +239,7 @@ def read_csv_rows(
     lines = io.StringIO(text, newline=None)
     reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
     try:
-        header = [name.strip() for name in next(reader)]
+        header = [composed(name.strip()) for name in next(reader)]
         for name in header:
             if name not in required and name not in optional:
                 raise error(
@@ -269,7 +269,10 @@ def read_csv_rows(
                     f"({delimiter.join(header)}){hint}",
                     where=f"{path}:{line}",
                 )
-            yield line, {name: cell.strip() for name, cell in zip(header, row, strict=True)}
+            yield (
+                line,
+                {name: composed(cell.strip()) for name, cell in zip(header, row, strict=True)},
+            )
     except csv.Error as e:
         raise error(f"is not valid CSV: {e}", where=f"{path}:{reader.line_num}") from None
 

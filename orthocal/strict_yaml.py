@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from orthocal.characters import shorten, text_problem
+from orthocal.characters import composed, shorten, text_problem
 
 LARGEST_YAML = 2**20
 """YAML files above this size are refused, [bytes]: PyYAML reads about one MiB a second."""
@@ -92,6 +92,8 @@ class StrictLoader(yaml.SafeLoader):
                     problem="a key is a list or a mapping; expected text",
                     problem_mark=key.start_mark,
                 )
+            if isinstance(key.value, str):
+                key.value = composed(key.value)
             if key.value in seen:
                 raise yaml.MarkedYAMLError(
                     problem=f"the key '{key.value}' stands twice", problem_mark=key.start_mark

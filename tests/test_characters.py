@@ -7,7 +7,14 @@ from dataclasses import replace
 
 import pytest
 
-from orthocal import calibrate, draw_scene, load_calibration, load_session, summarize
+from orthocal import (
+    calibrate,
+    draw_scene,
+    load_calibration,
+    load_robot,
+    load_session,
+    summarize,
+)
 from orthocal.characters import printable
 from orthocal.errors import ClosureError, OrthocalError
 from orthocal.markup import paragraph, table
@@ -91,3 +98,31 @@ def test_tables_of_pages_and_of_texts_are_escaped():
     assert steering(paragraph("\u202ea") + table(["\x1b"], [["\u2066"]])) == set()
     assert to_text("a\x1b[31mb") == "a\\x1b[31mb\n"
     assert short_name("a\x1bb") == r"a\x1bb"
+
+
+def test_a_name_is_one_name_in_every_form_of_its_accents(session):
+    """File names and texts of one computer are composed, of another decomposed."""
+    table, described = session / "readings.csv", session / "session.yaml"
+    composed, apart = (unicodedata.normalize(form, "max_é") for form in ("NFC", "NFD"))
+    assert composed != apart
+    text = described.read_text(encoding="utf-8").replace("x_max", apart)
+    described.write_text(text, encoding="utf-8")
+    rows = table.read_text(encoding="utf-8").replace("x_max", composed)
+    table.write_text(rows, encoding="utf-8")
+    assert composed in load_session(session).postures
+
+    twice = text.replace(f"  {apart}:", f"  {composed}: {{tcp_mm: [1, 2, 3]}}\n  {apart}:", 1)
+    described.write_text(twice, encoding="utf-8")
+    with pytest.raises(OrthocalError, match="the key 'max_é' stands twice"):
+        load_session(session)
+
+
+def test_a_joint_is_one_joint_in_every_form_of_its_accents(root, tmp_path):
+    for file in ("biglide.urdf", "biglide.yaml"):
+        text = (root / "tests/robots/biglide" / file).read_text(encoding="utf-8")
+        form = "NFC" if file.endswith("urdf") else "NFD"
+        renamed = text.replace("x_slide", unicodedata.normalize(form, "glissière_x"))
+        (tmp_path / file).write_text(renamed, encoding="utf-8")
+    robot = load_robot(tmp_path)
+    assert robot.drives[0].name == unicodedata.normalize("NFC", "glissière_x")
+    assert robot.parameters.select([unicodedata.normalize("NFD", "glissière_x.*")])

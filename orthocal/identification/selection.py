@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.characters import composed
 from orthocal.documents import parse_number
 from orthocal.errors import ParameterError
 from orthocal.robot.model import read_only
@@ -211,7 +212,7 @@ def _split(text: str, form: str, where: str) -> tuple[str, str]:
     key, equals, value = text.partition("=")
     if not equals:
         raise ParameterError(f"found '{text}'; expected {form}", where=where)
-    return key.strip(), value
+    return composed(key.strip()), value
 
 
 def _number(text: str, where: str, name: str) -> float:

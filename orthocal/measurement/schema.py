@@ -5,12 +5,17 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from orthocal.characters import composed
 from orthocal.documents import Number, PositiveNumber
 from orthocal.robot.parameters import Unit
 
-Name = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^,;\s\"]+$")]
+Name = Annotated[
+    str,
+    Field(min_length=1, max_length=200, pattern=r"^[^,;\s\"]+$"),
+    AfterValidator(composed),
+]
 Vector = Annotated[list[Number], Field(min_length=1, max_length=12)]
 
 LARGEST_READING_MM = 300.0

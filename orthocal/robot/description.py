@@ -8,15 +8,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from orthocal.characters import composed
 from orthocal.documents import Number, PositiveNumber, read_yaml, validate
 from orthocal.errors import RobotError
 from orthocal.robot.joint_types import JOINT_TYPES
 
 Row = Literal["x", "y", "z", "rx", "ry", "rz"]
 Coordinate = Literal["x", "y", "z"]
-Name = Annotated[str, Field(min_length=1, max_length=200)]
+Name = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(composed)]
 
 
 def _in_small_letters(value: object) -> object:

@@ -20,6 +20,7 @@ from fnmatch import fnmatchcase
 from typing import Literal
 
 from orthocal.arguments import require_numbers
+from orthocal.characters import composed
 from orthocal.errors import ParameterError
 
 Kind = Literal["offset", "scale", "translation", "rotation"]
@@ -134,13 +135,14 @@ class ParameterSet:
         """
         chosen: set[str] = set()
         for pattern in patterns:
-            glob = pattern.removeprefix("!")
+            without = pattern.startswith("!")
+            glob = composed(pattern.removeprefix("!"))
             found = [name for name in self._parameters if fnmatchcase(name, glob)]
             if not found:
                 raise ParameterError(
                     f"'{glob}' matches no error parameter{_suggest(glob, self._parameters)}"
                 )
-            chosen.difference_update(found) if pattern != glob else chosen.update(found)
+            chosen.difference_update(found) if without else chosen.update(found)
         return tuple(name for name in self._parameters if name in chosen)
 
     def select_model(self, model: str) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ import numpy as np
 import pinocchio as pin
 from lxml import etree
 
+from orthocal.characters import composed
 from orthocal.documents import read_text
 from orthocal.errors import RobotError
 from orthocal.robot.joint_types import retype_joints
@@ -43,6 +44,9 @@ _NUMBERS: dict[str, dict[str, int]] = {
 
 _BOUNDED = frozenset({"xyz", "rpy", "size", "radius", "length", "scale", "rgba"})
 """Attributes that say where and how large something is."""
+
+_NAMES = ("name", "link", "joint")
+"""Attributes by which elements speak of each other."""
 
 LARGEST_PLACE = 1e4
 """No length [m], angle [rad] or scale is larger: loops of metres must close to nanometres."""
@@ -166,6 +170,10 @@ def parse_urdf(path: Path, *, content: bytes | None = None) -> Any:  # noqa: ANN
         raise RobotError(f"has {count} elements; expected at most {MOST_ELEMENTS}", where=str(path))
     etree.strip_tags(root, etree.Comment)
     etree.strip_elements(root, etree.ProcessingInstruction, with_tail=False)
+    for element in root.iter():
+        for key in _NAMES:
+            if key in element.attrib:
+                element.set(key, composed(element.get(key)))
     return root
 
 
