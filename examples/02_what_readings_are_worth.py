@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 import orthocal
+from orthocal.kinematics.assembly import Assembly
+from orthocal.kinematics.workspace import cube
 from orthocal.measurement.synthetic import load_errors
-from orthocal.robot.assembly import Assembly
-from orthocal.robot.workspace import cube
 from orthocal.study.accuracy import assess_tool, find_remaining_errors
 
 EXAMPLES = Path(__file__).parent

@@ -274,6 +274,7 @@ def accuracy(
     Exit code 3: some cannot be reached; they are named, and their cells are empty.
     """
     from orthocal.identification.calibration_file import load_calibration
+    from orthocal.kinematics.workspace import Workspace, cube
     from orthocal.measurement.table import closures_named_by_row, read_points
     from orthocal.output.accuracy import (
         POINT_COLUMNS,
@@ -281,7 +282,6 @@ def accuracy(
         format_points,
         print_accuracy,
     )
-    from orthocal.robot.workspace import Workspace, cube
     from orthocal.study.accuracy import MOST_POINTS, assess_tool
     from orthocal.study.rows import accuracy_rows
 

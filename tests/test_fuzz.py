@@ -17,7 +17,7 @@ from fuzzing import KINDS, lay_out, make_case, run
 
 from orthocal import calibrate, load_calibration, load_robot
 from orthocal.errors import CalibrationFileError
-from orthocal.robot.assembly import nominal_assembly
+from orthocal.kinematics.assembly import nominal_assembly
 
 COUNT = 2000
 

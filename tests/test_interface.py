@@ -24,7 +24,7 @@ from orthocal import (
     write_report,
 )
 from orthocal.errors import OrthocalError
-from orthocal.robot.assembly import Assembly
+from orthocal.kinematics.assembly import Assembly
 from orthocal.study.accuracy import Workspace
 
 

@@ -46,9 +46,9 @@ from orthocal.identification.uncertainty import (
     project_out_zeros,
 )
 from orthocal.identification.unmodelled import find_other_errors, measure_unmodelled
+from orthocal.kinematics.assembly import as_rows
 from orthocal.measurement.session import Session
 from orthocal.measurement.session_file import load_session
-from orthocal.robot.assembly import as_rows
 from orthocal.robot.loading import packaged_robots
 from orthocal.robot.model import read_only
 from orthocal.robot.parameters import Parameter

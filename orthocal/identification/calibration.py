@@ -37,8 +37,8 @@ from orthocal.identification.records import (
 )
 from orthocal.identification.uncertainty import BY_CHANCE, confidence_factor
 from orthocal.identification.unmodelled import Unmodelled
+from orthocal.kinematics.assembly import Assembly
 from orthocal.markup import paragraph, table
-from orthocal.robot.assembly import Assembly
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from orthocal.identification.uncertainty import (
     decompose,
     project_out_zeros,
 )
-from orthocal.robot.orthoglide import displacement_angle
+from orthocal.kinematics.orthoglide import displacement_angle
 
 Array = NDArray[np.float64]
 

@@ -27,6 +27,10 @@ from orthocal.identification.pieces import (
     SharedInputs,
 )
 from orthocal.identification.selection import Known, Selection, select_parameters
+from orthocal.kinematics.assembly import Assembly
+from orthocal.kinematics.batch import BatchFunction
+from orthocal.kinematics.slopes import SharedPlacements
+from orthocal.kinematics.symbolic import SymbolicRobot
 from orthocal.measurement.gauge import (
     Observations,
     build_observations,
@@ -36,12 +40,8 @@ from orthocal.measurement.gauge import (
     zero_root_coordinate,
 )
 from orthocal.measurement.session import Session
-from orthocal.robot.assembly import Assembly
-from orthocal.robot.batch import BatchFunction
 from orthocal.robot.model import Robot, closure_row_units, coordinate_units
 from orthocal.robot.parameters import AXES
-from orthocal.robot.slopes import SharedPlacements
-from orthocal.robot.symbolic import SymbolicRobot
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

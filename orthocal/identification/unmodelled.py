@@ -21,8 +21,8 @@ from orthocal.identification.fit import SMALLEST_SIGMA, Fit
 from orthocal.identification.problem import CalibrationProblem
 from orthocal.identification.selection import Selection
 from orthocal.identification.uncertainty import project_out_zeros
+from orthocal.kinematics.symbolic import hangs_on
 from orthocal.robot.model import Robot, read_only
-from orthocal.robot.symbolic import hangs_on
 
 Array = NDArray[np.float64]
 

@@ -19,11 +19,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.kinematics.assembly import Assembly, nominal_assembly
+from orthocal.kinematics.batch import BatchFunction
+from orthocal.kinematics.symbolic import SymbolicRobot
 from orthocal.measurement.session import DIRECTIONS, Session, section_plane
-from orthocal.robot.assembly import Assembly, nominal_assembly
-from orthocal.robot.batch import BatchFunction
 from orthocal.robot.model import Leg, Robot
-from orthocal.robot.symbolic import SymbolicRobot
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -18,6 +18,7 @@ from orthocal.characters import shorten
 from orthocal.documents import parse_number, read_csv_rows, read_yaml, validate
 from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.files import is_folder, read_file, require_plain_name
+from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.measurement.gauge import locate_contacts
 from orthocal.measurement.schema import (
     LARGEST_READING_MM,
@@ -37,7 +38,6 @@ from orthocal.measurement.session import (
     section_plane,
 )
 from orthocal.measurement.session_robot import build_offsets, check_direction, require_given_zero
-from orthocal.robot.assembly import nominal_assembly
 from orthocal.robot.loading import load_robot
 from orthocal.robot.model import Robot, read_only
 

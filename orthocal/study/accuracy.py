@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from orthocal.arguments import require_kind
 from orthocal.errors import ClosureError, RobotError
 from orthocal.identification.calibration import Calibration
+from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
 from orthocal.robot.model import read_only
-from orthocal.robot.workspace import FEWEST_ALIGNED, Workspace
 from orthocal.study.entering import entered_offsets
 from orthocal.study.tool import CalibratedTool, error_covariance, find_tool, place_tool
 

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError
 from orthocal.identification.calibration import Calibration
-from orthocal.robot.assembly import Assembly, Failures, as_rows, nominal_assembly
+from orthocal.kinematics.assembly import Assembly, Failures, as_rows, nominal_assembly
+from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.robot.model import Robot, read_only
-from orthocal.robot.sensitivity import ToolSensitivity
 from orthocal.study.tool import error_covariance
 
 Array = NDArray[np.float64]

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError
 from orthocal.identification.calibration import Calibration
-from orthocal.robot.assembly import nominal_assembly
+from orthocal.kinematics.assembly import nominal_assembly
+from orthocal.kinematics.sensitivity import ToolSensitivity
+from orthocal.kinematics.workspace import Workspace, largest_cube
 from orthocal.robot.model import Robot, read_only
-from orthocal.robot.sensitivity import ToolSensitivity
-from orthocal.robot.workspace import Workspace, largest_cube
 
 Array = NDArray[np.float64]
 

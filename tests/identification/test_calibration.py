@@ -19,8 +19,8 @@ from orthocal import (
     summarize,
 )
 from orthocal.errors import CalibrationFileError
+from orthocal.kinematics import orthoglide as closed_form
 from orthocal.output.explanation import explain_fit
-from orthocal.robot import orthoglide as closed_form
 from orthocal.study.entering import find_entries
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}

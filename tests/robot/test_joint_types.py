@@ -12,7 +12,7 @@ from tolerances import KINEMATICS
 
 from orthocal import load_robot
 from orthocal.errors import RobotError
-from orthocal.robot.symbolic import SymbolicRobot
+from orthocal.kinematics.symbolic import SymbolicRobot
 from orthocal.robot.urdf import load_urdf
 
 YAML = "closed_loop: []\ntype: []\nname_mot: [j0]\n"

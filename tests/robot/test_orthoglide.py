@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tolerances import KINEMATICS, PRINTED
 
 from orthocal.errors import UnreachableError
-from orthocal.robot import orthoglide as og
+from orthocal.kinematics import orthoglide as og
 
 LENGTH = 0.31025
 inside = st.floats(-0.12, 0.12)

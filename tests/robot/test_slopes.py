@@ -8,8 +8,8 @@ import pinocchio as pin
 import pytest
 from tolerances import KINEMATICS
 
-from orthocal.robot.slopes import SharedPlacements, adjoint, log6_jacobian, right_jacobian
-from orthocal.robot.symbolic import SymbolicRobot, constant_pose
+from orthocal.kinematics.slopes import SharedPlacements, adjoint, log6_jacobian, right_jacobian
+from orthocal.kinematics.symbolic import SymbolicRobot, constant_pose
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-3, 0.3])

@@ -11,8 +11,7 @@ from tolerances import DERIVATIVE, KINEMATICS
 
 from orthocal import load_robot
 from orthocal.errors import RobotError
-from orthocal.robot.model import find_frame, place_frames
-from orthocal.robot.symbolic import (
+from orthocal.kinematics.symbolic import (
     ErrorExpressions,
     Pose,
     SymbolicRobot,
@@ -21,6 +20,7 @@ from orthocal.robot.symbolic import (
     exp6,
     log6,
 )
+from orthocal.robot.model import find_frame, place_frames
 from orthocal.robot.urdf import load_urdf
 
 

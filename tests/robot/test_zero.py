@@ -18,7 +18,7 @@ from tolerances import CLOSED, KINEMATICS
 
 from orthocal import load_robot
 from orthocal.errors import ClosureError, RobotError
-from orthocal.robot.assembly import Assembly
+from orthocal.kinematics.assembly import Assembly
 from orthocal.robot.zero import count_free_motions
 
 

@@ -23,11 +23,11 @@ from orthocal import (
 from orthocal.errors import RobotError
 from orthocal.identification.problem import build_problem
 from orthocal.identification.uncertainty import decompose, project_out_zeros
+from orthocal.kinematics.assembly import Assembly, nominal_assembly
+from orthocal.kinematics.orthoglide import inverse
+from orthocal.kinematics.sensitivity import ToolSensitivity
+from orthocal.kinematics.workspace import Workspace, cube, largest_cube, tool_at_zero
 from orthocal.measurement.synthetic import load_errors
-from orthocal.robot.assembly import Assembly, nominal_assembly
-from orthocal.robot.orthoglide import inverse
-from orthocal.robot.sensitivity import ToolSensitivity
-from orthocal.robot.workspace import Workspace, cube, largest_cube, tool_at_zero
 from orthocal.study.accuracy import (
     assess_tool,
     find_excess,

@@ -11,7 +11,7 @@ from fleets import Fleet
 from machines import write_orthoglide
 
 from orthocal import calibrate, load_plan, simulate_session, summarize
-from orthocal.robot.assembly import Assembly, nominal_assembly
+from orthocal.kinematics.assembly import Assembly, nominal_assembly
 from orthocal.study.accuracy import assess_tool, expect_after_offsets
 from orthocal.study.entering import choose_offsets, entered_offsets, find_entries
 from orthocal.study.tool import find_tool

@@ -14,10 +14,10 @@ from orthocal.identification.fit import fit_problem
 from orthocal.identification.nlp import NonlinearProgram
 from orthocal.identification.problem import build_problem
 from orthocal.identification.uncertainty import confidence_factor, decompose
+from orthocal.kinematics.assembly import Assembly
+from orthocal.kinematics.sensitivity import ToolSensitivity
+from orthocal.kinematics.workspace import cube
 from orthocal.measurement.session import Gauge
-from orthocal.robot.assembly import Assembly
-from orthocal.robot.sensitivity import ToolSensitivity
-from orthocal.robot.workspace import cube
 from orthocal.study.accuracy import assess_tool, measure_uncertainty
 
 SIGMA = 5e-6

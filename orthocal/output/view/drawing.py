@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError, ParameterError
 from orthocal.identification.calibration import Calibration
+from orthocal.kinematics.assembly import Assembly, nominal_assembly
 from orthocal.measurement.session import Session
 from orthocal.output.layout import counted, typeset
 from orthocal.output.view.deviations import (
@@ -39,7 +40,6 @@ from orthocal.output.view.scene import LegendEntry, Scene, round_scale
 from orthocal.output.view.shapes import Colour, css
 from orthocal.output.view.stage import GHOST_COLOUR, LINE_COLOUR, LINES, Stage
 from orthocal.output.view.tool_errors import draw_tool_errors
-from orthocal.robot.assembly import Assembly, nominal_assembly
 from orthocal.robot.model import Robot, coordinate_units
 from orthocal.robot.zero import count_free_motions
 from orthocal.study.entering import find_entries

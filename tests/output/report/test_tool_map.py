@@ -11,10 +11,10 @@ from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 
 from orthocal import calibrate, load_plan, simulate_session
+from orthocal.kinematics.workspace import Workspace, cube
 from orthocal.output.report import figure as style
 from orthocal.output.report import tool_map
 from orthocal.robot.model import Tcp
-from orthocal.robot.workspace import Workspace, cube
 from orthocal.study.accuracy import assess_tool, find_excess, measure_uncertainty
 from orthocal.study.tool import error_covariance
 

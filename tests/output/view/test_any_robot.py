@@ -18,9 +18,9 @@ from tolerances import CLOSED, KINEMATICS
 
 from orthocal import draw_scene, load_robot
 from orthocal.cli import main
+from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.output.view import drawing
 from orthocal.output.view.visuals import load_visuals
-from orthocal.robot.assembly import nominal_assembly
 from orthocal.robot.zero import count_free_motions
 
 

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from orthocal.robot.model import Closure, Robot, joint_axis
-from orthocal.robot.symbolic import (
+from orthocal.kinematics.symbolic import (
     Pose,
     SymbolicRobot,
     SymbolicTree,
@@ -25,6 +24,7 @@ from orthocal.robot.symbolic import (
     hangs_on,
     log6,
 )
+from orthocal.robot.model import Closure, Robot, joint_axis
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import RobotError
-from orthocal.robot.assembly import Assembly
-from orthocal.robot.batch import BatchFunction
+from orthocal.kinematics.assembly import Assembly
+from orthocal.kinematics.batch import BatchFunction
+from orthocal.kinematics.slopes import SharedPlacements
 from orthocal.robot.model import Robot
-from orthocal.robot.slopes import SharedPlacements
 
 Array = NDArray[np.float64]
 

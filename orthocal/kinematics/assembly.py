@@ -7,17 +7,17 @@ mechanical zero, so that the loops stay in the branch of assembly in which the m
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.arguments import require_kind
 from orthocal.errors import ClosureError, RobotError
-from orthocal.robot.batch import BatchFunction
+from orthocal.kinematics.compiled import compiled_robot
 from orthocal.robot.closing import describe_opening
 from orthocal.robot.model import (
     Robot,
@@ -27,7 +27,6 @@ from orthocal.robot.model import (
     coordinate_limits,
     coordinate_units,
 )
-from orthocal.robot.symbolic import SymbolicRobot
 
 Array = NDArray[np.float64]
 Failures = dict[int, ClosureError]
@@ -52,12 +51,23 @@ LARGEST_CONTINUATION_MOVE = 0.3
 _LIMIT_SLACK = 1e-9
 
 
+class _Machine(NamedTuple):
+    """What errors make of a machine: numbers that every posture shares."""
+
+    placements: Array
+    """Shape (12 n_moved,), [1, m]."""
+    offset: Array
+    """Shape (n_drives,), [m, rad]."""
+    gain: Array
+    """Shape (n_drives,)."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _System:
     """A square or redundant system r(x, p) = 0 of many postures, in metres."""
 
-    evaluate: BatchFunction
-    """(x, p, theta) -> residual (n_rows,), Jacobian by x (n_rows, n_x)."""
+    evaluate: Callable[[Array, Array, _Machine], tuple[Array, Array]]
+    """(x, p, machine) -> residuals (K, n_rows), Jacobians by x (K, n_rows, n_x)."""
     n_rows: int
     n_x: int
     start: Array
@@ -75,11 +85,6 @@ class _System:
     """Metres that one unit of each row amounts to, by which it was multiplied, shape (n_rows,)."""
     turns: NDArray[np.bool_]
     """Which rows are rotations, shape (n_rows,)."""
-
-    def __call__(self, x: Array, p: Array, theta: Array) -> tuple[Array, Array]:
-        """Residuals, shape (K, n_rows), and Jacobians, shape (K, n_rows, n_x)."""
-        residuals, jacobians = self.evaluate(x, p, theta)
-        return residuals, jacobians
 
     def step(self, residuals: Array, jacobians: Array) -> Array:
         """Newton steps, shape (K, n_x); least squares where rows depend on each other."""
@@ -99,9 +104,9 @@ class _System:
         with np.errstate(over="ignore"):  # steps without end are dropped by who asks
             return np.asarray(-(inverse @ residuals[..., None])[..., 0])
 
-    def describe(self, x: Array, p: Array, theta: Array) -> str:
+    def describe(self, x: Array, p: Array, machine: _Machine) -> str:
         """By how much the rows of one posture are open, in words."""
-        residuals, _ = self(x[None], p[None], theta)
+        residuals, _ = self.evaluate(x[None], p[None], machine)
         return describe_opening(residuals[0] / self.row_units, self.turns)
 
     def within_limits(self, x: Array) -> NDArray[np.bool_]:
@@ -129,18 +134,10 @@ class Assembly:
         require_kind(robot, Robot, expected="a Robot, such as load_robot(...)")
         self.robot = robot
         self.free = tuple(free)
-        drives = ca.SX.sym("drives", len(robot.drives))
-        passive = ca.SX.sym("passive", robot.passive_index.size)
-        theta = ca.SX.sym("theta", len(self.free))
-        errors: dict[str, ca.SX | float] = {
-            k: v for k, v in (fixed or {}).items() if k not in self.free
-        }
-        errors.update({name: theta[i] for i, name in enumerate(self.free)})
-        self._symbols = (drives, passive, theta)
-        self._symbolic = SymbolicRobot(robot, drives=drives, passive=passive, errors=errors)
-        self._closing = self._build_closing()
-        self._inverting: _System | None = None
-        self._tcp: BatchFunction | None = None
+        self._compiled = compiled_robot(robot)
+        self._columns = self._compiled.errors.columns(self.free)
+        others = {k: v for k, v in (fixed or {}).items() if k not in self.free}
+        self._fixed = self._compiled.errors.expand(others)
 
     def close(
         self,
@@ -173,9 +170,10 @@ class Assembly:
                 or, unless free motions are allowed, singular; names the posture and the residual.
         """
         d, single = as_rows(drives, len(self.robot.drives), "drive coordinates")
-        passive = self._solve(self._closing, d, self._theta(theta), start, names, failures)
+        machine = self._machine(theta)
+        passive = self._solve(self._closing, d, machine, start, names, failures)
         if not allow_free:
-            self._refuse_singular(d, passive, self._theta(theta), names, failures)
+            self._refuse_singular(d, passive, machine, names, failures)
         return passive[0] if single else passive
 
     def forward(
@@ -231,9 +229,7 @@ class Assembly:
             RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
         p, single = as_rows(points, len(self._require_tcp().coordinates), "coordinates")
-        if self._inverting is None:
-            self._inverting = self._build_inverting()
-        x = self._solve(self._inverting, p, self._theta(theta), None, names, failures)
+        x = self._solve(self._inverting, p, self._machine(theta), None, names, failures)
         drives = x[:, : len(self.robot.drives)]
         return drives[0] if single else drives
 
@@ -241,18 +237,24 @@ class Assembly:
         self, drives: ArrayLike, passive: ArrayLike, *, theta: ArrayLike | None = None
     ) -> Array:
         """Tool centre point of joint coordinates with closed loops, shape (K, 3) or (3,), [m]."""
-        if self._tcp is None:
-            position = self._symbolic.frame_pose(self._require_tcp().frame).position
-            function = ca.Function(
-                "tcp", list(self._symbols), [position], ["drives", "passive", "theta"], ["position"]
-            )
-            self._tcp = BatchFunction(function, shared=["theta"])
+        frame = self._require_tcp().frame
         d, _ = as_rows(drives, len(self.robot.drives), "drive coordinates")
         q, _ = as_rows(passive, self.robot.passive_index.size, "passive coordinates")
         if len(d) != len(q):
             raise ValueError(f"found {len(d)} rows of drive and {len(q)} of passive coordinates")
-        (points,) = self._tcp(d, q, self._theta(theta))
+        machine = self._machine(theta)
+        (points,) = self._compiled.position(frame)(
+            machine.gain * d + machine.offset, q, machine.placements
+        )
         return points[0] if np.ndim(drives) == 1 else points
+
+    def errors(self, theta: ArrayLike | None = None) -> Array:
+        """All errors of the machine for values of the free ones, shape (n_errors,), [SI]."""
+        return np.asarray(self._fixed + self._columns @ self._theta(theta))
+
+    def _machine(self, theta: ArrayLike | None) -> _Machine:
+        errors, at = self._compiled.errors, self.errors(theta)
+        return _Machine(errors.placements(at), errors.offsets(at), errors.gains(at))
 
     def _theta(self, theta: ArrayLike | None) -> Array:
         if theta is None:
@@ -269,19 +271,22 @@ class Assembly:
             )
         return self.robot.tcp
 
-    def _build_closing(self) -> _System:
-        drives, passive, theta = self._symbols
-        robot = self.robot
-        residual = self._symbolic.closure_residual() * closure_row_units(robot)
-        units = coordinate_units(robot)[robot.passive_index]
+    @cached_property
+    def _closing(self) -> _System:
+        robot, function = self.robot, self._compiled.closing
+
+        def evaluate(x: Array, p: Array, machine: _Machine) -> tuple[Array, Array]:
+            g, g_q = function(machine.gain * p + machine.offset, x, machine.placements)
+            return g, g_q
+
         lower, upper = coordinate_limits(robot)
         return _System(
-            evaluate=_residual_function("closing", passive, drives, theta, residual),
-            n_rows=residual.numel(),
-            n_x=passive.numel(),
+            evaluate=evaluate,
+            n_rows=robot.closure_rows,
+            n_x=robot.passive_index.size,
             start=robot.zero[robot.passive_index],
             origin=robot.drive_zero,
-            units=units,
+            units=coordinate_units(robot)[robot.passive_index],
             lower=lower[robot.passive_index],
             upper=upper[robot.passive_index],
             names=_joint_names(robot, robot.passive_index),
@@ -289,44 +294,52 @@ class Assembly:
             turns=closure_turns(robot),
         )
 
-    def _build_inverting(self) -> _System:
-        drives, passive, theta = self._symbols
+    @cached_property
+    def _inverting(self) -> _System:
         robot = self.robot
         tcp = self._require_tcp()
-        if len(tcp.coordinates) != len(robot.drives):
+        chosen = list(tcp.coordinates)
+        if len(chosen) != len(robot.drives):
             raise RobotError(
                 f"orthocal.tcp.coordinates names {len(tcp.coordinates)} coordinates for "
                 f"{len(robot.drives)} drives; the inverse needs as many",
                 where=str(robot.yaml),
             )
-        target = ca.SX.sym("target", len(tcp.coordinates))
-        reached = self._symbolic.frame_pose(tcp.frame).position[list(tcp.coordinates)]
-        closing = self._symbolic.closure_residual() * closure_row_units(robot)
-        residual = ca.vertcat(closing, reached - target)
-        x = ca.vertcat(drives, passive)
+        function, n_d = self._compiled.inverting, len(robot.drives)
+
+        def evaluate(x: Array, p: Array, machine: _Machine) -> tuple[Array, Array]:
+            d, q = x[:, :n_d], x[:, n_d:]
+            g, g_a, g_q, tool, t_a, t_q = function(
+                machine.gain * d + machine.offset, q, machine.placements
+            )
+            residuals = np.concatenate([g, tool[:, chosen] - p], axis=1)
+            by_drives = np.concatenate([g_a, t_a[:, chosen]], axis=1) * machine.gain
+            by_passive = np.concatenate([g_q, t_q[:, chosen]], axis=1)
+            return residuals, np.concatenate([by_drives, by_passive], axis=2)
+
         index = np.concatenate([robot.drive_index, robot.passive_index])
         lower, upper = coordinate_limits(robot)
         zero_passive = robot.zero[robot.passive_index]
-        origin = nominal_assembly(robot).tcp(robot.drive_zero, zero_passive)[list(tcp.coordinates)]
+        origin = nominal_assembly(robot).tcp(robot.drive_zero, zero_passive)[chosen]
         return _System(
-            evaluate=_residual_function("inverting", x, target, theta, residual),
-            n_rows=residual.numel(),
-            n_x=x.numel(),
+            evaluate=evaluate,
+            n_rows=robot.closure_rows + len(chosen),
+            n_x=index.size,
             start=np.concatenate([robot.drive_zero, zero_passive]),
             origin=origin,
             units=coordinate_units(robot)[index],
             lower=lower[index],
             upper=upper[index],
             names=_joint_names(robot, index),
-            row_units=np.append(closure_row_units(robot), np.ones(len(tcp.coordinates))),
-            turns=np.append(closure_turns(robot), np.zeros(len(tcp.coordinates), dtype=np.bool_)),
+            row_units=np.append(closure_row_units(robot), np.ones(len(chosen))),
+            turns=np.append(closure_turns(robot), np.zeros(len(chosen), dtype=np.bool_)),
         )
 
     def _solve(
         self,
         system: _System,
         targets: Array,
-        theta: Array,
+        machine: _Machine,
         start: ArrayLike | None,
         names: Sequence[str] | None,
         failures: Failures | None,
@@ -363,7 +376,7 @@ class Assembly:
         while pending.size:
             reach = np.minimum(1.0, done[pending] + step[pending])
             way = system.origin + reach[:, None] * (targets[pending] - system.origin)
-            trial, worst = _newton(system, x[pending], way, theta, tolerance)
+            trial, worst = _newton(system, x[pending], way, machine, tolerance)
             moved = np.abs((trial - x[pending]) / moves).max(axis=1, initial=0.0)
             good = (worst < tolerance) & (moved < LARGEST_CONTINUATION_MOVE)
             x[pending[good]] = trial[good]
@@ -373,14 +386,14 @@ class Assembly:
             fresh[pending] = False
             step[pending[~good]] *= 0.5
             for i in pending[~good & (step[pending] < SMALLEST_CONTINUATION_STEP)].tolist():
-                last, final = _newton(system, x[[i]], targets[[i]], theta, tolerance)
+                last, final = _newton(system, x[[i]], targets[[i]], machine, tolerance)
                 reason = (
                     "cannot be reached from the mechanical zero without changing the way in "
                     f"which the loops are assembled, {done[i]:.0%} of the way"
                     if final[0] < tolerance
                     else "cannot be reached: the loops stay open by "
-                    f"{system.describe(last[0], targets[i], theta)}, {done[i]:.0%} of the way from "
-                    "the mechanical zero"
+                    f"{system.describe(last[0], targets[i], machine)}, {done[i]:.0%} of the way "
+                    "from the mechanical zero"
                 )
                 refuse(i, reason, float(final[0]))
             pending = pending[(done[pending] < 1.0) & ~lost_for_good[pending]]
@@ -401,7 +414,7 @@ class Assembly:
         self,
         drives: Array,
         passive: Array,
-        theta: Array,
+        machine: _Machine,
         names: Sequence[str] | None,
         failures: Failures | None,
     ) -> None:
@@ -409,7 +422,7 @@ class Assembly:
         if system.n_x == 0:
             return
         solved = np.flatnonzero(np.isfinite(passive).all(axis=1))
-        _, jacobians = system(passive[solved], drives[solved], theta)
+        _, jacobians = system.evaluate(passive[solved], drives[solved], machine)
         values = np.linalg.svd(jacobians / system.units, compute_uv=False)
         smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
         largest = values.max(axis=1, initial=0.0)  # without closures there are no values
@@ -449,18 +462,8 @@ def as_rows(values: ArrayLike, n: int, what: str) -> tuple[Array, bool]:
     return np.atleast_2d(given), given.ndim == 1
 
 
-def _residual_function(
-    name: str, x: ca.SX, p: ca.SX, theta: ca.SX, residual: ca.SX
-) -> BatchFunction:
-    jacobian = ca.jacobian(residual, x)
-    function = ca.Function(
-        name, [x, p, theta], [residual, jacobian], ["x", "p", "theta"], ["residual", "jacobian"]
-    )
-    return BatchFunction(function, shared=["theta"], matrices=["jacobian"])
-
-
 def _newton(
-    system: _System, x: Array, p: Array, theta: Array, tolerance: float
+    system: _System, x: Array, p: Array, machine: _Machine, tolerance: float
 ) -> tuple[Array, Array]:
     """Damped Newton of many postures at once.
 
@@ -468,7 +471,7 @@ def _newton(
         Solutions, shape (K, n_x), and the largest residual of each, shape (K,), [m].
     """
     x = np.array(x)
-    residuals, jacobians = system(x, p, theta)
+    residuals, jacobians = system.evaluate(x, p, machine)
     worst = np.abs(residuals).max(axis=1, initial=0.0)
     active = np.flatnonzero(worst >= tolerance)
     for _ in range(MAX_NEWTON_STEPS):
@@ -483,7 +486,7 @@ def _newton(
         for _ in range(6):
             rows = active[pending]
             trial = x[rows] + scale[pending, None] * step[pending]
-            r, j = system(trial, p[rows], theta)
+            r, j = system.evaluate(trial, p[rows], machine)
             size = np.abs(r).max(axis=1, initial=0.0)
             better = size < worst[rows]
             good = rows[better]

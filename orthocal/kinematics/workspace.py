@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError
-from orthocal.robot.assembly import nominal_assembly
+from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.robot.model import Robot, read_only
 
 Array = NDArray[np.float64]

@@ -1,0 +1,251 @@
+"""All errors of a robot as one vector, and the placements that they make: numbers, nothing built.
+
+A placement with errors is placement · exp6(δ). Its derivative by δ is a twist in its own frame,
+
+    d exp6(δ) = exp6(δ) T(δ) dδ,  T(δ) = Σ (−ad δ)^k/(k + 1)!
+
+(Chirikjian, Stochastic Models, Information Theory, and Lie Groups, volume 2, 2012, section 10.8).
+Everything that errors do to a machine goes through these twists and through where its drives are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.kinematics.symbolic import nominal_frame_placement
+from orthocal.robot.model import Robot, read_only
+from orthocal.robot.parameters import ElementaryError
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+SERIES_TERMS = 40
+"""Terms of the series of T, at most: enough for a turn by π."""
+
+
+@dataclass(frozen=True, slots=True)
+class MovedPlacement:
+    """A joint or frame whose placement errors can move."""
+
+    index: int
+    """Of the joint, or of the frame."""
+    of_frame: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Slopes:
+    """What errors do to placements and drives to first order, for a choice of n parameters."""
+
+    twists: Array
+    """∂ξ of every moved placement in its own frame, shape (6 n_moved, n), [m, rad]."""
+    offsets: Array
+    """∂ of where the drives are, shape (n_drives, n), [m, rad]."""
+    gains: Array
+    """The same as a multiple of the commanded coordinates, shape (n_drives, n)."""
+
+
+class ErrorMap:
+    """The elementary errors of a robot in a fixed order, shape (n_errors,), [m, rad, 1].
+
+    Args:
+        robot: The nominal robot.
+
+    Attributes:
+        names: Of the errors.
+        moved: Placements that they move.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        elementary = tuple(robot.parameters.elementary.values())
+        self.names = tuple(e.name for e in elementary)
+        self._index = {name: i for i, name in enumerate(self.names)}
+        drives = {d.name: i for i, d in enumerate(robot.drives)}
+        moved: dict[MovedPlacement, int] = {}
+        twist = np.full(len(elementary), -1)
+        offset, scale = np.array(twist), np.array(twist)
+        for i, e in enumerate(elementary):
+            if e.kind == "offset":
+                offset[i] = drives[e.owner]
+            elif e.kind == "scale":
+                scale[i] = drives[e.owner]
+            else:
+                place = moved.setdefault(_placement_of(robot, e), len(moved))
+                twist[i] = 6 * place + e.axis
+        self.moved = tuple(moved)
+        self._twist, self._offset, self._scale = twist, offset, scale
+        nominal = [
+            nominal_frame_placement(robot.model, m.index)
+            if m.of_frame
+            else robot.model.jointPlacements[m.index]
+            for m in self.moved
+        ]
+        self._rotations = np.array([p.rotation for p in nominal]).reshape(-1, 3, 3)
+        self._positions = np.array([p.translation for p in nominal]).reshape(-1, 3)
+
+    def expand(self, values: Mapping[str, float]) -> Array:
+        """The vector of named parameters, which may be sums, shape (n_errors,), [SI].
+
+        Raises:
+            ParameterError: If a name is unknown.
+        """
+        result = np.zeros(len(self.names))
+        for name, value in self.robot.parameters.expand(values).items():
+            result[self._index[name]] = value
+        return result
+
+    def columns(self, names: Sequence[str]) -> Array:
+        """What one unit of each named parameter adds to the vector, shape (n_errors, n)."""
+        result = np.zeros((len(self.names), len(names)))
+        for column, name in enumerate(names):
+            for term, coefficient in self.robot.parameters[name].terms:
+                result[self._index[term], column] += coefficient
+        return result
+
+    def placements(self, errors: ArrayLike) -> Array:
+        """Moved placements: rotation by columns, then position.
+
+        Args:
+            errors: Shape (..., n_errors), [SI].
+
+        Returns:
+            Shape (..., 12 n_moved), [1, m].
+        """
+        twists = self._twists(np.asarray(errors, dtype=np.float64))
+        turn, shift = exp6(twists)
+        rotations = self._rotations @ turn
+        positions = (self._rotations @ shift[..., None])[..., 0] + self._positions
+        columns = np.swapaxes(rotations, -1, -2).reshape(*rotations.shape[:-2], 9)
+        values = np.concatenate([columns, positions], axis=-1)
+        return values.reshape(*values.shape[:-2], -1)
+
+    def drives(self, errors: ArrayLike, commanded: ArrayLike) -> Array:
+        """Where the drives really are, gain · commanded + offset, shape (..., n_drives), [m, rad].
+
+        Args:
+            errors: Shape (n_errors,) or (..., n_errors), [SI].
+            commanded: Shape (..., n_drives), [m, rad].
+        """
+        offset, gain = self.offsets(errors), self.gains(errors)
+        return np.asarray(gain * np.asarray(commanded, dtype=np.float64) + offset)
+
+    def offsets(self, errors: ArrayLike) -> Array:
+        """Offsets of the drives, shape (..., n_drives), [m, rad]."""
+        return self._of_drives(np.asarray(errors, dtype=np.float64), self._offset)
+
+    def gains(self, errors: ArrayLike) -> Array:
+        """1 + scale error of the drives, shape (..., n_drives)."""
+        scale = self._of_drives(np.asarray(errors, dtype=np.float64), self._scale)
+        return np.asarray(self.robot.drive_gain + scale)
+
+    def slopes(self, errors: ArrayLike, columns: Array) -> Slopes:
+        """Derivatives of placements and drives by parameters.
+
+        Args:
+            errors: Where, shape (n_errors,), [SI].
+            columns: What one unit of each parameter adds to them, shape (n_errors, n).
+        """
+        at = right_jacobian(self._twists(np.asarray(errors, dtype=np.float64)))
+        count = len(self.moved)
+        inner = np.zeros((6 * count, columns.shape[1]))
+        chosen = self._twist >= 0
+        inner[self._twist[chosen]] = columns[chosen]
+        twists = at @ inner.reshape(count, 6, -1)
+        offsets, gains = (np.zeros((len(self.robot.drives), columns.shape[1])) for _ in range(2))
+        for target, index in ((offsets, self._offset), (gains, self._scale)):
+            np.add.at(target, index[index >= 0], columns[index >= 0])
+        return Slopes(twists.reshape(6 * count, -1), offsets, gains)
+
+    @property
+    def twist_index(self) -> Indices:
+        """Component of the moved placements' twists that each error is, or −1, (n_errors,)."""
+        return self._twist
+
+    @property
+    def offset_index(self) -> Indices:
+        """Drive that each error offsets, or −1, shape (n_errors,)."""
+        return self._offset
+
+    @property
+    def scale_index(self) -> Indices:
+        """Drive whose scale each error is, or −1, shape (n_errors,)."""
+        return self._scale
+
+    def _twists(self, errors: Array) -> Array:
+        result = np.zeros((*errors.shape[:-1], 6 * len(self.moved)))
+        chosen = self._twist >= 0
+        result[..., self._twist[chosen]] = errors[..., chosen]
+        return result.reshape(*errors.shape[:-1], len(self.moved), 6)
+
+    def _of_drives(self, errors: Array, index: Indices) -> Array:
+        result = np.zeros((*errors.shape[:-1], len(self.robot.drives)))
+        chosen = index >= 0
+        result[..., index[chosen]] = errors[..., chosen]
+        return result
+
+
+@lru_cache(maxsize=8)
+def error_map(robot: Robot) -> ErrorMap:
+    """The error map of a robot, made once."""
+    return ErrorMap(robot)
+
+
+def _placement_of(robot: Robot, error: ElementaryError) -> MovedPlacement:
+    if error.of_frame:
+        return MovedPlacement(robot.frame_id(error.owner), True)
+    return MovedPlacement(int(robot.model.getJointId(error.owner)), False)
+
+
+def exp6(twists: Array) -> tuple[Array, Array]:
+    """Exponentials of twists (translation v, rotation ω), as Pinocchio's exp6.
+
+    Args:
+        twists: Shape (..., 6), [m, rad].
+
+    Returns:
+        Rotations, shape (..., 3, 3), and positions, shape (..., 3), [m].
+    """
+    flat = twists.reshape(-1, 6)
+    rotations, positions = np.empty((len(flat), 3, 3)), np.empty((len(flat), 3))
+    for i, twist in enumerate(flat):
+        pose = pin.exp6(twist)
+        rotations[i], positions[i] = pose.rotation, pose.translation
+    shape = twists.shape[:-1]
+    return rotations.reshape(*shape, 3, 3), positions.reshape(*shape, 3)
+
+
+def right_jacobian(twists: Array) -> Array:
+    """T with exp6(δ + dδ) = exp6(δ) exp6(T dδ) to first order, shape (..., 6, 6) of (..., 6)."""
+    ad = _small_adjoint(twists)
+    term = np.broadcast_to(np.eye(6), ad.shape)
+    total = np.array(term)
+    for k in range(1, SERIES_TERMS):
+        term = -(term @ ad) / (k + 1)
+        total += term
+        if not term.any() or np.abs(term).max() < 1e-18:
+            break
+    return read_only(total)
+
+
+def _small_adjoint(twists: Array) -> Array:
+    """Ad of twists (v, ω): [[ω, v], [0, ω]] of their cross products, shape (..., 6, 6)."""
+    result = np.zeros((*twists.shape, 6))
+    hat_v, hat_w = _hat(twists[..., :3]), _hat(twists[..., 3:])
+    result[..., :3, :3] = result[..., 3:, 3:] = hat_w
+    result[..., :3, 3:] = hat_v
+    return result
+
+
+def _hat(vectors: Array) -> Array:
+    result = np.zeros((*vectors.shape, 3))
+    x, y, z = (vectors[..., i] for i in range(3))
+    result[..., 0, 1], result[..., 0, 2] = -z, y
+    result[..., 1, 0], result[..., 1, 2] = z, -x
+    result[..., 2, 0], result[..., 2, 1] = -y, x
+    return result
