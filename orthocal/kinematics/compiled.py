@@ -40,6 +40,8 @@ class CompiledRobot:
 
     Args:
         robot: The nominal robot.
+        passive: Passive coordinates instead of symbols.
+        placements: Symbols of another one to share.
 
     Attributes:
         actuated: Symbol for where the drives are, shape (n_drives,), [m, rad].
@@ -47,13 +49,17 @@ class CompiledRobot:
         placements: Symbol for the moved placements, shape (12 n_moved,), [1, m].
     """
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(
+        self, robot: Robot, *, passive: ca.SX | None = None, placements: ca.SX | None = None
+    ) -> None:
         self.robot = robot
         self.errors: ErrorMap = error_map(robot)
         moved = self.errors.moved
         self.actuated = ca.SX.sym("actuated", len(robot.drives))
-        self.passive = ca.SX.sym("passive", robot.passive_index.size)
-        self.placements = ca.SX.sym("placements", 12 * len(moved))
+        self.passive = ca.SX.sym("passive", robot.passive_index.size) if passive is None else passive
+        self.placements = (
+            ca.SX.sym("placements", 12 * len(moved)) if placements is None else placements
+        )
         coordinates = ca.SX(robot.model.nv, 1)
         coordinates[robot.drive_index.tolist()] = self.actuated
         coordinates[robot.passive_index.tolist()] = self.passive
@@ -72,6 +78,13 @@ class CompiledRobot:
     def symbols(self) -> list[ca.SX]:
         """Actuated and passive coordinates, placements."""
         return [self.actuated, self.passive, self.placements]
+
+    @cached_property
+    def at_zero(self) -> CompiledRobot:
+        """The same machine in its zero posture, passive joints as nominal: what moves with drives
+        alone is where it is. Its drives are symbols of their own, its placements shared."""
+        zero = ca.SX(self.robot.zero[self.robot.passive_index])
+        return CompiledRobot(self.robot, passive=zero, placements=self.placements)
 
     @property
     def n_twists(self) -> int:
