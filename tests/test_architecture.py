@@ -14,7 +14,17 @@ import orthocal
 STAGES = [
     *("characters", "arguments", "errors", "interrupts", "streams"),
     *("files", "strict_yaml", "documents", "markup"),
-    *("robot", "kinematics", "measurement", "identification", "study", "output", "cli", "__main__"),
+    *(
+        "robot",
+        "kinematics",
+        "sensors",
+        "measurement",
+        "identification",
+        "study",
+        "output",
+        "cli",
+        "__main__",
+    ),
 ]
 
 MODULES = sorted((ROOT / "orthocal").rglob("*.py"))

@@ -351,7 +351,7 @@ class NonlinearProgram:
 
     def _shared_call(self, theta: ca.MX) -> tuple[ca.MX, ...]:
         """What depends on θ̂ alone, once for all postures and readings."""
-        return tuple(self.problem.shared.function(theta))
+        return tuple(self.problem.machine_map.function(theta))
 
     def _add_readings(
         self,
@@ -384,7 +384,8 @@ class NonlinearProgram:
             p[piece.entries.tolist()].T,
             p[(o.size + piece.entries).tolist()].T,
             ca.MX(ca.DM(problem.drives[postures].T)),
-            ca.MX(ca.DM(problem.setup_columns[o.setup[piece.entries]].T)),
+            ca.MX(ca.DM(np.tile(problem.session.zero_drives[:, None], count))),
+            ca.MX(ca.DM(piece.table.T)),
         ]
         common = [p[2 * o.size], p[2 * o.size + 2], *shared]
         arguments = [*own, *common]
@@ -421,8 +422,9 @@ class NonlinearProgram:
         second = weight * bend * (slope.T @ slope)
         if exact:
             second += pull * self._reading_curvature(piece) / -sigma
-        inputs = [zero, piece.passive, y, weight, piece.drives, piece.setup, sigma, width]
-        inputs += self.problem.shared.symbols
+        inputs = [zero, piece.passive, y, weight]
+        inputs += [piece.drives, piece.zero, piece.constants, sigma, width]
+        inputs += self.problem.machine_map.symbols
 
         def pick(rows: Indices, columns: Indices) -> ca.SX:
             return ca.vertcat(*(second[int(i), int(j)] for i, j in zip(rows, columns, strict=True)))
@@ -434,7 +436,7 @@ class NonlinearProgram:
             "hessian": [pick(*triangle[0]), pick(*triangle[1])],
         }
         return {
-            name: ca.Function(f"{name}_{piece.leg}", inputs, [ca.densify(v) for v in values])
+            name: ca.Function(f"{name}_{piece.group}", inputs, [ca.densify(v) for v in values])
             for name, values in outputs.items()
         }
 
@@ -444,11 +446,14 @@ class NonlinearProgram:
         theta = direct.theta[piece.theta_index.tolist()]
         passive = direct.passive[piece.passive_index.tolist()]
         u = ca.vertcat(theta, ca.SX.sym("zero"), passive)
-        second, _ = ca.hessian(direct.readings[piece.leg], u)
+        second, _ = ca.hessian(direct.readings[piece.group], u)
         function = ca.Function(
-            "curvature", [direct.theta, passive, direct.drives, direct.setup], [ca.densify(second)]
+            "curvature",
+            [direct.theta, passive, direct.drives, direct.zero, direct.constants[piece.group]],
+            [ca.densify(second)],
         )
-        return function(self.problem.shared.symbols[0], piece.passive, piece.drives, piece.setup)
+        theta = self.problem.machine_map.symbols[0]
+        return function(theta, piece.passive, piece.drives, piece.zero, piece.constants)
 
     def _add_closures(
         self, x: ca.MX, lam_g: ca.MX, shared: list[ca.MX], hessian: SparseSum
@@ -460,7 +465,7 @@ class NonlinearProgram:
         piece = problem.posture_piece
         slope = ca.sparsify(ca.horzcat(piece.by_theta, piece.by_passive))
         pattern_rows, pattern_columns = (np.array(v) for v in slope.sparsity().get_triplet())
-        inputs = [piece.passive, piece.drives, *problem.shared.symbols]
+        inputs = [piece.passive, piece.drives, *problem.machine_map.symbols]
         closure_f = ca.Function("closure", inputs, [ca.densify(piece.closure)])
         slope_f = ca.Function("closure_slope", inputs, [ca.densify(slope.nz[:])])
         arguments = [

@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SharedInputs:
-    """What depends on θ̂ alone: evaluated once, and given to every piece."""
-
-    symbols: tuple[ca.SX, ...]
-    """Column vectors: θ̂, placements, their slopes, and per leg that is read the coordinate of its
-    root in the zero posture with its slope."""
-    function: ca.Function
-    """θ̂ to the values of the symbols."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,11 +30,14 @@ class PosturePiece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingPiece:
-    """One reading on one leg, in the few variables that it depends on."""
+    """One reading of a kind of sensor, in the few variables that it depends on."""
 
-    leg: str
+    group: int
+    """Index of the sensor group."""
     entries: Indices
-    """Entries of the observations that are on this leg, shape (n,)."""
+    """Entries of the observations that are of it, shape (n,)."""
+    table: Array
+    """Constants of their setups, shape (n, n_constants)."""
     passive_index: Indices
     """Which passive coordinates it depends on."""
     theta_index: Indices
@@ -54,8 +46,10 @@ class ReadingPiece:
     """Those q̂."""
     drives: ca.SX
     """Commanded drive coordinates of the posture, shape (n_drives,), [m, rad]."""
-    setup: ca.SX
-    """Constants of the setup, shape (5,): direction, plane, from_root."""
+    zero: ca.SX
+    """Those of the zero posture, shape (n_drives,), [m, rad]."""
+    constants: ca.SX
+    """Constants of the setup, shape (n_constants,)."""
     reading: ca.SX
     """h, [m]."""
     by_passive: ca.SX
@@ -71,8 +65,11 @@ class DirectExpressions:
     theta: ca.SX
     passive: ca.SX
     drives: ca.SX
-    setup: ca.SX
+    zero: ca.SX
+    """Commanded drive coordinates of the zero posture, shape (n_drives,), [m, rad]."""
     closure: ca.SX
     """ĝ, shape (closure_rows,)."""
-    readings: Mapping[str, ca.SX]
-    """Leg to h, [m]."""
+    constants: tuple[ca.SX, ...]
+    """Constants of a setup, by sensor group."""
+    readings: tuple[ca.SX, ...]
+    """h by sensor group, [m]."""

@@ -24,30 +24,34 @@ from orthocal.identification.pieces import (
     DirectExpressions,
     PosturePiece,
     ReadingPiece,
-    SharedInputs,
 )
 from orthocal.identification.selection import Known, Selection, select_parameters
-from orthocal.kinematics.assembly import Assembly
-from orthocal.kinematics.batch import BatchFunction
-from orthocal.kinematics.slopes import SharedPlacements
+from orthocal.kinematics.assembly import Assembly, Machine
+from orthocal.kinematics.compiled import CompiledRobot, compiled_robot
+from orthocal.kinematics.error_map import Slopes
+from orthocal.kinematics.machine_map import MachineMap
 from orthocal.kinematics.symbolic import SymbolicRobot
 from orthocal.measurement.gauge import (
     Observations,
+    SensorGroup,
     build_observations,
     drive_table,
-    reading_expression,
-    setup_columns,
-    zero_root_coordinate,
+    group_sensors,
 )
 from orthocal.measurement.session import Session
 from orthocal.robot.model import Robot, closure_row_units, coordinate_units
 from orthocal.robot.parameters import AXES
+from orthocal.sensors.protocol import View
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 LENGTH_SCALE = 1e-3
 """What closures, passive motions and gauge zeros are scaled by, [m]."""
+
+
+READINGS_AT_ONCE = 1024
+"""Readings whose derivatives are held at a time, for their memory."""
 
 
 class CalibrationProblem:
@@ -71,7 +75,6 @@ class CalibrationProblem:
         _require_independent_rows(self.robot)
         self.observations: Observations = build_observations(session)
         self.drives = drive_table(session)
-        self.setup_columns = setup_columns(session)
         self.theta_scale = selection.tolerances
         self.prior_precision = selection.prior.astype(np.float64)
         self.prior_mean = np.where(selection.prior, selection.mean, 0.0)
@@ -147,94 +150,62 @@ class CalibrationProblem:
         return self.assembly.close(self.drives, theta=theta, start=start, names=names)
 
     @cached_property
-    def shared(self) -> SharedInputs:
-        """What depends on θ̂ alone."""
-        theta, placements = self._placements.theta, self._placements
-        machine = placements.machine(
-            drives=ca.SX(self.session.zero_drives), passive=self._nominal_zero_passive
-        )
-        values, symbols = [], []
-        for leg, (coordinate, slope) in self._zero_roots.items():
-            frame = self.robot.frame_id(self.robot.legs[leg].root)
-            axis = ca.SX(np.array(self.robot.legs[leg].axis)).T
-            _, by_theta = placements.position_slopes(machine, frame, axis)
-            index = self._leg_theta[leg].tolist()
-            values += [zero_root_coordinate(self.robot.legs[leg], machine), by_theta[0, index].T]
-            symbols += [coordinate, slope]
-        inner = ca.Function("roots", [theta, placements.values, placements.slope_nonzeros], values)
-        values_at, slopes_at = placements.function(theta)
-        outputs = [theta, values_at, slopes_at]
-        if values:
-            found = inner(theta, values_at, slopes_at)
-            outputs += [ca.densify(v) for v in (found if isinstance(found, tuple) else (found,))]
-        return SharedInputs(
-            (theta, placements.values, placements.slope_nonzeros, *symbols),
-            ca.Function("shared", [theta], outputs),
-        )
+    def machine_map(self) -> MachineMap:
+        """What θ̂ makes of the machine, as functions of CasADi."""
+        return MachineMap(self.compiled.errors, fixed=self._fixed_errors, columns=self._columns)
 
     @cached_property
     def posture_piece(self) -> PosturePiece:
         """The closures of one posture."""
+        robot, compiled, shared = self.robot, self.compiled, self.machine_map
         drives, passive = self._posture_symbols()
-        machine = self._placements.machine(drives=drives, passive=passive * self.passive_scale)
-        scale = closure_row_units(self.robot) / LENGTH_SCALE
-        by_joints, by_theta = self._placements.closure_slopes(machine)
-        rows = ca.diag(ca.SX(scale))
+        g, g_a, g_q, g_t = compiled.expressions(
+            shared.actuated(drives), passive * self.passive_scale, shared.placements
+        )
         columns = ca.diag(ca.SX(self.passive_scale))
         return PosturePiece(
             passive=passive,
             drives=drives,
-            closure=machine.closure_residual() * scale,
-            by_passive=rows @ by_joints[:, self.robot.passive_index.tolist()] @ columns,
-            by_theta=rows @ by_theta,
+            closure=g / LENGTH_SCALE,
+            by_passive=g_q @ columns / LENGTH_SCALE,
+            by_theta=shared.chain(g_t, g_a, drives) / LENGTH_SCALE,
         )
 
     @cached_property
     def reading_pieces(self) -> tuple[ReadingPiece, ...]:
-        """The readings, leg by leg; legs that are not read are left out."""
-        drives, passive = self._posture_symbols()
-        machine = self._placements.machine(drives=drives, passive=passive * self.passive_scale)
-        legs = list(self.robot.legs)
-        leg_of_setup = np.array(
-            [legs.index(s.leg) for s in self.session.setups.values()], dtype=np.int64
-        )
+        """The readings, by the expression that they are of."""
+        shared = self.machine_map
         pieces = []
-        for name, (zero_root, zero_slope) in self._zero_roots.items():
-            leg = self.robot.legs[name]
-            setup = ca.SX.sym("setup", 5)
-            root, tip = ca.SX.sym("root", 3), ca.SX.sym("tip", 3)
-            section = ca.SX.sym("section")
-            h = reading_expression(root, tip, axis=leg.axis, direction=setup[:3], section=section)
-            rows = [ca.jacobian(h, v) for v in (root, tip, section)]
-            local = ca.Function("local", [root, tip, section, setup], [h, *rows])
-            places = [machine.frame_pose(f).position for f in (leg.root, leg.tip)]
-            value, by_root, by_tip, by_section = local(
-                *places, setup[3] + setup[4] * zero_root, setup
+        for k, group in enumerate(self.sensor_groups):
+            drives, passive = self._posture_symbols()
+            zero = ca.SX.sym("zero", len(self.robot.drives))
+            constants = ca.SX.sym("constants", group.constants.shape[1])
+            h, h_a, h_q, h_t, h_z, _ = group.reading.expression(
+                shared.actuated(drives),
+                passive * self.passive_scale,
+                shared.placements,
+                shared.actuated(zero),
+                constants,
+                ca.SX(0, 1),
             )
-            by_joints, by_theta = ca.SX(1, self.robot.model.nv), ca.SX(1, self.n_free)
-            for frame, row in ((leg.root, by_root), (leg.tip, by_tip)):
-                joints, theta = self._placements.position_slopes(
-                    machine, self.robot.frame_id(frame), row
-                )
-                by_joints, by_theta = by_joints + joints, by_theta + theta
-            theta_index = self._leg_theta[name]
-            by_passive = ca.sparsify(by_joints[0, self.robot.passive_index.tolist()])
-            used = _dependencies(value, passive)
+            by_theta = shared.chain(h_t, h_a, drives) + shared.chain(ca.SX(*h_t.shape), h_z, zero)
+            by_theta, by_passive = ca.sparsify(by_theta), ca.sparsify(h_q)
+            theta_index, used = _columns_of(by_theta), _columns_of(by_passive)
+            scale = ca.SX(self.passive_scale[used]).T
             pieces.append(
                 ReadingPiece(
-                    leg=name,
-                    entries=np.flatnonzero(
-                        leg_of_setup[self.observations.setup] == legs.index(name)
-                    ),
+                    group=k,
+                    entries=group.entries,
+                    table=group.constants,
                     passive_index=used,
                     theta_index=theta_index,
                     passive=passive[used.tolist()],
                     drives=drives,
-                    setup=setup,
-                    reading=value,
-                    by_passive=by_passive[0, used.tolist()] * ca.SX(self.passive_scale[used]).T,
-                    by_theta=by_theta[0, theta_index.tolist()]
-                    + by_section * setup[4] * zero_slope.T,
+                    zero=zero,
+                    constants=constants,
+                    reading=h,
+                    by_passive=by_passive[0, used.tolist()] * scale,
+                    by_theta=by_theta[0, theta_index.tolist()],
                 )
             )
         return tuple(pieces)
@@ -242,33 +213,53 @@ class CalibrationProblem:
     @cached_property
     def direct(self) -> DirectExpressions:
         """Closures and readings as expressions of θ̂ itself."""
+        robot = self.robot
         drives, passive = self._posture_symbols()
-        theta, setup = ca.SX.sym("theta", self.n_free), ca.SX.sym("setup", 5)
+        theta, zero = ca.SX.sym("theta", self.n_free), ca.SX.sym("zero", len(robot.drives))
         errors = self._errors(theta)
         machine, at_zero = (
-            SymbolicRobot(self.robot, drives=d, passive=p, errors=errors)
+            SymbolicRobot(robot, drives=d, passive=p, errors=errors)
             for d, p in (
                 (drives, passive * self.passive_scale),
-                (ca.SX(self.session.zero_drives), self._nominal_zero_passive),
+                (zero, ca.SX(robot.zero[robot.passive_index])),
             )
         )
-        readings = {}
-        for name in self._zero_roots:
-            leg = self.robot.legs[name]
-            root, tip = (machine.frame_pose(f).position for f in (leg.root, leg.tip))
-            section = setup[3] + setup[4] * zero_root_coordinate(leg, at_zero)
-            readings[name] = reading_expression(
-                root, tip, axis=leg.axis, direction=setup[:3], section=section
+        setups = list(self.session.setups.values())
+        constants, readings = [], []
+        for group in self.sensor_groups:
+            sensor = setups[int(self.observations.setup[group.entries[0]])].sensor
+            frames = sensor.frames(robot)
+            own = ca.SX.sym("constants", group.constants.shape[1])
+            view = View(
+                [machine.frame_pose(f) for f in frames.in_posture],
+                [at_zero.frame_pose(f) for f in frames.at_zero],
+                own,
+                ca.SX(0, 1),
             )
-        scale = closure_row_units(self.robot) / LENGTH_SCALE
+            constants.append(own)
+            readings.append(sensor.expression(view, robot))
+        scale = closure_row_units(robot) / LENGTH_SCALE
         return DirectExpressions(
-            theta, passive, drives, setup, machine.closure_residual() * scale, readings
+            theta,
+            passive,
+            drives,
+            zero,
+            machine.closure_residual() * scale,
+            tuple(constants),
+            tuple(readings),
         )
 
     def predict(self, theta: ArrayLike, passive: Array | None = None) -> Array:
         """Readings h(q(θ), θ) of all entries, gauge zeros at 0, shape (n_entries,), [m]."""
         q = self.close(theta) if passive is None else passive
-        return self._evaluate_readings(np.asarray(theta), q)[0]
+        machine = self.assembly.machine(theta)
+        result = np.empty(self.observations.size)
+        for group in self.sensor_groups:
+            for entries, constants in group.parts(READINGS_AT_ONCE):
+                at = self.observations.posture[entries]
+                (h,) = self._read(group, constants, at, machine, q, slopes=False)
+                result[entries] = h[:, 0]
+        return result
 
     def linearise(self, theta: ArrayLike, passive: Array | None = None) -> tuple[Array, Array]:
         """Readings and identification Jacobian at given parameters.
@@ -288,20 +279,29 @@ class CalibrationProblem:
             ClosureError: If the machine with these errors cannot reach a posture.
         """
         q = self.close(theta) if passive is None else passive
-        h, by_passive, by_theta = self._evaluate_readings(np.asarray(theta), q)
-        g_q, g_theta = self._closure_jacobians(
-            q / self.passive_scale, self.drives, *self._shared_values(np.asarray(theta))
+        machine, slopes = self._machine_and_slopes(theta)
+        _, g_a, g_q, g_t = self.compiled.slopes(machine.drives(self.drives), q, machine.placements)
+        inverse = _inverse(g_q)
+        result, jacobian = (
+            np.empty(self.observations.size),
+            np.empty((self.observations.size, self.n_free)),
         )
-        if g_q.shape[1] == g_q.shape[2]:
-            slopes = -np.linalg.solve(g_q, g_theta)
-        else:
-            slopes = -np.linalg.pinv(g_q, rcond=1e-10) @ g_theta
-        jacobian = by_theta
-        for start in range(0, len(jacobian), 1024):
-            part = slice(start, start + 1024)
-            chosen = slopes[self.observations.posture[part]]
-            jacobian[part] += np.einsum("ni,nij->nj", by_passive[part], chosen)
-        return h, jacobian
+        zero_drives = self.session.zero_drives
+        for group in self.sensor_groups:
+            for entries, constants in group.parts(READINGS_AT_ONCE):
+                at = self.observations.posture[entries]
+                h, h_a, h_q, h_t, h_z, _ = self._read(group, constants, at, machine, q, slopes=True)
+                pull = h_q @ inverse[at]
+                twists = (h_t - pull @ g_t[at])[:, 0]
+                drives = (h_a - pull @ g_a[at])[:, 0]
+                zero = h_z[:, 0]
+                result[entries] = h[:, 0]
+                jacobian[entries] = (
+                    twists @ slopes.twists
+                    + (drives + zero) @ slopes.offsets
+                    + (drives * self.drives[at] + zero * zero_drives) @ slopes.gains
+                )
+        return result, jacobian
 
     def split_errors(self, theta: ArrayLike) -> dict[str, float]:
         """Parameter name to value, free and fixed, [SI]."""
@@ -319,88 +319,56 @@ class CalibrationProblem:
         )
 
     @cached_property
-    def _placements(self) -> SharedPlacements:
-        theta = ca.SX.sym("theta", self.n_free)
-        return SharedPlacements(self.robot, theta, self._errors(theta))
-
-    @property
-    def _nominal_zero_passive(self) -> ca.SX:
-        return ca.SX(self.robot.zero[self.robot.passive_index])
+    def compiled(self) -> CompiledRobot:
+        """The functions of the robot."""
+        return compiled_robot(self.robot)
 
     @cached_property
-    def _leg_theta(self) -> dict[str, Indices]:
-        """Leg that is read to the free parameters that its readings depend on."""
-        drives, passive = self._posture_symbols()
-        machine = self._placements.machine(drives=drives, passive=passive)
-        found = {}
-        read = {list(self.session.setups.values())[i].leg for i in self.observations.setup}
-        for name, leg in self.robot.legs.items():
-            if name not in read:
-                continue
-            used: set[int] = set()
-            for frame in (leg.root, leg.tip):
-                row = ca.SX.sym("row", 1, 3)
-                _, by_theta = self._placements.position_slopes(
-                    machine, self.robot.frame_id(frame), row
-                )
-                used.update(ca.sparsify(by_theta).sparsity().get_col())
-            found[name] = np.array(sorted(used), dtype=np.int64)
-        return found
+    def sensor_groups(self) -> tuple[SensorGroup, ...]:
+        """Entries by the expression that they are readings of."""
+        return group_sensors(self.session, self.observations)
 
     @cached_property
-    def _zero_roots(self) -> dict[str, tuple[ca.SX, ca.SX]]:
-        """Leg that is read to symbols for its root's coordinate in the zero posture and slope."""
-        return {
-            name: (ca.SX.sym("zero_root"), ca.SX.sym("zero_slope", index.size))
-            for name, index in self._leg_theta.items()
-        }
+    def _fixed_errors(self) -> Array:
+        return self.compiled.errors.expand(self.fixed)
 
     @cached_property
-    def _closure_jacobians(self) -> BatchFunction:
-        piece = self.posture_piece
-        function = ca.Function(
-            "closure_jacobians",
-            [piece.passive, piece.drives, *self.shared.symbols],
-            [piece.by_passive, piece.by_theta],
+    def _columns(self) -> Array:
+        """What one tolerance of each free parameter adds to all errors, (n_errors, n_free)."""
+        return self.compiled.errors.columns(self.free) * self.theta_scale
+
+    def _machine_and_slopes(self, theta: ArrayLike) -> tuple[Machine, Slopes]:
+        """The machine, and what tolerances of the free parameters do to it."""
+        errors = self.assembly.errors(theta)
+        return self.assembly.machine(theta), self.compiled.errors.slopes(errors, self._columns)
+
+    def _read(
+        self,
+        group: SensorGroup,
+        constants: Array,
+        postures: Indices,
+        machine: Machine,
+        passive: Array,
+        *,
+        slopes: bool,
+    ) -> tuple[Array, ...]:
+        function = group.reading.slopes if slopes else group.reading.value
+        zero = machine.drives(self.session.zero_drives)
+        return function(
+            machine.drives(self.drives[postures]),
+            passive[postures],
+            machine.placements,
+            np.tile(zero, (postures.size, 1)),
+            constants,
+            np.zeros((postures.size, 0)),
         )
-        return BatchFunction(function, shared=function.name_in()[2:], matrices=function.name_out())
 
-    @cached_property
-    def _reading_functions(self) -> tuple[BatchFunction, ...]:
-        functions = []
-        for piece in self.reading_pieces:
-            function = ca.Function(
-                "reading",
-                [piece.passive, piece.drives, piece.setup, *self.shared.symbols],
-                [piece.reading, piece.by_passive, piece.by_theta],
-            )
-            functions.append(BatchFunction(function, shared=function.name_in()[3:]))
-        return tuple(functions)
 
-    def _shared_values(self, theta: Array) -> list[Array]:
-        values = self.shared.function(theta / self.theta_scale)
-        return [np.asarray(v.full()).reshape(-1) for v in values]
-
-    def _evaluate_readings(self, theta: Array, passive: Array) -> tuple[Array, Array, Array]:
-        """h, ∂h/∂q̂ and ∂h/∂θ̂ at fixed q, shapes (n,), (n, n_passive), (n, n_free)."""
-        o = self.observations
-        h = np.zeros(o.size)
-        by_passive = np.zeros((o.size, self.robot.passive_index.size))
-        by_theta = np.zeros((o.size, self.n_free))
-        q_hat = passive / self.passive_scale
-        shared = self._shared_values(theta)
-        for piece, function in zip(self.reading_pieces, self._reading_functions, strict=True):
-            n, postures = piece.entries, o.posture[piece.entries]
-            value, h_q, h_theta = function(
-                q_hat[postures][:, piece.passive_index],
-                self.drives[postures],
-                self.setup_columns[o.setup[n]],
-                *shared,
-            )
-            h[n] = value[:, 0]
-            by_passive[np.ix_(n, piece.passive_index)] = h_q.reshape(len(n), -1)
-            by_theta[np.ix_(n, piece.theta_index)] = h_theta.reshape(len(n), -1)
-        return h, by_passive, by_theta
+def _inverse(matrices: Array) -> Array:
+    """Inverses of square matrices, shape (K, n, n); least squares of others."""
+    if matrices.shape[1] == matrices.shape[2]:
+        return np.asarray(np.linalg.inv(matrices))
+    return np.asarray(np.linalg.pinv(matrices, rcond=1e-10))
 
 
 def build_problem(
@@ -453,8 +421,6 @@ def _require_independent_rows(robot: Robot) -> None:
         )
 
 
-def _dependencies(expression: ca.SX, symbols: ca.SX) -> Indices:
-    """Indices of the symbols that an expression contains."""
-    present = {s.__hash__() for s in ca.symvar(expression)}
-    found = [i for i in range(symbols.numel()) if symbols[i].__hash__() in present]
-    return np.array(found, dtype=np.int64)
+def _columns_of(row: ca.SX) -> Indices:
+    """Columns of a sparse row that are not empty."""
+    return np.array(sorted(set(row.sparsity().get_col())), dtype=np.int64)

@@ -51,7 +51,7 @@ LARGEST_CONTINUATION_MOVE = 0.3
 _LIMIT_SLACK = 1e-9
 
 
-class _Machine(NamedTuple):
+class Machine(NamedTuple):
     """What errors make of a machine: numbers that every posture shares."""
 
     placements: Array
@@ -61,12 +61,16 @@ class _Machine(NamedTuple):
     gain: Array
     """Shape (n_drives,)."""
 
+    def drives(self, commanded: Array) -> Array:
+        """Where drives really are, shape (..., n_drives) of commanded coordinates, [m, rad]."""
+        return np.asarray(self.gain * commanded + self.offset)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _System:
     """A square or redundant system r(x, p) = 0 of many postures, in metres."""
 
-    evaluate: Callable[[Array, Array, _Machine], tuple[Array, Array]]
+    evaluate: Callable[[Array, Array, Machine], tuple[Array, Array]]
     """(x, p, machine) -> residuals (K, n_rows), Jacobians by x (K, n_rows, n_x)."""
     n_rows: int
     n_x: int
@@ -104,7 +108,7 @@ class _System:
         with np.errstate(over="ignore"):  # steps without end are dropped by who asks
             return np.asarray(-(inverse @ residuals[..., None])[..., 0])
 
-    def describe(self, x: Array, p: Array, machine: _Machine) -> str:
+    def describe(self, x: Array, p: Array, machine: Machine) -> str:
         """By how much the rows of one posture are open, in words."""
         residuals, _ = self.evaluate(x[None], p[None], machine)
         return describe_opening(residuals[0] / self.row_units, self.turns)
@@ -170,7 +174,7 @@ class Assembly:
                 or, unless free motions are allowed, singular; names the posture and the residual.
         """
         d, single = as_rows(drives, len(self.robot.drives), "drive coordinates")
-        machine = self._machine(theta)
+        machine = self.machine(theta)
         passive = self._solve(self._closing, d, machine, start, names, failures)
         if not allow_free:
             self._refuse_singular(d, passive, machine, names, failures)
@@ -229,7 +233,7 @@ class Assembly:
             RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
         p, single = as_rows(points, len(self._require_tcp().coordinates), "coordinates")
-        x = self._solve(self._inverting, p, self._machine(theta), None, names, failures)
+        x = self._solve(self._inverting, p, self.machine(theta), None, names, failures)
         drives = x[:, : len(self.robot.drives)]
         return drives[0] if single else drives
 
@@ -242,19 +246,18 @@ class Assembly:
         q, _ = as_rows(passive, self.robot.passive_index.size, "passive coordinates")
         if len(d) != len(q):
             raise ValueError(f"found {len(d)} rows of drive and {len(q)} of passive coordinates")
-        machine = self._machine(theta)
-        (points,) = self._compiled.position(frame)(
-            machine.gain * d + machine.offset, q, machine.placements
-        )
+        machine = self.machine(theta)
+        (points,) = self._compiled.position(frame)(machine.drives(d), q, machine.placements)
         return points[0] if np.ndim(drives) == 1 else points
 
     def errors(self, theta: ArrayLike | None = None) -> Array:
         """All errors of the machine for values of the free ones, shape (n_errors,), [SI]."""
         return np.asarray(self._fixed + self._columns @ self._theta(theta))
 
-    def _machine(self, theta: ArrayLike | None) -> _Machine:
+    def machine(self, theta: ArrayLike | None = None) -> Machine:
+        """The machine for values of the free parameters, shape (n_free,); 0 by default."""
         errors, at = self._compiled.errors, self.errors(theta)
-        return _Machine(errors.placements(at), errors.offsets(at), errors.gains(at))
+        return Machine(errors.placements(at), errors.offsets(at), errors.gains(at))
 
     def _theta(self, theta: ArrayLike | None) -> Array:
         if theta is None:
@@ -275,8 +278,8 @@ class Assembly:
     def _closing(self) -> _System:
         robot, function = self.robot, self._compiled.closing
 
-        def evaluate(x: Array, p: Array, machine: _Machine) -> tuple[Array, Array]:
-            g, g_q = function(machine.gain * p + machine.offset, x, machine.placements)
+        def evaluate(x: Array, p: Array, machine: Machine) -> tuple[Array, Array]:
+            g, g_q = function(machine.drives(p), x, machine.placements)
             return g, g_q
 
         lower, upper = coordinate_limits(robot)
@@ -307,11 +310,9 @@ class Assembly:
             )
         function, n_d = self._compiled.inverting, len(robot.drives)
 
-        def evaluate(x: Array, p: Array, machine: _Machine) -> tuple[Array, Array]:
+        def evaluate(x: Array, p: Array, machine: Machine) -> tuple[Array, Array]:
             d, q = x[:, :n_d], x[:, n_d:]
-            g, g_a, g_q, tool, t_a, t_q = function(
-                machine.gain * d + machine.offset, q, machine.placements
-            )
+            g, g_a, g_q, tool, t_a, t_q = function(machine.drives(d), q, machine.placements)
             residuals = np.concatenate([g, tool[:, chosen] - p], axis=1)
             by_drives = np.concatenate([g_a, t_a[:, chosen]], axis=1) * machine.gain
             by_passive = np.concatenate([g_q, t_q[:, chosen]], axis=1)
@@ -339,7 +340,7 @@ class Assembly:
         self,
         system: _System,
         targets: Array,
-        machine: _Machine,
+        machine: Machine,
         start: ArrayLike | None,
         names: Sequence[str] | None,
         failures: Failures | None,
@@ -414,7 +415,7 @@ class Assembly:
         self,
         drives: Array,
         passive: Array,
-        machine: _Machine,
+        machine: Machine,
         names: Sequence[str] | None,
         failures: Failures | None,
     ) -> None:
@@ -463,7 +464,7 @@ def as_rows(values: ArrayLike, n: int, what: str) -> tuple[Array, bool]:
 
 
 def _newton(
-    system: _System, x: Array, p: Array, machine: _Machine, tolerance: float
+    system: _System, x: Array, p: Array, machine: Machine, tolerance: float
 ) -> tuple[Array, Array]:
     """Damped Newton of many postures at once.
 

@@ -56,7 +56,9 @@ class CompiledRobot:
         self.errors: ErrorMap = error_map(robot)
         moved = self.errors.moved
         self.actuated = ca.SX.sym("actuated", len(robot.drives))
-        self.passive = ca.SX.sym("passive", robot.passive_index.size) if passive is None else passive
+        self.passive = (
+            ca.SX.sym("passive", robot.passive_index.size) if passive is None else passive
+        )
         self.placements = (
             ca.SX.sym("placements", 12 * len(moved)) if placements is None else placements
         )
@@ -82,7 +84,8 @@ class CompiledRobot:
     @cached_property
     def at_zero(self) -> CompiledRobot:
         """The same machine in its zero posture, passive joints as nominal: what moves with drives
-        alone is where it is. Its drives are symbols of their own, its placements shared."""
+        alone is where it is. Its drives are symbols of their own, its placements shared.
+        """
         zero = ca.SX(self.robot.zero[self.robot.passive_index])
         return CompiledRobot(self.robot, passive=zero, placements=self.placements)
 
@@ -136,10 +139,15 @@ class CompiledRobot:
     @cached_property
     def slopes(self) -> BatchFunction:
         """(actuated, passive, placements) to g, ∂g by actuated, by passive and by twists."""
+        outputs = [self.expressions.name_out(i) for i in range(1, 4)]
+        return BatchFunction(self.expressions, shared=["placements"], matrices=outputs)
+
+    @cached_property
+    def expressions(self) -> ca.Function:
+        """The same with sparse rows, to be put into other expressions."""
         joints, twists = self.closure_slopes
-        return self._batch(
-            "slopes", [self.closure, *self._split(joints), twists], matrices=(1, 2, 3)
-        )
+        outputs = [self.closure, *self._split(joints), twists]
+        return self._function("slopes", outputs)
 
     # ---- frames
 
@@ -250,12 +258,17 @@ class CompiledRobot:
     def _batch(
         self, name: str, outputs: list[ca.SX], *, matrices: int | tuple[int, ...] = ()
     ) -> BatchFunction:
+        function = self._function(name, outputs)
+        chosen = (matrices,) if isinstance(matrices, int) else matrices
+        return BatchFunction(
+            function, shared=["placements"], matrices=[function.name_out(i) for i in chosen]
+        )
+
+    def _function(self, name: str, outputs: list[ca.SX]) -> ca.Function:
         names = [f"y{i}" for i in range(len(outputs))]
-        function = ca.Function(
+        return ca.Function(
             name, self.symbols, outputs, ["actuated", "passive", "placements"], names
         )
-        chosen = (matrices,) if isinstance(matrices, int) else matrices
-        return BatchFunction(function, shared=["placements"], matrices=[names[i] for i in chosen])
 
 
 @lru_cache(maxsize=4)

@@ -141,8 +141,11 @@ class ErrorMap:
 
     def gains(self, errors: ArrayLike) -> Array:
         """1 + scale error of the drives, shape (..., n_drives)."""
-        scale = self._of_drives(np.asarray(errors, dtype=np.float64), self._scale)
-        return np.asarray(self.robot.drive_gain + scale)
+        return np.asarray(self.robot.drive_gain + self.scales(errors))
+
+    def scales(self, errors: ArrayLike) -> Array:
+        """Scale errors of the drives, shape (..., n_drives)."""
+        return self._of_drives(np.asarray(errors, dtype=np.float64), self._scale)
 
     def slopes(self, errors: ArrayLike, columns: Array) -> Slopes:
         """Derivatives of placements and drives by parameters.
@@ -152,36 +155,26 @@ class ErrorMap:
             columns: What one unit of each parameter adds to them, shape (n_errors, n).
         """
         at = right_jacobian(self._twists(np.asarray(errors, dtype=np.float64)))
-        count = len(self.moved)
-        inner = np.zeros((6 * count, columns.shape[1]))
+        n = columns.shape[1]
+        twists = at @ self.twists_of(columns.T).T.reshape(len(self.moved), 6, n)
+        return Slopes(twists.reshape(-1, n), self.offsets(columns.T).T, self.scales(columns.T).T)
+
+    @property
+    def nominal(self) -> Array:
+        """Moved placements without errors: rotation by columns, position; (n_moved, 12)."""
+        columns = np.swapaxes(self._rotations, 1, 2).reshape(-1, 9)
+        return np.concatenate([columns, self._positions], axis=1)
+
+    def twists_of(self, errors: ArrayLike) -> Array:
+        """Twists δ of the moved placements, shape (..., 6 n_moved), [m, rad]."""
+        given = np.asarray(errors, dtype=np.float64)
+        result = np.zeros((*given.shape[:-1], 6 * len(self.moved)))
         chosen = self._twist >= 0
-        inner[self._twist[chosen]] = columns[chosen]
-        twists = at @ inner.reshape(count, 6, -1)
-        offsets, gains = (np.zeros((len(self.robot.drives), columns.shape[1])) for _ in range(2))
-        for target, index in ((offsets, self._offset), (gains, self._scale)):
-            np.add.at(target, index[index >= 0], columns[index >= 0])
-        return Slopes(twists.reshape(6 * count, -1), offsets, gains)
-
-    @property
-    def twist_index(self) -> Indices:
-        """Component of the moved placements' twists that each error is, or −1, (n_errors,)."""
-        return self._twist
-
-    @property
-    def offset_index(self) -> Indices:
-        """Drive that each error offsets, or −1, shape (n_errors,)."""
-        return self._offset
-
-    @property
-    def scale_index(self) -> Indices:
-        """Drive whose scale each error is, or −1, shape (n_errors,)."""
-        return self._scale
+        result[..., self._twist[chosen]] = given[..., chosen]
+        return result
 
     def _twists(self, errors: Array) -> Array:
-        result = np.zeros((*errors.shape[:-1], 6 * len(self.moved)))
-        chosen = self._twist >= 0
-        result[..., self._twist[chosen]] = errors[..., chosen]
-        return result.reshape(*errors.shape[:-1], len(self.moved), 6)
+        return self.twists_of(errors).reshape(*errors.shape[:-1], len(self.moved), 6)
 
     def _of_drives(self, errors: Array, index: Indices) -> Array:
         result = np.zeros((*errors.shape[:-1], len(self.robot.drives)))

@@ -1,29 +1,17 @@
-"""The observation model: what an indicator shows of a leg that is not parallel to its motion.
-
-The gauge stands on the base and touches the leg where the leg's line, from root to tip, crosses
-the plane of the section. Its reading is the coordinate of that point along its direction, plus the
-unknown zero of the setup:
-
-    h = d · (root + t (tip − root)),  t = (c − a · root) / (a · (tip − root))
-
-with a the leg's nominal axis and c the plane: a world coordinate, or counted from the root in the
-zero posture (the paper's X-leg midpoint, section 3.2).
-"""
+"""A session's readings as single ones with unknown zeros, and what a machine shows of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.kinematics.assembly import Assembly, nominal_assembly
-from orthocal.kinematics.batch import BatchFunction
-from orthocal.kinematics.symbolic import SymbolicRobot
-from orthocal.measurement.session import DIRECTIONS, Session, section_plane
-from orthocal.robot.model import Leg, Robot
+from orthocal.kinematics.compiled import compiled_robot
+from orthocal.measurement.session import Session, section_plane
+from orthocal.sensors.compiled import CompiledReading, compile_reading
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -161,46 +149,43 @@ def _difference_groups(session: Session) -> dict[tuple[str, int, str], str]:
     return {node: find(node)[2] for node in list(leader)}
 
 
-def reading_expression(
-    root: ca.SX, tip: ca.SX, *, axis: Array, direction: ca.SX, section: ca.SX
-) -> ca.SX:
-    """H of a gauge on a leg, [m].
-
-    Args:
-        root: Position of the leg's root, shape (3,), [m].
-        tip: Position of its tip, shape (3,), [m].
-        axis: The leg's nominal axis, shape (3,).
-        direction: Unit vector of a growing reading, shape (3,).
-        section: Coordinate of the section's plane along the axis, [m].
-    """
-    a = ca.sparsify(ca.SX(np.array(axis)))
-    t = (section - ca.dot(a, root)) / ca.dot(a, tip - root)
-    return ca.dot(direction, root + t * (tip - root))
-
-
-def zero_root_coordinate(leg: Leg, at_zero: SymbolicRobot) -> ca.SX:
-    """Where sections that count from the root begin: a · root in the zero posture, [m].
-
-    Args:
-        leg: The leg.
-        at_zero: The machine in the zero posture, passive joints as nominal: the root needs only
-            its drive.
-    """
-    return ca.dot(ca.sparsify(ca.SX(np.array(leg.axis))), at_zero.frame_pose(leg.root).position)
-
-
-def setup_columns(session: Session) -> Array:
-    """Constants of every setup: direction (3), plane, from_root; shape (n_setups, 5), [1, m, 1]."""
-    columns = []
-    for setup in session.setups.values():
-        plane, from_root = section_plane(session.robot, setup)
-        columns.append([*DIRECTIONS[setup.direction], plane, float(from_root)])
-    return np.array(columns)
-
-
 def drive_table(session: Session) -> Array:
     """Commanded drive coordinates of all postures, shape (n_postures, n_drives), [m, rad]."""
     return np.array([p.drives for p in session.postures.values()])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorGroup:
+    """Entries whose sensors have one expression."""
+
+    reading: CompiledReading
+    entries: Indices
+    """Shape (n,)."""
+    constants: Array
+    """Of their setups, shape (n, n_constants)."""
+
+    def parts(self, size: int) -> Iterator[tuple[Indices, Array]]:
+        """Entries and constants, not more than so many at a time."""
+        for first in range(0, self.entries.size, size):
+            part = slice(first, first + size)
+            yield self.entries[part], self.constants[part]
+
+
+def group_sensors(session: Session, observations: Observations) -> tuple[SensorGroup, ...]:
+    """Entries by the expression that they are readings of."""
+    robot = session.robot
+    setups = list(session.setups.values())
+    found: dict[int, tuple[CompiledReading, list[int]]] = {}
+    for i in np.unique(observations.setup).tolist():
+        reading = compile_reading(robot, setups[i].sensor)
+        found.setdefault(id(reading), (reading, []))[1].append(i)
+    groups = []
+    for reading, members in found.values():
+        entries = np.flatnonzero(np.isin(observations.setup, members))
+        constants = {i: setups[i].sensor.constants(robot) for i in members}
+        table = np.array([constants[i] for i in observations.setup[entries].tolist()])
+        groups.append(SensorGroup(reading, entries, table))
+    return tuple(groups)
 
 
 def predict_entries(
@@ -223,47 +208,24 @@ def predict_entries(
     """
     robot = session.robot
     drives = drive_table(session)
+    assembly = Assembly(robot, fixed=errors)
     if passive is None:
-        passive = Assembly(robot, fixed=errors).close(drives, names=list(session.postures))
-    columns = setup_columns(session)
+        passive = assembly.close(drives, names=list(session.postures))
+    machine = assembly.machine()
+    actuated, zero = machine.drives(drives), machine.drives(session.zero_drives)
     result = np.empty(observations.size)
-    leg_of_setup = np.array(
-        [list(robot.legs).index(s.leg) for s in session.setups.values()], dtype=np.int64
-    )
-    for i, leg in enumerate(robot.legs.values()):
-        chosen = np.flatnonzero(leg_of_setup[observations.setup] == i)
-        if chosen.size:
-            function = _reading_function(robot, leg, errors)
-            postures = observations.posture[chosen]
-            (h,) = function(
-                drives[postures],
-                passive[postures],
-                session.zero_drives,
-                columns[observations.setup[chosen]],
-            )
-            result[chosen] = h[:, 0]
+    for group in group_sensors(session, observations):
+        at = observations.posture[group.entries]
+        (h,) = group.reading.value(
+            actuated[at],
+            passive[at],
+            machine.placements,
+            np.tile(zero, (at.size, 1)),
+            group.constants,
+            np.zeros((at.size, 0)),
+        )
+        result[group.entries] = h[:, 0]
     return result
-
-
-def _reading_function(robot: Robot, leg: Leg, errors: Mapping[str, float] | None) -> BatchFunction:
-    drives = ca.SX.sym("drives", len(robot.drives))
-    passive = ca.SX.sym("passive", robot.passive_index.size)
-    zero_drives = ca.SX.sym("zero_drives", len(robot.drives))
-    column = ca.SX.sym("setup", 5)
-    at_posture = SymbolicRobot(robot, drives=drives, passive=passive, errors=errors)
-    zero_passive = ca.SX(robot.zero[robot.passive_index])
-    at_zero = SymbolicRobot(robot, drives=zero_drives, passive=zero_passive, errors=errors)
-    section = column[3] + column[4] * zero_root_coordinate(leg, at_zero)
-    root, tip = (at_posture.frame_pose(f).position for f in (leg.root, leg.tip))
-    h = reading_expression(root, tip, axis=leg.axis, direction=column[:3], section=section)
-    function = ca.Function(
-        "reading",
-        [drives, passive, zero_drives, column],
-        [h],
-        ["drives", "passive", "zero_drives", "setup"],
-        ["h"],
-    )
-    return BatchFunction(function, shared=["zero_drives"])
 
 
 def locate_contacts(session: Session) -> dict[tuple[str, str], float]:
@@ -274,18 +236,19 @@ def locate_contacts(session: Session) -> dict[tuple[str, str], float]:
     """
     robot = session.robot
     nominal = drive_table(session) + session.active_offsets
-    passive = nominal_assembly(robot).close(nominal, names=list(session.postures))
-    drives_in = ca.SX.sym("drives", len(robot.drives))
-    passive_in = ca.SX.sym("passive", robot.passive_index.size)
-    machine = SymbolicRobot(robot, drives=drives_in, passive=passive_in)
-    ends = []
-    for leg in robot.legs.values():
-        for frame in (leg.root, leg.tip):
-            ends.append(ca.dot(ca.SX(np.array(leg.axis)), machine.frame_pose(frame).position))
-    function = BatchFunction(ca.Function("ends", [drives_in, passive_in], [ca.vertcat(*ends)]))
-    (along,) = function(nominal, passive)
+    assembly = nominal_assembly(robot)
+    passive = assembly.close(nominal, names=list(session.postures))
+    machine, compiled = assembly.machine(), compiled_robot(robot)
+
+    def positions(frame: str) -> Array:
+        (found,) = compiled.position(frame)(nominal, passive, machine.placements)
+        return found
+
+    ends = {
+        leg.name: (positions(leg.root) @ leg.axis, positions(leg.tip) @ leg.axis)
+        for leg in robot.legs.values()
+    }
     postures = {name: i for i, name in enumerate(session.postures)}
-    legs = {name: i for i, name in enumerate(robot.legs)}
     read: dict[str, set[str]] = {name: set() for name in session.setups}
     for reading in session.readings:
         read[reading.setup].update(p for p in (reading.posture, reading.minus) if p is not None)
@@ -296,6 +259,6 @@ def locate_contacts(session: Session) -> dict[tuple[str, str], float]:
         if from_root:
             plane += float(leg.axis @ leg.zero_root)
         for name in sorted(read[setup.name], key=postures.__getitem__):
-            root, tip = along[postures[name], 2 * legs[leg.name] :][:2]
+            root, tip = (end[postures[name]] for end in ends[leg.name])
             result[setup.name, name] = float((plane - root) / (tip - root))
     return result

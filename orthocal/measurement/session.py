@@ -14,25 +14,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.errors import SessionError
 from orthocal.markup import paragraph, table
 from orthocal.robot.model import Robot, read_only
+from orthocal.sensors.leg_indicator import DIRECTIONS, LegIndicator, Section, SectionForm
+from orthocal.sensors.protocol import Sensor
+
+__all__ = ["DIRECTIONS", "Section", "SectionForm"]
 
 Array = NDArray[np.float64]
-
-DIRECTIONS: dict[str, tuple[float, float, float]] = {
-    "x": (1.0, 0.0, 0.0),
-    "y": (0.0, 1.0, 0.0),
-    "z": (0.0, 0.0, 1.0),
-    "-x": (-1.0, 0.0, 0.0),
-    "-y": (0.0, -1.0, 0.0),
-    "-z": (0.0, 0.0, -1.0),
-}
-"""Names of measured directions, and their unit vectors in the world."""
-
-
-SectionForm = Literal["coordinate_mm", "from_root_mm", "fraction"]
-"""How a section is given."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,15 +50,6 @@ class Posture:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Section:
-    """Where along the leg's nominal axis the gauge touches."""
-
-    form: SectionForm
-    value: float
-    """World coordinate [m], distance from the root in the zero posture [m], or fraction [1]."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Setup:
     """One standing of the gauge, with one unknown zero."""
 
@@ -78,6 +58,11 @@ class Setup:
     direction: str
     """x, y, z, -x, -y or -z of the world: the direction of a growing reading."""
     section: Section
+
+    @property
+    def sensor(self) -> Sensor:
+        """What stands there."""
+        return LegIndicator(self.leg, self.direction, self.section)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,33 +180,5 @@ class Session:
 
 
 def section_plane(robot: Robot, setup: Setup, *, where: str = "") -> tuple[float, bool]:
-    """Plane across the leg that the gauge touches in: a · p = plane (+ a · root).
-
-    Args:
-        robot: The robot.
-        setup: The setup.
-        where: File and key, for messages.
-
-    Returns:
-        Coordinate of the plane along the leg's axis a (from root to tip), [m], and whether it
-        counts from the root in the zero posture.
-
-    Raises:
-        SessionError: If the section's form does not fit the leg.
-    """
-    leg = robot.legs[setup.leg]
-    form, value = setup.section.form, setup.section.value
-    if form == "coordinate_mm":
-        axis = int(np.abs(leg.axis).argmax())
-        if abs(leg.axis[axis]) < 1.0 - 1e-9:
-            raise SessionError(
-                f"leg {leg.name} does not lie along a world axis; give from_root_mm or fraction",
-                where=where,
-            )
-        return float(np.sign(leg.axis[axis]) * value), False
-    if not leg.root_driven:
-        raise SessionError(
-            f"the root of leg {leg.name} moves with passive joints; give coordinate_mm",
-            where=where,
-        )
-    return (value * leg.length if form == "fraction" else value), True
+    """Plane across the leg that the gauge touches in; see `LegIndicator.plane`."""
+    return LegIndicator(setup.leg, setup.direction, setup.section).plane(robot, where=where)

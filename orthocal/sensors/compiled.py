@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.kinematics.batch import BatchFunction
-from orthocal.kinematics.compiled import CompiledRobot, compiled_robot
+from orthocal.kinematics.compiled import compiled_robot
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Frames, Sensor, View
@@ -35,6 +35,8 @@ class CompiledReading:
     """h, [m]."""
     slopes: BatchFunction
     """h; ∂h by actuated, passive, twists, zero drives and unknowns, each of one row."""
+    expression: ca.Function
+    """The same with sparse rows, to be put into other expressions."""
 
 
 def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
@@ -86,7 +88,9 @@ def _compile(pattern: _Pattern) -> CompiledReading:
         [h, *(v for pull in pulls for v in pull), ca.jacobian(h, unknowns)],
     )
     seen = [machine.tree.frame_pose(frame) for machine, frame in trees]
-    found = local(*(s for pose in seen for s in (pose.rotation, pose.position)), constants, unknowns)
+    found = local(
+        *(s for pose in seen for s in (pose.rotation, pose.position)), constants, unknowns
+    )
     value, by_unknowns = found[0], found[-1]
     n_d, n_p = here.actuated.numel(), here.passive.numel()
     by_actuated, by_passive = ca.SX(1, n_d), ca.SX(1, n_p)
@@ -104,13 +108,15 @@ def _compile(pattern: _Pattern) -> CompiledReading:
     names = ["actuated", "passive", "placements", "zero", "constants", "unknowns"]
     outputs = [value, by_actuated, by_passive, by_twists, by_zero, by_unknowns]
     labels = ["h", *(f"by_{n}" for n in ("actuated", "passive", "twists", "zero", "unknowns"))]
+    slopes = ca.Function("slopes", inputs, outputs, names, labels)
     return CompiledReading(
         value=BatchFunction(ca.Function("h", inputs, [value], names, ["h"]), shared=["placements"]),
         slopes=BatchFunction(
-            ca.Function("slopes", inputs, outputs, names, labels),
+            slopes,
             shared=["placements"],
             matrices=labels[1:],
         ),
+        expression=slopes,
     )
 
 
@@ -118,7 +124,5 @@ def _pull(h: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
     """Force and moment, in the world, by which a pose moves a reading."""
     force = ca.jacobian(h, pose.position).T
     by_rotation = ca.reshape(ca.jacobian(h, ca.vec(pose.rotation)), 3, 3)
-    moment = [
-        ca.dot(by_rotation, ca.skew(ca.SX(np.eye(3)[i])) @ pose.rotation) for i in range(3)
-    ]
+    moment = [ca.dot(by_rotation, ca.skew(ca.SX(np.eye(3)[i])) @ pose.rotation) for i in range(3)]
     return force, ca.vertcat(*moment)
