@@ -157,7 +157,7 @@ class CalibrationProblem:
     @cached_property
     def posture_piece(self) -> PosturePiece:
         """The closures of one posture."""
-        robot, compiled, shared = self.robot, self.compiled, self.machine_map
+        compiled, shared = self.compiled, self.machine_map
         drives, passive = self._posture_symbols()
         g, g_a, g_q, g_t = compiled.expressions(
             shared.actuated(drives), passive * self.passive_scale, shared.placements

@@ -83,8 +83,9 @@ class CompiledRobot:
 
     @cached_property
     def at_zero(self) -> CompiledRobot:
-        """The same machine in its zero posture, passive joints as nominal: what moves with drives
-        alone is where it is. Its drives are symbols of their own, its placements shared.
+        """The same machine in its zero posture, its drives symbols of their own.
+
+        Passive joints are as nominal: what moves with drives alone is where it is.
         """
         zero = ca.SX(self.robot.zero[self.robot.passive_index])
         return CompiledRobot(self.robot, passive=zero, placements=self.placements)

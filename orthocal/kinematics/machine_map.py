@@ -69,15 +69,12 @@ class MachineMap:
 
 def _slope_pattern(inner: Array) -> ca.Sparsity:
     """Where ∂ξ/∂θ̂ can differ from 0: a shift stays a shift, a turn may become both."""
-    blocks = np.abs(inner).reshape(-1, 2, 3, inner.shape[1]).any(axis=2)  # (moved, kind, n)
-    shifts, turns = blocks[:, 0] | blocks[:, 1], blocks[:, 1]
-    pattern = np.repeat(np.stack([shifts, turns], axis=1), 3, axis=1).reshape(inner.shape)
-    return ca.DM(pattern.astype(np.float64)).sparsity() if pattern.all() else _sparsity(pattern)
-
-
-def _sparsity(pattern: NDArray[np.bool_]) -> ca.Sparsity:
+    sizes = np.abs(inner).reshape(-1, 2, 3, inner.shape[1]).sum(axis=2)  # (moved, kind, n)
+    turns, either = sizes[:, 1] > 0.0, sizes.sum(axis=1) > 0.0
+    pattern = np.repeat(np.stack([either, turns], axis=1), 3, axis=1).reshape(inner.shape)
     columns, rows = np.nonzero(pattern.T)
-    return ca.Sparsity.triplet(*pattern.shape, rows.tolist(), columns.tolist())
+    n_rows, n_columns = inner.shape
+    return ca.Sparsity.triplet(n_rows, n_columns, rows.tolist(), columns.tolist())
 
 
 def _gather_slopes(inner: Array, pattern: ca.Sparsity) -> ca.MX:

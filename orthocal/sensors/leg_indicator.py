@@ -1,4 +1,4 @@
-"""The paper's sensor: an indicator on the base that reads a leg which is not parallel to its motion.
+"""The paper's sensor: an indicator on the base reads a leg that is not parallel to its motion.
 
 It touches the leg where the leg's line, from root to tip, crosses the plane of the section. Its
 reading is the coordinate of that point along its direction:
@@ -59,7 +59,7 @@ class LegIndicator:
     kind = "leg"
 
     def frames(self, robot: Robot) -> Frames:
-        """Root and tip of the leg; the root in the zero posture where the section counts from it."""
+        """Root and tip of the leg; its root at zero, where a section may count from it."""
         leg = robot.legs[self.leg]
         return Frames((leg.root, leg.tip), (leg.root,) if leg.root_driven else ())
 
