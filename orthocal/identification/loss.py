@@ -67,6 +67,12 @@ class Loss:
         """ρ'(r)/r: how much of a square a residual counts."""
         return 1.0 / ca.sqrt(1.0 + (r / width) ** 2) if self.robust else ca.SX(1.0)
 
+    def value(self, r: Array) -> Array:
+        """ρ(r) of residuals in standard deviations, shape as r."""
+        if not self.robust:
+            return np.asarray(0.5 * r**2)
+        return np.asarray(r**2 / (1.0 + np.sqrt(1.0 + (r / self.width) ** 2)))
+
     def influence(self, r: Array) -> Array:
         """ρ'(r) of residuals in standard deviations, shape as r."""
         return r / np.sqrt(1.0 + (r / self.width) ** 2) if self.robust else r

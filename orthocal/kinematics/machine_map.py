@@ -84,13 +84,10 @@ def _gather_slopes(inner: Array, pattern: ca.Sparsity) -> ca.MX:
     weights = inner.reshape(-1, 6, inner.shape[1])[block, :, columns]  # (nnz, 6)
     place = 36 * block[:, None] + 6 * np.arange(6)[None, :] + row[:, None]
     nonzero, axis = np.nonzero(weights)
-    triplet = ca.Sparsity.triplet(
-        rows.size, 6 * inner.shape[0], nonzero.tolist(), place[nonzero, axis].tolist()
-    )
-    values = np.zeros((rows.size, 6 * inner.shape[0]))
-    values[nonzero, place[nonzero, axis]] = weights[nonzero, axis]
-    dense = ca.DM(values) if values.size else ca.DM(*values.shape)
-    return ca.MX(ca.project(dense, triplet))
+    target = place[nonzero, axis]
+    order = np.lexsort((nonzero, target))  # of compressed columns
+    triplet = ca.Sparsity.triplet(rows.size, 6 * inner.shape[0], nonzero.tolist(), target.tolist())
+    return ca.MX(ca.DM(triplet, weights[nonzero, axis][order].tolist()))
 
 
 @lru_cache(maxsize=1)
