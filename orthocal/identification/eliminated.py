@@ -103,9 +103,10 @@ class EliminatedProgram:
         task = _Task(problem, self.options.loss, readings, weights, sigma, low, high)
 
         state = task.at(np.clip(theta, low, high), start_passive)
-        for iteration in range(1, self.options.max_iterations + 1):
-            prediction, jacobian = problem.linearise(state.theta * scale, state.passive)
-            del prediction
+        iterations, taken = 0, np.full(theta.size, np.inf)
+        while iterations < self.options.max_iterations:
+            iterations += 1
+            _, jacobian = problem.linearise(state.theta * scale, state.passive)
             step = task.step(state, jacobian / sigma)
             state, taken = self._move(task, state, step)
             if np.abs(taken).max(initial=0.0) < SETTLED:
@@ -113,11 +114,11 @@ class EliminatedProgram:
         else:
             raise SolverError(
                 f"did not converge: the step is still {np.abs(taken).max():.2g} tolerances after "
-                f"{iteration} iterations; there is no result. Look for a reading with a wrong sign "
+                f"{iterations} iterations; there is no result. Look for a reading with a wrong sign "
                 "or in a wrong row first"
                 + ("" if self.options.loss.robust else "; with the loss 'huber' it may be named"),
                 status="Maximum_Iterations_Exceeded",
-                iterations=iteration,
+                iterations=iterations,
             )
         pull = task.pull(state, jacobian / sigma)
         at_bound = np.zeros(theta.size, dtype=np.int8)
@@ -130,7 +131,7 @@ class EliminatedProgram:
             passive=state.passive,
             objective=state.objective,
             status="Solve_Succeeded",
-            iterations=iteration,
+            iterations=iterations,
             hessian="gauss-newton",
             seconds_build=self.seconds_build,
             seconds_solve=time.perf_counter() - began,

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import RobotError
 from orthocal.kinematics.assembly import Assembly
-from orthocal.kinematics.batch import BatchFunction
-from orthocal.kinematics.slopes import SharedPlacements
+from orthocal.kinematics.compiled import compiled_robot
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
@@ -44,29 +42,9 @@ class ToolSensitivity:
         self.free = tuple(free)
         self.theta = np.array([at.get(name, 0.0) for name in self.free])
         self.assembly = Assembly(robot, fixed=at)
-        theta = ca.SX.sym("theta", len(self.free))
-        errors: dict[str, ca.SX | float] = {k: v for k, v in at.items() if k not in self.free}
-        errors.update({name: theta[i] for i, name in enumerate(self.free)})
-        shared = SharedPlacements(robot, theta, errors)
-        drives = ca.SX.sym("drives", len(robot.drives))
-        passive = ca.SX.sym("passive", robot.passive_index.size)
-        machine = shared.machine(drives=drives, passive=passive)
-        frame = robot.frame_id(robot.tcp.frame)
-        rows = [shared.position_slopes(machine, frame, ca.SX(np.eye(3)[i]).T) for i in range(3)]
-        by_joints, by_theta = (ca.vertcat(*(r[k] for r in rows)) for k in (0, 1))
-        g_joints, g_theta = shared.closure_slopes(machine)
-        index = robot.passive_index.tolist()
-        function = ca.Function(
-            "tool_sensitivity",
-            [drives, passive, theta, shared.values, shared.slope_nonzeros],
-            [by_joints[:, index], by_theta, g_joints[:, index], g_theta],
-            ["drives", "passive", "theta", "placements", "slopes"],
-            ["p_q", "p_theta", "g_q", "g_theta"],
-        )
-        self._function = BatchFunction(
-            function, shared=["theta", "placements", "slopes"], matrices=function.name_out()
-        )
-        self._shared = [np.asarray(v.full()).reshape(-1) for v in shared.function(self.theta)]
+        self._compiled = compiled_robot(robot)
+        errors = self._compiled.errors
+        self._slopes = errors.slopes(self.assembly.errors(), errors.columns(self.free))
 
     def __call__(
         self,
@@ -92,9 +70,18 @@ class ToolSensitivity:
         d = np.atleast_2d(np.asarray(drives, dtype=np.float64))
         if passive is None:
             passive = self.assembly.close(d, names=names)
-        p_q, p_theta, g_q, g_theta = self._function(d, passive, self.theta, *self._shared)
+        machine, slopes = self.assembly.machine(), self._slopes
+        arguments = machine.drives(d), passive, machine.placements
+        _, p_a, p_q, p_t = self._compiled.tool(*arguments)
+        _, g_a, g_q, g_t = self._compiled.slopes(*arguments)
         if g_q.shape[1] == g_q.shape[2]:
-            slopes = np.linalg.solve(g_q, g_theta)
+            pull = np.swapaxes(
+                np.linalg.solve(np.swapaxes(g_q, 1, 2), np.swapaxes(p_q, 1, 2)), 1, 2
+            )
         else:
-            slopes = np.linalg.pinv(g_q, rcond=1e-10) @ g_theta
-        return np.asarray(p_theta - p_q @ slopes)
+            pull = p_q @ np.linalg.pinv(g_q, rcond=1e-10)
+        twists, drives = p_t - pull @ g_t, p_a - pull @ g_a
+        commanded = drives * d[:, None, :]
+        return np.asarray(
+            twists @ slopes.twists + drives @ slopes.offsets + commanded @ slopes.gains
+        )

@@ -1,0 +1,138 @@
+"""Functions compiled once a robot, against expressions of the errors themselves and Pinocchio."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from tolerances import KINEMATICS
+
+from orthocal.kinematics.compiled import adjoint, compiled_robot, log6_jacobian
+from orthocal.kinematics.error_map import right_jacobian as right_jacobians
+from orthocal.kinematics.machine_map import MachineMap, right_jacobian
+from orthocal.kinematics.symbolic import SymbolicRobot, constant_pose
+from orthocal.robot.model import closure_row_units
+
+
+def _draw(robot, size, seed=1):
+    """Errors, commanded drives and passive coordinates; loops need not be closed."""
+    rng = np.random.default_rng(seed)
+    errors = size * rng.normal(size=len(compiled_robot(robot).errors.names))
+    drives = robot.drive_zero + 0.03 * rng.normal(size=len(robot.drives))
+    passive = robot.zero[robot.passive_index]
+    return errors, drives, passive + 0.3 * rng.normal(size=passive.size)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-3, 0.3])
+@pytest.mark.parametrize("name", ["orthoglide", "fivebar", "biglide"])
+def test_slopes_equal_those_of_the_expressions(request, name, size):
+    """Every error the robot has: joints, frames, offsets, scales; closures and a frame."""
+    robot = request.getfixturevalue(name)
+    compiled = compiled_robot(robot)
+    names = compiled.errors.names
+    theta = ca.SX.sym("theta", len(names))
+    drives = ca.SX.sym("drives", len(robot.drives))
+    passive = ca.SX.sym("passive", robot.passive_index.size)
+    plain = SymbolicRobot(
+        robot, drives=drives, passive=passive, errors={n: theta[i] for i, n in enumerate(names)}
+    )
+    frame = robot.frame_id(robot.closures[0].frame_b)
+    pose = plain.tree.frame_pose(frame)
+    row = np.array([0.3, -0.5, 0.8])
+    g, p = plain.closure_residual() * closure_row_units(robot), ca.dot(ca.SX(row), pose.position)
+    theirs = ca.Function(
+        "theirs",
+        [theta, drives, passive],
+        [ca.densify(e) for e in (g, p)]
+        + [ca.densify(ca.jacobian(e, v)) for e in (g, p) for v in (passive, theta)],
+    )
+    at, d, q = _draw(robot, size)
+    expected = [np.asarray(v.full()) for v in theirs(at, d, q)]
+
+    errors = compiled.errors
+    slopes = errors.slopes(at, np.eye(len(names)))
+    where = errors.drives(at, d)[None], q[None], errors.placements(at)
+    residual, g_a, g_q, g_t = (v[0] for v in compiled.slopes(*where))
+    joints, twists = compiled.wrench_row(frame, force=ca.SX(row))
+    actuated, rest = compiled.split(joints)
+    of_frame = ca.Function("row", compiled.symbols, [actuated, rest, twists])
+    p_a, p_q, p_t = (np.asarray(v.full()) for v in of_frame(*(w.reshape(-1) for w in where)))
+
+    def by_errors(by_twists, by_drives):
+        gains = (by_drives * d) @ slopes.gains
+        return by_twists @ slopes.twists + by_drives @ slopes.offsets + gains
+
+    position = float(row @ compiled.position(robot.closures[0].frame_b)(*where)[0][0])
+    found = [residual[:, None], np.array([[position]]), g_q, by_errors(g_t, g_a), p_q]
+    found.append(by_errors(p_t, p_a))
+    for ours, wanted in zip(found, expected, strict=True):
+        assert np.abs(ours - wanted).max() < KINEMATICS
+
+
+@pytest.mark.parametrize("name", ["orthoglide", "fivebar", "biglide"])
+def test_a_choice_of_parameters_as_expressions_is_the_same_in_numbers(request, name):
+    """Sums and scales too: what a program of CasADi is given, and what NumPy computes with."""
+    robot = request.getfixturevalue(name)
+    compiled, rng = compiled_robot(robot), np.random.default_rng(3)
+    errors = compiled.errors
+    free = robot.parameters.names[::2]
+    columns = errors.columns(free) * rng.uniform(0.5, 2.0, len(free))
+    fixed = 1e-3 * rng.normal(size=len(errors.names))
+    chosen = MachineMap(errors, fixed=fixed, columns=columns)
+    theta = 1e-2 * rng.normal(size=len(free))
+    at, slopes = fixed + columns @ theta, errors.slopes(fixed + columns @ theta, columns)
+    _, d, q = _draw(robot, 0.0)
+    values = [np.asarray(v.full()).reshape(-1) for v in chosen.function(theta)]
+    assert np.abs(values[1] - errors.placements(at)).max() < KINEMATICS
+
+    drives = ca.SX.sym("drives", len(robot.drives))
+    passive = ca.SX.sym("passive", robot.passive_index.size)
+    _, g_a, _, g_t = compiled.expressions(chosen.actuated(drives), passive, chosen.placements)
+    function = ca.Function(
+        "chain",
+        [drives, passive, *chosen.symbols],
+        [chosen.actuated(drives), ca.densify(chosen.chain(g_t, g_a, drives))],
+    )
+    actuated, by_theta = (np.asarray(v.full()) for v in function(d, q, *values))
+    assert np.abs(actuated[:, 0] - errors.drives(at, d)).max() < KINEMATICS
+    _, g_a, _, g_t = (v[0] for v in compiled.slopes(errors.drives(at, d)[None], q[None], values[1]))
+    expected = g_t @ slopes.twists + g_a @ slopes.offsets + (g_a * d) @ slopes.gains
+    assert np.abs(by_theta - expected).max() < KINEMATICS
+
+
+@pytest.mark.parametrize("name", ["orthoglide", "biglide"])
+def test_placements_are_those_that_pinocchio_is_given(request, name):
+    robot = request.getfixturevalue(name)
+    errors = compiled_robot(robot).errors
+    values = dict(zip(errors.names, _draw(robot, 0.05)[0], strict=True))
+    values = {n: v for n, v in values.items() if not n.endswith((".offset", ".scale"))}
+    machine = robot.with_errors(values)
+    found = errors.placements(errors.expand(values)).reshape(-1, 12)
+    for moved, placement in zip(errors.moved, found, strict=True):
+        if not moved.of_frame:
+            expected = machine.model.jointPlacements[moved.index]
+            assert np.abs(placement[:9].reshape(3, 3).T - expected.rotation).max() < KINEMATICS
+            assert np.abs(placement[9:] - expected.translation).max() < KINEMATICS
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.1, 1.0, 3.0])
+def test_the_derivative_of_exp6_in_numbers_is_pinocchios(angle):
+    xi = np.r_[0.2, -0.4, 0.1, angle * np.array([0.36, 0.48, 0.8])]
+    assert np.abs(right_jacobians(xi[None])[0] - pin.Jexp6(xi)).max() < KINEMATICS
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.1, 1.0])
+def test_jacobians_of_exp6_and_log6_equal_pinocchios(angle):
+    xi = np.r_[0.2, -0.4, 0.1, angle * np.array([0.36, 0.48, 0.8])]
+    found = np.asarray(ca.DM(ca.evalf(right_jacobian(ca.SX(xi)))))
+    assert np.abs(found - pin.Jexp6(xi)).max() < KINEMATICS
+    pose = pin.exp6(xi)
+    found = np.asarray(ca.DM(ca.evalf(log6_jacobian(constant_pose(pose)))))
+    assert np.abs(found - pin.Jlog6(pose)).max() < 10 * KINEMATICS
+
+
+def test_the_adjoint_is_pinocchios():
+    pose = pin.exp6(np.array([0.1, 0.2, 0.3, 0.5, -0.4, 0.2]))
+    found = np.asarray(ca.DM(ca.evalf(adjoint(constant_pose(pose)))))
+    assert np.abs(found - pose.toActionMatrix()).max() < KINEMATICS
