@@ -336,8 +336,10 @@ def render_controller(calibration: Calibration) -> RenderableType:
         notes.append(
             Text(
                 "For a controller that takes offsets and nothing else: these leave the least error "
-                "at the tool, making up for a part of the other errors. The identified ones are "
-                "for what knows all errors (`orthocal inverse`)."
+                "at the tool of work that is aligned on the machine (shift and rotation taken "
+                "out), making up for a part of the other errors; ± says how well that is known. "
+                "The identified ones are where the sliders really are: for what knows all errors "
+                "(`orthocal inverse`)."
             )
         )
         notes += [Text(line) for line in _promise(calibration)]
@@ -357,7 +359,7 @@ def _example(calibration: Calibration, entry: ControllerEntry) -> str:
     drive = next(d for d in calibration.robot.drives if d.name == entry.drive)
     factor, unit = drive.edge_factor, drive.edge_unit
     whole = "the whole offset, in place of the active one" if entry.active is not None else "more"
-    at, really = drive.zero * factor, (drive.zero + entry.enter) * factor
+    at, really = drive.zero * factor, (drive.zero + entry.identified) * factor
     if entry.active is None:
         return (
             "An offset is what to add to the encoder's coordinate to get the slider's true one; "

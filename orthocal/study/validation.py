@@ -139,6 +139,7 @@ class Validation:
                 "kind": self.mistake.kind,
                 "drives": list(self.mistake.drives),
                 "active": self.mistake.active.tolist(),
+                "by": list(self.mistake.by),
                 "rms": self.mistake.rms,
             },
             "enter": [{"drive": e.drive, "unit": e.unit, "value": e.enter} for e in self.enter],
@@ -198,7 +199,8 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
     if found.confirmed is not False:
         return found
     mistake = _find_mistake(calibration, fit, session)
-    enter = entries if mistake is not None else find_entries(refit)
+    slip = mistake is not None and mistake.kind != "one differs"
+    enter = entries if slip else find_entries(refit)
     return replace(found, mistake=mistake, enter=enter)
 
 
@@ -214,17 +216,21 @@ def _find_mistake(calibration: Calibration, fit: Fit, session: Session) -> Enter
             k = problem.free.index(name)
             slopes[:, i] = fit.jacobian[:, k] / problem.theta_scale[k]
     entries = {e.drive: e for e in find_entries(calibration)}
-    change, scatter = (
+    identified, scatter = (
         np.array([getattr(entries[d.name], key) if d.name in entries else 0.0 for d in drives])
-        for key in ("change", "scatter")
+        for key in ("identified", "scatter")
     )
+    zeros = project_out_zeros(slopes, o)
+    told = np.linalg.matrix_rank(zeros) / max(o.size, 1)
     return find_mistake(
         deviations,
-        project_out_zeros(slopes, o),
-        change,
+        zeros,
+        before=calibration.active_offsets,
+        identified=identified,
         entered=session.active_offsets,
         names=tuple(d.name for d in drives),
         rounding=np.nan_to_num(scatter),
+        noise=calibration.rms_after / calibration.row_factor * math.sqrt(told),
     )
 
 
@@ -243,17 +249,23 @@ def _further_changes(calibration: Calibration, refit: Calibration) -> tuple[Furt
 def _require_offsets(calibration: Calibration, session: Session) -> None:
     """The offsets that a session states must be those of the calibration, up to rounding."""
     drives = [d.name for d in session.robot.drives]
+    others, where = [], ""
     for entry in find_entries(calibration):
         stated = float(session.active_offsets[drives.index(entry.drive)])
         allowed = max(0.5 * entry.scatter, 0.02e-3)
         if not math.isnan(allowed) and abs(stated - entry.enter) > allowed:
             factor, unit = entry.edge_factor, entry.edge_unit
-            raise SessionError(
-                f"{entry.drive} has {stated * factor:g} {unit}; the calibration identified "
-                f"{entry.enter * factor:.3f} {unit}. A validation needs the identified offsets "
-                "active",
-                where=f"{session.path or 'session'}: controller.offsets_{unit}",
+            where = f"{session.path or 'session'}: controller.offsets_{unit}"
+            others.append(
+                f"{entry.drive} has {stated * factor:g} {unit} where the calibration says to enter "
+                f"{entry.enter * factor:.3f} {unit}"
             )
+    if others:
+        raise SessionError(
+            f"{'; '.join(others)}. A validation needs a session that was measured with what the "
+            "calibration says to enter",
+            where=where,
+        )
 
 
 def _excess_probability(calibration: Calibration, refit: Calibration) -> float:
