@@ -42,7 +42,7 @@ from orthocal.identification.uncertainty import (
 )
 from orthocal.identification.unmodelled import Unmodelled
 from orthocal.markup import paragraph, table
-from orthocal.robot.assembly import Assembly
+from orthocal.robot.assembly import Assembly, as_rows, find_beyond_travel
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
@@ -292,7 +292,13 @@ class Calibration:
         Raises:
             ClosureError: If the machine cannot be at such coordinates.
         """
-        return Assembly(self.robot, fixed=self.errors).forward(joints, names=names)
+        robot = self.robot
+        rows, single = as_rows(joints, len(robot.drives), "drive coordinates")
+        labels = names or [f"posture {i + 1}" for i in range(len(rows))]
+        for error in find_beyond_travel(robot, rows, labels).values():
+            raise error
+        points = Assembly(robot, fixed=self.errors).forward(rows, names=labels)
+        return points[0] if single else points
 
     def inverse(self, points: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
         """Drive coordinates that bring the calibrated machine's tool to given points.

@@ -37,7 +37,8 @@ def advise(calibration: Calibration) -> str:
     suspicious = len(calibration.suspicious)
     if turned is not None:
         return (
-            f"Do not enter these yet: the readings of setup {turned.name} seem to have the wrong "
+            "Do not enter these yet: the readings of setup "
+            f"{' or '.join((turned.name, *turned.also))} seem to have the wrong "
             f"sign. As they are, they differ from what all others say by {mm(turned.as_read)} mm "
             f"(r.m.s.); with the sign turned by {mm(turned.turned)} mm."
         )

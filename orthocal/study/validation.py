@@ -34,6 +34,9 @@ from orthocal.study.repetition import Repetition, measure_repetition
 
 Array = NDArray[np.float64]
 
+FEWEST = 5.0
+"""Degrees of freedom below which what does not repeat of two sessions is not known."""
+
 CHANGE_CHANCE = 0.05
 """Probability that any parameter of a calibration that is right is said to change."""
 
@@ -180,6 +183,7 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         session = session.with_controller(offsets)
     fit = repeat_fit(calibration, session)
     refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
+    repetition = measure_repetition(calibration, refit)
     found = Validation(
         title=session.title,
         offsets_stated=stated,
@@ -190,10 +194,10 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         refit_rms=refit.rms_after,
         refit_largest=refit.largest_after,
         excess_probability=_excess_probability(calibration, refit),
-        changes=_further_changes(calibration, refit),
+        changes=_further_changes(calibration, refit, repetition),
         mistake=None,
         enter=entries,
-        repetition=measure_repetition(calibration, refit),
+        repetition=repetition,
         rows=refit.residuals,
     )
     if found.confirmed is not False:
@@ -234,14 +238,26 @@ def _find_mistake(calibration: Calibration, fit: Fit, session: Session) -> Enter
     )
 
 
-def _further_changes(calibration: Calibration, refit: Calibration) -> tuple[FurtherChange, ...]:
-    """New less old estimates, against the standard error of the difference of the two."""
+def _further_changes(
+    calibration: Calibration, refit: Calibration, repetition: Repetition
+) -> tuple[FurtherChange, ...]:
+    """New less old estimates, against the standard error of the difference of the two.
+
+    What repeats in both sessions, as errors of the model do, moves both estimates alike: where the
+    readings tell how much does not repeat, only that counts.
+    """
     pairs = list(zip(calibration.free, refit.free, strict=True))
-    # so many chances to be wrong by chance: each gets its share of the 5 %
-    factor = confidence_factor(min(calibration.dof, refit.dof), 1.0 - CHANGE_CHANCE / len(pairs))
+    scale, dof = (1.0, 1.0), min(calibration.dof, refit.dof)
+    if not calibration.prior and repetition.scatter_dof >= FEWEST:
+        scatter = repetition.scatter
+        scale = (min(scatter / calibration.sigma, 1.0), min(scatter / refit.sigma, 1.0))
+        dof = repetition.scatter_dof
+    # so many chances to be wrong by chance: each gets its share
+    factor = confidence_factor(dof, 1.0 - CHANGE_CHANCE / len(pairs))
     changes = []
     for old, new in pairs:
-        change, std = new.value - old.value, math.hypot(old.std, new.std)
+        change = new.value - old.value
+        std = math.hypot(old.std * scale[0], new.std * scale[1])
         changes.append(FurtherChange(new.name, new.unit, change, std, abs(change) > factor * std))
     return tuple(changes)
 
