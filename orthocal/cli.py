@@ -307,7 +307,7 @@ def accuracy(
         if half_side_mm is None:
             raise SessionError(e.reason, where=e.posture) from None
         largest = assess_tool(result).workspace.half_side
-        known = "" if largest is None else f"; it reaches ±{largest * 1e3:.3g} mm"
+        known = "" if largest is None else f"; without this it is ±{largest * 1e3:.3g} mm"
         raise SessionError(
             f"the machine does not reach a cube of ±{half_side_mm:g} mm{known} ({e.reason})",
             where="--half-side-mm",

@@ -321,7 +321,11 @@ def _widen(
         i = fit.problem.free.index(name)
         value, more = float(fit.solution.theta[i]), float(spread[i])
         low, high = (math.hypot(value - end, more) for end in ends)
-        result[name] = (value - low, value + high)
+        selection = fit.problem.selection
+        result[name] = (
+            max(value - low, float(selection.lower[i])),
+            min(value + high, float(selection.upper[i])),
+        )
     return result
 
 

@@ -433,8 +433,9 @@ class NonlinearProgram:
             "gradient": [gradient[:n_t], gradient[n_t:]],
             "hessian": [pick(*triangle[0]), pick(*triangle[1])],
         }
+        index = list(self.problem.robot.legs).index(piece.leg)  # a leg's name may be any
         return {
-            name: ca.Function(f"{name}_{piece.leg}", inputs, [ca.densify(v) for v in values])
+            name: ca.Function(f"{name}_{index}", inputs, [ca.densify(v) for v in values])
             for name, values in outputs.items()
         }
 
