@@ -34,8 +34,11 @@ from orthocal.study.repetition import Repetition, measure_repetition
 
 Array = NDArray[np.float64]
 
-LEAVES = 2.0
-"""Times the expected deviations that a mistake may leave at most, to be taken for the reason."""
+KNOWN_LEAVES = 2.0
+"""Times the expected deviations that a known mistake may leave at most, to be the reason."""
+
+LEAVES = 1.4
+"""The same where it is no known one, but any offset of one drive."""
 
 FEWEST = 5.0
 """Degrees of freedom below which what does not repeat of two sessions is not known."""
@@ -206,12 +209,10 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
     if found.confirmed is not False:
         return found
     mistake = _find_mistake(calibration, fit, session)
-    # what it leaves must be what was expected
-    if (
-        mistake is not None
-        and mistake.rms > LEAVES * calibration.rms_after / calibration.row_factor
-    ):
-        mistake = None
+    if mistake is not None:  # what it leaves must be what was expected
+        times = LEAVES if mistake.kind == "one differs" else KNOWN_LEAVES
+        if mistake.rms > times * calibration.rms_after / calibration.row_factor:
+            mistake = None
     slip = mistake is not None and mistake.kind != "one differs"
     enter = entries if slip else find_entries(refit)
     return replace(found, mistake=mistake, enter=enter)
