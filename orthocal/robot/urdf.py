@@ -18,7 +18,7 @@ import pinocchio as pin
 from lxml import etree
 
 from orthocal.characters import composed
-from orthocal.documents import read_text
+from orthocal.documents import LARGEST_NUMBER, read_text
 from orthocal.errors import RobotError
 from orthocal.robot.joint_types import retype_joints
 
@@ -50,7 +50,7 @@ _SHAPES = {
 }
 """What a <geometry> holds, and the attributes that it needs."""
 
-_BOUNDED = frozenset({"xyz", "rpy", "size", "radius", "length", "scale", "rgba", "lower", "upper"})
+_BOUNDED = frozenset({"xyz", "rpy", "size", "radius", "length", "scale", "rgba"})
 """Attributes that say where and how large something is."""
 
 _NAMES = ("name", "link", "joint")
@@ -339,11 +339,11 @@ def _numbers(element: Any, key: str, count: int, where: str) -> list[float] | No
     if len(values) != count or not all(math.isfinite(v) for v in values):
         kind = "a finite number" if count == 1 else f"{count} finite numbers"
         raise RobotError(f"{key} is '{text}'; expected {kind}", where=where)
-    if key in _BOUNDED and max(map(abs, values)) > LARGEST_PLACE:
+    # a limit that is far away is none, and some write a million for that
+    largest = LARGEST_PLACE if key in _BOUNDED else LARGEST_NUMBER
+    if max(map(abs, values)) > largest:
         kind = "a number" if count == 1 else "numbers"
-        raise RobotError(
-            f"{key} is '{text}'; expected {kind} within ±{LARGEST_PLACE:g}", where=where
-        )
+        raise RobotError(f"{key} is '{text}'; expected {kind} within ±{largest:g}", where=where)
     return values
 
 
