@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 from scipy import special
 
 from orthocal.identification.calibration import Calibration
@@ -29,6 +30,9 @@ FEWEST = 5.0
 
 TOO_COARSE = 30.0
 """Times what readings scatter by that no σ of a gauge is, in the right unit."""
+
+COMPUTED = 1e-7
+"""Scatter below which no dial showed the readings, [m]."""
 
 TINY = 2e-3
 """Part of the largest distance of postures below which no two are meant to be apart."""
@@ -133,8 +137,8 @@ def _coarse(calibration: Calibration) -> Doubt | None:
     given, noise = calibration.session.gauge_sigma, calibration.noise
     scatter = noise.cycles_sigma if noise.cycles_dof >= FEWEST else noise.residual_sigma
     dof = noise.cycles_dof if noise.cycles_dof >= FEWEST else noise.residual_dof
-    if given is None or dof < FEWEST or not given > TOO_COARSE * scatter:
-        return None
+    if given is None or dof < FEWEST or not COMPUTED < TOO_COARSE * scatter < given:
+        return None  # readings without any scatter were computed
     return Doubt(
         "coarse",
         f"The σ given for the gauge, {given * 1e3:g} mm, is {given / scatter:.0f} times what its "
@@ -144,21 +148,22 @@ def _coarse(calibration: Calibration) -> Doubt | None:
 
 def _tiny(calibration: Calibration) -> Doubt | None:
     """Postures hardly away from another one, beside far ones: given in metres."""
-    postures = {p.name: p.drives for p in calibration.postures}
-    if len(postures) < 3:
+    drives = np.array([p.drives for p in calibration.postures])
+    places, first = np.unique(drives, axis=0, return_index=True)
+    if len(places) < 3:
         return None
-    names = list(postures)
-    gaps: dict[str, float] = {}
-    for name in names:
-        others = [math.dist(postures[name], postures[n]) for n in names if n != name]
-        gaps[name] = min((g for g in others if g > 0.0), default=0.0)
-    largest = max(math.dist(a, b) for a in postures.values() for b in postures.values())
-    near = [n for n in names if 0.0 < gaps[n] < TINY * largest]
-    if not near:
+    from scipy.spatial import KDTree
+
+    gaps = np.asarray(KDTree(places).query(places, k=2)[0])[:, 1]
+    largest = float(np.linalg.norm(np.ptp(places, axis=0)))
+    near = np.flatnonzero(gaps < TINY * largest)
+    if not near.size:
         return None
+    worst = near[first[near].argmax()]
+    name = calibration.postures[int(first[worst])].name
     return Doubt(
         "tiny",
-        f"Posture '{near[-1]}' is {gaps[near[-1]] * 1e3:.2g} mm from another one, where postures "
+        f"Posture '{name}' is {gaps[worst] * 1e3:.2g} mm from another one, where postures "
         f"are up to {largest * 1e3:.0f} mm apart: is it in mm, not in metres?",
     )
 
