@@ -16,7 +16,7 @@ import typer
 
 import orthocal
 from orthocal.characters import printable
-from orthocal.errors import OrthocalError, ParameterError, SessionError
+from orthocal.errors import ClosureError, OrthocalError, ParameterError, SessionError
 from orthocal.interrupts import INTERRUPTED, ending_at_interrupt
 from orthocal.streams import ReaderGoneError, guarded_streams
 
@@ -275,7 +275,7 @@ def accuracy(
     """
     from orthocal.identification.calibration_file import load_calibration
     from orthocal.kinematics.workspace import Workspace, cube
-    from orthocal.measurement.table import closures_named_by_row, read_points
+    from orthocal.measurement.table import read_points
     from orthocal.output.accuracy import (
         POINT_COLUMNS,
         accuracy_json,
@@ -301,8 +301,17 @@ def accuracy(
         workspace = Workspace.even(given)
     elif half_side_mm is not None:
         workspace = cube(result.robot, half_side=half_side_mm * 1e-3)
-    with closures_named_by_row():
+    try:
         found = assess_tool(result, workspace, names=names)
+    except ClosureError as e:
+        if half_side_mm is None:
+            raise SessionError(e.reason, where=e.posture) from None
+        largest = assess_tool(result).workspace.half_side
+        known = "" if largest is None else f"; without this it is ±{largest * 1e3:.3g} mm"
+        raise SessionError(
+            f"the machine does not reach a cube of ±{half_side_mm:g} mm{known} ({e.reason})",
+            where="--half-side-mm",
+        ) from None
     if json:
         _out(accuracy_json(result, found).rstrip("\n"))
     else:

@@ -377,7 +377,8 @@ def _expectation(kind: str, words: str, context: Mapping[str, Any]) -> str:
 
 def _join(path: list[Any]) -> str:
     """A location as text: setups.yx.section or closed_loop[2]."""
-    return "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
+    parts = (f"[{p}]" if isinstance(p, int) else f".{shorten(str(p))}" for p in path)
+    return "".join(parts).lstrip(".")
 
 
 def _is_pydantic_tag(part: object) -> bool:

@@ -52,6 +52,8 @@ def read_file(
         with open(descriptor, "rb", closefd=False) as stream:
             size = os.fstat(descriptor).st_size
             content = b"" if size > largest else stream.read(largest + 1)
+            if content is None:
+                raise error("cannot be read: it is not ready", where=str(path))
     except OSError as e:
         raise error(f"cannot be read: {e.strerror}", where=str(path)) from None
     finally:

@@ -42,6 +42,16 @@ class StrictLoader(yaml.SafeLoader):
         super().__init__(stream)
         self._count = self._depth = 0
 
+    def scan_flow_scalar(self, style: str) -> Any:  # noqa: ANN401 - a token of PyYAML
+        """A quoted text; its escapes are characters."""
+        mark = self.get_mark()
+        try:
+            return super().scan_flow_scalar(style)
+        except (ValueError, OverflowError):
+            raise yaml.MarkedYAMLError(
+                problem="an escape in a quoted text is no character", problem_mark=mark
+            ) from None
+
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         """The next node, where it is one that is meant."""
         event: Any = self.peek_event()  # type: ignore[no-untyped-call] # PyYAML's stub

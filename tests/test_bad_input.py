@@ -740,8 +740,8 @@ OPTION_CASES = [
     ),
     Case(
         "accuracy-cube-too-large",
-        "point 2: cannot be reached: the loops stay open by # mm, #% of the way from the "
-        "mechanical zero",
+        "--half-side-mm: the machine does not reach a cube of ±500 mm; without this it is ±60 mm "
+        "(cannot be reached: the loops stay open by # mm, #% of the way from the mechanical zero)",
         command="accuracy {tmp}/calibration.json --half-side-mm 500",
         base="machine",
         calibrated=True,
@@ -1458,8 +1458,10 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "offsets-not-entered",
-        "{tmp}/session.yaml: controller.offsets_mm: x_slide has 0 mm; the calibration identified "
-        "-0.527 mm. A validation needs the identified offsets active",
+        "{tmp}/session.yaml: controller.offsets_mm: x_slide has 0 mm where the calibration "
+        "says to enter -0.527 mm; y_slide has 0 mm where the calibration says to enter 0.592 mm; "
+        "z_slide has 0 mm where the calibration says to enter -1.761 mm. A validation needs a "
+        "session that was measured with what the calibration says to enter",
         command=VALIDATE,
     ),
     calibration(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -42,10 +43,15 @@ from orthocal.identification.selection import Known, Selection
 from orthocal.identification.turned import find_turned_setup
 from orthocal.identification.uncertainty import (
     Information,
+    confidence_factor,
     estimate_repeatability,
     project_out_zeros,
 )
-from orthocal.identification.unmodelled import find_other_errors, measure_unmodelled
+from orthocal.identification.unmodelled import (
+    Unmodelled,
+    find_other_errors,
+    measure_unmodelled,
+)
 from orthocal.kinematics.assembly import as_rows
 from orthocal.measurement.session import Session
 from orthocal.measurement.session_file import load_session
@@ -197,6 +203,7 @@ def assemble_calibration(
     covariance = fit.covariance()
     # a base parameter is the whole combination: nothing of it is left out
     others = find_other_errors(fit, spoken_for=() if whole is None else whole.free)
+    unmodelled = measure_unmodelled(fit, others)
     diagnostics = diagnose_readings(fit)
     residuals = _residual_rows(fit, diagnostics, nominal)
     factor = np.sqrt(2.0) if session.only_differences else 1.0
@@ -215,9 +222,9 @@ def assemble_calibration(
             loss=loss.kind,
             loss_width=loss.width,
         ),
-        parameters=_estimates(fit, covariance, intervals or {}),
+        parameters=_estimates(fit, covariance, _widen(fit, unmodelled, intervals or {})),
         covariance=read_only(covariance),
-        unmodelled=measure_unmodelled(fit, others),
+        unmodelled=unmodelled,
         identifiability=_identifiability(fit, whole),
         base=whole is not None,
         noise=NoiseRecord(
@@ -302,6 +309,24 @@ def _identifiability(fit: Fit, whole: CalibrationProblem | None) -> Identifiabil
     # how well the base parameters are told; which they are follows from the whole
     found = analyse(linearise_at_reference(whole).information, whole.parameters)
     return replace(found, singular_values=own.singular_values, rank=own.structural_rank)
+
+
+def _widen(
+    fit: Fit, unmodelled: Unmodelled, intervals: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float]]:
+    """Intervals of what the noise explains, with the errors of the machine that were left out."""
+    spread = confidence_factor(np.inf) * np.sqrt(np.diag(unmodelled.bias_covariance))
+    result = {}
+    for name, ends in intervals.items():
+        i = fit.problem.free.index(name)
+        value, more = float(fit.solution.theta[i]), float(spread[i])
+        low, high = (math.hypot(value - end, more) for end in ends)
+        selection = fit.problem.selection
+        result[name] = (
+            max(value - low, float(selection.lower[i])),
+            min(value + high, float(selection.upper[i])),
+        )
+    return result
 
 
 def _estimates(

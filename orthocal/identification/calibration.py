@@ -35,9 +35,13 @@ from orthocal.identification.records import (
     TurnedSetup,
     root_mean_square,
 )
-from orthocal.identification.uncertainty import BY_CHANCE, confidence_factor
+from orthocal.identification.uncertainty import (
+    BY_CHANCE,
+    chance_of_excess,
+    confidence_factor,
+)
 from orthocal.identification.unmodelled import Unmodelled
-from orthocal.kinematics.assembly import Assembly
+from orthocal.kinematics.assembly import Assembly, as_rows, find_beyond_travel
 from orthocal.markup import paragraph, table
 from orthocal.robot.model import Robot
 
@@ -134,6 +138,24 @@ class Calibration:
         """Independent readings that the parameters leave to check the model."""
         found = self.identifiability
         return found.n_readings - (len(self.free) if self.base else found.structural_rank)
+
+    @property
+    def chance_within_tolerances(self) -> float | None:
+        """Probability that a machine within its tolerances shows such readings, or odder ones.
+
+        Beside a prior what is left of the readings and what the parameters took of their tolerances
+        add up to χ² of the readings as the prior foretells them. None where the noise is not known
+        but from the residuals.
+        """
+        known = self.noise.source in ("cycles", "gauge") and self.sigma > 0.0
+        if not known or not self.prior or any(p.at_bound for p in self.free):
+            return None
+        left = sum((r.residual / self.sigma) ** 2 for r in self.residuals)
+        taken = sum(((p.value - p.mean) / p.tolerance) ** 2 for p in self.free if p.prior)
+        zeros = len({r.setup for r in self.residuals if r.minus is None})
+        flat = sum(not p.prior for p in self.free)
+        dof = len(self.residuals) - zeros - flat
+        return chance_of_excess(left + taken, dof) if dof > 0 else None
 
     @property
     def suspicious(self) -> tuple[ResidualRow, ...]:
@@ -270,7 +292,13 @@ class Calibration:
         Raises:
             ClosureError: If the machine cannot be at such coordinates.
         """
-        return Assembly(self.robot, fixed=self.errors).forward(joints, names=names)
+        robot = self.robot
+        rows, single = as_rows(joints, len(robot.drives), "drive coordinates")
+        labels = names or [f"posture {i + 1}" for i in range(len(rows))]
+        for error in find_beyond_travel(robot, rows, labels).values():
+            raise error
+        points = Assembly(robot, fixed=self.errors).forward(rows, names=labels)
+        return points[0] if single else points
 
     def inverse(self, points: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
         """Drive coordinates that bring the calibrated machine's tool to given points.

@@ -139,6 +139,7 @@ class _TurnedKeys(_Keys):
     name: str
     as_read: Number | None
     turned: Number | None
+    also: list[str] = []
     evidence: Number
 
 
@@ -406,7 +407,9 @@ def _residual(keys: _ResidualKeys) -> ResidualRow:
 
 
 def _turned(keys: _TurnedKeys) -> TurnedSetup:
-    return TurnedSetup(keys.name, _float(keys.as_read), _float(keys.turned), keys.evidence)
+    return TurnedSetup(
+        keys.name, _float(keys.as_read), _float(keys.turned), keys.evidence, tuple(keys.also)
+    )
 
 
 def _float(value: float | None) -> float:

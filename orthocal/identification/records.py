@@ -96,7 +96,8 @@ class ParameterEstimate(InUnit):
     at_bound: Literal["lower", "upper"] | None
     """Which bound holds it: it has no standard deviation then, and others hold with it there."""
     interval: tuple[float, float] | None
-    """Profile-likelihood interval of 95 %, [unit], where it was asked for."""
+    """Profile-likelihood interval of 95 %, [unit], where it was asked for; widened by errors of the
+    machine that were not free, at their tolerances."""
 
     @property
     def data_share(self) -> float:
@@ -227,6 +228,8 @@ class TurnedSetup:
     """The same with the sign turned, [m]."""
     evidence: float
     """Logarithm of the factor by which the turned sign makes all readings more likely."""
+    also: tuple[str, ...] = ()
+    """Setups of which it is nearly as likely that they are the one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,6 +21,9 @@ Known = float | tuple[float, float]
 
 DEFAULT_MODEL = "offsets"
 
+LARGEST_TOLERANCE = 200.0
+"""Times the robot's own tolerance that no other is: it is in another unit."""
+
 LARGEST_KNOWN = 100.0
 """Tolerances beyond which a known value is taken for a length or an angle instead of an error."""
 
@@ -284,6 +287,12 @@ def _tolerance(value: float, parameter: Parameter) -> float:
         raise ParameterError(
             f"the tolerance of '{parameter.name}' is {value * factor:g} {unit}; expected at least "
             f"{SMALLEST_TOLERANCE * factor:g} {unit}"
+        )
+    if value > LARGEST_TOLERANCE * parameter.tolerance:
+        unit, factor = parameter.edge_unit, parameter.edge_factor
+        raise ParameterError(
+            f"the tolerance of '{parameter.name}' is {value * factor:g} {unit}; expected at most "
+            f"{LARGEST_TOLERANCE:g} times the robot's own, {parameter.tolerance * factor:g} {unit}"
         )
     return float(value)
 

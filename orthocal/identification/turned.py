@@ -78,6 +78,10 @@ class _Spread:
         return float(special.logsumexp(weights - 0.5 * (squares + logs)))
 
 
+NEARLY = 3.0
+"""Logarithm of the factor up to which another setup is nearly as likely to be the turned one."""
+
+
 def find_turned_setup(
     fit: Fit, others: OtherErrors, rows: Sequence[ResidualRow]
 ) -> TurnedSetup | None:
@@ -88,7 +92,7 @@ def find_turned_setup(
         others: Errors of the machine that it left out.
         rows: Its rows, each with what all other setups say of it.
     """
-    name, evidence = weigh_signs(fit, others)
+    name, evidence, also = weigh_signs(fit, others)
     if not evidence > CLEARLY:
         return None
     own = [r for r in rows if r.setup == name]
@@ -101,10 +105,11 @@ def find_turned_setup(
         as_read=root_mean_square(missed),
         turned=root_mean_square(missed - 2.0 * measured),
         evidence=evidence,
+        also=also,
     )
 
 
-def weigh_signs(fit: Fit, others: OtherErrors) -> tuple[str, float]:
+def weigh_signs(fit: Fit, others: OtherErrors) -> tuple[str, float, tuple[str, ...]]:
     """The setup that is turned most likely, and how much more likely its turned sign is.
 
     Args:
@@ -112,7 +117,8 @@ def weigh_signs(fit: Fit, others: OtherErrors) -> tuple[str, float]:
         others: Errors of the machine that it left out.
 
     Returns:
-        Its name, and the logarithm of the factor; "" and -inf where none is worth a look.
+        Its name, and the logarithm of the factor; "" and -inf where none is worth a look. And the
+        names of others that are nearly as likely to be the one.
     """
     problem, o = fit.problem, fit.problem.observations
     sigma = first_sigma(problem.session, estimate_repeatability(problem.values, o))
@@ -120,17 +126,20 @@ def weigh_signs(fit: Fit, others: OtherErrors) -> tuple[str, float]:
     deviation = _deviation(problem, fit.residual, fit.solution.theta, fit.jacobian)
     as_read = spread.log_likelihood(deviation)
     centred = project_out_zeros(problem.values, o)
-    best, gain, sign = "", 0.0, np.ones(o.size)
+    gains: dict[str, float] = {}
+    signs: dict[str, Array] = {}
     for i, name in enumerate(problem.session.setups):
         entries = o.setup == i
         if np.unique(o.posture[entries]).size > LEAST_READINGS:
             turned = deviation - np.where(entries, 2.0 * centred, 0.0)
-            found = spread.log_likelihood(turned) - as_read
-            if found > gain:
-                best, gain, sign = name, found, np.where(entries, -1.0, 1.0)
-    if not best:
-        return "", -np.inf
-    return best, _likelihood_refitted(fit, others, sign * problem.values, sigma) - as_read
+            gains[name] = spread.log_likelihood(turned) - as_read
+            signs[name] = np.where(entries, -1.0, 1.0)
+    best = max(gains, key=lambda n: gains[n], default="")
+    if not best or gains[best] <= 0.0:
+        return "", -np.inf, ()
+    evidence = _likelihood_refitted(fit, others, signs[best] * problem.values, sigma) - as_read
+    also = tuple(n for n in gains if n != best and gains[n] > gains[best] - NEARLY)
+    return best, evidence, also
 
 
 def _likelihood_refitted(fit: Fit, others: OtherErrors, values: Array, sigma: float) -> float:

@@ -448,6 +448,20 @@ def nominal_assembly(robot: Robot) -> Assembly:
     return Assembly(robot)
 
 
+def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str]) -> Failures:
+    """The rows that are beyond a drive's travel, shape (K, n_drives), [m, rad]."""
+    failures: Failures = {}
+    for drive, values in zip(robot.drives, drives.T, strict=True):
+        factor, unit = drive.edge_factor, drive.edge_unit
+        for i in np.flatnonzero((values < drive.lower) | (values > drive.upper)).tolist():
+            reason = (
+                f"{drive.name}_{unit} is {values[i] * factor:g}; the drive reaches from "
+                f"{drive.lower * factor:g} to {drive.upper * factor:g}"
+            )
+            failures.setdefault(i, ClosureError(reason, posture=names[i]))
+    return failures
+
+
 def as_rows(values: ArrayLike, n: int, what: str) -> tuple[Array, bool]:
     """Numbers as an array of shape (K, n), and whether they were a single row.
 

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.arguments import require_array
 from orthocal.markup import paragraph, table
 from orthocal.robot.model import Robot, read_only
 from orthocal.sensors.leg_indicator import DIRECTIONS, LegIndicator, Section, SectionForm
@@ -159,7 +160,7 @@ class Session:
         Args:
             offsets: Shape (n_drives,), [m, rad].
         """
-        active = np.asarray(offsets, dtype=np.float64)
+        active = require_array(offsets, shape=(len(self.robot.drives),), argument="offsets")
         shift = self.active_offsets - active
         postures = {
             name: replace(p, drives=read_only(p.drives + shift))
@@ -173,8 +174,9 @@ class Session:
         Args:
             values: Shape (n_readings,), [m].
         """
+        given = require_array(values, shape=(len(self.readings),), argument="values")
         changed = tuple(
-            replace(r, value=float(v)) for r, v in zip(self.readings, values, strict=True)
+            replace(r, value=float(v)) for r, v in zip(self.readings, given, strict=True)
         )
         return replace(self, readings=changed, sha256="")
 

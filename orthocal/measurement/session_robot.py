@@ -86,6 +86,15 @@ def build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Arra
     return read_only(offsets)
 
 
+def _crooked(leg: Leg) -> str:
+    """That a leg lies along no axis, which may not be meant."""
+    along = ", ".join(f"{v:.3f}" for v in leg.axis)
+    return (
+        f". In the mechanical zero the leg lies along ({along}): where it should lie along an axis "
+        "of the world, check lengths and zeros in the robot's files"
+    )
+
+
 def check_direction(direction: str, leg: Leg, *, where: str) -> None:
     """Refuse a gauge that does not measure square to the leg, as its model takes for granted.
 
@@ -114,5 +123,6 @@ def check_direction(direction: str, leg: Leg, *, where: str) -> None:
         problem = (
             f"'{direction}' is at {found:.1f}° to leg {leg.name} in the mechanical zero; expected "
             f"a direction square to the leg, to within {LARGEST_OBLIQUITY_DEG:g}°{choice}"
+            + ("" if square else _crooked(leg))
         )
     raise SessionError(problem, where=where)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from orthocal.arguments import require_kind, require_numbers
+from orthocal.arguments import require_kind, require_names, require_numbers, require_seed
 from orthocal.documents import Number, parse_number, read_yaml, validate
 from orthocal.errors import ParameterError, SessionError
 from orthocal.measurement.gauge import build_observations, predict_entries
@@ -48,19 +49,29 @@ def draw_errors(
 
     Args:
         robot: The robot.
-        patterns: Names or globs of the parameters to draw; '!' takes out.
+        patterns: Names or globs of the parameters to draw; '!' takes out. Of a sum and the errors
+            that it is made of only these are drawn.
         seed: Of the random numbers.
         tolerances: Name or glob to another standard deviation than the robot's, [SI].
 
     Raises:
         ParameterError: If a pattern matches nothing.
     """
+    require_kind(robot, Robot, expected="a Robot, such as load_robot(...)")
+    require_names(patterns, argument="patterns")
+    require_seed(seed)
     rng = np.random.default_rng(seed)
     parameters = robot.parameters
+    chosen = parameters.select(patterns)
+    # a sum beside the errors that it is made of would be drawn twice
+    chosen = tuple(
+        n
+        for n in chosen
+        if len(parameters[n].terms) == 1 or not {t for t, _ in parameters[n].terms} & set(chosen)
+    )
     own = {n: value for g, value in (tolerances or {}).items() for n in parameters.select([g])}
     return {
-        name: float(rng.normal() * own.get(name, parameters[name].tolerance))
-        for name in parameters.select(patterns)
+        name: float(rng.normal() * own.get(name, parameters[name].tolerance)) for name in chosen
     }
 
 
@@ -87,6 +98,9 @@ def simulate_session(
     """
     require_kind(plan, Session, expected="a Session, such as load_plan(...)")
     require_numbers(errors, argument="errors")
+    require_seed(seed)
+    if sigma is not None and not 0.0 <= sigma < math.inf:
+        raise ValueError(f"sigma: found {sigma!r}; expected a number of at least 0")
     rng = np.random.default_rng(seed)
     observations = build_observations(plan)
     entries = predict_entries(plan, observations, errors)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.documents import parse_number, read_csv_rows
-from orthocal.errors import ClosureError, SessionError
+from orthocal.errors import SessionError
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
@@ -65,15 +63,6 @@ def format_rows(columns: dict[str, float], values: Array) -> str:
         (",".join(f"{v:.6f}" for v in row) if np.isfinite(row).all() else empty) + "\n"
         for row in scaled
     )
-
-
-@contextmanager
-def closures_named_by_row() -> Iterator[None]:
-    """Let a ClosureError of a row whose name is its file and line begin with that."""
-    try:
-        yield
-    except ClosureError as e:
-        raise SessionError(e.reason, where=e.posture) from None
 
 
 def _read(

@@ -67,7 +67,7 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
         accuracy: Its errors at the tool.
     """
     table = table_of("[µm]", "r.m.s.", "95 %", "worst point", "shift out", "absolute")
-    rows = [("off its target now", accuracy.measure(accuracy.deviation))]
+    rows = [("known to be off now", accuracy.measure(accuracy.deviation))]
     if not calibration.only_offsets and find_entries(calibration):
         rows.append(("with the offsets entered", accuracy.measure(accuracy.error_after_offsets)))
     rows.append(("not known before", accuracy.before.sizes))

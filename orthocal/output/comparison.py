@@ -58,7 +58,7 @@ def _scores(comparison: Comparison) -> RenderableType:
                 plain(score.rms * 1e3, 4),
                 _short(score.chi_square),
                 f"{score.dof:.1f}",
-                _short(score.aicc),
+                _short(score.aicc if score.dof >= FEWEST_LEFT else math.inf),
                 _short(score.bic),
                 plain(score.unseen_rms * 1e3, 4),
             )
@@ -132,6 +132,11 @@ def _residuals(comparison: Comparison, all_rows: bool) -> RenderableType:
     for i in order:
         add_row(table, comparison.labels[i], *(signed(r.exact.residuals[i] * 1e3) for r in results))
     return Group(table, Text(note)) if note else table
+
+
+FEWEST_LEFT = 3.0
+"""Degrees of freedom below which AICc is decided by its correction, and hundredths of a parameter
+move it by more than the readings do."""
 
 
 def _short(value: float) -> str:

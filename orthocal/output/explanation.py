@@ -37,7 +37,8 @@ def advise(calibration: Calibration) -> str:
     suspicious = len(calibration.suspicious)
     if turned is not None:
         return (
-            f"Do not enter these yet: the readings of setup {turned.name} seem to have the wrong "
+            "Do not enter these yet: the readings of setup "
+            f"{' or '.join((turned.name, *turned.also))} seem to have the wrong "
             f"sign. As they are, they differ from what all others say by {mm(turned.as_read)} mm "
             f"(r.m.s.); with the sign turned by {mm(turned.turned)} mm."
         )
@@ -63,6 +64,12 @@ def advise(calibration: Calibration) -> str:
     if calibration.noise.source == "unknown":
         return "Enter these only if you must: nothing tells how far they can be trusted."
     if calibration.spare_readings <= 0:
+        chance = calibration.chance_within_tolerances
+        if chance is not None and chance >= BY_CHANCE:
+            return (
+                "Enter these, and measure again to confirm them: no reading is left to check "
+                "them, but the readings are such as a machine within its tolerances shows."
+            )
         return "Enter these only if you must: no reading is left to check them."
     if calibration.has_model_error:
         return (
@@ -106,19 +113,19 @@ def explain_fit(calibration: Calibration) -> list[str]:
             "As many parameters as readings and no word on the gauge: nothing tells how far the "
             "numbers can be trusted."
         )
-    elif noise.source == "gauge":
+    elif noise.source == "gauge" and calibration.spare_readings > 0:
         sentences.append(
-            "There are no readings to spare: standard deviations rest on the σ given for the "
-            "gauge alone"
-            + ("." if calibration.suspicious else ", and a wrong model would not show.")
+            "What remains is no more than the σ given for the gauge: that is what standard "
+            "deviations rest on."
         )
+    elif noise.source == "gauge":
+        sentences.append("Standard deviations rest on the σ given for the gauge alone.")
     if noise.source == "residuals" and noise.cycles_dof > 0:
         ratio = noise.residual_sigma / noise.cycles_sigma
         sentences.append(
             f"What remains is {ratio:.1f} times what repeated cycles scatter by "
-            f"({mm(noise.cycles_sigma)} mm a reading): it is error of the model (legs, axes, "
-            "mounting), or a wrong sign, direction or setup; not noise. "
-            "Standard deviations are taken from the residuals."
+            f"({mm(noise.cycles_sigma)} mm a reading): it is error of the model"
+            f"{_blame(calibration)}; not noise. Standard deviations are taken from the residuals."
         )
     elif noise.source == "residuals" and gauge is not None:
         ratio = noise.residual_sigma / gauge
@@ -126,8 +133,7 @@ def explain_fit(calibration: Calibration) -> list[str]:
             sentences.append(
                 f"What remains, σ = {mm(calibration.sigma)} mm of {row}, is {_times(ratio)} "
                 f"what the gauge itself would leave ({mm(gauge * factor)} mm): it is error of the "
-                f"model (legs, axes, mounting), or a wrong sign, direction or setup; not noise of "
-                "the gauge."
+                f"model{_blame(calibration)}; not noise of the gauge."
                 + (
                     ""
                     if calibration.suspicious
@@ -145,9 +151,10 @@ def explain_fit(calibration: Calibration) -> list[str]:
                 "for these readings."
             )
     elif noise.source == "cycles":
+        scatter = _gauge_scatter(calibration)
         fits = (
             "the model fits."
-            if gauge is None or noise.chance_in_cycles(gauge) >= BY_CHANCE
+            if scatter is None or noise.chance_in_cycles(scatter) >= BY_CHANCE
             else "but they scatter by more than the gauge explains."
         )
         sentences.append(f"What remains is what repeated cycles scatter by: {fits}")
@@ -159,6 +166,18 @@ def explain_fit(calibration: Calibration) -> list[str]:
     sentences += _explain_trust(calibration)
     sentences += _explain_standstill(calibration)
     return sentences
+
+
+def _blame(calibration: Calibration) -> str:
+    """What kind of error of the model it may be that remains."""
+    excess = find_excess(calibration)
+    left_out = calibration.unmodelled.residual_rms
+    if excess == 1.0 and left_out > 0.0:
+        return (
+            " (legs, axes, mounting): no more than a machine within its tolerances leaves, "
+            f"{mm(left_out)} mm"
+        )
+    return " (legs, axes, mounting), or a wrong sign, direction or setup"
 
 
 def _explain_check(calibration: Calibration) -> list[str]:
@@ -263,7 +282,7 @@ def _explain_trust(calibration: Calibration) -> list[str]:
 
 def _explain_cycles(calibration: Calibration) -> list[str]:
     """Whether repeated readings scatter more than the gauge's σ allows, and where most."""
-    worst, gauge = _find_scattered(calibration), calibration.session.gauge_sigma
+    worst, gauge = _find_scattered(calibration), _gauge_scatter(calibration)
     if not worst or gauge is None:
         return []
     shown = ", ".join(f"{signed(r.measured * 1e3)} in cycle {r.cycle}" for r in worst[:6])
@@ -283,7 +302,7 @@ def _explain_cycles(calibration: Calibration) -> list[str]:
 
 def _find_scattered(calibration: Calibration) -> list[ResidualRow]:
     """Repeated readings that differ most, where they differ by more than the gauge explains."""
-    noise, gauge = calibration.noise, calibration.session.gauge_sigma
+    noise, gauge = calibration.noise, _gauge_scatter(calibration)
     if noise.cycles_dof == 0 or gauge is None or noise.chance_in_cycles(gauge) >= BY_CHANCE:
         return []
     groups: dict[str, list[ResidualRow]] = {}
@@ -294,6 +313,12 @@ def _find_scattered(calibration: Calibration) -> list[ResidualRow]:
         return max(r.measured for r in rows) - min(r.measured for r in rows)
 
     return max(groups.values(), key=spread)
+
+
+def _gauge_scatter(calibration: Calibration) -> float | None:
+    """What repeated readings of the gauge may scatter by: its σ, and rounding to its steps, [m]."""
+    sigma, step = calibration.session.gauge_sigma, calibration.session.gauge_resolution
+    return None if sigma is None else math.hypot(sigma, (step or 0.0) / math.sqrt(12.0))
 
 
 def _odd_one_out(rows: list[ResidualRow]) -> ResidualRow | None:

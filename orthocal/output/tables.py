@@ -44,7 +44,10 @@ def render_heading(calibration: Calibration, *, effort: bool = True) -> Renderab
     """What was calibrated, from what and how, with what it took."""
     session, solver = calibration.session, calibration.solver
     kind = "difference" if calibration.rows_are_differences else "reading"
-    legs = sorted({s.leg for s in calibration.setups})
+    read = {r.setup for r in calibration.residuals}
+    setups = [s for s in calibration.setups if s.name in read]
+    idle = [s.name for s in calibration.setups if s.name not in read]
+    legs = sorted({s.leg for s in setups})
     lines = [
         Text(
             f"Calibration of {calibration.robot_record.name}, model '{calibration.model}'",
@@ -61,8 +64,9 @@ def render_heading(calibration: Calibration, *, effort: bool = True) -> Renderab
     lines.append(
         Text(
             f"Measured: {counted(len(calibration.residuals), kind)} in "
-            f"{counted(len(used), 'posture')}, {counted(len(calibration.setups), 'setup')} on "
+            f"{counted(len(used), 'posture')}, {counted(len(setups), 'setup')} on "
             f"{'leg' if len(legs) == 1 else 'legs'} {', '.join(legs)}"
+            + (f"; no reading of {', '.join(idle)}" if idle else "")
         )
     )
     with_prior = sum(p.prior for p in calibration.free)
@@ -97,7 +101,7 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
         "95 % interval",
         *(["profile interval"] if profiled else []),
         *([] if told or profiled or robust else ["exact − linear"]),
-        *([] if (told and profiled) or robust else ["in σ"]),
+        *([] if profiled or robust else ["in σ"]),
         "unit",
     )
     few = all_rows or len(c.free) <= MANY_PARAMETERS
@@ -115,7 +119,7 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
             "" if p.at_bound else _interval(*interval, f),
             *([_interval(*p.interval, f) if p.interval else ""] if profiled else []),
             *([] if told or profiled or robust else [signed((p.value - p.linear) * f, 4)]),
-            *([] if (told and profiled) or robust else [_ratio(p.value - p.linear, std)]),
+            *([] if profiled or robust else [_ratio(p.value - p.linear, std)]),
             p.edge_unit,
         )
     notes: list[RenderableType] = [table]
@@ -192,8 +196,8 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
     sight = f"singular values above the noise, {found.threshold * 1e6:.3g} µm a tolerance"
     if calibration.base:
         lines = [
-            f"{count} base parameters: as many sums of errors as the readings tell better than "
-            f"their tolerances ({sight})."
+            f"{count} base parameters: sums of errors, each of which the readings tell apart from "
+            f"those before it and better than its tolerance ({sight})."
         ]
     else:
         lines = [
@@ -336,8 +340,10 @@ def render_controller(calibration: Calibration) -> RenderableType:
         notes.append(
             Text(
                 "For a controller that takes offsets and nothing else: these leave the least error "
-                "at the tool, making up for a part of the other errors. The identified ones are "
-                "for what knows all errors (`orthocal inverse`)."
+                "at the tool of work that is aligned on the machine (shift and rotation taken "
+                "out), making up for a part of the other errors; ± says how well that is known. "
+                "The identified ones are where the sliders really are: for what knows all errors "
+                "(`orthocal inverse`)."
             )
         )
         notes += [Text(line) for line in _promise(calibration)]
@@ -357,7 +363,7 @@ def _example(calibration: Calibration, entry: ControllerEntry) -> str:
     drive = next(d for d in calibration.robot.drives if d.name == entry.drive)
     factor, unit = drive.edge_factor, drive.edge_unit
     whole = "the whole offset, in place of the active one" if entry.active is not None else "more"
-    at, really = drive.zero * factor, (drive.zero + entry.enter) * factor
+    at, really = drive.zero * factor, (drive.zero + entry.identified) * factor
     if entry.active is None:
         return (
             "An offset is what to add to the encoder's coordinate to get the slider's true one; "

@@ -17,7 +17,7 @@ from orthocal.output.layout import (
     signed,
     table_of,
 )
-from orthocal.study.mistakes import Mistake
+from orthocal.study.mistakes import EnteringMistake, Mistake
 from orthocal.study.validation import FurtherChange, Validation
 
 REMOVED = 0.7
@@ -112,8 +112,9 @@ def explain_validation(validation: Validation) -> list[str]:
             else "it looks like noise"
         )
         sentences.append(
-            f"What remains does not repeat (correlation {repetition.correlation:.3f} over "
-            f"{repetition.matched} rows): {reason}."
+            f"What remains does not repeat beyond chance (correlation "
+            f"{repetition.correlation:.3f} over {repetition.matched} rows; chance "
+            f"{repetition.chance:.0%}): {reason}."
         )
     if not validation.offsets_stated:
         sentences.append(
@@ -149,12 +150,16 @@ _MISTAKES: dict[Mistake, str] = {
     "not entered": "were not entered: what was active before still is",
     "wrong sign": "were entered with the wrong sign",
     "entered twice": "were entered twice, or on top of what was active",
+    "identified": "are those of the column 'identified', not of the column 'enter'",
+    "interchanged": "were interchanged",
 }
 
 
 def _explain_change(validation: Validation) -> str:
     """What may have happened where more was found than expected, and what to do."""
     mistake = validation.mistake
+    if mistake is not None and mistake.kind == "one differs":
+        return _explain_one(validation, mistake)
     if mistake is not None:
         whose = "The offsets" if mistake.all_drives else f"The offsets of {_and(mistake.drives)}"
         return (
@@ -176,6 +181,18 @@ def _explain_change(validation: Validation) -> str:
     return (
         "Other offsets would not help, so those entered are not to blame: the readings scatter "
         "more than before, or something else has moved."
+    )
+
+
+def _explain_one(validation: Validation, mistake: EnteringMistake) -> str:
+    """One drive's offset explains it: another was entered, or its zero has moved."""
+    entry = next(e for e in validation.enter if e.drive == mistake.drives[0])
+    return (
+        f"The offset of {entry.drive} alone explains it: what is in the controller seems to be "
+        f"{signed(mistake.by[0] * entry.edge_factor)} {entry.edge_unit} from what the session "
+        f"says. That leaves r.m.s. {mm(mistake.rms)} mm of these readings unexplained. "
+        "Look there first, for a slip of the pen. If the controller holds what the session says, "
+        "the zero of this drive has moved: then enter what stands below."
     )
 
 

@@ -28,6 +28,10 @@ ClosureKind = Annotated[Literal["3d", "6d"], BeforeValidator(_in_small_letters)]
 """Gepetto's robots write it in capitals, too."""
 
 
+MOST_PARTS = 100
+"""Legs, closures and named sums of a robot, of each."""
+
+
 class _Keys(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -87,9 +91,11 @@ class OrthocalKeys(_Keys):
     passive_start: dict[Name, Number] = {}
     """Passive joint with `_mm` or `_deg` suffix to the value from which the loops are first
     closed; 0 where absent."""
-    legs: dict[Name, LegKeys] = {}
+    legs: Annotated[dict[Name, LegKeys], Field(max_length=MOST_PARTS)] = {}
     tcp: TcpKeys | None = None
-    parameters: dict[Name, Annotated[list[Name], Field(min_length=1)]] = {}
+    parameters: Annotated[
+        dict[Name, Annotated[list[Name], Field(min_length=1)]], Field(max_length=MOST_PARTS)
+    ] = {}
     """Named sums of elementary errors; a leading '-' subtracts."""
     tolerances: ToleranceKeys = ToleranceKeys()
     models: dict[Name, Annotated[list[Name], Field(min_length=1)]] = {}
@@ -98,7 +104,10 @@ class OrthocalKeys(_Keys):
 class RobotKeys(_Keys):
     """A whole robot YAML."""
 
-    closed_loop: list[Annotated[list[Name], Field(min_length=2, max_length=2)]]
+    closed_loop: Annotated[
+        list[Annotated[list[Name], Field(min_length=2, max_length=2)]],
+        Field(max_length=MOST_PARTS),
+    ]
     """Pairs of frames that coincide."""
     type: list[ClosureKind]
     """Whether a pair shares its origin only, or its axes too."""

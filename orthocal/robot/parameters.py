@@ -14,6 +14,7 @@ A parameter is one elementary error or a named sum of several. All are 0 for the
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -183,6 +184,8 @@ class ParameterSet:
         require_numbers(values, argument="errors")
         total: dict[str, float] = {}
         for name, value in values.items():
+            if not math.isfinite(value):
+                raise ParameterError(f"'{name}' is {value}; expected a finite number")
             for term, coefficient in self[name].terms:
                 total[term] = total.get(term, 0.0) + coefficient * value
         return {name: value for name, value in total.items() if value != 0.0}

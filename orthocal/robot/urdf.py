@@ -18,7 +18,7 @@ import pinocchio as pin
 from lxml import etree
 
 from orthocal.characters import composed
-from orthocal.documents import read_text
+from orthocal.documents import LARGEST_NUMBER, read_text
 from orthocal.errors import RobotError
 from orthocal.robot.joint_types import retype_joints
 
@@ -42,11 +42,22 @@ _NUMBERS: dict[str, dict[str, int]] = {
 }
 """Elements and how many numbers each of their attributes holds."""
 
+_SHAPES = {
+    "box": ("size",),
+    "cylinder": ("radius", "length"),
+    "sphere": ("radius",),
+    "mesh": ("filename",),
+}
+"""What a <geometry> holds, and the attributes that it needs."""
+
 _BOUNDED = frozenset({"xyz", "rpy", "size", "radius", "length", "scale", "rgba"})
 """Attributes that say where and how large something is."""
 
 _NAMES = ("name", "link", "joint")
 """Attributes by which elements speak of each other."""
+
+KEPT_NAMES = frozenset({"universe"})
+"""Names that Pinocchio keeps for itself."""
 
 LARGEST_PLACE = 1e4
 """No length [m], angle [rad] or scale is larger: loops of metres must close to nanometres."""
@@ -57,8 +68,11 @@ LARGEST_URDF = 16 * 2**20
 MOST_ELEMENTS = 20_000
 """XML elements of a URDF; a humanoid with its hands has some thousands."""
 
-MOST_JOINTS = 1_000
+MOST_JOINTS = 400
 """Joints, fixed ones too: urdfdom calls itself for every one in a chain, until its stack ends."""
+
+MOST_VISUALS = 500
+"""Visuals, each of which a page draws by itself."""
 
 MOST_MOVING = 120
 """Moving joints: their symbolic derivatives grow with the square. A humanoid with its hands has
@@ -191,6 +205,8 @@ def _check_elements(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has n
             name = element.get("name")
             if not name:
                 raise RobotError(f"<{tag}> has no name", where=at(element))
+            if name in KEPT_NAMES:
+                raise RobotError(f"a {tag} cannot be named '{name}'", where=at(element))
             if name in seen:
                 raise RobotError(
                     f"the {tag} '{name}' stands twice; first in line {seen[name]}",
@@ -266,8 +282,21 @@ def _check_elements(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has n
                 _numbers(element, key, count, at(element))
     for tag in ("visual", "collision"):
         for element in root.iter(tag):
-            if element.find("geometry") is None:
+            geometry = element.find("geometry")
+            if geometry is None:
                 raise RobotError(f"<{tag}> has no <geometry>", where=at(element))
+            shapes = [child for child in geometry if child.tag in _SHAPES]
+            if len(shapes) != 1:
+                raise RobotError(
+                    f"<geometry> holds {len(shapes)} shapes; expected one of {', '.join(_SHAPES)}",
+                    where=at(geometry),
+                )
+            for key in _SHAPES[shapes[0].tag]:
+                if shapes[0].get(key) is None:
+                    raise RobotError(f"<{shapes[0].tag}> has no {key}", where=at(shapes[0]))
+    visuals = sum(1 for _ in root.iter("visual"))
+    if visuals > MOST_VISUALS:
+        raise RobotError(f"has {visuals} visuals; expected at most {MOST_VISUALS}", where=str(path))
 
 
 def _check_counts(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has no types
@@ -304,17 +333,17 @@ def _numbers(element: Any, key: str, count: int, where: str) -> list[float] | No
     if text is None:
         return None
     try:
-        values = [float(part) for part in text.split()]
+        values = [float(part) for part in text.split() if "_" not in part]
     except ValueError:
         values = []
     if len(values) != count or not all(math.isfinite(v) for v in values):
         kind = "a finite number" if count == 1 else f"{count} finite numbers"
         raise RobotError(f"{key} is '{text}'; expected {kind}", where=where)
-    if key in _BOUNDED and max(map(abs, values)) > LARGEST_PLACE:
+    # a limit that is far away is none, and some write a million for that
+    largest = LARGEST_PLACE if key in _BOUNDED else LARGEST_NUMBER
+    if max(map(abs, values)) > largest:
         kind = "a number" if count == 1 else "numbers"
-        raise RobotError(
-            f"{key} is '{text}'; expected {kind} within ±{LARGEST_PLACE:g}", where=where
-        )
+        raise RobotError(f"{key} is '{text}'; expected {kind} within ±{largest:g}", where=where)
     return values
 
 

@@ -1,34 +1,37 @@
-"""Which mistake in entering offsets explains new readings: forgotten, wrong sign, entered twice.
+"""What is in the controller instead of what was to be entered, as new readings tell it.
 
-The calibration said which offsets to enter, d more than were active. If other ones are active
-instead, by m d less for some of the drives, the machine shows J m d more than it should: m is 1
-where they were not entered, 2 where their sign was turned, −1 where they were entered twice.
+The calibration said which offsets E to enter where A were active and I were identified. If others
+C are in the controller, the machine shows J (E − C) more than it should. What people do: leave A,
+leave nothing (0), turn the sign (−E, or A less the change), enter twice or on top (2E, A + E, E and
+the change), take the column beside it (I), or take another drive's.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, permutations
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Mistake = Literal["not entered", "wrong sign", "entered twice"]
+Mistake = Literal[
+    "not entered", "wrong sign", "entered twice", "identified", "interchanged", "one differs"
+]
 
-MULTIPLES: Mapping[Mistake, float] = {"not entered": 1.0, "wrong sign": 2.0, "entered twice": -1.0}
-"""What of the change that was asked for is missing in the controller."""
-
-EXPLAINED = 0.5
+EXPLAINED = 0.2
 """Part of what offsets can explain that a mistake may leave of it at most, r.m.s., to be taken for
-the reason."""
+the reason; or what the noise leaves, if that is more."""
 
 AS_GOOD = 1.05
-"""Times what the best of the mistakes leaves up to which fewer of the drives are held to be it:
-what hardly shows is not said of a drive."""
+"""Times what the best of the mistakes leaves up to which the simpler one is held to be it: what
+hardly shows is not said of a drive."""
+
+MOST_DRIVES = 6
+"""Drives up to which all choices among them are tried."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,24 +39,39 @@ class EnteringMistake:
     """A mistake in entering offsets that explains what a new session shows."""
 
     kind: Mistake
+    """`one differs`: no known mistake, but the offset of one drive alone explains the readings: a
+    slip of the pen, or its zero has moved."""
     drives: tuple[str, ...]
     """Of which drives."""
     all_drives: bool
     """Whether these are all drives whose offsets were to change."""
     active: Array
     """Offsets that are in the controller then, shape (n_drives,), [m, rad]."""
+    by: tuple[float, ...]
+    """What is in the controller less what was to be entered, for each of the drives, [m, rad]."""
     rms: float
     """What it leaves of the deviations, [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Guess:
+    kind: Mistake
+    drives: tuple[int, ...]
+    active: Array
+    left: float
+    """What it leaves of what offsets can explain, r.m.s., [m]."""
 
 
 def find_mistake(
     deviations: Array,
     slopes: Array,
-    change: Array,
     *,
+    before: Array,
+    identified: Array,
     entered: Array,
     names: tuple[str, ...],
     rounding: Array,
+    noise: float = 0.0,
 ) -> EnteringMistake | None:
     """The mistake that explains deviations best, if one does.
 
@@ -61,38 +79,80 @@ def find_mistake(
         deviations: New readings less those of the calibrated machine, zeros eliminated, (n,), [m].
         slopes: How the readings answer to the offsets of the drives, zeros eliminated, shape
             (n, n_drives), [m per m or rad].
-        change: d, what was to be entered more than was active, shape (n_drives,), [m, rad].
-        entered: Offsets that are taken to be active, shape (n_drives,), [m, rad].
+        before: Offsets that were active while the calibration was measured, A, [m, rad].
+        identified: Offsets of the identified machine, I, shape (n_drives,), [m, rad].
+        entered: Offsets that are taken to be active, E, shape (n_drives,), [m, rad].
         names: Of the drives.
-        rounding: Changes that are none, shape (n_drives,), [m, rad].
+        rounding: Differences that are none, shape (n_drives,), [m, rad].
+        noise: What the noise leaves of what offsets can explain, r.m.s., [m].
     """
     # what offsets have no part in is error of the model, and stays whatever is entered
-    shown = slopes @ np.linalg.lstsq(slopes, deviations, rcond=None)[0]
-    moved = [i for i in range(change.size) if abs(change[i]) > rounding[i]]
-    found: list[tuple[float, int, Mistake, tuple[int, ...]]] = []
-    for kind, multiple in MULTIPLES.items():
-        for count in range(1, len(moved) + 1):
-            for drives in combinations(moved, count):
-                missing = np.zeros_like(change)
-                missing[list(drives)] = multiple * change[list(drives)]
-                found.append((_rms(shown - slopes @ missing), count, kind, drives))
-    if not found:
+    solution = np.linalg.lstsq(slopes, deviations, rcond=None)[0]
+    shown = slopes @ solution
+    allowed = max(EXPLAINED * _rms(shown), noise)
+    guesses = [
+        _Guess(kind, drives, active, _rms(shown - slopes @ (entered - active)))
+        for kind, drives, active in _guesses(before, identified, entered, rounding)
+    ]
+    known = [g for g in guesses if g.left <= allowed]
+    if not known:
+        known = [g for g in _single(shown, slopes, entered, rounding) if g.left <= allowed]
+    if not known:
         return None
-    least = min(f[0] for f in found)
-    if not least < EXPLAINED * _rms(shown):
-        return None
-    _, _, kind, drives = min(
-        (f for f in found if f[0] <= AS_GOOD * least), key=lambda f: (f[1], f[0])
-    )
-    missing = np.zeros_like(change)
-    missing[list(drives)] = MULTIPLES[kind] * change[list(drives)]
+    least = max(min(g.left for g in known) * AS_GOOD, noise)
+    best = min((g for g in known if g.left <= least), key=lambda g: (len(g.drives), g.left))
+    moved = int((np.abs(entered - before) > rounding).sum())
     return EnteringMistake(
-        kind=kind,
-        drives=tuple(names[i] for i in drives),
-        all_drives=len(drives) == len(moved),
-        active=entered - missing,
-        rms=_rms(deviations - slopes @ missing),
+        kind=best.kind,
+        drives=tuple(names[i] for i in best.drives),
+        all_drives=best.kind != "one differs" and len(best.drives) >= max(moved, 1),
+        active=best.active,
+        by=tuple((best.active - entered)[list(best.drives)].tolist()),
+        rms=_rms(deviations - slopes @ (entered - best.active)),
     )
+
+
+def _guesses(
+    before: Array, identified: Array, entered: Array, rounding: Array
+) -> Iterator[tuple[Mistake, tuple[int, ...], Array]]:
+    """Known mistakes: their kind, the drives and what is in the controller then."""
+    change = entered - before
+    kinds: tuple[tuple[Mistake, Array], ...] = (
+        ("not entered", before),
+        ("not entered", np.zeros_like(entered)),
+        ("wrong sign", -entered),
+        ("wrong sign", before - change),
+        ("entered twice", 2.0 * entered),
+        ("entered twice", before + entered),
+        ("entered twice", entered + change),
+        ("identified", identified),
+    )
+    for kind, values in kinds:
+        other = [i for i in range(entered.size) if abs(values[i] - entered[i]) > rounding[i]]
+        sizes = range(1, len(other) + 1) if len(other) <= MOST_DRIVES else [len(other)]
+        for count in sizes:
+            for drives in combinations(other, count):
+                active = np.array(entered)
+                active[list(drives)] = values[list(drives)]
+                yield kind, drives, active
+    if entered.size > MOST_DRIVES:
+        return
+    for order in permutations(range(entered.size)):
+        active = entered[list(order)]
+        drives = tuple(i for i in range(entered.size) if order[i] != i)
+        if any(abs(active[i] - entered[i]) > rounding[i] for i in drives):
+            yield "interchanged", drives, active
+
+
+def _single(shown: Array, slopes: Array, entered: Array, rounding: Array) -> Iterator[_Guess]:
+    """For each drive the offset that explains most by itself."""
+    for i in range(entered.size):
+        square = float(slopes[:, i] @ slopes[:, i])
+        missing = float(slopes[:, i] @ shown) / square if square > 0.0 else 0.0
+        if abs(missing) > rounding[i]:
+            active = np.array(entered)
+            active[i] -= missing
+            yield _Guess("one differs", (i,), active, _rms(shown - slopes[:, i] * missing))
 
 
 def _rms(values: Array) -> float:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 from scipy import special
 
 from orthocal.identification.calibration import Calibration
@@ -24,10 +25,22 @@ to be another machine's. Errors of the machine add to what is seen, they do not 
 LEAST_UNSUITED = 1e-3
 """Deviations below this are those of a machine, [m]."""
 
+FEWEST = 5.0
+"""Degrees of freedom below which a scatter says little."""
+
+TOO_COARSE = 30.0
+"""Times what readings scatter by that no σ of a gauge is, in the right unit."""
+
+COMPUTED = 1e-7
+"""Scatter below which no dial showed the readings, [m]."""
+
+TINY = 2e-3
+"""Part of the largest distance of postures below which no two are meant to be apart."""
+
 DIFFERENT = 5.0
 """Tolerances of a length by which legs of one machine may differ by intent."""
 
-Oddity = Literal["finer", "smooth", "postures", "legs"]
+Oddity = Literal["finer", "smooth", "coarse", "tiny", "postures", "legs"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +54,14 @@ class Doubt:
 
 def find_doubts(calibration: Calibration) -> tuple[Doubt, ...]:
     """What is odd, the gravest first."""
-    found = (_postures(calibration), _finer(calibration), _smooth(calibration), _legs(calibration))
+    found = (
+        _postures(calibration),
+        _finer(calibration),
+        _smooth(calibration),
+        _coarse(calibration),
+        _tiny(calibration),
+        _legs(calibration),
+    )
     return tuple(doubt for doubt in found if doubt is not None)
 
 
@@ -109,6 +129,42 @@ def _smooth(calibration: Calibration) -> Doubt | None:
         f"What remains, {noise.residual_sigma * 1e6:.2g} µm, is less than rounding to the gauge's "
         f"resolution of {step * 1e3:g} mm leaves ({least * 1e6:.2g} µm): the readings are in "
         "another unit than mm, were computed, or the dial did not move.",
+    )
+
+
+def _coarse(calibration: Calibration) -> Doubt | None:
+    """A σ far above what repeated readings scatter by, or what remains: in another unit."""
+    given, noise = calibration.session.gauge_sigma, calibration.noise
+    scatter = noise.cycles_sigma if noise.cycles_dof >= FEWEST else noise.residual_sigma
+    dof = noise.cycles_dof if noise.cycles_dof >= FEWEST else noise.residual_dof
+    if given is None or dof < FEWEST or not COMPUTED < TOO_COARSE * scatter < given:
+        return None  # readings without any scatter were computed
+    return Doubt(
+        "coarse",
+        f"The σ given for the gauge, {given * 1e3:g} mm, is {given / scatter:.0f} times what its "
+        f"readings scatter by ({scatter * 1e3:.2g} mm): is gauge.sigma_mm in mm?",
+    )
+
+
+def _tiny(calibration: Calibration) -> Doubt | None:
+    """Postures hardly away from another one, beside far ones: given in metres."""
+    drives = np.array([p.drives for p in calibration.postures])
+    places, first = np.unique(drives, axis=0, return_index=True)
+    if len(places) < 3:
+        return None
+    from scipy.spatial import KDTree
+
+    gaps = np.asarray(KDTree(places).query(places, k=2)[0])[:, 1]
+    largest = float(np.linalg.norm(np.ptp(places, axis=0)))
+    near = np.flatnonzero(gaps < TINY * largest)
+    if not near.size:
+        return None
+    worst = near[first[near].argmax()]
+    name = calibration.postures[int(first[worst])].name
+    return Doubt(
+        "tiny",
+        f"Posture '{name}' is {gaps[worst] * 1e3:.2g} mm from another one, where postures "
+        f"are up to {largest * 1e3:.0f} mm apart: is it in mm, not in metres?",
     )
 
 

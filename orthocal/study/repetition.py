@@ -28,6 +28,12 @@ class Repetition:
     chance: float
     """Probability of such a correlation between residuals that are noise; NaN if unknown."""
 
+    scatter: float
+    """Standard deviation of a row that does not repeat in the other session, [m]; NaN without
+    degrees of freedom."""
+    scatter_dof: float
+    """Degrees of freedom of that."""
+
     @property
     def repeats(self) -> bool | None:
         """Whether what is left is the same again: model error, not noise. None if unknown."""
@@ -54,7 +60,22 @@ def measure_repetition(first: Calibration, second: Calibration) -> Repetition:
         # directions of noise are spread evenly over the space that the fit leaves to residuals
         tail = 0.5 * (1.0 - float(special.betainc(0.5, 0.5 * (dims - 1.0), cosine**2)))
         chance = tail if cosine > 0.0 else 1.0 - tail
-    return Repetition(matched, correlation, chance)
+    scatter, scatter_dof = _scatter(first, second)
+    return Repetition(matched, correlation, chance, scatter, scatter_dof)
+
+
+def _scatter(first: Calibration, second: Calibration) -> tuple[float, float]:
+    """What does not repeat, from residuals of rows that both sessions have, cycle for cycle."""
+    rows = [
+        {(r.setup, r.posture, r.minus, r.cycle): r for r in c.residuals} for c in (first, second)
+    ]
+    if rows[0].keys() != rows[1].keys():
+        return math.nan, 0.0
+    # both fits have taken parameters and gauge zeros out, and with them out of the difference
+    square = sum((rows[0][k].residual - rows[1][k].residual) ** 2 for k in rows[0])
+    setups = {r.setup for r in second.residuals if r.minus is None}
+    dof = float(len(rows[0]) - len(setups) - len(second.free))
+    return (math.sqrt(0.5 * square / dof) if dof > 0.0 else math.nan), max(dof, 0.0)
 
 
 def _residual_dimensions(refit: Calibration, matched: int) -> float:

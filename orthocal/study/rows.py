@@ -13,9 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError
 from orthocal.identification.calibration import Calibration
-from orthocal.kinematics.assembly import Assembly, Failures, as_rows, nominal_assembly
+from orthocal.kinematics.assembly import (
+    Assembly,
+    Failures,
+    as_rows,
+    find_beyond_travel,
+    nominal_assembly,
+)
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.robot.model import Robot, read_only
+from orthocal.robot.model import read_only
 from orthocal.study.tool import error_covariance
 
 Array = NDArray[np.float64]
@@ -58,7 +64,7 @@ def forward_rows(
     assembly = Assembly(robot, fixed=calibration.errors)
 
     def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
-        _refuse_beyond_travel(robot, rows, names, failures)
+        failures.update(find_beyond_travel(robot, rows, names))
         return assembly.forward(rows, names=names, failures=failures)
 
     yield from _by_chunks(evaluate, rows, names)
@@ -131,20 +137,6 @@ def accuracy_rows(
         return result
 
     yield from _by_chunks(evaluate, rows, names)
-
-
-def _refuse_beyond_travel(
-    robot: Robot, rows: Array, names: Sequence[str], failures: Failures
-) -> None:
-    """Fill in the rows that are beyond a drive's travel."""
-    for drive, values in zip(robot.drives, rows.T, strict=True):
-        factor, unit = drive.edge_factor, drive.edge_unit
-        for i in np.flatnonzero((values < drive.lower) | (values > drive.upper)).tolist():
-            reason = (
-                f"{drive.name}_{unit} is {values[i] * factor:g}; the drive reaches from "
-                f"{drive.lower * factor:g} to {drive.upper * factor:g}"
-            )
-            failures.setdefault(i, ClosureError(reason, posture=names[i]))
 
 
 def _by_chunks(evaluate: _Evaluate, rows: Array, names: Sequence[str] | None) -> Iterator[Chunk]:

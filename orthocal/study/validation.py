@@ -34,6 +34,15 @@ from orthocal.study.repetition import Repetition, measure_repetition
 
 Array = NDArray[np.float64]
 
+KNOWN_LEAVES = 2.0
+"""Times the expected deviations that a known mistake may leave at most, to be the reason."""
+
+LEAVES = 1.4
+"""The same where it is no known one, but any offset of one drive."""
+
+FEWEST = 5.0
+"""Degrees of freedom below which what does not repeat of two sessions is not known."""
+
 CHANGE_CHANCE = 0.05
 """Probability that any parameter of a calibration that is right is said to change."""
 
@@ -139,6 +148,7 @@ class Validation:
                 "kind": self.mistake.kind,
                 "drives": list(self.mistake.drives),
                 "active": self.mistake.active.tolist(),
+                "by": list(self.mistake.by),
                 "rms": self.mistake.rms,
             },
             "enter": [{"drive": e.drive, "unit": e.unit, "value": e.enter} for e in self.enter],
@@ -179,6 +189,7 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         session = session.with_controller(offsets)
     fit = repeat_fit(calibration, session)
     refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
+    repetition = measure_repetition(calibration, refit)
     found = Validation(
         title=session.title,
         offsets_stated=stated,
@@ -189,16 +200,21 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         refit_rms=refit.rms_after,
         refit_largest=refit.largest_after,
         excess_probability=_excess_probability(calibration, refit),
-        changes=_further_changes(calibration, refit),
+        changes=_further_changes(calibration, refit, repetition),
         mistake=None,
         enter=entries,
-        repetition=measure_repetition(calibration, refit),
+        repetition=repetition,
         rows=refit.residuals,
     )
     if found.confirmed is not False:
         return found
     mistake = _find_mistake(calibration, fit, session)
-    enter = entries if mistake is not None else find_entries(refit)
+    if mistake is not None:  # what it leaves must be what was expected
+        times = LEAVES if mistake.kind == "one differs" else KNOWN_LEAVES
+        if mistake.rms > times * calibration.rms_after / calibration.row_factor:
+            mistake = None
+    slip = mistake is not None and mistake.kind != "one differs"
+    enter = entries if slip else find_entries(refit)
     return replace(found, mistake=mistake, enter=enter)
 
 
@@ -214,28 +230,44 @@ def _find_mistake(calibration: Calibration, fit: Fit, session: Session) -> Enter
             k = problem.free.index(name)
             slopes[:, i] = fit.jacobian[:, k] / problem.theta_scale[k]
     entries = {e.drive: e for e in find_entries(calibration)}
-    change, scatter = (
+    identified, scatter = (
         np.array([getattr(entries[d.name], key) if d.name in entries else 0.0 for d in drives])
-        for key in ("change", "scatter")
+        for key in ("identified", "scatter")
     )
+    zeros = project_out_zeros(slopes, o)
+    told = np.linalg.matrix_rank(zeros) / max(o.size, 1)
     return find_mistake(
         deviations,
-        project_out_zeros(slopes, o),
-        change,
+        zeros,
+        before=calibration.active_offsets,
+        identified=identified,
         entered=session.active_offsets,
         names=tuple(d.name for d in drives),
         rounding=np.nan_to_num(scatter),
+        noise=calibration.rms_after / calibration.row_factor * math.sqrt(told),
     )
 
 
-def _further_changes(calibration: Calibration, refit: Calibration) -> tuple[FurtherChange, ...]:
-    """New less old estimates, against the standard error of the difference of the two."""
+def _further_changes(
+    calibration: Calibration, refit: Calibration, repetition: Repetition
+) -> tuple[FurtherChange, ...]:
+    """New less old estimates, against the standard error of the difference of the two.
+
+    What repeats in both sessions, as errors of the model do, moves both estimates alike: where the
+    readings tell how much does not repeat, only that counts.
+    """
     pairs = list(zip(calibration.free, refit.free, strict=True))
-    # so many chances to be wrong by chance: each gets its share of the 5 %
-    factor = confidence_factor(min(calibration.dof, refit.dof), 1.0 - CHANGE_CHANCE / len(pairs))
+    scale, dof = (1.0, 1.0), min(calibration.dof, refit.dof)
+    if not calibration.prior and repetition.scatter_dof >= FEWEST:
+        scatter = repetition.scatter
+        scale = (min(scatter / calibration.sigma, 1.0), min(scatter / refit.sigma, 1.0))
+        dof = repetition.scatter_dof
+    # so many chances to be wrong by chance: each gets its share
+    factor = confidence_factor(dof, 1.0 - CHANGE_CHANCE / len(pairs))
     changes = []
     for old, new in pairs:
-        change, std = new.value - old.value, math.hypot(old.std, new.std)
+        change = new.value - old.value
+        std = math.hypot(old.std * scale[0], new.std * scale[1])
         changes.append(FurtherChange(new.name, new.unit, change, std, abs(change) > factor * std))
     return tuple(changes)
 
@@ -243,17 +275,23 @@ def _further_changes(calibration: Calibration, refit: Calibration) -> tuple[Furt
 def _require_offsets(calibration: Calibration, session: Session) -> None:
     """The offsets that a session states must be those of the calibration, up to rounding."""
     drives = [d.name for d in session.robot.drives]
+    others, where = [], ""
     for entry in find_entries(calibration):
         stated = float(session.active_offsets[drives.index(entry.drive)])
         allowed = max(0.5 * entry.scatter, 0.02e-3)
         if not math.isnan(allowed) and abs(stated - entry.enter) > allowed:
             factor, unit = entry.edge_factor, entry.edge_unit
-            raise SessionError(
-                f"{entry.drive} has {stated * factor:g} {unit}; the calibration identified "
-                f"{entry.enter * factor:.3f} {unit}. A validation needs the identified offsets "
-                "active",
-                where=f"{session.path or 'session'}: controller.offsets_{unit}",
+            where = f"{session.path or 'session'}: controller.offsets_{unit}"
+            others.append(
+                f"{entry.drive} has {stated * factor:g} {unit} where the calibration says to enter "
+                f"{entry.enter * factor:.3f} {unit}"
             )
+    if others:
+        raise SessionError(
+            f"{'; '.join(others)}. A validation needs a session that was measured with what the "
+            "calibration says to enter",
+            where=where,
+        )
 
 
 def _excess_probability(calibration: Calibration, refit: Calibration) -> float:

@@ -19,8 +19,13 @@ from orthocal.identification.uncertainty import confidence_factor, project_out_z
 def test_where_the_problem_is_nearly_linear_it_is_students_interval(raw_cycles):
     result = calibrate(raw_cycles, profile=["x_slide.offset"])
     p = result["x_slide.offset"]
-    half = result.confidence_factor * p.std
+    # that of the readings' scatter, and beside it what errors that were not free may have done
+    student, normal = result.confidence_factor, confidence_factor(np.inf)
+    bias = np.sqrt(result.unmodelled.bias_covariance[0, 0])
+    assert bias > 10.0 * p.std
+    half = np.hypot(student * p.std, normal * bias)
     assert p.interval == pytest.approx((p.value - half, p.value + half), abs=0.01 * half)
+    assert p.interval == pytest.approx(result.intervals[0], abs=0.01 * half)
     assert result["y_slide.offset"].interval is None
 
 
@@ -68,7 +73,9 @@ def test_beside_a_prior_it_is_that_of_the_posterior(root):
     session = load_session(root / "examples/raw-cycles")
     result = calibrate(session, model="lengths", profile=["x_leg.length"])
     p = result["x_leg.length"]
-    half = result.confidence_factor * p.std
+    i = [q.name for q in result.free].index(p.name)
+    bias = np.sqrt(result.unmodelled.bias_covariance[i, i])
+    half = np.hypot(result.confidence_factor * p.std, confidence_factor(np.inf) * bias)
     assert p.interval == pytest.approx((p.value - half, p.value + half), abs=0.02 * half)
 
 

@@ -80,7 +80,7 @@ def fleet(raw_plan):
 
 
 def accused(fleet, fit):
-    name, evidence = weigh_signs(fit, fleet.others)
+    name, evidence, _ = weigh_signs(fit, fleet.others)
     return name if evidence > CLEARLY else None
 
 

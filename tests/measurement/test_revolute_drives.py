@@ -117,7 +117,9 @@ def test_what_was_identified_is_validated(tmp_path, robot):
     new = simulate_session(plan, OFFSETS, seed=2).session
     assert validate_calibration(found, new).confirmed
     wrong = load_plan(write_plan(tmp_path / "c", robot, "{offsets_deg: [0, 0]}"))
-    with pytest.raises(SessionError, match=r"controller.*: motor_a has 0 mrad; the calibration"):
+    with pytest.raises(
+        SessionError, match=r"controller.*: motor_a has 0 mrad where the calibration"
+    ):
         validate_calibration(found, simulate_session(wrong, OFFSETS, seed=3).session)
 
 

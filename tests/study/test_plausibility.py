@@ -129,3 +129,26 @@ def test_a_leg_of_250_metres_is_refused(tmp_path):
     write_orthoglide(tmp_path / "machine", 250.0)
     with pytest.raises(RobotError, match=r"legs\.x: is 250 m long; expected at most 20 m"):
         load_robot(tmp_path / "machine")
+
+
+def test_a_sigma_in_micrometres_is_noticed_and_computed_readings_are_no_scatter(root):
+    session = load_session(root / "examples/raw-cycles")
+    coarse = replace(session, gauge=replace(session.gauge, sigma=10e-3))
+    words = [d.words for d in find_doubts(calibrate(coarse)) if d.kind == "coarse"]
+    assert len(words) == 1
+    assert "The σ given for the gauge, 10 mm" in words[0]
+    assert not [d for d in find_doubts(calibrate(session)) if d.kind == "coarse"]
+    same = session.with_values(np.zeros(len(session.readings)))
+    same = replace(same, gauge=replace(same.gauge, sigma=10e-6, resolution=None))
+    assert not [d for d in find_doubts(calibrate(same)) if d.kind == "coarse"]
+
+
+def test_a_posture_in_metres_is_noticed(root):
+    calibration = calibrate(load_session(root / "examples/raw-cycles"))
+    assert not [d for d in find_doubts(calibration) if d.kind == "tiny"]
+    first, *others = calibration.postures
+    near = tuple(v + 0.05e-3 for v in others[-1].drives)
+    moved = replace(calibration, postures=(replace(first, drives=near), *others))
+    words = [d.words for d in find_doubts(moved) if d.kind == "tiny"]
+    assert len(words) == 1
+    assert "0.087 mm from another one" in words[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from orthocal.errors import RobotError
-from orthocal.files import exists, require_file
+from orthocal.files import exists, read_file, require_file
 from orthocal.output.view.shapes import Colour, cylinder, pose_along
 from orthocal.robot.model import Robot
 from orthocal.robot.urdf import LARGEST_PLACE, captured_stderr, parse_urdf
@@ -22,6 +23,12 @@ from orthocal.robot.urdf import LARGEST_PLACE, captured_stderr, parse_urdf
 Array = NDArray[np.float64]
 
 MESH_FORMATS = (".stl", ".obj", ".dae", ".ply")
+
+LARGEST_REPETITION = 10 * 2**20
+"""What a mesh file amounts to where it is drawn again and again, [bytes]."""
+
+LONGEST_LINE = 4_000
+"""Characters of a line of an OBJ: a face of some hundred corners."""
 
 MOST_TRIANGLES = 300_000
 """Of a mesh; a page holds each as text."""
@@ -65,6 +72,7 @@ def _with_absolute_meshes(robot: Robot) -> str:
     """Text of the URDF with the paths of its meshes resolved within the robot's folder."""
     root = parse_urdf(robot.urdf)
     folder = robot.folder.resolve()
+    uses: Counter[Path] = Counter()
     for mesh in root.iter("mesh"):
         name = mesh.get("filename") or ""
         where = f"{robot.urdf}:{mesh.sourceline}"
@@ -76,8 +84,29 @@ def _with_absolute_meshes(robot: Robot) -> str:
         if not exists(path):
             raise RobotError(f"there is no mesh file {path}", where=where)
         require_file(path, error=RobotError)
+        if path.suffix.lower() == ".obj":
+            _require_short_lines(path, where)
+        again = path.stat().st_size * uses[path]
+        uses[path] += 1
+        if again > LARGEST_REPETITION:
+            raise RobotError(
+                f"the mesh '{name}' is drawn {uses[path]} times, {again / 2**20:.0f} MiB again; "
+                f"expected at most {LARGEST_REPETITION / 2**20:g} MiB",
+                where=where,
+            )
         mesh.set("filename", str(path))
     return str(etree.tostring(root, encoding="unicode"))
+
+
+def _require_short_lines(path: Path, where: str) -> None:
+    """Refuse an OBJ with a face of thousands of corners: cutting it up takes their square."""
+    lines = read_file(path, error=RobotError).split(b"\n")
+    longest = max(len(line) for line in lines)
+    if longest > LONGEST_LINE:
+        raise RobotError(
+            f"the mesh {path} has a line of {longest} characters; expected at most {LONGEST_LINE}",
+            where=where,
+        )
 
 
 def _relative(name: str) -> Path:
