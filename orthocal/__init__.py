@@ -20,7 +20,7 @@ _HOMES = {
     "Robot": "orthocal.robot.model",
     "Scene": "orthocal.output.view.scene",
     "Session": "orthocal.measurement.session",
-    "SolverOptions": "orthocal.identification.nlp",
+    "SolverOptions": "orthocal.identification.options",
     "assess_tool": "orthocal.study.accuracy",
     "calibrate": "orthocal.identification.calibrate",
     "compare_models": "orthocal.study.comparison",
@@ -68,7 +68,7 @@ if TYPE_CHECKING:
     from orthocal.identification.calibration import Calibration
     from orthocal.identification.calibration_file import load_calibration
     from orthocal.identification.loss import Loss
-    from orthocal.identification.nlp import SolverOptions
+    from orthocal.identification.options import SolverOptions
     from orthocal.measurement.session import Session
     from orthocal.measurement.session_file import load_plan, load_session
     from orthocal.measurement.session_output import write_session

@@ -161,6 +161,13 @@ def calibrate(
             help="What residuals cost; with huber single wrong readings pull less.",
         ),
     ] = "squares",
+    solver: Annotated[
+        str,
+        typer.Option(
+            metavar="ipopt|eliminated|linearised",
+            help="The reference; the same optimum sooner; to first order, as the paper.",
+        ),
+    ] = "ipopt",
     profile: Annotated[
         list[str] | None,
         typer.Option(
@@ -178,7 +185,7 @@ def calibrate(
     from orthocal.files import require_writable, write_files
     from orthocal.identification.calibrate import calibrate as run
     from orthocal.identification.loss import Loss
-    from orthocal.identification.nlp import SolverOptions
+    from orthocal.identification.options import SolverOptions
     from orthocal.identification.selection import read_bounds, read_known, read_tolerances
     from orthocal.measurement.session_file import load_session
     from orthocal.output.summary import print_summary
@@ -197,7 +204,7 @@ def calibrate(
         bounds=read_bounds(bound or [], parameters, where="--bound"),
         base=base,
         profile=_globs(profile),
-        options=SolverOptions(loss=Loss(loss)),  # type: ignore[arg-type] # checked there
+        options=SolverOptions(solver=solver, loss=Loss(loss)),  # type: ignore[arg-type] # checked there
     )
     if json:
         _out(result.to_json().rstrip("\n"))

@@ -249,7 +249,7 @@ def test_simulate_draws_by_seed(orthocal, root, tmp_path):
 
 
 def test_a_solve_that_does_not_converge_exits_1(orthocal, experiment, monkeypatch, tmp_path):
-    from orthocal.identification import nlp
+    from orthocal.identification.solvers import ipopt as nlp
 
     monkeypatch.setattr(nlp, "CONVERGED", frozenset())
     code, out, err = orthocal("calibrate", experiment, "--out", tmp_path / "none")

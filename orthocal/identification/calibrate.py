@@ -26,7 +26,7 @@ from orthocal.identification.identifiability import (
 )
 from orthocal.identification.linear import linearise_at_reference
 from orthocal.identification.loss import Loss
-from orthocal.identification.nlp import SolverOptions
+from orthocal.identification.options import SolverOptions
 from orthocal.identification.problem import CalibrationProblem, build_problem
 from orthocal.identification.profile import profile_interval
 from orthocal.identification.records import (
@@ -93,13 +93,13 @@ def calibrate(
         base: Identify base parameters instead, without any prior: of what the readings cannot
             tell apart one parameter stays, and stands for the whole combination.
         profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
-        options: How Ipopt is run, and what a residual costs.
+        options: Which solver, how it is run, and what a residual costs.
         start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
             solution.
 
     Raises:
         NotIdentifiableError: If the readings leave a parameter open and there is no prior.
-        SolverError: If Ipopt does not converge.
+        SolverError: If the solver does not converge.
         ClosureError: If the machine cannot reach a posture.
         ParameterError: If the model or a name is unknown.
         TypeError: If an argument is of another kind.
@@ -174,7 +174,7 @@ def repeat_fit(calibration: Calibration, session: Session) -> Fit:
         fixed={p.name: p.value for p in calibration.parameters if not p.free},
     )
     solver = calibration.solver
-    options = SolverOptions(loss=Loss(solver.loss, solver.loss_width))
+    options = SolverOptions(solver=solver.name, loss=Loss(solver.loss, solver.loss_width))
     return fit_problem(CalibrationProblem(session, selection), options=options)
 
 
@@ -213,7 +213,7 @@ def assemble_calibration(
         model=problem.selection.label,
         prior=problem.prior,
         solver=SolverRecord(
-            name="ipopt",
+            name=fit.program.options.solver,
             status=fit.solution.status,
             iterations=fit.iterations,
             seconds_build=fit.seconds_build,

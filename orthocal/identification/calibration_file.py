@@ -66,7 +66,7 @@ class _SessionKeys(_Keys):
 
 
 class _SolverKeys(_Keys):
-    name: str
+    name: Literal["ipopt", "eliminated", "linearised"]
     status: str
     iterations: Count
     seconds_build: Number

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.errors import ClosureError, SolverError
 from orthocal.identification.linear import Linearisation, linearise_at_reference
 from orthocal.identification.loss import Loss
-from orthocal.identification.nlp import NonlinearProgram, Solution, SolverOptions
+from orthocal.identification.options import SolverOptions
 from orthocal.identification.problem import CalibrationProblem
+from orthocal.identification.solvers.program import Program, Solution, build_program
 from orthocal.identification.uncertainty import (
     Information,
     Noise,
@@ -46,13 +47,13 @@ class Fit:
     """A solved problem."""
 
     problem: CalibrationProblem
-    program: NonlinearProgram
+    program: Program
     seconds_build: float
     """Building all functions and the program, once, [s]."""
     seconds_solve: float
     """All solutions until sigma had settled, [s]."""
     iterations: int
-    """Of Ipopt, in all of them."""
+    """Of the solver, in all of them."""
     linearisation: Linearisation
     """About what the controller already corrects."""
     linear: Array
@@ -123,20 +124,20 @@ def fit_problem(
     *,
     options: SolverOptions | None = None,
     start: ArrayLike | None = None,
-    program: NonlinearProgram | None = None,
+    program: Program | None = None,
 ) -> Fit:
     """Solve a problem exactly, with sigma from the readings where they tell it.
 
     Args:
         problem: The problem.
-        options: How Ipopt is run.
+        options: Which solver, and how it is run.
         start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
             solution.
         program: Of the same problem with other readings, to be used again; `options` are its own.
 
     Raises:
         NotIdentifiableError: If neither readings nor a prior determine a parameter.
-        SolverError: If Ipopt does not converge.
+        SolverError: If the solver does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
     began = time.perf_counter()
@@ -144,7 +145,7 @@ def fit_problem(
     require_determined(problem, linearisation.information)
     repeatability = estimate_repeatability(problem.values, problem.observations)
     if program is None:
-        program = NonlinearProgram(problem, options=options)
+        program = build_program(problem, options)
     else:
         program = program.with_problem(problem)
     built = time.perf_counter()
@@ -210,7 +211,7 @@ def require_assembly(problem: CalibrationProblem, solution: Solution, *, robust:
         ) from None
 
 
-def _matters(program: NonlinearProgram) -> bool:
+def _matters(program: Program) -> bool:
     """Whether sigma matters to the estimate: beside a prior, or with a robust loss."""
     return program.problem.prior or program.options.loss.robust
 
@@ -220,7 +221,7 @@ def _settled(found: float, sigma: float) -> bool:
 
 
 def _linearised_sigma(
-    program: NonlinearProgram, linearisation: Linearisation, repeatability: tuple[float, int]
+    program: Program, linearisation: Linearisation, repeatability: tuple[float, int]
 ) -> float:
     """Sigma as the linearised problem has it, [m]: mostly near enough for one exact solution."""
     problem = program.problem
@@ -262,7 +263,7 @@ def require_determined(problem: CalibrationProblem, information: Information) ->
     )
 
 
-def _residual(program: NonlinearProgram, solution: Solution, prediction: Array) -> Array:
+def _residual(program: Program, solution: Solution, prediction: Array) -> Array:
     """Residuals with the zeros that the loss gives: their mean for squares."""
     problem, o = program.problem, program.problem.observations
     left = problem.values - prediction
@@ -272,7 +273,7 @@ def _residual(program: NonlinearProgram, solution: Solution, prediction: Array) 
 
 
 def _noise(
-    program: NonlinearProgram,
+    program: Program,
     residual: Array,
     information: Information,
     sigma: float,

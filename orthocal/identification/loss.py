@@ -23,10 +23,15 @@ from numpy.typing import NDArray
 from orthocal.errors import OrthocalError
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 LossKind = Literal["squares", "huber"]
 
 HUBER_WIDTH = 1.345
 """k at which the estimate is 95 % as precise as by squares where all residuals are normal."""
+
+MOST_STEPS = 100
+SETTLED = 1e-11
+"""Last step of a search for a centre, [standard deviations]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +86,41 @@ class Loss:
         """ρ'(r)/r: how much of a square a residual counts, 1 at 0, shape as r."""
         return 1.0 / np.sqrt(1.0 + (r / self.width) ** 2) if self.robust else np.ones_like(r)
 
+    def bend(self, r: Array) -> Array:
+        """ρ''(r): how steeply its influence grows, 1 at 0, shape as r."""
+        return np.asarray((1.0 + (r / self.width) ** 2) ** -1.5) if self.robust else np.ones_like(r)
+
+    def centres(self, values: Array, group: Indices, count: int, *, weights: Array) -> Array:
+        """What is best taken off the values of each group: their mean, for squares.
+
+        Args:
+            values: In standard deviations, shape (n,).
+            group: Of each value, shape (n,).
+            count: Number of groups; none is empty.
+            weights: How often each value counts, shape (n,).
+
+        Returns:
+            c with Σ w ρ(v − c) least, shape (count,).
+        """
+
+        def sums(each: Array) -> Array:
+            total = np.bincount(group, weights * each, minlength=count)
+            return np.asarray(total, dtype=np.float64)
+
+        result = sums(values) / sums(np.ones_like(values))
+        steepest = np.full(count, np.inf)
+        for _ in range(MOST_STEPS if self.robust else 0):
+            residual = values - result[group]
+            pull = sums(self.influence(residual))
+            # by ρ'' as long as that brings it nearer; else by the secant, which always does
+            nearer = np.abs(pull) < 0.5 * steepest
+            bend = np.where(nearer, sums(self.bend(residual)), sums(self.weight(residual)))
+            steepest = np.where(nearer, np.abs(pull), np.inf)
+            result += pull / bend
+            if np.abs(pull / bend).max(initial=0.0) < SETTLED:
+                break
+        return result
+
     def gain(self, r: Array, *, used: float) -> float:
         """Mean of ρ''(r): how steeply the estimate answers to the readings; 1 for squares.
 
@@ -93,7 +133,7 @@ class Loss:
         """
         if not self.robust or not r.size:
             return 1.0
-        curvature = (1.0 + (r / self.width) ** 2) ** -1.5
+        curvature = self.bend(r)
         mean = float(np.mean(curvature))
         return mean / (1.0 + used / r.size * float(np.var(curvature)) / mean**2)
 

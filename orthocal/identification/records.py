@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from orthocal.identification.loss import LossKind
+from orthocal.identification.options import SolverKind
 from orthocal.identification.uncertainty import NoiseSource, chance_of_excess
 from orthocal.measurement.session import SectionForm
 from orthocal.robot.parameters import InUnit, Unit
@@ -49,9 +50,9 @@ class SessionRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolverRecord:
-    """How the exact solution was found."""
+    """How the solution was found."""
 
-    name: str
+    name: SolverKind
     status: str
     iterations: int
     """In all solutions until sigma had settled."""
@@ -64,6 +65,14 @@ class SolverRecord:
     """What residuals cost: their squares, or Huber's smooth loss."""
     loss_width: float
     """Where that turns from square to linear, [standard deviations]."""
+
+    @property
+    def tells_linearisation(self) -> bool:
+        """Whether what it found, less the linearised estimate, is what linearising costs.
+
+        Not with a robust loss: the linearised estimate is by squares.
+        """
+        return self.name != "linearised" and self.loss == "squares"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

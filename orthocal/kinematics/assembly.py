@@ -43,6 +43,9 @@ smaller ratio would not be seen. The Orthoglide has 1/20 to 1/60."""
 TOO_FAR = 1e3
 """A Newton step that goes farther comes from rows that depend on each other, [m or rad]."""
 
+LAST_STEP = 1e-6
+"""A step from closed loops that goes farther is that of a nearly singular posture, [m or rad]."""
+
 MAX_NEWTON_STEPS = 30
 SMALLEST_CONTINUATION_STEP = 1.0 / 512.0
 LARGEST_CONTINUATION_MOVE = 0.3
@@ -514,6 +517,11 @@ def _newton(
                 break
         active = active[moved]
         active = active[worst[active] >= tolerance]
+    closed = np.flatnonzero(worst < tolerance)
+    if closed.size and system.n_x:  # what is left goes too: residual and slope are at hand
+        step = system.step(residuals[closed], jacobians[closed])
+        small = np.abs(step).max(axis=1) < LAST_STEP
+        x[closed[small]] += step[small]
     return x, worst
 
 

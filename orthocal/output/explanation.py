@@ -238,7 +238,7 @@ def _explain_standstill(calibration: Calibration) -> list[str]:
 
 
 def _explain_linearisation(calibration: Calibration) -> list[str]:
-    if calibration.solver.loss == "huber":  # the linearised estimate is by squares
+    if not calibration.solver.tells_linearisation:
         return []
     shifts = [
         (abs(p.value - p.linear), std, p)

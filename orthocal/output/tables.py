@@ -76,7 +76,7 @@ def render_heading(calibration: Calibration, *, effort: bool = True) -> Renderab
     kind = "base parameter" if calibration.base else "parameter"
     loss = ", Huber's loss" if solver.loss == "huber" else ""
     took = (
-        f"; Ipopt {solver.status}, {counted(solver.iterations, 'iteration')}, "
+        f"; {solver.name}: {solver.status}, {counted(solver.iterations, 'iteration')}, "
         f"{solver.seconds_build:.2f} + {solver.seconds_solve:.2f} s"
     )
     solved = f"Solved: {counted(len(calibration.free), kind)}, {prior}{loss}"
@@ -87,21 +87,21 @@ def render_heading(calibration: Calibration, *, effort: bool = True) -> Renderab
 def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> RenderableType:
     """Every parameter that the readings tell, or all: estimate, ± σ and interval."""
     c, told = calibration, calibration.prior
-    robust = c.solver.loss == "huber"  # the linearised estimate is by squares
+    linear = c.solver.name == "linearised"
+    both = c.solver.tells_linearisation
     profiled = any(p.interval for p in c.free)
     biased = bool((c.total_std > c.standard_deviations).any())
     rows = list(zip(c.free, c.total_std.tolist(), c.intervals, strict=True))
     table = table_of(
         "parameter",
-        "linear",
-        "exact",
+        *(["linearised"] if linear else ["linear", "exact"]),
         "± σ",
         *(["scatter"] if all_rows and biased else []),
         *(["told"] if told else []),
         "95 % interval",
         *(["profile interval"] if profiled else []),
-        *([] if told or profiled or robust else ["exact − linear"]),
-        *([] if profiled or robust else ["in σ"]),
+        *(["exact − linear"] if both and not (told or profiled) else []),
+        *(["in σ"] if both and not profiled else []),
         "unit",
     )
     few = all_rows or len(c.free) <= MANY_PARAMETERS
@@ -111,15 +111,15 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
         add_row(
             table,
             p.name,
-            signed(p.linear * f),
+            *([] if linear else [signed(p.linear * f)]),
             signed(p.value * f),
             "at bound" if p.at_bound else plain(std * f),
             *([plain(p.std * f)] if all_rows and biased else []),
             *([_share(p)] if told else []),
             "" if p.at_bound else _interval(*interval, f),
             *([_interval(*p.interval, f) if p.interval else ""] if profiled else []),
-            *([] if told or profiled or robust else [signed((p.value - p.linear) * f, 4)]),
-            *([] if profiled or robust else [_ratio(p.value - p.linear, std)]),
+            *([signed((p.value - p.linear) * f, 4)] if both and not (told or profiled) else []),
+            *([_ratio(p.value - p.linear, std)] if both and not profiled else []),
             p.edge_unit,
         )
     notes: list[RenderableType] = [table]

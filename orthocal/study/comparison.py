@@ -11,7 +11,7 @@ from typing import Any
 from orthocal.arguments import require_kind, require_names
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.identification.calibrate import repeat_calibration
-from orthocal.identification.nlp import SolverOptions
+from orthocal.identification.options import SolverOptions
 from orthocal.identification.problem import build_problem
 from orthocal.identification.uncertainty import estimate_repeatability
 from orthocal.measurement.session import Session
@@ -87,12 +87,12 @@ def compare_models(
         models: Models of the robot's YAML; all by default.
         tolerances: Name or glob to another standard deviation than the robot's, [SI].
         repeat: Another session of the same rows: whether what remains repeats.
-        options: How Ipopt is run.
+        options: Which solver, and how it is run.
 
     Raises:
         ParameterError: If a model or name is unknown.
         SessionError: If the other session is of another robot, or the same one.
-        SolverError: If Ipopt does not converge.
+        SolverError: If the solver does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
     require_kind(session, Session, expected="a Session, such as load_session(...)")

@@ -15,7 +15,7 @@ from orthocal.identification.calibrate import assemble_calibration
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.fit import SMALLEST_SIGMA, Fit, fit_problem, require_determined
 from orthocal.identification.linear import Linearisation
-from orthocal.identification.nlp import SolverOptions
+from orthocal.identification.options import SolverOptions
 from orthocal.identification.problem import CalibrationProblem
 from orthocal.identification.uncertainty import decompose, project_out_zeros
 from orthocal.study.accuracy import ErrorSize, ToolAccuracy, assess_tool
@@ -103,11 +103,11 @@ def score_model(
         noise: Standard deviation of a reading that residuals are held against, [m]; NaN if unknown.
         by_choice: Whether its prior, or that it has none, is as it should be; else it has one
             because the readings leave it open.
-        options: How Ipopt is run.
+        options: Which solver, and how it is run.
 
     Raises:
         NotIdentifiableError: If the readings leave the model open.
-        SolverError: If Ipopt does not converge.
+        SolverError: If the solver does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
     fit = fit_problem(problem, options=options)

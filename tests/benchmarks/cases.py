@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal import load_plan, simulate_session
-from orthocal.identification.nlp import NonlinearProgram, Solution
 from orthocal.identification.problem import build_problem
+from orthocal.identification.solvers.ipopt import NonlinearProgram
+from orthocal.identification.solvers.program import Solution
 from orthocal.measurement.session import Session
 from orthocal.measurement.synthetic import draw_errors
 

@@ -12,8 +12,8 @@ from cases import MODEL, SIGMA, SWEEP
 from peer import PeerProblem
 from tolerances import KINEMATICS, SAME_OPTIMUM
 
-from orthocal.identification.nlp import NonlinearProgram
 from orthocal.identification.problem import build_problem
+from orthocal.identification.solvers.ipopt import NonlinearProgram
 from orthocal.measurement.gauge import build_observations, predict_entries
 
 PEER_OFFSETS = 1e-8

@@ -9,7 +9,7 @@ from orthocal import calibrate, compare_models, load_session
 from orthocal.identification.cross_validation import predict_unseen
 from orthocal.identification.fit import fit_problem
 from orthocal.identification.loss import Loss
-from orthocal.identification.nlp import SolverOptions
+from orthocal.identification.options import SolverOptions
 from orthocal.identification.problem import build_problem
 
 FIRST_ORDER = 2e-3

@@ -12,8 +12,8 @@ from orthocal.errors import SolverError
 from orthocal.identification.diagnostics import diagnose_readings
 from orthocal.identification.fit import fit_problem, require_assembly
 from orthocal.identification.loss import Loss
-from orthocal.identification.nlp import NonlinearProgram
 from orthocal.identification.problem import build_problem
+from orthocal.identification.solvers.ipopt import NonlinearProgram
 from orthocal.measurement.session import Gauge, Session
 from orthocal.output.explanation import explain_fit
 

@@ -11,8 +11,8 @@ from orthocal import SolverOptions, calibrate, load_plan, simulate_session
 from orthocal.identification.fit import fit_problem
 from orthocal.identification.linear import linearise_at_reference
 from orthocal.identification.loss import Loss
-from orthocal.identification.nlp import NonlinearProgram
 from orthocal.identification.problem import build_problem
+from orthocal.identification.solvers.ipopt import NonlinearProgram
 from orthocal.identification.uncertainty import decompose, project_out_zeros
 from orthocal.output.explanation import explain_fit
 

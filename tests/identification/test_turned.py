@@ -12,8 +12,8 @@ from machines import write_orthoglide
 
 from orthocal import calibrate, load_plan, load_session, simulate_session
 from orthocal.identification.fit import fit_problem
-from orthocal.identification.nlp import NonlinearProgram
 from orthocal.identification.problem import build_problem
+from orthocal.identification.solvers.ipopt import NonlinearProgram
 from orthocal.identification.turned import CLEARLY, weigh_signs
 from orthocal.identification.uncertainty import project_out_zeros
 

@@ -11,8 +11,8 @@ from tolerances import KINEMATICS
 
 from orthocal import calibrate, load_plan
 from orthocal.errors import NotIdentifiableError
-from orthocal.identification.nlp import NonlinearProgram
 from orthocal.identification.problem import build_problem
+from orthocal.identification.solvers.ipopt import NonlinearProgram
 from orthocal.identification.uncertainty import (
     Information,
     chance_of_excess,

@@ -9,8 +9,8 @@ from fleets import Fleet
 from orthocal import calibrate, load_plan, simulate_session
 from orthocal.identification import calibrate as calibrate_module
 from orthocal.identification.fit import fit_problem
-from orthocal.identification.nlp import NonlinearProgram
 from orthocal.identification.problem import build_problem
+from orthocal.identification.solvers.ipopt import NonlinearProgram
 from orthocal.identification.uncertainty import project_out_zeros
 from orthocal.identification.unmodelled import (
     find_other_errors,

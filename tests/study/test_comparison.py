@@ -12,8 +12,8 @@ import pytest
 from orthocal import load_session, summarize
 from orthocal.errors import ParameterError
 from orthocal.identification.fit import fit_problem
-from orthocal.identification.nlp import NonlinearProgram
 from orthocal.identification.problem import build_problem
+from orthocal.identification.solvers.ipopt import NonlinearProgram
 from orthocal.identification.uncertainty import project_out_zeros
 from orthocal.study.comparison import compare_models
 

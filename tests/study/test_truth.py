@@ -11,8 +11,8 @@ from machines import place, reading_by_pinocchio
 from orthocal import calibrate, draw_errors, load_plan, load_session
 from orthocal.identification.calibrate import assemble_calibration
 from orthocal.identification.fit import fit_problem
-from orthocal.identification.nlp import NonlinearProgram
 from orthocal.identification.problem import build_problem
+from orthocal.identification.solvers.ipopt import NonlinearProgram
 from orthocal.identification.uncertainty import confidence_factor, decompose
 from orthocal.kinematics.assembly import Assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity

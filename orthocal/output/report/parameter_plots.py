@@ -250,7 +250,7 @@ def _draw_singular_values(calibration: Calibration) -> Figure:
 
 def _linearisation_shifts(calibration: Calibration) -> list[tuple[float, ParameterEstimate]]:
     """Exact less linearised estimate in σ, the largest first."""
-    if calibration.solver.loss == "huber":  # the linearised estimate is by squares
+    if not calibration.solver.tells_linearisation:
         return []
     known = [p for p in calibration.free if math.isfinite(p.std) and p.std > 0.0]
     shifts = [((p.value - p.linear) / p.std, p) for p in known]

@@ -13,8 +13,9 @@ from orthocal import load_plan, load_session, simulate_session
 from orthocal.errors import SolverError
 from orthocal.identification.linear import solve_linearised
 from orthocal.identification.loss import SQUARES, Loss
-from orthocal.identification.nlp import NonlinearProgram, SolverOptions
+from orthocal.identification.options import SolverOptions
 from orthocal.identification.problem import LENGTH_SCALE, build_problem
+from orthocal.identification.solvers.ipopt import NonlinearProgram
 from orthocal.identification.uncertainty import project_out_zeros
 
 HUBER = Loss("huber")

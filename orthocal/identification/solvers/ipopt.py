@@ -9,28 +9,26 @@ gradient, Jacobian and Hessian of the whole by index: building does not grow wit
 from __future__ import annotations
 
 import copy
-import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.arguments import require_kind
 from orthocal.errors import SolverError
-from orthocal.identification.loss import SQUARES, Loss
+from orthocal.identification.options import SolverOptions
 from orthocal.identification.pieces import ReadingPiece
 from orthocal.identification.problem import LENGTH_SCALE, CalibrationProblem
+from orthocal.identification.solvers.program import LEFT_OUT, Solution, no_convergence
 from orthocal.identification.sparse import SparseSum
 from orthocal.interrupts import noticed_interrupt
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-Hessian = Literal["gauss-newton", "exact"]
 
 FINEST_WEIGHT = 5e-6
 """Readings are weighted as if they had at least this standard deviation, [m], and the prior is
@@ -42,10 +40,9 @@ EXACT_READINGS = 20_000
 MOST_EXACT = 2_000
 """Readings up to which the exact Hessian is tried where the other does not converge."""
 
-LEFT_OUT = 1e-9
-"""Weight of readings that are left out: next to nothing, and their gauge zeros stay determined."""
-
-MOST_ITERATIONS = 10**6
+WIDENINGS = (256.0, 64.0, 16.0, 4.0, 2.0, 1.0)
+"""Widths of a robust loss, as multiples of the one wanted, each solution the next one's start: for
+readings so far out that neither Hessian converges."""
 
 CONVERGED = frozenset({"Solve_Succeeded"})
 """Ipopt's words for a solution; anything else is an error."""
@@ -54,66 +51,6 @@ CONVERGED = frozenset({"Solve_Succeeded"})
 COMPLEMENTARITY = 1e-11
 """Multiplier of a bound times the distance to it, both scaled, at most. A parameter within the root
 of that of its bound is said to be held by it, whether it is or not: 16 nm of an offset of 5 mm."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SolverOptions:
-    """How Ipopt is run."""
-
-    hessian: Hessian = "gauss-newton"
-    """Hessian of the Lagrangian: exact, or without the curvature of readings and closures. Where
-    the latter does not converge the exact one is tried."""
-    tolerance: float = 1e-6
-    """Ipopt's `tol` on the gradient of the scaled problem, in units of θ̂ (one tolerance) where
-    only the prior holds a parameter, and far less where readings do. Readings of 0.3 m known to
-    5 µm leave rounding errors of up to 1e-7 in it."""
-    closure_tolerance: float = 1e-9
-    """Largest scaled closure residual: units of 1 mm."""
-    max_iterations: int = 200
-    print_level: int = 0
-    """Ipopt's own printing, 0 (none) to 12."""
-    loss: Loss = SQUARES
-    """What a residual costs."""
-
-    def __post_init__(self) -> None:
-        require_kind(self.loss, Loss, expected="Loss(...)")
-        for name in ("tolerance", "closure_tolerance"):
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and 0.0 < value < math.inf):
-                raise ValueError(f"{name} is {value!r}; expected a number above 0")
-        for name in ("max_iterations", "print_level"):
-            value = getattr(self, name)
-            if not (isinstance(value, int) and 0 <= value <= MOST_ITERATIONS):
-                raise ValueError(f"{name} is {value!r}; expected a whole number of at least 0")
-        if self.hessian not in get_args(Hessian):
-            raise ValueError(
-                f"the Hessian is {self.hessian!r}; expected one of {', '.join(get_args(Hessian))}"
-            )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Solution:
-    """What Ipopt found."""
-
-    theta: Array
-    """Free parameters, shape (n_free,), [SI]."""
-    zeros: Array
-    """Gauge zeros, shape (n_zeros,), [m]."""
-    passive: Array
-    """Passive coordinates, shape (n_postures, n_passive), [m, rad]."""
-    objective: float
-    """Σ ρ((y − h − z)/σ), and the prior's share."""
-    status: str
-    """Ipopt's own word."""
-    iterations: int
-    hessian: Hessian
-    """With which it was found."""
-    seconds_build: float
-    seconds_solve: float
-    closure: float
-    """Largest closure residual that is left, rotations times characteristic length, [m]."""
-    at_bound: NDArray[np.int8]
-    """-1 where a parameter is held by its lower bound, 1 by its upper one, else 0, (n_free,)."""
 
 
 class NonlinearProgram:
@@ -153,24 +90,55 @@ class NonlinearProgram:
         left_out: ArrayLike | None = None,
         held: Mapping[int, float] | None = None,
     ) -> Solution:
-        """Solve for given readings.
-
-        Args:
-            sigma: Standard deviation of one reading, [m].
-            values: Readings as single ones, shape (n_entries,), [m]; the session's by default.
-            start: Free parameters to start from, shape (n_free,), [SI]; by default what the
-                controller already corrects.
-            start_passive: Passive coordinates to start closing the loops from.
-            left_out: Entries not to be used, as indices.
-            held: Index of a free parameter to the value it is held at, [SI].
+        """Solve for given readings; arguments as for `Program.solve`.
 
         Raises:
             SolverError: If Ipopt does not converge.
             ClosureError: If the machine cannot reach a posture with the start values.
             KeyboardInterrupt: At Ctrl-C, which CasADi would swallow.
         """
+        y = self.problem.values if values is None else np.asarray(values, dtype=np.float64)
+
+        def run(program: NonlinearProgram, widening: float = 1.0) -> Solution:
+            return program._solve(
+                start,
+                start_passive,
+                sigma=sigma,
+                values=y,
+                left_out=left_out,
+                held=held or {},
+                widening=widening,
+            )
+
+        try:
+            return run(self)
+        except SolverError:
+            if not self._can_be_exact:
+                raise
+        try:
+            return run(self._exact)
+        except SolverError:
+            if not self.options.loss.robust:
+                raise
+        for widening in WIDENINGS:  # nearly squares first, then as wanted
+            solution = run(self._exact, widening)
+            start, start_passive = solution.theta, solution.passive
+        return solution
+
+    def _solve(
+        self,
+        start: ArrayLike | None,
+        start_passive: Array | None,
+        *,
+        sigma: float,
+        values: Array,
+        left_out: ArrayLike | None,
+        held: Mapping[int, float],
+        widening: float,
+    ) -> Solution:
+        """One run of Ipopt, the width of a robust loss a multiple of the one wanted."""
         problem = self.problem
-        lower, upper = (self._bounds(side, held or {}) for side in ("lower", "upper"))
+        lower, upper = (self._bounds(side, held) for side in ("lower", "upper"))
         theta = np.array(problem.reference if start is None else start, dtype=np.float64)
         theta = np.clip(
             theta,
@@ -178,11 +146,11 @@ class NonlinearProgram:
             upper[: self._n_theta] * problem.theta_scale,
         )
         passive = problem.close(theta, start=start_passive)
-        y = problem.values if values is None else np.asarray(values, dtype=np.float64)
-        residual = y - problem.predict(theta, passive)
+        residual = (values - problem.predict(theta, passive)) / sigma
         o = problem.observations
-        counts = np.maximum(np.bincount(o.zero, minlength=o.n_zeros), 1)
-        zeros = np.bincount(o.zero, residual, minlength=o.n_zeros) / counts
+        loss = self.options.loss
+        wide = replace(loss, width=loss.width * widening)
+        zeros = sigma * wide.centres(residual, o.zero, o.n_zeros, weights=np.ones(o.size))
         x0 = np.concatenate(
             [
                 theta / problem.theta_scale,
@@ -190,33 +158,17 @@ class NonlinearProgram:
                 (passive / problem.passive_scale).reshape(-1),
             ]
         )
+        p = self.pack(sigma=sigma, values=values, left_out=left_out, widening=widening)
         began = time.perf_counter()
         with noticed_interrupt():
-            answer = self._solver(
-                x0=x0,
-                p=self.pack(sigma=sigma, values=y, left_out=left_out),
-                lbx=lower,
-                ubx=upper,
-                lbg=0.0,
-                ubg=0.0,
-            )
+            answer = self._solver(x0=x0, p=p, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
         seconds = time.perf_counter() - began
         stats = self._solver.stats()
         status, iterations = str(stats["return_status"]), int(stats["iter_count"])
-        if status not in CONVERGED and self._can_be_exact:
-            return self._exact.solve(
-                sigma=sigma,
-                values=values,
-                start=start,
-                start_passive=start_passive,
-                left_out=left_out,
-                held=held,
-            )
         if status not in CONVERGED:
             raise SolverError(
-                f"Ipopt did not converge: {status} after {iterations} iterations; there is no "
-                "result. Look for a reading with a wrong sign or in a wrong row first"
-                + ("" if self.options.loss.robust else "; with the loss 'huber' it may be named"),
+                f"Ipopt did not converge: {status} after {iterations} iterations; "
+                f"{no_convergence(self.options)}",
                 status=status,
                 iterations=iterations,
             )
@@ -235,11 +187,16 @@ class NonlinearProgram:
             seconds_build=self.seconds_build,
             seconds_solve=seconds,
             closure=float(closures) * LENGTH_SCALE,
-            at_bound=_at_bound(x[: self._n_theta], pull, lower, upper, held or {}),
+            at_bound=_at_bound(x[: self._n_theta], pull, lower, upper, held),
         )
 
     def pack(
-        self, *, sigma: float, values: Array | None = None, left_out: ArrayLike | None = None
+        self,
+        *,
+        sigma: float,
+        values: Array | None = None,
+        left_out: ArrayLike | None = None,
+        widening: float = 1.0,
     ) -> Array:
         """The program's parameters p: readings, their weights, σ, the prior's scale, the width.
 
@@ -247,13 +204,14 @@ class NonlinearProgram:
             sigma: Standard deviation of one reading, [m].
             values: Readings as single ones, shape (n_entries,), [m]; the session's by default.
             left_out: Entries not to be used, as indices.
+            widening: What the width of a robust loss is multiplied by.
         """
         y = self.problem.values if values is None else values
         weights = np.ones(y.size)
         if left_out is not None:
             weights[np.asarray(left_out, dtype=np.int64)] = LEFT_OUT
         weighted, scale = _weighting(sigma)
-        width = self.options.loss.width * sigma / weighted
+        width = self.options.loss.width * widening * sigma / weighted
         return np.concatenate([y, weights, [weighted, scale, width]])
 
     def functions(self) -> dict[str, ca.Function]:
