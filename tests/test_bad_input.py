@@ -623,8 +623,8 @@ OPTION_CASES = [
         "--free *.offset,*_leg.length,*_fork.x --no-prior",
         "{tmp}/readings.csv: the readings do not determine x_slide.offset, y_slide.offset, "
         "z_slide.offset, x_fork.x, y_fork.x, z_fork.x and 3 more: 5 of 9 free parameters can be "
-        "told from them. No reading sees a change of these together: y_fork.x up, y_slide.offset "
-        "up. No reading sees a change of these together: z_fork.x up, z_slide.offset up. Or use "
+        "told from them. No reading sees a change of these together: x_fork.x up, x_slide.offset "
+        "up. No reading sees a change of these together: y_fork.x up, y_slide.offset up. Or use "
         "tolerances as a prior (--prior), or identify base parameters (--base)",
     ),
     option(

@@ -352,7 +352,7 @@ def _advise_lost(information: Information, names: tuple[str, ...], null: Array) 
     rest_null = _reduce(null[:, ~unread])
     seen = [n for n, out in zip(names, unread, strict=True) if not out]
     for row in rest_null[:MOST_LOST]:
-        order = np.argsort(-np.abs(row))
+        order = np.argsort(-np.round(np.abs(row), 9), kind="stable")
         terms = [i for i in order if abs(row[i]) > 1e-6]
         ways = ", ".join(
             f"{seen[i]} {'up' if row[i] * row[terms[0]] > 0 else 'down'}"
@@ -364,17 +364,19 @@ def _advise_lost(information: Information, names: tuple[str, ...], null: Array) 
 
 
 def _reduce(rows: Array) -> Array:
-    """Reduced echelon form of what rows span, its pivots the largest entries."""
-    left = np.array(rows)
-    found: list[Array] = []
-    while left.size:
-        i, j = np.unravel_index(np.abs(left).argmax(), left.shape)
-        if abs(left[i, j]) < 1e-6:
-            break
-        row = left[i] / left[i, j]
-        found = [f - f[j] * row for f in found] + [row]
-        left = np.delete(left - np.outer(left[:, j], row), i, axis=0)
-    return np.array(found).reshape(-1, rows.shape[1])
+    """Reduced echelon form of what rows span: the same for any rows that span it.
+
+    The pivots are the largest columns; of those that are alike, the first.
+    """
+    _, values, basis = np.linalg.svd(rows, full_matrices=False)
+    basis = basis[values > 1e-6]
+    left, pivots = np.array(basis), []
+    for _ in range(len(basis)):
+        sizes = np.linalg.norm(left, axis=0)
+        pivots.append(int(np.argmax(sizes >= (1.0 - 1e-6) * sizes.max())))
+        along = left[:, pivots[-1]] / sizes[pivots[-1]]
+        left -= np.outer(along, along @ left)
+    return np.asarray(np.linalg.solve(basis[:, pivots], basis))
 
 
 def confidence_factor(dof: float, level: float = 0.95) -> float:
