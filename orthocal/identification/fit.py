@@ -14,7 +14,8 @@ from orthocal.identification.linear import Linearisation, linearise_at_reference
 from orthocal.identification.loss import Loss
 from orthocal.identification.options import SolverOptions
 from orthocal.identification.problem import CalibrationProblem
-from orthocal.identification.solvers.program import Program, Solution, build_program
+from orthocal.identification.solvers.choice import build_program
+from orthocal.identification.solvers.program import Program, Solution
 from orthocal.identification.uncertainty import (
     Information,
     Noise,

@@ -79,22 +79,6 @@ class Program(Protocol):
         """
 
 
-def build_program(problem: CalibrationProblem, options: SolverOptions | None = None) -> Program:
-    """A problem made ready for the solver that is chosen; Ipopt by default."""
-    chosen = options or SolverOptions()
-    if chosen.solver == "eliminated":
-        from orthocal.identification.solvers.eliminated import EliminatedProgram
-
-        return EliminatedProgram(problem, options=chosen)
-    if chosen.solver == "linearised":
-        from orthocal.identification.solvers.linearised import LinearisedProgram
-
-        return LinearisedProgram(problem, options=chosen)
-    from orthocal.identification.solvers.ipopt import NonlinearProgram
-
-    return NonlinearProgram(problem, options=chosen)
-
-
 def no_convergence(options: SolverOptions) -> str:
     """What to look for where a solver does not converge."""
     return "there is no result. Look for a reading with a wrong sign or in a wrong row first" + (
