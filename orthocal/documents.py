@@ -73,6 +73,13 @@ Finite = Annotated[float, BeforeValidator(_refuse_truth_values), Field(allow_inf
 PositiveNumber = Annotated[Number, Field(gt=0.0), AfterValidator(_refuse_tiny)]
 """A number of sane size above 0."""
 
+Name = Annotated[
+    str,
+    Field(min_length=1, max_length=200, pattern=r"^[^,;\s\"]+$"),
+    AfterValidator(composed),
+]
+"""A name that can stand in a CSV."""
+
 PositiveInSI = Annotated[
     Number, Field(gt=0.0), AfterValidator(lambda v: _refuse_tiny(v, SMALLEST_IN_SI))
 ]
@@ -308,8 +315,16 @@ def validate(
     *,
     where: str,
     error: type[OrthocalError],
+    under: str = "",
 ) -> Model:
     """Data as an instance of a pydantic schema.
+
+    Args:
+        schema: What is expected.
+        data: The data.
+        where: File, for messages.
+        error: Kind of error.
+        under: Key of the file under which the data stand.
 
     Raises:
         OrthocalError: Of the kind given, with the first key that does not fit.
@@ -317,11 +332,13 @@ def validate(
     if not isinstance(data, Mapping):
         kinds = {str: "text", int: "a number", float: "a number", list: "a list", bool: "a word"}
         found = "nothing" if data is None else kinds.get(type(data), f"a {type(data).__name__}")
-        raise error(f"holds {found}; expected keys and values", where=where)
+        at = f"{where}: {under}" if under else where
+        raise error(f"holds {found}; expected keys and values", where=at)
     try:
         return schema.model_validate(data)
     except ValidationError as e:
         key, problem = explain_validation_error(e, schema)
+        key = ".".join(part for part in (under, key) if part)
         raise error(problem, where=f"{where}: {key}" if key else where) from None
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from orthocal.measurement.session import DIRECTIONS, section_plane
 from orthocal.robot.loading import packaged_robots
+from orthocal.sensors.leg_indicator import DIRECTIONS
 
 
 def place(machine, drives, frame, *, start=None):
@@ -21,13 +21,14 @@ def place(machine, drives, frame, *, start=None):
 
 def reading_by_pinocchio(session, machine, setup, posture):
     """The gauge's reading from placements of a calibrated Pinocchio model, in plain NumPy."""
-    leg = machine.legs[setup.leg]
+    sensor = setup.sensor
+    leg = machine.legs[sensor.leg]
     root, tip = (place(machine, posture.drives, f) for f in (leg.root, leg.tip))
-    plane, from_root = section_plane(machine, setup)
+    plane, from_root = sensor.plane(machine)
     if from_root:
         plane = plane + leg.axis @ place(machine, session.zero_drives, leg.root)
     along = (plane - leg.axis @ root) / (leg.axis @ (tip - root))
-    return float(np.dot(DIRECTIONS[setup.direction], root + along * (tip - root)))
+    return float(np.dot(DIRECTIONS[sensor.direction], root + along * (tip - root)))
 
 
 def write_orthoglide(folder, length, *, travel=None):

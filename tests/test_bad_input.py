@@ -1358,12 +1358,12 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "schema-other",
-        f"{CALIBRATION}: schema is 'orthocal/calibration/9'; expected 'orthocal/calibration/2'",
-        swap(FILE, "orthocal/calibration/2", "orthocal/calibration/9"),
+        f"{CALIBRATION}: schema is 'orthocal/calibration/9'; expected 'orthocal/calibration/3'",
+        swap(FILE, "orthocal/calibration/3", "orthocal/calibration/9"),
     ),
     calibration(
         "schema-missing",
-        f"{CALIBRATION}: schema: is missing; expected 'orthocal/calibration/2'",
+        f"{CALIBRATION}: schema: is missing; expected 'orthocal/calibration/3'",
         write(FILE, "{}"),
     ),
     calibration(
@@ -1400,9 +1400,9 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "section-form",
-        f"{CALIBRATION}: setups[0].section_form: found 'middle'; expected 'coordinate_mm', "
-        "'from_root_mm' or 'fraction'",
-        put(FILE, "setups.0.section_form", "middle"),
+        f"{CALIBRATION}: setups[0].reads.section.middle: unknown key; known keys: coordinate_mm, "
+        "from_root_mm, fraction",
+        put(FILE, "setups.0.reads.section", {"middle": 0.5}),
     ),
     calibration(
         "posture-with-too-few-drives",
@@ -1741,22 +1741,34 @@ VIEW_CASES = [
     *(
         Case(
             f"view-calibration-{keys}",
-            f"{{tmp}}/calibration.json: {where}: 'w' is {message}",
+            f"{{tmp}}/calibration.json: {where}: {message}",
             (put("calibration.json", keys, "w"),),
             command="view {tmp}/calibration.json --html {tmp}/a.html",
             base="machine",
             calibrated=True,
         )
         for keys, where, message in (
-            ("setups.1.leg", "setups[1].leg", "none of x, y, z"),
-            ("setups.0.direction", "setups[0].direction", "none of x, y, z, -x, -y, -z"),
+            (
+                "setups.1.reads.leg",
+                "setups[1].reads.leg",
+                "'w' is not a leg of orthoglide; legs: x, y, z",
+            ),
+            (
+                "setups.0.reads.direction",
+                "setups[0].reads.direction",
+                "found 'w'; expected one of x, y, z, -x, -y, -z",
+            ),
             (
                 "residuals.2.posture",
                 "residuals[2].posture",
-                "not among the file's postures",
+                "'w' is not among the file's postures",
             ),
-            ("residuals.3.minus", "residuals[3].minus", "not among the file's postures"),
-            ("residuals.0.setup", "residuals[0].setup", "not among the file's setups"),
+            (
+                "residuals.3.minus",
+                "residuals[3].minus",
+                "'w' is not among the file's postures",
+            ),
+            ("residuals.0.setup", "residuals[0].setup", "'w' is not among the file's setups"),
         )
     ),
     Case("view-nothing", "{tmp}/none" + NO_SUBJECT, command="view {tmp}/none --html {tmp}/a.html"),

@@ -460,6 +460,6 @@ def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
         if real
     }
     return tuple(
-        SetupRecord(s.name, s.leg, s.direction, s.section.form, s.section.value, zeros.get(s.name))
+        SetupRecord(s.name, s.sensor, zeros.get(s.name))
         for s in fit.problem.session.setups.values()
     )

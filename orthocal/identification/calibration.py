@@ -44,12 +44,13 @@ from orthocal.identification.unmodelled import Unmodelled
 from orthocal.kinematics.assembly import Assembly, as_rows, find_beyond_travel
 from orthocal.markup import paragraph, table
 from orthocal.robot.model import Robot
+from orthocal.sensors.registry import write_sensor
 
 Array = NDArray[np.float64]
 
 Found = TypeVar("Found")
 
-SCHEMA = "orthocal/calibration/2"
+SCHEMA = "orthocal/calibration/3"
 
 FEW = 12
 """Parameters up to which a notebook lists all."""
@@ -347,7 +348,10 @@ class Calibration:
             "residuals": [{**_plain(r), "residual": r.residual} for r in self.residuals],
             "turned": None if self.turned is None else _plain(self.turned),
             "postures": [_plain(p) for p in self.postures],
-            "setups": [_plain(s) for s in self.setups],
+            "setups": [
+                {"name": s.name, "reads": write_sensor(s.sensor), "zero": s.zero}
+                for s in self.setups
+            ],
         }
 
     def to_json(self) -> str:

@@ -28,8 +28,8 @@ from orthocal.identification.records import (
     TurnedSetup,
 )
 from orthocal.identification.unmodelled import Unmodelled
-from orthocal.measurement.session import SectionForm
 from orthocal.robot.model import read_only
+from orthocal.sensors.registry import read_setup
 
 Array = NDArray[np.float64]
 
@@ -128,10 +128,7 @@ class _PostureKeys(_Keys):
 
 class _SetupKeys(_Keys):
     name: str
-    leg: str
-    direction: str
-    section_form: SectionForm
-    section_value: Number
+    reads: dict[str, Any]
     zero: Number | None
 
 
@@ -174,7 +171,7 @@ class _IdentifiabilityKeys(_Keys):
 
 
 class _CalibrationKeys(_Keys):
-    schema_: Annotated[Literal["orthocal/calibration/2"], Field(alias="schema")]
+    schema_: Annotated[Literal["orthocal/calibration/3"], Field(alias="schema")]
     orthocal: str
     robot: _RobotKeys
     session: _SessionKeys
@@ -278,7 +275,7 @@ def load_calibration(path: str | Path) -> Calibration:
         postures=tuple(
             PostureRecord(p.name, tuple(p.drives), tuple(p.passive)) for p in keys.postures
         ),
-        setups=tuple(SetupRecord(**s.model_dump()) for s in keys.setups),
+        setups=_setups(keys, str(file)),
         version=keys.orthocal,
         path=file,
     )
@@ -404,6 +401,16 @@ def _residual(keys: _ResidualKeys) -> ResidualRow:
     for name in ("linear", "studentised", "unseen"):
         values[name] = _float(values[name])
     return ResidualRow(**values)
+
+
+def _setups(keys: _CalibrationKeys, file: str) -> tuple[SetupRecord, ...]:
+    found = []
+    for i, setup in enumerate(keys.setups):
+        _, sensor = read_setup(
+            setup.reads, where=file, under=f"setups[{i}].reads", error=CalibrationFileError
+        )
+        found.append(SetupRecord(setup.name, sensor, setup.zero))
+    return tuple(found)
 
 
 def _turned(keys: _TurnedKeys) -> TurnedSetup:

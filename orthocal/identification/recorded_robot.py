@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from orthocal.errors import CalibrationFileError, ParameterError, RobotError
+from orthocal.errors import CalibrationFileError, ParameterError, RobotError, SessionError
 from orthocal.files import is_folder
 from orthocal.identification.records import (
     ParameterEstimate,
@@ -17,7 +17,6 @@ from orthocal.identification.records import (
     RobotRecord,
     SetupRecord,
 )
-from orthocal.measurement.session import DIRECTIONS
 from orthocal.robot.loading import load_robot, packaged_robots
 from orthocal.robot.model import Robot
 
@@ -120,14 +119,10 @@ def require_rows(
         CalibrationFileError: Naming the key.
     """
     for i, setup in enumerate(setups):
-        for key, found, known in (
-            ("leg", setup.leg, tuple(robot.legs)),
-            ("direction", setup.direction, tuple(DIRECTIONS)),
-        ):
-            if found not in known:
-                raise CalibrationFileError(
-                    f"'{found}' is none of {', '.join(known)}", where=f"{prefix}setups[{i}].{key}"
-                )
+        try:
+            setup.sensor.require_fit(robot, where=f"{prefix}setups[{i}].reads")
+        except SessionError as e:
+            raise CalibrationFileError(e.problem, where=e.where) from None
     for i, posture in enumerate(postures):
         for key, values, count, kind in (
             ("drives", posture.drives, len(robot.drives), "drive"),

@@ -10,8 +10,8 @@ from typing import Literal
 from orthocal.identification.loss import LossKind
 from orthocal.identification.options import SolverKind
 from orthocal.identification.uncertainty import NoiseSource, chance_of_excess
-from orthocal.measurement.session import SectionForm
 from orthocal.robot.parameters import InUnit, Unit
+from orthocal.sensors.protocol import Sensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,11 +217,8 @@ class SetupRecord:
     """A setup of the session."""
 
     name: str
-    leg: str
-    direction: str
-    section_form: SectionForm
-    section_value: float
-    """[m], or 1 for a fraction."""
+    sensor: Sensor
+    """What stood there."""
     zero: float | None
     """Estimated zero of the gauge, [m]; None where only differences were given."""
 

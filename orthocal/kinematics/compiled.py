@@ -9,6 +9,7 @@ than differentiating the expressions, and as exact.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -75,6 +76,7 @@ class CompiledRobot:
         )
         self._first = {(m.index, m.of_frame): 6 * k for k, m in enumerate(moved)}
         self._positions: dict[int, BatchFunction] = {}
+        self._poses: dict[int, BatchFunction] = {}
 
     @property
     def symbols(self) -> list[ca.SX]:
@@ -158,6 +160,15 @@ class CompiledRobot:
         if index not in self._positions:
             self._positions[index] = self._batch("frame", [self.tree.frame_pose(index).position])
         return self._positions[index]
+
+    def pose(self, frame: str) -> BatchFunction:
+        """(actuated, passive, placements) to the pose of a frame, shape (4, 4), [1, m]."""
+        index = self.robot.frame_id(frame)
+        if index not in self._poses:
+            pose = self.tree.frame_pose(index)
+            rows = ca.vertcat(ca.horzcat(pose.rotation, pose.position), ca.SX([[0, 0, 0, 1]]))
+            self._poses[index] = self._batch("pose", [rows])
+        return self._poses[index]
 
     @cached_property
     def tool(self) -> BatchFunction:
@@ -276,6 +287,15 @@ class CompiledRobot:
 def compiled_robot(robot: Robot) -> CompiledRobot:
     """The functions of a robot, built once."""
     return CompiledRobot(robot)
+
+
+def zero_poses(robot: Robot, frames: Sequence[str]) -> list[Array]:
+    """Poses of frames of the nominal machine in its zero posture, shape (4, 4) each, [1, m]."""
+    compiled = compiled_robot(robot)
+    errors = compiled.errors
+    placements = errors.placements(np.zeros(len(errors.names)))
+    zero = robot.drive_zero[None], robot.zero[robot.passive_index][None]
+    return [compiled.pose(frame)(*zero, placements)[0][0] for frame in frames]
 
 
 def adjoint(pose: Pose) -> ca.SX:

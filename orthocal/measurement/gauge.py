@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.kinematics.assembly import Assembly, nominal_assembly
-from orthocal.kinematics.compiled import compiled_robot
-from orthocal.measurement.session import Session, section_plane
+from orthocal.kinematics.compiled import compiled_robot, zero_poses
+from orthocal.measurement.session import Session
 from orthocal.sensors.compiled import CompiledReading, compile_reading
+from orthocal.sensors.protocol import Contact
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -228,11 +229,11 @@ def predict_entries(
     return result
 
 
-def locate_contacts(session: Session) -> dict[tuple[str, str], float]:
-    """Where on the leg the gauge touches, nominally: 0 at the root, 1 at the tip.
+def locate_contacts(session: Session) -> dict[str, tuple[list[str], Contact]]:
+    """Where sensors touch the nominal machine.
 
     Returns:
-        (setup, posture) to the fraction t, for every pair that is read.
+        Setup to the postures that it is read in, and where it touches in them.
     """
     robot = session.robot
     nominal = drive_table(session) + session.active_offsets
@@ -240,25 +241,22 @@ def locate_contacts(session: Session) -> dict[tuple[str, str], float]:
     passive = assembly.close(nominal, names=list(session.postures))
     machine, compiled = assembly.machine(), compiled_robot(robot)
 
-    def positions(frame: str) -> Array:
-        (found,) = compiled.position(frame)(nominal, passive, machine.placements)
+    def poses(frame: str, drives: Array, passive: Array) -> Array:
+        (found,) = compiled.pose(frame)(drives, passive, machine.placements)
         return found
 
-    ends = {
-        leg.name: (positions(leg.root) @ leg.axis, positions(leg.tip) @ leg.axis)
-        for leg in robot.legs.values()
-    }
     postures = {name: i for i, name in enumerate(session.postures)}
     read: dict[str, set[str]] = {name: set() for name in session.setups}
     for reading in session.readings:
         read[reading.setup].update(p for p in (reading.posture, reading.minus) if p is not None)
     result = {}
     for setup in session.setups.values():
-        plane, from_root = section_plane(robot, setup)
-        leg = robot.legs[setup.leg]
-        if from_root:
-            plane += float(leg.axis @ leg.zero_root)
-        for name in sorted(read[setup.name], key=postures.__getitem__):
-            root, tip = (end[postures[name]] for end in ends[leg.name])
-            result[setup.name, name] = float((plane - root) / (tip - root))
+        names = sorted(read[setup.name], key=postures.__getitem__)
+        rows, frames = [postures[n] for n in names], setup.sensor.frames(robot)
+        contact = setup.sensor.contact(
+            [poses(f, nominal[rows], passive[rows]) for f in frames.in_posture],
+            zero_poses(robot, frames.at_zero),
+            robot,
+        )
+        result[setup.name] = names, contact
     return result

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from orthocal.characters import composed
-from orthocal.documents import Number, PositiveNumber
+from orthocal.documents import Name, Number, PositiveNumber
 from orthocal.robot.parameters import Unit
 
-Name = Annotated[
-    str,
-    Field(min_length=1, max_length=200, pattern=r"^[^,;\s\"]+$"),
-    AfterValidator(composed),
-]
 Vector = Annotated[list[Number], Field(min_length=1, max_length=12)]
 
 LARGEST_READING_MM = 300.0
@@ -80,33 +74,6 @@ class PostureKeys(_Keys):
         return self
 
 
-class SectionKeys(_Keys):
-    """Where along the leg's nominal axis the gauge touches."""
-
-    coordinate_mm: Number | None = None
-    from_root_mm: Number | None = None
-    fraction: Number | None = None
-
-    @model_validator(mode="after")
-    def _one_form(self) -> SectionKeys:
-        forms = ("coordinate_mm", "from_root_mm", "fraction")
-        given = [k for k in forms if getattr(self, k) is not None]
-        if len(given) != 1:
-            found = " and ".join(given) if given else "none"
-            raise ValueError(f"found {found}; expected one of {', '.join(forms)}")
-        return self
-
-
-class SetupKeys(_Keys):
-    """One standing of the gauge."""
-
-    leg: Name
-    direction: str
-    section: SectionKeys
-    postures: Annotated[list[Name], Field(min_length=1)] | None = None
-    """In a plan: the postures it is to be read in; all by default."""
-
-
 class ControllerKeys(_Keys):
     """What the controller already corrects: one number a drive of the kind, in their order."""
 
@@ -140,7 +107,8 @@ class SessionKeys(_Keys):
     gauge: GaugeKeys = GaugeKeys()
     postures: Annotated[dict[Name, PostureKeys], Field(min_length=1, max_length=MOST_POSTURES)]
     controller: ControllerKeys | None = None
-    setups: Annotated[dict[Name, SetupKeys], Field(min_length=1, max_length=MOST_SETUPS)]
+    setups: Annotated[dict[Name, dict[str, Any]], Field(min_length=1, max_length=MOST_SETUPS)]
+    """What each may say is the sensor's own affair; see `orthocal.sensors.registry`."""
     cycles: Annotated[int, Field(ge=1, le=1000)] = 1
     """In a plan: how often the postures are gone through."""
     readings: str | None = None

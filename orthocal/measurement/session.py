@@ -17,10 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.arguments import require_array
 from orthocal.markup import paragraph, table
 from orthocal.robot.model import Robot, read_only
-from orthocal.sensors.leg_indicator import DIRECTIONS, LegIndicator, Section, SectionForm
 from orthocal.sensors.protocol import Sensor
-
-__all__ = ["DIRECTIONS", "Section", "SectionForm"]
 
 Array = NDArray[np.float64]
 
@@ -52,18 +49,10 @@ class Posture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setup:
-    """One standing of the gauge, with one unknown zero."""
+    """One standing of a sensor, with one unknown zero."""
 
     name: str
-    leg: str
-    direction: str
-    """x, y, z, -x, -y or -z of the world: the direction of a growing reading."""
-    section: Section
-
-    @property
-    def sensor(self) -> Sensor:
-        """What stands there."""
-        return LegIndicator(self.leg, self.direction, self.section)
+    sensor: Sensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,18 +128,15 @@ class Session:
         rows = []
         for setup in self.setups.values():
             values = [r.value * 1e3 for r in self.readings if r.setup == setup.name]
-            form, place = setup.section.form, setup.section.value
-            words = form.removesuffix("_mm").replace("_", " ")
-            where = f"{words} {place:g}" if form == "fraction" else f"{words} {place * 1e3:g} mm"
             span = (f"{min(values):+.3f}", f"{max(values):+.3f}") if values else ("", "")
-            rows.append((setup.name, setup.leg, setup.direction, where, str(len(values)), *span))
+            rows.append((setup.name, setup.sensor.describe(), str(len(values)), *span))
         kind = "differences" if self.only_differences else "readings"
         about = f"{len(self.readings)} {kind} in {len(self.postures)} postures"
-        headers = ("setup", "leg", "direction", "section", kind, "least [mm]", "largest [mm]")
+        headers = ("setup", "what is read", kind, "least [mm]", "largest [mm]")
         return (
             paragraph(f"Session on {self.robot.name}: {self.title}")
             + (paragraph(f"Source: {self.source}") if self.source else "")
-            + table(headers, rows, left=4)
+            + table(headers, rows, left=2)
             + paragraph(about)
         )
 
@@ -179,8 +165,3 @@ class Session:
             replace(r, value=float(v)) for r, v in zip(self.readings, given, strict=True)
         )
         return replace(self, readings=changed, sha256="")
-
-
-def section_plane(robot: Robot, setup: Setup, *, where: str = "") -> tuple[float, bool]:
-    """Plane across the leg that the gauge touches in; see `LegIndicator.plane`."""
-    return LegIndicator(setup.leg, setup.direction, setup.section).plane(robot, where=where)

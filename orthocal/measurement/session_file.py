@@ -6,7 +6,7 @@ They are checked against the robot and the nominal machine.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,23 +23,14 @@ from orthocal.measurement.gauge import locate_contacts
 from orthocal.measurement.schema import (
     LARGEST_READING_MM,
     MOST_READINGS,
-    SectionKeys,
     SessionKeys,
-    SetupKeys,
 )
-from orthocal.measurement.session import (
-    DIRECTIONS,
-    Gauge,
-    Posture,
-    Reading,
-    Section,
-    Session,
-    Setup,
-    section_plane,
-)
-from orthocal.measurement.session_robot import build_offsets, check_direction, require_given_zero
+from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
+from orthocal.measurement.session_robot import build_offsets, require_given_zero
 from orthocal.robot.loading import load_robot
 from orthocal.robot.model import Robot, read_only
+from orthocal.sensors.protocol import Sensor, SetupKeys
+from orthocal.sensors.registry import read_setup
 
 Array = NDArray[np.float64]
 
@@ -66,7 +57,7 @@ def _load_session(file: Path, content: bytes, keys: SessionKeys) -> Session:
     if keys.readings is None:
         raise SessionError("is missing; expected the name of a CSV file", where=f"{file}: readings")
     require_plain_name(file, error=SessionError)
-    plan = _build_plan(file, keys)
+    plan = _build_plan(file, keys, _read_setups(file, keys))
     if not keys.readings.strip() or "\0" in keys.readings:
         raise SessionError(
             f"found {keys.readings!r}; expected the name of a CSV file", where=f"{file}: readings"
@@ -93,16 +84,17 @@ def load_plan(path: str | Path) -> Session:
     file, content, keys = _read_keys(Path(path))
     if keys.readings is not None:
         return _load_session(file, content, keys)
-    count = keys.cycles * sum(len(s.postures or keys.postures) for s in keys.setups.values())
+    read = _read_setups(file, keys)
+    count = keys.cycles * sum(len(s.postures or keys.postures) for s, _ in read.values())
     if count > MOST_READINGS:
         raise SessionError(
             f"plans {count} readings, {keys.cycles} times those of all setups; expected at most "
             f"{MOST_READINGS}",
             where=f"{file}: cycles",
         )
-    plan = _build_plan(file, keys)
+    plan = _build_plan(file, keys, read)
     readings = []
-    for name, setup in keys.setups.items():
+    for name, (setup, _) in read.items():
         readings += [
             Reading(name, posture, None, cycle, 0.0, None)
             for cycle in range(1, keys.cycles + 1)
@@ -114,20 +106,18 @@ def load_plan(path: str | Path) -> Session:
 
 
 def check_contacts(session: Session) -> None:
-    """Check, on the nominal machine, that the gauge touches the leg in every posture it is read in.
+    """Check, on the nominal machine, that a sensor touches in every posture it is read in.
 
     Raises:
         SessionError: Naming the setup and the posture.
     """
-    fractions = locate_contacts(session)
-    for (setup, posture), fraction in fractions.items():
-        if not 0.0 <= fraction <= 1.0:
-            length = session.robot.legs[session.setups[setup].leg].length * 1e3
-            raise SessionError(
-                f"in posture '{posture}' the gauge would touch at {fraction * length:.1f} mm from "
-                f"the root; the leg reaches from 0 to {length:.1f} mm",
-                where=_where(session.path, f"setups.{setup}.section"),
-            )
+    for setup, (postures, contact) in locate_contacts(session).items():
+        for posture, problem in zip(postures, contact.problems, strict=True):
+            if problem:
+                raise SessionError(
+                    f"in posture '{posture}' {problem}",
+                    where=_where(session.path, f"setups.{setup}.{contact.key}"),
+                )
 
 
 def _where(path: Path | None, key: str) -> str:
@@ -143,7 +133,18 @@ def _read_keys(path: Path) -> tuple[Path, bytes, SessionKeys]:
     return file, content, validate(SessionKeys, data, where=str(file), error=SessionError)
 
 
-def _build_plan(file: Path, keys: SessionKeys) -> Session:
+_Setups = Mapping[str, tuple[SetupKeys, Sensor]]
+
+
+def _read_setups(file: Path, keys: SessionKeys) -> _Setups:
+    """What the file says of each setup, and the sensor that stands there."""
+    return {
+        name: read_setup(data, where=str(file), under=f"setups.{name}", error=SessionError)
+        for name, data in keys.setups.items()
+    }
+
+
+def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
     """Everything of a session but its readings."""
     try:
         robot = load_robot(keys.robot, beside=file.parent)
@@ -151,15 +152,13 @@ def _build_plan(file: Path, keys: SessionKeys) -> Session:
         if e.where is None:
             raise SessionError(e.problem, where=f"{file}: robot") from None
         raise
-    if not robot.legs:
-        raise SessionError(
-            f"'{robot.name}' has no legs for a gauge to touch; add orthocal.legs to {robot.yaml}",
-            where=f"{file}: robot",
-        )
     require_given_zero(robot, f"{file}: robot")
     offsets = build_offsets(keys.controller, robot, f"{file}: controller")
-    setups = {n: _build_setup(n, s, robot, f"{file}: setups.{n}") for n, s in keys.setups.items()}
-    _check_planned_postures(file, keys)
+    setups = {}
+    for name, (_, sensor) in read.items():
+        sensor.require_fit(robot, where=f"{file}: setups.{name}")
+        setups[name] = Setup(name, sensor)
+    _check_planned_postures(file, keys, read)
     g = keys.gauge
     return Session(
         robot=robot,
@@ -181,8 +180,8 @@ def _build_plan(file: Path, keys: SessionKeys) -> Session:
     )
 
 
-def _check_planned_postures(file: Path, keys: SessionKeys) -> None:
-    for name, setup in keys.setups.items():
+def _check_planned_postures(file: Path, keys: SessionKeys, read: _Setups) -> None:
+    for name, (setup, _) in read.items():
         where = f"{file}: setups.{name}.postures"
         seen: set[str] = set()
         for posture in setup.postures or ():
@@ -194,36 +193,6 @@ def _check_planned_postures(file: Path, keys: SessionKeys) -> None:
             if posture in seen:
                 raise SessionError(f"'{posture}' stands twice", where=where)
             seen.add(posture)
-
-
-def _build_setup(name: str, keys: SetupKeys, robot: Robot, where: str) -> Setup:
-    if keys.leg not in robot.legs:
-        raise SessionError(
-            f"'{keys.leg}' is not a leg of {robot.name}; legs: {', '.join(robot.legs)}",
-            where=f"{where}.leg",
-        )
-    if keys.direction not in DIRECTIONS:
-        raise SessionError(
-            f"found '{keys.direction}'; expected one of {', '.join(DIRECTIONS)}",
-            where=f"{where}.direction",
-        )
-    check_direction(keys.direction, robot.legs[keys.leg], where=f"{where}.direction")
-    setup = Setup(name, keys.leg, keys.direction, _build_section(keys.section))
-    if setup.section.form == "fraction" and not 0.0 <= setup.section.value <= 1.0:
-        raise SessionError(
-            f"found {setup.section.value:g}; expected 0 (root) to 1 (tip)",
-            where=f"{where}.section.fraction",
-        )
-    section_plane(robot, setup, where=f"{where}.section")
-    return setup
-
-
-def _build_section(keys: SectionKeys) -> Section:
-    if keys.coordinate_mm is not None:
-        return Section("coordinate_mm", keys.coordinate_mm * 1e-3)
-    if keys.from_root_mm is not None:
-        return Section("from_root_mm", keys.from_root_mm * 1e-3)
-    return Section("fraction", keys.fraction or 0.0)
 
 
 def _check_count(values: Sequence[float], robot: Robot, where: str) -> None:

@@ -14,6 +14,8 @@ import yaml
 from orthocal.files import write_files
 from orthocal.measurement.session import Session
 from orthocal.robot.loading import packaged_robots
+from orthocal.sensors.registry import write_sensor
+from orthocal.units import tidy, to_mm
 
 COLUMNS = ("setup", "posture", "minus", "cycle", "reading_mm")
 """Columns of a readings.csv; `minus` and `cycle` may be absent."""
@@ -37,24 +39,13 @@ def session_document(session: Session, *, readings: str = "readings.csv") -> dic
         document["gauge"] = entries
     document["postures"] = {
         p.name: {
-            p.form: [_tidy(np.rad2deg(v)) if p.form == "joints_deg" else to_mm(v) for v in p.values]
+            p.form: [tidy(np.rad2deg(v)) if p.form == "joints_deg" else to_mm(v) for v in p.values]
         }
         for p in session.postures.values()
     }
     if session.controller_offsets is not None:
         document["controller"] = _offsets_document(session)
-    document["setups"] = {
-        s.name: {
-            "leg": s.leg,
-            "direction": s.direction,
-            "section": {
-                s.section.form: s.section.value
-                if s.section.form == "fraction"
-                else to_mm(s.section.value)
-            },
-        }
-        for s in session.setups.values()
-    }
+    document["setups"] = {s.name: write_sensor(s.sensor) for s in session.setups.values()}
     document["readings"] = readings
     return document
 
@@ -64,7 +55,7 @@ def _offsets_document(session: Session) -> dict[str, list[float]]:
     document: dict[str, list[float]] = {}
     for drive, offset in zip(session.robot.drives, session.active_offsets, strict=True):
         key = "offsets_mm" if drive.unit == "m" else "offsets_mrad"
-        document.setdefault(key, []).append(_tidy(float(offset) * 1e3))
+        document.setdefault(key, []).append(tidy(float(offset) * 1e3))
     return document
 
 
@@ -116,15 +107,6 @@ def write_session(
     files = {"session.yaml": text, "readings.csv": table.getvalue(), **(extra or {})}
     write_files(folder, files)
     return folder / "session.yaml"
-
-
-def to_mm(value: float) -> float:
-    """Metres as mm, without the rounding that the factor brings."""
-    return _tidy(value * 1e3)
-
-
-def _tidy(value: float) -> float:
-    return float(f"{value:.12g}")
 
 
 def _trim(number: str) -> str:

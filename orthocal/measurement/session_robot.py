@@ -1,4 +1,4 @@
-"""What a session says of its robot, held against it: zero, controller, directions of gauges."""
+"""What a session says of its robot, held against it: zero and controller."""
 
 from __future__ import annotations
 
@@ -7,14 +7,9 @@ from numpy.typing import NDArray
 
 from orthocal.errors import SessionError
 from orthocal.measurement.schema import OFFSET_KEYS, ControllerKeys
-from orthocal.measurement.session import DIRECTIONS
-from orthocal.robot.model import Leg, Robot, read_only
+from orthocal.robot.model import Robot, read_only
 
 Array = NDArray[np.float64]
-
-LARGEST_OBLIQUITY_DEG = 1.0
-"""How far a measured direction may be from square to the leg; the nominal leg, in the mechanical
-zero."""
 
 
 def require_given_zero(robot: Robot, where: str) -> None:
@@ -84,45 +79,3 @@ def build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Arra
                 f"states no offset of {drive.name}; expected {expected}, too", where=where
             )
     return read_only(offsets)
-
-
-def _crooked(leg: Leg) -> str:
-    """That a leg lies along no axis, which may not be meant."""
-    along = ", ".join(f"{v:.3f}" for v in leg.axis)
-    return (
-        f". In the mechanical zero the leg lies along ({along}): where it should lie along an axis "
-        "of the world, check lengths and zeros in the robot's files"
-    )
-
-
-def check_direction(direction: str, leg: Leg, *, where: str) -> None:
-    """Refuse a gauge that does not measure square to the leg, as its model takes for granted.
-
-    An oblique plunger also sees how far the leg moves along itself.
-
-    Args:
-        direction: One of `DIRECTIONS`.
-        leg: The leg it touches.
-        where: File and key, for messages.
-
-    Raises:
-        SessionError: With the angle to the leg, and the directions that are square to it.
-    """
-    angles = {
-        name: float(np.degrees(np.arccos(np.clip(np.dot(axis, leg.axis), -1.0, 1.0))))
-        for name, axis in DIRECTIONS.items()
-    }
-    if abs(angles[direction] - 90.0) <= LARGEST_OBLIQUITY_DEG:
-        return
-    square = [n for n, a in angles.items() if abs(a - 90.0) <= LARGEST_OBLIQUITY_DEG]
-    choice = f"; square to it: {', '.join(square)}" if square else ""
-    found = min(angles[direction], 180.0 - angles[direction])
-    if found < LARGEST_OBLIQUITY_DEG:
-        problem = f"'{direction}' is along leg {leg.name}; a gauge measures across it{choice}"
-    else:
-        problem = (
-            f"'{direction}' is at {found:.1f}° to leg {leg.name} in the mechanical zero; expected "
-            f"a direction square to the leg, to within {LARGEST_OBLIQUITY_DEG:g}°{choice}"
-            + ("" if square else _crooked(leg))
-        )
-    raise SessionError(problem, where=where)

@@ -18,8 +18,8 @@ from orthocal.documents import Number, parse_number, read_yaml, validate
 from orthocal.errors import ParameterError, SessionError
 from orthocal.measurement.gauge import build_observations, predict_entries
 from orthocal.measurement.session import Session
-from orthocal.measurement.session_output import to_mm
 from orthocal.robot.model import Robot
+from orthocal.units import to_mm
 
 Array = NDArray[np.float64]
 

@@ -195,3 +195,15 @@ def short_name(text: str, longest: int = LONGEST_NAME) -> str:
     shown = printable(text)
     half = longest // 2
     return shown if len(shown) <= longest else f"{shown[:half]}…{shown[-half + 1 :]}"
+
+
+def list_places(places: Iterable[tuple[str, str]]) -> str:
+    """Where sensors stand, such as "legs x, y, z" or "leg x and tool"."""
+    named: dict[str, list[str]] = {}
+    for kind, name in sorted(set(places)):
+        named.setdefault(kind, []).append(name)
+    words = [
+        f"{kind}{'' if len(names) == 1 else 's'} {', '.join(names)}".strip()
+        for kind, names in named.items()
+    ]
+    return " and ".join(words)

@@ -12,7 +12,16 @@ from orthocal.identification.calibration import Calibration
 from orthocal.identification.records import ControllerEntry, ParameterEstimate, ResidualRow
 from orthocal.output.accuracy import describe_promise
 from orthocal.output.explanation import advise
-from orthocal.output.layout import add_row, choose_rows, counted, mm, plain, signed, table_of
+from orthocal.output.layout import (
+    add_row,
+    choose_rows,
+    counted,
+    list_places,
+    mm,
+    plain,
+    signed,
+    table_of,
+)
 from orthocal.study.accuracy import assess_tool
 from orthocal.study.entering import find_entries
 from orthocal.study.plausibility import describe_machine
@@ -47,7 +56,7 @@ def render_heading(calibration: Calibration, *, effort: bool = True) -> Renderab
     read = {r.setup for r in calibration.residuals}
     setups = [s for s in calibration.setups if s.name in read]
     idle = [s.name for s in calibration.setups if s.name not in read]
-    legs = sorted({s.leg for s in setups})
+    places = list_places(s.sensor.place for s in setups)
     lines = [
         Text(
             f"Calibration of {calibration.robot_record.name}, model '{calibration.model}'",
@@ -64,8 +73,7 @@ def render_heading(calibration: Calibration, *, effort: bool = True) -> Renderab
     lines.append(
         Text(
             f"Measured: {counted(len(calibration.residuals), kind)} in "
-            f"{counted(len(used), 'posture')}, {counted(len(setups), 'setup')} on "
-            f"{'leg' if len(legs) == 1 else 'legs'} {', '.join(legs)}"
+            f"{counted(len(used), 'posture')}, {counted(len(setups), 'setup')} on {places}"
             + (f"; no reading of {', '.join(idle)}" if idle else "")
         )
     )

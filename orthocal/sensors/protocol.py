@@ -1,4 +1,4 @@
-"""What every sensor says of itself, and nothing else is known of any.
+"""What every kind of sensor says of itself, and nothing else is known of any.
 
 A sensor looks at frames of the machine, in the posture and (where they move with drives alone) in
 the zero posture, and shows a number: an expression of their poses, of constants of its setup and of
@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Any, ClassVar, Protocol, Self
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
+from orthocal.documents import Name
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import Unit
@@ -59,22 +61,63 @@ class Frames:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """Where and how a sensor touches, for scenes and checks."""
+    """Where and how a sensor touches, in K postures: for scenes and checks."""
 
-    point: Array
-    """In the world, shape (3,), [m]."""
+    points: Array
+    """In the world, shape (K, 3), [m]."""
     direction: Array
     """Of a growing reading, shape (3,)."""
-    along: float
-    """Where on what it touches: 0 where that begins, 1 where it ends."""
+    along: Array
+    """Way on what it touches on which there is room beside it, shape (3,)."""
+    problems: Sequence[str]
+    """Why it cannot touch there, in words; empty where it can. K of them."""
+    key: str
+    """Key of the setup that says where it touches, for messages."""
+
+
+class SetupKeys(BaseModel):
+    """What a session.yaml may say of a setup, whatever stands there."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    sensor: str = "leg"
+    """The kind of sensor."""
+    gauge: Name | None = None
+    """Which of the session's gauges; needed where there are several."""
+    postures: Annotated[list[Name], Field(min_length=1)] | None = None
+    """In a plan: the postures it is to be read in; all by default."""
 
 
 class Sensor(Protocol):
     """One standing of a sensor: all that a setup says of it."""
 
+    kind: ClassVar[str]
+    """Name of this kind of sensor: those of a kind and the same frames share one expression."""
+    keys: ClassVar[type[SetupKeys]]
+    """What a session.yaml says of a setup with it."""
+    ideal: ClassVar[str]
+    """What the place would be if there were no deviation, such as parallel."""
+
+    @classmethod
+    def from_keys(cls, keys: Any) -> Self:  # noqa: ANN401 - an instance of `keys`
+        """As a session.yaml describes it."""
+
+    def to_keys(self) -> dict[str, Any]:
+        """As a session.yaml describes it, without what every setup may say."""
+
+    def require_fit(self, robot: Robot, *, where: str) -> None:
+        """Refuse what the robot does not have.
+
+        Raises:
+            SessionError: Naming the key; `where` is the setup's file and key.
+        """
+
     @property
-    def kind(self) -> str:
-        """Name of this kind of sensor: those of a kind and the same frames share one expression."""
+    def place(self) -> tuple[str, str]:
+        """What of the machine it stands at, as kind and name, such as leg and x."""
+
+    def describe(self) -> str:
+        """What it reads, in a few words: for tables."""
 
     def frames(self, robot: Robot) -> Frames:
         """What it looks at."""
@@ -89,5 +132,11 @@ class Sensor(Protocol):
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """What it shows, its zero at 0, [m]."""
 
-    def describe(self) -> str:
-        """What it reads, in a few words: for tables."""
+    def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
+        """Where it touches.
+
+        Args:
+            frames: Poses of its frames in K postures, shape (K, 4, 4) each.
+            at_zero: Poses of its frames in the zero posture, shape (4, 4) each.
+            robot: The robot.
+        """

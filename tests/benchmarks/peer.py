@@ -18,9 +18,10 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
-from orthocal.measurement.session import DIRECTIONS, Session, section_plane
+from orthocal.measurement.session import Session
 from orthocal.robot.closing import CLOSED
 from orthocal.robot.model import Robot
+from orthocal.sensors.leg_indicator import DIRECTIONS
 
 Array = NDArray[np.float64]
 
@@ -117,9 +118,10 @@ class PeerProblem:
         legs = {name: k for k, name in enumerate(robot.legs)}
         self._posture = np.array([postures[r.posture] for r in session.readings])
         self._setup = np.array([setups[r.setup] for r in session.readings])
-        self._leg = np.array([legs[s.leg] for s in session.setups.values()])[self._setup]
-        self._direction = np.array([DIRECTIONS[s.direction] for s in session.setups.values()])
-        planes = [section_plane(robot, s) for s in session.setups.values()]
+        sensors = [s.sensor for s in session.setups.values()]
+        self._leg = np.array([legs[s.leg] for s in sensors])[self._setup]
+        self._direction = np.array([DIRECTIONS[s.direction] for s in sensors])
+        planes = [s.plane(robot) for s in sensors]
         self._plane = np.array([plane for plane, _ in planes])
         self._from_root = np.array([from_root for _, from_root in planes])
         self._axis = np.array([leg.axis for leg in robot.legs.values()])

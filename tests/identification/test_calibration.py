@@ -46,7 +46,7 @@ def test_the_file_gives_the_same_object_back(root, tmp_path, example, model):
 
 def test_the_file_has_what_was_promised(result):
     document = json.loads(result.to_json())
-    assert document["schema"] == "orthocal/calibration/2"
+    assert document["schema"] == "orthocal/calibration/3"
     assert {
         "robot",
         "session",

@@ -12,7 +12,7 @@ from tolerances import KINEMATICS, PRINTED, THREE_DECIMALS_MM
 
 from orthocal import load_plan, load_session
 from orthocal.measurement.gauge import build_observations, locate_contacts, predict_entries
-from orthocal.measurement.session import Section
+from orthocal.sensors.leg_indicator import Section
 
 OFFSETS = ("x_slide.offset", "y_slide.offset", "z_slide.offset")
 
@@ -31,7 +31,14 @@ def test_readings_equal_those_of_a_pinocchio_machine_with_all_errors(root):
         Section("coordinate_mm", 0.15),
     ]
     setups = {
-        name: replace(s, section=sections[i % 3], direction=("-" if i % 2 else "") + s.direction)
+        name: replace(
+            s,
+            sensor=replace(
+                s.sensor,
+                section=sections[i % 3],
+                direction=("-" if i % 2 else "") + s.sensor.direction,
+            ),
+        )
         for i, (name, s) in enumerate(plan.setups.items())
     }
     plan = replace(plan, setups=setups, controller_offsets=np.array([1e-3, 0.0, -2e-3]))

@@ -10,7 +10,6 @@ from tolerances import CLOSED_FORM, KINEMATICS
 
 from orthocal import load_plan, load_session, write_session
 from orthocal.errors import SessionError
-from orthocal.measurement.session import section_plane
 
 HEAD = """robot: orthoglide
 postures:
@@ -67,7 +66,7 @@ def test_offsets_in_the_controller_are_taken_off_the_encoders_coordinates(tmp_pa
 def test_sections_become_planes_along_the_leg(tmp_path, section, expected):
     setup = f"{{leg: x, direction: -y, section: {section}}}"
     session = load_session(write(tmp_path / "s", setup))
-    plane, from_root = section_plane(session.robot, session.setups["yx"])
+    plane, from_root = session.setups["yx"].sensor.plane(session.robot)
     assert abs(plane - expected[0]) < KINEMATICS
     assert from_root is expected[1]
 

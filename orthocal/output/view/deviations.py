@@ -13,10 +13,13 @@ from orthocal.errors import ParameterError
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.uncertainty import project_out_zeros
 from orthocal.measurement.gauge import build_observations, predict_entries
-from orthocal.measurement.session import Section, Session, Setup
+from orthocal.measurement.session import Session, Setup
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
+
+Place = tuple[str, str]
+"""What of the machine a sensor stands at, as kind and name."""
 
 FEW_NAMES = 12
 """Postures up to which a message names all."""
@@ -63,6 +66,10 @@ class Measurement:
     planned: bool
     """Whether it has not been made yet: all readings are 0."""
 
+    def place(self, row: Deviation) -> Place:
+        """What of the machine a row is of."""
+        return self.setups[row.setup].sensor.place
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stop:
@@ -72,8 +79,8 @@ class Stop:
     drives: Array
     rows: tuple[Deviation, ...]
     """What the gauges show there: at most one a setup."""
-    leg: str | None = None
-    """Leg that is being measured; None where it is all of them."""
+    place: Place | None = None
+    """What is being measured, such as leg x; None where it is all of them."""
     taken_off: tuple[str, ...] = ()
     """Postures from whose readings those of this one are taken off."""
 
@@ -142,10 +149,7 @@ def measurement_of_calibration(calibration: Calibration) -> Measurement:
     robot, offsets = calibration.robot, calibration.session.controller_offsets
     return Measurement(
         robot=robot,
-        setups={
-            s.name: Setup(s.name, s.leg, s.direction, Section(s.section_form, s.section_value))
-            for s in calibration.setups
-        },
+        setups={s.name: Setup(s.name, s.sensor) for s in calibration.setups},
         drives={p.name: np.array(p.drives) for p in calibration.postures},
         offsets=np.zeros(len(robot.drives)) if offsets is None else np.array(offsets),
         rows=_average(
@@ -170,7 +174,7 @@ def worst_of_setups(rows: Sequence[Deviation]) -> tuple[Deviation, ...]:
 
 
 def plan_stops(measured: Measurement, posture: str | None) -> tuple[list[Stop], int]:
-    """Where the machine goes: an overview at the zero, then every leg through its postures.
+    """Where the machine goes: an overview at the zero, then all that is measured on each leg.
 
     Args:
         measured: The measurement.
@@ -193,21 +197,23 @@ def plan_stops(measured: Measurement, posture: str | None) -> tuple[list[Stop], 
         return [_stop_at(measured, posture, measured.rows, None)], 0
     overview = Stop("overview", zero, worst_of_setups(measured.rows))
     path: list[Stop] = []
-    for leg in dict.fromkeys(measured.setups[r.setup].leg for r in measured.rows):
-        rows = [r for r in measured.rows if measured.setups[r.setup].leg == leg]
+    for place in dict.fromkeys(measured.place(r) for r in measured.rows):
+        rows = [r for r in measured.rows if measured.place(r) == place]
         names = dict.fromkeys(n for r in rows for n in (r.posture, r.minus) if n is not None)
-        stops = [_stop_at(measured, name, rows, leg) for name in names]
+        stops = [_stop_at(measured, name, rows, place) for name in names]
         if not np.allclose(stops[0].drives, zero, rtol=0.0, atol=1e-9):
-            path.append(Stop("zero", zero, (), leg))
+            path.append(Stop("zero", zero, (), place))
         path += stops
     chosen = np.unique(np.linspace(0, len(path) - 1, min(MOST_STOPS, len(path))).round())
     return [overview, *(path[int(i)] for i in chosen), overview], len(path) - len(chosen)
 
 
-def _stop_at(measured: Measurement, name: str, rows: Sequence[Deviation], leg: str | None) -> Stop:
+def _stop_at(
+    measured: Measurement, name: str, rows: Sequence[Deviation], place: Place | None
+) -> Stop:
     here = worst_of_setups([r for r in rows if r.posture == name])
     taken_off = dict.fromkeys(r.posture for r in rows if r.minus == name)
-    return Stop(name, measured.drives[name], here, leg, tuple(taken_off))
+    return Stop(name, measured.drives[name], here, place, tuple(taken_off))
 
 
 def _name_some(name: str, known: Iterable[str]) -> str:

@@ -9,9 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.measurement.session import DIRECTIONS, Setup, section_plane
-from orthocal.output.layout import counted, short_name, typeset
-from orthocal.output.view.deviations import Deviation, Measurement, Stop, worst_of_setups
+from orthocal.kinematics.compiled import zero_poses
+from orthocal.measurement.session import Setup
+from orthocal.output.layout import counted, list_places, short_name, typeset
+from orthocal.output.view.deviations import (
+    Deviation,
+    Measurement,
+    Place,
+    Stop,
+    worst_of_setups,
+)
 from orthocal.output.view.motion import Film, Timeline
 from orthocal.output.view.scene import Label, LegendEntry, Scene, Step, node_name, round_scale
 from orthocal.output.view.shapes import (
@@ -24,6 +31,7 @@ from orthocal.output.view.shapes import (
     to_triple,
 )
 from orthocal.output.view.stage import VIEW, Stage
+from orthocal.sensors.protocol import Contact
 
 Array = NDArray[np.float64]
 
@@ -102,12 +110,12 @@ def draw_readings(
         scene.arrow_scale = round_scale(LONGEST_ARROW * stage.size / longest)
     dial = DIAL * stage.size * min(1.0, math.sqrt(MANY_GAUGES / max(len(used), 1)))
     overview = len(stops) > 1
-    named = _named_setups(used, measured)
+    found = {s.name: _find_contact(stage, s, poses) for s in used}
+    named = _named_setups(used, measured, found)
     contacts: list[Array] = []
     for setup in used:
         rows = [next((r for r in s.rows if r.setup == setup.name), None) for s in stops]
-        contact = _find_contact(stage, setup, poses)
-        direction = np.array(DIRECTIONS[setup.direction])
+        contact, direction = found[setup.name].points[0], found[setup.name].direction
         gauge = f"{GAUGES}/{node_name(setup.name)}"
         draw_gauge(scene, gauge, contact, direction, _facing(direction), dial)
         tips = [contact for _ in rows]
@@ -116,7 +124,7 @@ def draw_readings(
         contacts.append(contact)
         for kind in kinds:
             away = kind.side * (FIRST_ARROW + NEXT_ARROW * beside) * dial
-            foot = contact + away * stage.robot.legs[setup.leg].axis
+            foot = contact + away * found[setup.name].along
             lengths = [kind.length(row) * scene.arrow_scale for row in rows]
             path, width = f"{kind.node}/{node_name(setup.name)}", arrow_width(dial)
             draw_arrow(
@@ -133,7 +141,7 @@ def draw_readings(
             if kind.node == BEFORE:
                 tips = [foot + v * direction for v in lengths]
         # while another leg is measured its gauge is not there: the leg moves sideways
-        there = [s.leg is None or s.leg == setup.leg for s in stops]
+        there = [s.place is None or s.place == setup.sensor.place for s in stops]
         _film_presence(film, gauge, timeline, there)
         silent = overview and setup.name not in named
         texts = [
@@ -171,28 +179,26 @@ def _find_kinds(measured: Measurement) -> tuple[_Kind, ...]:
     return (before, after) if any(r.after is not None for r in measured.rows) else (before,)
 
 
-def _named_setups(used: Sequence[Setup], measured: Measurement) -> set[str]:
-    """Setups that the overview names: of many the worst of each leg and direction."""
+def _named_setups(
+    used: Sequence[Setup], measured: Measurement, contacts: Mapping[str, Contact]
+) -> set[str]:
+    """Setups that the overview names: of many the worst of each place and direction."""
     if len(used) <= MOST_LABELS:
         return {s.name for s in used}
-    worst: dict[tuple[str, str], Deviation] = {}
+    worst: dict[tuple[Place, int], Deviation] = {}
     for row in worst_of_setups(measured.rows):
-        setup = measured.setups[row.setup]
-        key = (setup.leg, setup.direction.strip("-"))
+        axis = int(np.abs(contacts[row.setup].direction).argmax())
+        key = (measured.place(row), axis)
         if key not in worst or abs(row.before) > abs(worst[key].before):
             worst[key] = row
     return {row.setup for row in worst.values()}
 
 
-def _find_contact(stage: Stage, setup: Setup, poses: Mapping[str, Array]) -> Array:
-    """Where the gauge touches the leg's line as it is drawn in the first frame, shape (3,), [m]."""
-    leg = stage.robot.legs[setup.leg]
-    plane, from_root = section_plane(stage.robot, setup)
-    if from_root:
-        plane = plane + float(leg.axis @ leg.zero_root)
-    root, tip = (poses[frame][0][:3, 3] for frame in (leg.root, leg.tip))
-    along = (plane - leg.axis @ root) / (leg.axis @ (tip - root))
-    return np.asarray(root + along * (tip - root))
+def _find_contact(stage: Stage, setup: Setup, poses: Mapping[str, Array]) -> Contact:
+    """Where a sensor touches what is drawn in the first frame."""
+    frames = setup.sensor.frames(stage.robot)
+    at_zero = zero_poses(stage.robot, frames.at_zero)
+    return setup.sensor.contact([poses[f][:1] for f in frames.in_posture], at_zero, stage.robot)
 
 
 def _facing(direction: Array) -> Array:
@@ -239,12 +245,13 @@ def _overview(measured: Measurement, shown: bool) -> str:
 
 def _caption(stop: Stop, measured: Measurement) -> str:
     if not stop.rows and stop.taken_off:
-        return f"{stop.name}, leg {stop.leg}: taken off what is read at {', '.join(stop.taken_off)}"
+        place = "" if stop.place is None else f", {list_places([stop.place])}"
+        return f"{stop.name}{place}: taken off what is read at {', '.join(stop.taken_off)}"
     if not stop.rows:
         return f"{stop.name}: nothing is read here"
-    legs = ", ".join(sorted({measured.setups[r.setup].leg for r in stop.rows}))
+    places = list_places(measured.place(r) for r in stop.rows)
     readings = "; ".join(_label(r, measured).split("\n")[0] for r in stop.rows)
-    return f"{stop.name}, leg {legs}: {readings}"
+    return f"{stop.name}, {places}: {readings}"
 
 
 def _explain(scene: Scene, kinds: int, shown: bool) -> None:
@@ -268,11 +275,12 @@ def write_headline(measured: Measurement) -> str:
         readings = counted(measured.count, "reading")
         return f"A plan: {readings} in {counted(postures, 'posture')}, none taken yet."
     if abs(worst.before) < NOTHING:
-        return "All legs are parallel to their axes: no gauge has seen anything."
-    leg = measured.setups[worst.setup].leg
+        return "No gauge has seen any deviation."
+    place = list_places([measured.place(worst)])
     mean = f", mean of {worst.cycles} cycles" if worst.cycles > 1 else ""
     text = (
-        f"Leg {leg} is furthest from parallel: {_mm(worst.before)} mm at gauge "
+        f"{place[0].upper()}{place[1:]} is furthest from "
+        f"{measured.setups[worst.setup].sensor.ideal}: {_mm(worst.before)} mm at gauge "
         f"{worst.setup}, {worst.where}{mean}."
     )
     if worst.after is None or measured.largest_after is None:

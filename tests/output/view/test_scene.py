@@ -15,7 +15,6 @@ from tolerances import KINEMATICS
 from orthocal import calibrate, draw_scene, load_robot, load_session
 from orthocal.errors import ParameterError
 from orthocal.identification.calibration_file import load_calibration
-from orthocal.measurement.session import DIRECTIONS
 from orthocal.measurement.session_file import load_plan
 from orthocal.measurement.synthetic import simulate_session
 from orthocal.output.view import drawing, readings, stage, tool_errors
@@ -23,6 +22,7 @@ from orthocal.output.view.deviations import measure_deviations
 from orthocal.output.view.motion import FRAMES_A_SECOND
 from orthocal.output.view.scene import round_scale
 from orthocal.output.view.shapes import arrow_parts, head_length
+from orthocal.sensors.leg_indicator import DIRECTIONS
 from orthocal.study.accuracy import assess_tool, find_excess, measure_uncertainty
 from orthocal.study.entering import find_entries
 from orthocal.study.tool import error_covariance
@@ -215,7 +215,7 @@ def test_arrows_are_as_long_as_the_residuals(scene, calibration):
             assert arrow_length(scene, path) == pytest.approx(value * scene.arrow_scale, abs=1e-9)
             setup = next(s for s in calibration.setups if s.name == row.setup)
             along = scene.pose(path)[:3, 2]
-            assert along == pytest.approx(np.array(DIRECTIONS[setup.direction]))
+            assert along == pytest.approx(np.array(DIRECTIONS[setup.sensor.direction]))
     arrows = [e.text for e in scene.legend if e.nodes[0] in (readings.BEFORE, readings.AFTER)]
     assert len(arrows) == 2
     assert all(text.endswith(f"(× {scene.arrow_scale:g})") for text in arrows)
@@ -234,15 +234,15 @@ def test_arrow_that_is_shorter_than_its_head_is_a_smaller_head():
 def test_gauges_touch_the_leg_at_their_section(scene, calibration):
     for setup in calibration.setups:
         tip = scene.pose(f"{readings.GAUGES}/{setup.name}")[:3, 3]
-        line = scene.pose(f"{stage.LINES}/leg {setup.leg}")
+        line = scene.pose(f"{stage.LINES}/leg {setup.sensor.leg}")
         along = line[:3, 2] / np.linalg.norm(line[:3, 2])
         off = tip - line[:3, 3]
         assert np.linalg.norm(off - (off @ along) * along) < KINEMATICS
-        leg = calibration.robot.legs[setup.leg]
-        plane = leg.axis @ leg.zero_root + setup.section_value * leg.length
+        leg = calibration.robot.legs[setup.sensor.leg]
+        plane = leg.axis @ leg.zero_root + setup.sensor.section.value * leg.length
         assert leg.axis @ tip == pytest.approx(plane, abs=KINEMATICS)
         stem = scene.pose(f"{readings.GAUGES}/{setup.name}")[:3, 2]
-        assert stem == pytest.approx(np.array(DIRECTIONS[setup.direction]))
+        assert stem == pytest.approx(np.array(DIRECTIONS[setup.sensor.direction]))
 
 
 def test_labels_say_setup_millimetres_and_postures(scene, calibration):

@@ -1,0 +1,56 @@
+"""The kinds of sensor that a session may name: each is known from here on by its protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from orthocal.documents import validate
+from orthocal.errors import OrthocalError
+from orthocal.sensors.leg_indicator import LegIndicator
+from orthocal.sensors.protocol import Sensor, SetupKeys
+
+DEFAULT = LegIndicator.kind
+
+_KINDS: dict[str, type[Sensor]] = {LegIndicator.kind: LegIndicator}
+
+
+def register_sensor(kind: type[Sensor]) -> None:
+    """Make a kind of sensor known by its name; one that is known already is replaced."""
+    _KINDS[kind.kind] = kind
+
+
+def sensor_kinds() -> tuple[str, ...]:
+    """Names of the kinds that are known."""
+    return tuple(_KINDS)
+
+
+def read_setup(
+    data: Mapping[str, Any], *, where: str, under: str, error: type[OrthocalError]
+) -> tuple[SetupKeys, Sensor]:
+    """What a document says of a setup, and the sensor that stands there.
+
+    Args:
+        data: Keys and values of the setup.
+        where: File, for messages.
+        under: Key of the setup in it.
+        error: Kind of error.
+
+    Raises:
+        OrthocalError: Of that kind, naming the key that does not fit.
+    """
+    name = data.get("sensor", DEFAULT)
+    if not isinstance(name, str) or name not in _KINDS:
+        raise error(
+            f"found {name!r}; expected one of {', '.join(_KINDS)}",
+            where=f"{where}: {under}.sensor",
+        )
+    kind = _KINDS[name]
+    keys = validate(kind.keys, data, where=where, error=error, under=under)
+    return keys, kind.from_keys(keys)
+
+
+def write_sensor(sensor: Sensor) -> dict[str, Any]:
+    """A sensor as a document describes it."""
+    kind = {} if sensor.kind == DEFAULT else {"sensor": sensor.kind}
+    return {**kind, **sensor.to_keys()}
