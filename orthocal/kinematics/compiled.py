@@ -144,6 +144,14 @@ class CompiledRobot:
         return BatchFunction(self.expressions, shared=["placements"], matrices=outputs)
 
     @cached_property
+    def sparse_slopes(self) -> BatchFunction:
+        """The same, of ∂g by twists the nonzeros alone."""
+        first, second, twists = (self.expressions.name_out(i) for i in range(1, 4))
+        return BatchFunction(
+            self.expressions, shared=["placements"], matrices=[first, second], sparse=[twists]
+        )
+
+    @cached_property
     def expressions(self) -> ca.Function:
         """The same with sparse rows, to be put into other expressions."""
         joints, twists = self.closure_slopes
