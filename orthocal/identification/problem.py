@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import RobotError
+from orthocal.identification.expansion import Expander, Expansion
 from orthocal.identification.pieces import (
     DirectExpressions,
     PosturePiece,
@@ -257,8 +258,7 @@ class CalibrationProblem:
         for group in self.sensor_groups:
             for entries, constants in group.parts(READINGS_AT_ONCE):
                 at = self.observations.posture[entries]
-                (h,) = self._read(group, constants, at, machine, q, slopes=False)
-                result[entries] = h[:, 0]
+                result[entries] = self._read(group, constants, at, machine, q)
         return result
 
     def linearise(self, theta: ArrayLike, passive: Array | None = None) -> tuple[Array, Array]:
@@ -279,29 +279,33 @@ class CalibrationProblem:
             ClosureError: If the machine with these errors cannot reach a posture.
         """
         q = self.close(theta) if passive is None else passive
-        machine, slopes = self._machine_and_slopes(theta)
-        _, g_a, g_q, g_t = self.compiled.slopes(machine.drives(self.drives), q, machine.placements)
-        inverse = _inverse(g_q)
-        result, jacobian = (
-            np.empty(self.observations.size),
-            np.empty((self.observations.size, self.n_free)),
+        found = self.expand(theta, q)
+        return found.reading, found.jacobian
+
+    def expand(self, theta: ArrayLike, passive: Array) -> Expansion:
+        """Readings to first order about parameters and passive coordinates near closed loops.
+
+        Args:
+            theta: Shape (n_free,), [SI].
+            passive: Shape (n_postures, n_passive), [m, rad].
+
+        Raises:
+            LinAlgError: If a posture is singular.
+        """
+        return self._expander(*self._machine_and_slopes(theta), passive)
+
+    @cached_property
+    def _expander(self) -> Expander:
+        errors = self.compiled.errors
+        moved = errors.twists_of(self._columns.T).any(axis=0).reshape(-1, 6).any(axis=1)
+        return Expander(
+            self.compiled,
+            self.observations,
+            self.sensor_groups,
+            drives=self.drives,
+            zero_drives=self.session.zero_drives,
+            used=np.repeat(moved, 6),
         )
-        zero_drives = self.session.zero_drives
-        for group in self.sensor_groups:
-            for entries, constants in group.parts(READINGS_AT_ONCE):
-                at = self.observations.posture[entries]
-                h, h_a, h_q, h_t, h_z, _ = self._read(group, constants, at, machine, q, slopes=True)
-                pull = h_q @ inverse[at]
-                twists = (h_t - pull @ g_t[at])[:, 0]
-                drives = (h_a - pull @ g_a[at])[:, 0]
-                zero = h_z[:, 0]
-                result[entries] = h[:, 0]
-                jacobian[entries] = (
-                    twists @ slopes.twists
-                    + (drives + zero) @ slopes.offsets
-                    + (drives * self.drives[at] + zero * zero_drives) @ slopes.gains
-                )
-        return result, jacobian
 
     def split_errors(self, theta: ArrayLike) -> dict[str, float]:
         """Parameter name to value, free and fixed, [SI]."""
@@ -349,12 +353,9 @@ class CalibrationProblem:
         postures: Indices,
         machine: Machine,
         passive: Array,
-        *,
-        slopes: bool,
-    ) -> tuple[Array, ...]:
-        function = group.reading.slopes if slopes else group.reading.value
+    ) -> Array:
         zero = machine.drives(self.session.zero_drives)
-        return function(
+        (h,) = group.reading.value(
             machine.drives(self.drives[postures]),
             passive[postures],
             machine.placements,
@@ -362,13 +363,7 @@ class CalibrationProblem:
             constants,
             np.zeros((postures.size, 0)),
         )
-
-
-def _inverse(matrices: Array) -> Array:
-    """Inverses of square matrices, shape (K, n, n); least squares of others."""
-    if matrices.shape[1] == matrices.shape[2]:
-        return np.asarray(np.linalg.inv(matrices))
-    return np.asarray(np.linalg.pinv(matrices, rcond=1e-10))
+        return np.asarray(h[:, 0])
 
 
 def build_problem(

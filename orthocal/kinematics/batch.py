@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 CHUNK = 256
 """Points evaluated in one call; bounds the memory and the number of maps that are built."""
 
 
 class BatchFunction:
-    """A CasADi function of column vectors, with dense outputs, mapped over points.
+    """A CasADi function of column vectors, mapped over points.
 
     CasADi's own conversion of results goes through Python lists; its buffers do not.
 
@@ -23,24 +24,41 @@ class BatchFunction:
         function: Inputs are column vectors; outputs are taken dense.
         shared: Names of the inputs that are the same at every point.
         matrices: Names of the outputs that are matrices, though they may have one column.
+        sparse: Names of the outputs of which the nonzeros are taken, in the order of `pattern`.
     """
 
     def __init__(
-        self, function: ca.Function, *, shared: Sequence[str] = (), matrices: Sequence[str] = ()
+        self,
+        function: ca.Function,
+        *,
+        shared: Sequence[str] = (),
+        matrices: Sequence[str] = (),
+        sparse: Sequence[str] = (),
     ) -> None:
         symbols = [function.sx_in(i) for i in range(function.n_in())]
-        outputs = (
-            [ca.densify(y) for y in function(*symbols)]
-            if function.n_out() > 1
-            else [ca.densify(function(*symbols))]
-        )
+        found = function.call(symbols)
+        names = function.name_out()
+        outputs = [
+            ca.densify(ca.vertcat(*y.nonzeros()) if name in sparse else y)
+            for name, y in zip(names, found, strict=True)
+        ]
+        self._patterns = {
+            name: tuple(np.array(v, dtype=np.int64) for v in y.sparsity().get_triplet())
+            for name, y in zip(names, found, strict=True)
+            if name in sparse
+        }
         self._function = ca.Function(
             function.name(), symbols, outputs, function.name_in(), function.name_out()
         )
         self._shared = [function.index_in(name) for name in shared]
-        self._shapes = [function.size_out(i) for i in range(function.n_out())]
+        self._shapes = [self._function.size_out(i) for i in range(function.n_out())]
         self._matrices = [function.index_out(name) for name in matrices]
         self._maps: dict[int, ca.Function] = {}
+
+    def pattern(self, name: str) -> tuple[Indices, Indices]:
+        """Rows and columns of the nonzeros of a sparse output, shape (nnz,) each."""
+        rows, columns = self._patterns[name]
+        return rows, columns
 
     def __call__(self, *inputs: ArrayLike) -> tuple[Array, ...]:
         """Evaluate at K points.
@@ -50,7 +68,7 @@ class BatchFunction:
 
         Returns:
             Each output with shape (K, rows, columns), or (K, rows) for a column vector; `matrices`
-            keep their one column.
+            keep their one column; sparse ones have shape (K, nnz).
         """
         arrays = [np.ascontiguousarray(a, dtype=np.float64) for a in inputs]
         count = next(len(a) for i, a in enumerate(arrays) if i not in self._shared)

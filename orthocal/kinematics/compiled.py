@@ -146,6 +146,14 @@ class CompiledRobot:
         return BatchFunction(self.expressions, shared=["placements"], matrices=outputs)
 
     @cached_property
+    def sparse_slopes(self) -> BatchFunction:
+        """The same, of ∂g by twists the nonzeros alone."""
+        first, second, twists = (self.expressions.name_out(i) for i in range(1, 4))
+        return BatchFunction(
+            self.expressions, shared=["placements"], matrices=[first, second], sparse=[twists]
+        )
+
+    @cached_property
     def expressions(self) -> ca.Function:
         """The same with sparse rows, to be put into other expressions."""
         joints, twists = self.closure_slopes
@@ -217,22 +225,26 @@ class CompiledRobot:
         return joints, twists
 
     def _closure_blocks(self, closure: Closure) -> tuple[ca.SX, ca.SX]:
+        """∂g of one closure, its rows as forces and moments on b where b is, in the world."""
         a, b = self.robot.frame_id(closure.frame_a), self.robot.frame_id(closure.frame_b)
-        pose_b = self.tree.frame_pose(b)
-        relative = self.tree.frame_pose(a).relative(pose_b)
+        pose_a, pose_b = self.tree.frame_pose(a), self.tree.frame_pose(b)
+        rows = list(closure.rows)
         if closure.kind == "3d":
-            outer = ca.horzcat(relative.rotation, ca.SX(3, 3))
+            forces, moments = pose_a.rotation[:, rows].T, ca.SX(len(rows), 3)
         else:
-            outer = log6_jacobian(relative)
-        outer = outer[list(closure.rows), :]
-        joints = ca.SX(len(closure.rows), self.robot.model.nv)
-        twists = ca.SX(len(closure.rows), self.n_twists)
+            outer = log6_jacobian(pose_a.relative(pose_b))[rows, :]
+            forces, moments = outer[:, :3] @ pose_b.rotation.T, outer[:, 3:] @ pose_b.rotation.T
+        joints = ca.SX(len(rows), self.robot.model.nv)
+        twists = ca.SX(len(rows), self.n_twists)
         of_a, of_b = self._sources(a), self._sources(b)
         for key in (*of_b, *of_a):
             if key in of_a and key in of_b:
                 continue  # moves both alike
             sign, source = (1.0, of_b[key]) if key in of_b else (-1.0, of_a[key])
-            block = sign * (outer @ adjoint(pose_b.relative(source.pose)))
+            arm = pose_b.position - source.pose.position
+            turning = moments - forces @ ca.skew(arm)
+            to_source = sign * source.pose.rotation
+            block = ca.horzcat(forces @ to_source, turning @ to_source)
             self._place(joints, twists, source, block)
         return joints, twists
 

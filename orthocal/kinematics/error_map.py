@@ -10,15 +10,15 @@ Everything that errors do to a machine goes through these twists and through whe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.kinematics.symbolic import nominal_frame_placement
+from orthocal.kinematics.symbolic import SERIES_BELOW, nominal_frame_placement
 from orthocal.robot.model import Robot, read_only
 from orthocal.robot.parameters import ElementaryError
 
@@ -204,13 +204,32 @@ def exp6(twists: Array) -> tuple[Array, Array]:
     Returns:
         Rotations, shape (..., 3, 3), and positions, shape (..., 3), [m].
     """
-    flat = twists.reshape(-1, 6)
-    rotations, positions = np.empty((len(flat), 3, 3)), np.empty((len(flat), 3))
-    for i, twist in enumerate(flat):
-        pose = pin.exp6(twist)
-        rotations[i], positions[i] = pose.rotation, pose.translation
-    shape = twists.shape[:-1]
-    return rotations.reshape(*shape, 3, 3), positions.reshape(*shape, 3)
+    v, w = twists[..., :3], twists[..., 3:]
+    square = (w * w).sum(axis=-1)[..., None]
+    near = square < SERIES_BELOW
+    safe = np.where(near, 1.0, square)
+    angle = np.sqrt(safe)
+    sine, cosine = np.sin(angle), np.cos(angle)
+    a, b, c = (
+        np.where(near, _alternating(square, first), far)
+        for first, far in (
+            (1, sine / angle),
+            (2, (1.0 - cosine) / safe),
+            (3, (angle - sine) / (safe * angle)),
+        )
+    )
+    hat = _hat(w)
+    rotations = np.eye(3) + a[..., None] * hat + b[..., None] * (hat @ hat)
+    turned = hat @ v[..., None]
+    return rotations, v + b * turned[..., 0] + c * (hat @ turned)[..., 0]
+
+
+def _alternating(square: Array, first: int) -> Array:
+    """Σ (−θ²)^k / (first + 2k)!, enough terms for double precision below SERIES_BELOW."""
+    total = np.zeros_like(square)
+    for k in reversed(range(7)):
+        total = total * -square + 1.0 / math.factorial(first + 2 * k)
+    return total
 
 
 def right_jacobian(twists: Array) -> Array:

@@ -34,7 +34,8 @@ class CompiledReading:
     value: BatchFunction
     """h, [m]."""
     slopes: BatchFunction
-    """h; ∂h by actuated, passive, twists, zero drives and unknowns, each of one row."""
+    """h; ∂h by actuated, passive, twists, zero drives and unknowns, each of one row; of that by
+    twists the nonzeros alone."""
     expression: ca.Function
     """The same with sparse rows, to be put into other expressions."""
 
@@ -114,7 +115,8 @@ def _compile(pattern: _Pattern) -> CompiledReading:
         slopes=BatchFunction(
             slopes,
             shared=["placements"],
-            matrices=labels[1:],
+            matrices=[name for name in labels[1:] if name != "by_twists"],
+            sparse=["by_twists"],
         ),
         expression=slopes,
     )
