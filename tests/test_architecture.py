@@ -12,7 +12,7 @@ from conftest import ROOT
 import orthocal
 
 STAGES = [
-    *("characters", "arguments", "errors", "interrupts", "streams"),
+    *("characters", "arguments", "errors", "interrupts", "streams", "units"),
     *("files", "strict_yaml", "documents", "markup"),
     *(
         "robot",

@@ -24,12 +24,13 @@ from orthocal.identification.identifiability import (
     analyse_identifiability,
     find_base_parameters,
 )
-from orthocal.identification.linear import linearise_at_reference
+from orthocal.identification.linear import Linearisation, linearise_at_reference
 from orthocal.identification.loss import Loss
 from orthocal.identification.options import SolverOptions
 from orthocal.identification.problem import CalibrationProblem, build_problem
 from orthocal.identification.profile import profile_interval
 from orthocal.identification.records import (
+    GaugeRecord,
     NoiseRecord,
     ParameterEstimate,
     PostureRecord,
@@ -45,6 +46,7 @@ from orthocal.identification.uncertainty import (
     Information,
     confidence_factor,
     estimate_repeatability,
+    marginalise,
     project_out_zeros,
 )
 from orthocal.identification.unmodelled import (
@@ -52,7 +54,9 @@ from orthocal.identification.unmodelled import (
     find_other_errors,
     measure_unmodelled,
 )
+from orthocal.identification.weighting import split_by_gauge
 from orthocal.kinematics.assembly import as_rows
+from orthocal.measurement.joining import join_sessions
 from orthocal.measurement.session import Session
 from orthocal.measurement.session_file import load_session
 from orthocal.robot.loading import packaged_robots
@@ -66,7 +70,7 @@ MAX_BASE_ROUNDS = 8
 
 
 def calibrate(
-    session: Session | str | Path,
+    session: Session | str | Path | Sequence[Session | str | Path],
     *,
     model: str | None = None,
     free: Sequence[str] = (),
@@ -82,7 +86,7 @@ def calibrate(
     """Identify the errors of a machine from a session, exactly, with their uncertainty.
 
     Args:
-        session: The session, or the path to one.
+        session: The session, or the path to one; or several, which are fitted together.
         model: A model of the robot's YAML: `offsets` (the default), `lengths`, `full` or one's own.
         free: Names or globs that are free too, or instead where no model is named; '!' takes out.
         prior: Whether tolerances act as a prior; by default not where only offsets are free.
@@ -105,9 +109,7 @@ def calibrate(
         TypeError: If an argument is of another kind.
         ValueError: If there are not as many free parameters to start from as there are.
     """
-    if not isinstance(session, Session):
-        require_kind(session, (str, Path), expected="a Session, or the path to one")
-        session = load_session(session)
+    session = _gather(session)
     require_names(free, argument="free")
     require_names(profile, argument="profile")
     require_numbers(known or {}, argument="known", counts=(1, 2))
@@ -146,6 +148,19 @@ def calibrate(
     profiled = _match_profiled(fit.problem, profile)
     intervals = {name: profile_interval(fit, name) for name in profiled}
     return assemble_calibration(fit, whole=whole, intervals=intervals)
+
+
+def _gather(given: Session | str | Path | Sequence[Session | str | Path]) -> Session:
+    """What was given as one session."""
+    several: list[Session | str | Path]
+    several = list(given) if isinstance(given, (list, tuple)) else [given]  # type: ignore[list-item]
+    found = []
+    for one in several:
+        if not isinstance(one, Session):
+            require_kind(one, (str, Path), expected="a Session, or the path to one")
+            one = load_session(one)
+        found.append(one)
+    return join_sessions(found)
 
 
 def repeat_calibration(calibration: Calibration, session: Session) -> Calibration:
@@ -200,10 +215,12 @@ def assemble_calibration(
     """
     problem, noise, loss = fit.problem, fit.noise, fit.loss
     session = problem.session
+    n = problem.n_machine
     covariance = fit.covariance()
     # a base parameter is the whole combination: nothing of it is left out
     others = find_other_errors(fit, spoken_for=() if whole is None else whole.free)
     unmodelled = measure_unmodelled(fit, others)
+    estimates = _estimates(fit, covariance, _widen(fit, unmodelled, intervals or {}))
     diagnostics = diagnose_readings(fit)
     residuals = _residual_rows(fit, diagnostics, nominal)
     factor = np.sqrt(2.0) if session.only_differences else 1.0
@@ -211,7 +228,7 @@ def assemble_calibration(
         robot_record=_robot_record(session),
         session=_session_record(session),
         model=problem.selection.label,
-        prior=problem.prior,
+        prior=bool(problem.machine_selection.prior.any()),
         solver=SolverRecord(
             name=fit.program.options.solver,
             status=fit.solution.status,
@@ -222,8 +239,9 @@ def assemble_calibration(
             loss=loss.kind,
             loss_width=loss.width,
         ),
-        parameters=_estimates(fit, covariance, _widen(fit, unmodelled, intervals or {})),
-        covariance=read_only(covariance),
+        parameters=(*estimates[:n], *_held_estimates(problem)),
+        sensors=estimates[n:],
+        covariance=read_only(covariance[:n, :n]),
         unmodelled=unmodelled,
         identifiability=_identifiability(fit, whole),
         base=whole is not None,
@@ -246,6 +264,7 @@ def assemble_calibration(
             for i, (name, p) in enumerate(session.postures.items())
         ),
         setups=_setup_records(fit),
+        gauges=_gauge_records(fit),
         version=__version__,
     )
     require_loadable(calibration)
@@ -265,7 +284,9 @@ def _fit_base(
     sigma = first_sigma(problem.session, repeatability)
     leads: list[str] = []
     for _ in range(MAX_BASE_ROUNDS):
-        found = find_base_parameters(information.factor, problem.parameters, threshold=sigma)
+        factor = information.factor[:, : problem.n_machine]
+        machine = problem.machine_selection.parameters
+        found = find_base_parameters(factor, machine, threshold=sigma)
         if not found:
             raise NotIdentifiableError(
                 "the readings tell none of the free parameters", parameters=problem.free
@@ -274,7 +295,7 @@ def _fit_base(
         if chosen == leads:
             break
         leads = chosen
-        reduced = CalibrationProblem(problem.session, problem.selection.keep(leads))
+        reduced = CalibrationProblem(problem.session, problem.machine_selection.keep(leads))
         fit = fit_problem(reduced, options=options, start=start)
         sigma = max(fit.sigma, sigma)  # no more parameters than before
     return fit
@@ -303,11 +324,16 @@ def _identifiability(fit: Fit, whole: CalibrationProblem | None) -> Identifiabil
             n_readings=fit.independent_readings,
         )
 
-    own = analyse(fit.linearisation.information, fit.problem.parameters)
+    def of_machine(linearisation: Linearisation) -> Identifiability:
+        machine = linearisation.problem.machine_selection.parameters
+        information = marginalise(linearisation.information, len(machine), sigma=fit.sigma)
+        return analyse(information, machine)
+
+    own = of_machine(fit.linearisation)
     if whole is None:
         return own
     # how well the base parameters are told; which they are follows from the whole
-    found = analyse(linearise_at_reference(whole).information, whole.parameters)
+    found = of_machine(linearise_at_reference(whole.with_noise(fit.problem.noise)))
     return replace(found, singular_values=own.singular_values, rank=own.structural_rank)
 
 
@@ -335,9 +361,10 @@ def _estimates(
     problem, solution = fit.problem, fit.solution
     selection = problem.selection
     std = np.sqrt(np.diag(covariance))
-    determined = fit.information.determined(sigma=fit.noise.sigma)
+    told = fit.machine_information.determined(sigma=fit.noise.sigma)
+    determined = np.append(told, np.zeros(problem.n_free - told.size, dtype=bool))
     words: dict[int, Literal["lower", "upper"] | None] = {-1: "lower", 0: None, 1: "upper"}
-    estimates = [
+    return tuple(
         ParameterEstimate(
             name=p.name,
             unit=p.unit,
@@ -356,7 +383,11 @@ def _estimates(
             interval=intervals.get(p.name),
         )
         for i, p in enumerate(problem.parameters)
-    ]
+    )
+
+
+def _held_estimates(problem: CalibrationProblem) -> tuple[ParameterEstimate, ...]:
+    estimates = []
     for name, value in problem.fixed.items():
         p = problem.robot.parameters[name]
         estimates.append(
@@ -410,6 +441,7 @@ def _session_record(session: Session) -> SessionRecord:
         gauge_sigma=session.gauge.sigma,
         gauge_resolution=session.gauge.resolution,
         controller_offsets=None if offsets is None else tuple(offsets.tolist()),
+        parts=tuple(_session_record(part) for part in session.parts),
     )
 
 
@@ -418,11 +450,11 @@ def _residual_rows(
 ) -> tuple[ResidualRow, ...]:
     """Readings beside what three machines would show, each with its best gauge zeros."""
     problem, o = fit.problem, fit.problem.observations
-    measured, session = problem.values, problem.session
+    measured, session, noise = problem.values, problem.session, problem.noise[o.plus]
 
     def fitted(prediction: Array) -> Array:
         residual = project_out_zeros(measured - prediction, o, weights=fit.weights)
-        return session.values - o.rows(residual)
+        return session.values - noise * o.rows(residual)
 
     reference = problem.reference if nominal_theta is None else nominal_theta
     nominal = fitted(problem.predict(reference))
@@ -430,8 +462,8 @@ def _residual_rows(
         by_linear = fitted(problem.predict(fit.linear))
     except ClosureError:  # the linearised machine cannot be assembled
         by_linear = np.full(len(session.readings), np.nan)
-    predicted = session.values - o.rows(fit.residual)
-    unseen = predict_unseen(fit)
+    predicted = session.values - noise * o.rows(fit.residual)
+    unseen = noise * predict_unseen(fit)
     return tuple(
         ResidualRow(
             setup=r.setup,
@@ -443,6 +475,7 @@ def _residual_rows(
             linear=float(by_linear[i]),
             predicted=float(predicted[i]),
             line=r.line,
+            file=None if r.file is None else str(r.file),
             studentised=float(diagnostics.studentised[i]),
             influence=float(diagnostics.influence[i]),
             influenced=problem.free[diagnostics.influenced[i]],
@@ -452,10 +485,26 @@ def _residual_rows(
     )
 
 
+def _gauge_records(fit: Fit) -> tuple[GaugeRecord, ...]:
+    problem = fit.problem
+    return tuple(
+        GaugeRecord(
+            name=g.name,
+            sigma=g.gauge.sigma,
+            resolution=g.gauge.resolution,
+            noise=fit.noise.sigma * float(problem.noise[g.entries][0]),
+            readings=int(g.entries.sum()),
+        )
+        for g in split_by_gauge(problem.session, problem.observations)
+    )
+
+
 def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
     o = fit.problem.observations
+    noise = np.ones(o.n_zeros)
+    noise[o.zero] = fit.problem.noise
     zeros = {
-        name: float(fit.solution.zeros[i])
+        name: float(fit.solution.zeros[i] * noise[i])
         for i, (name, real) in enumerate(zip(o.zero_setup, o.zero_real, strict=True))
         if real
     }

@@ -24,6 +24,7 @@ from orthocal.identification.recorded_robot import (
     require_rows,
 )
 from orthocal.identification.records import (
+    GaugeRecord,
     NoiseRecord,
     ParameterEstimate,
     PostureRecord,
@@ -68,6 +69,8 @@ class Calibration:
     solver: SolverRecord
     parameters: tuple[ParameterEstimate, ...]
     """Free parameters, then those held at a known value."""
+    sensors: tuple[ParameterEstimate, ...]
+    """What was not known of the sensors, estimated with them."""
     covariance: Array
     """Of the free parameters, shape (n_free, n_free), [SI]."""
     unmodelled: Unmodelled
@@ -89,6 +92,7 @@ class Calibration:
     """Studentised residuals beyond this are suspicious; infinite if nothing tells the noise."""
     postures: tuple[PostureRecord, ...]
     setups: tuple[SetupRecord, ...]
+    gauges: tuple[GaugeRecord, ...]
     version: str
     """Of orthocal."""
     path: Path | None = None
@@ -166,9 +170,10 @@ class Calibration:
 
     def where(self, row: ResidualRow) -> str:
         """File and line of a row, for messages."""
-        if self.session.readings_path is None or row.line is None:
+        file = row.file or self.session.readings_path
+        if file is None or row.line is None:
             return f"reading {row.label}"
-        return f"{self.session.readings_path}:{row.line}"
+        return f"{file}:{row.line}"
 
     @property
     def rms_before(self) -> float:
@@ -322,11 +327,12 @@ class Calibration:
             "schema": SCHEMA,
             "orthocal": self.version,
             "robot": _plain(self.robot_record),
-            "session": _plain(self.session),
+            "session": _session_document(self.session),
             "model": self.model,
             "prior": self.prior,
             "solver": _plain(self.solver),
             "parameters": [_plain(p) for p in self.parameters],
+            "sensors": [_plain(p) for p in self.sensors],
             "covariance": [[_number(v) for v in row] for row in self.covariance.tolist()],
             "sigma": _number(self.sigma),
             "dof": _number(self.dof),
@@ -352,6 +358,7 @@ class Calibration:
                 {"name": s.name, "reads": write_sensor(s.sensor), "zero": s.zero}
                 for s in self.setups
             ],
+            "gauges": [_plain(g) for g in self.gauges],
         }
 
     def to_json(self) -> str:
@@ -405,6 +412,11 @@ class Calibration:
         require_rows(robot, self.setups, self.postures, self.residuals, prefix=prefix)
         require_offsets(robot, self.session.controller_offsets, prefix=prefix)
         return robot
+
+
+def _session_document(record: SessionRecord) -> dict[str, Any]:
+    parts = [{k: v for k, v in _plain(p).items() if k != "parts"} for p in record.parts]
+    return {**_plain(record), "parts": parts}
 
 
 def _identifiability_document(found: Identifiability) -> dict[str, Any]:

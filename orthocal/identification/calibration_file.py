@@ -17,6 +17,7 @@ from orthocal.files import exists, is_folder
 from orthocal.identification.calibration import SCHEMA, Calibration
 from orthocal.identification.identifiability import Combination, Identifiability
 from orthocal.identification.records import (
+    GaugeRecord,
     NoiseRecord,
     ParameterEstimate,
     PostureRecord,
@@ -54,7 +55,7 @@ class _RobotKeys(_Keys):
     travel: Many[tuple[str, Literal["m", "rad"], Number | None, Number | None]]
 
 
-class _SessionKeys(_Keys):
+class _PartKeys(_Keys):
     path: str | None
     readings_path: str | None
     title: str
@@ -63,6 +64,10 @@ class _SessionKeys(_Keys):
     gauge_sigma: PositiveInSI | None
     gauge_resolution: PositiveInSI | None
     controller_offsets: Many[Number] | None
+
+
+class _SessionKeys(_PartKeys):
+    parts: Many[_PartKeys]
 
 
 class _SolverKeys(_Keys):
@@ -113,6 +118,7 @@ class _ResidualKeys(_Keys):
     linear: Number | None
     predicted: Number
     line: Count | None
+    file: str | None
     studentised: Number | None
     influence: Number
     influenced: str
@@ -130,6 +136,14 @@ class _SetupKeys(_Keys):
     name: str
     reads: dict[str, Any]
     zero: Number | None
+
+
+class _GaugeKeys(_Keys):
+    name: str
+    sigma: PositiveInSI | None
+    resolution: PositiveInSI | None
+    noise: Annotated[Number, Field(ge=0.0)] | None
+    readings: Count
 
 
 class _TurnedKeys(_Keys):
@@ -179,6 +193,7 @@ class _CalibrationKeys(_Keys):
     prior: bool
     solver: _SolverKeys
     parameters: Annotated[Many[_ParameterKeys], Field(min_length=1)]
+    sensors: Many[_ParameterKeys]
     covariance: Many[Many[Number | None]]
     unmodelled: _UnmodelledKeys
     identifiability: _IdentifiabilityKeys
@@ -196,6 +211,7 @@ class _CalibrationKeys(_Keys):
     turned: _TurnedKeys | None
     postures: Many[_PostureKeys]
     setups: Many[_SetupKeys]
+    gauges: Many[_GaugeKeys]
 
 
 MAKE_ONE = "`orthocal calibrate SESSION --out FOLDER` makes one"
@@ -235,19 +251,15 @@ def load_calibration(path: str | Path) -> Calibration:
                 "travel": tuple(keys.robot.travel),
             }
         ),
-        session=SessionRecord(
-            **{
-                **keys.session.model_dump(),
-                "controller_offsets": None
-                if keys.session.controller_offsets is None
-                else tuple(keys.session.controller_offsets),
-            }
-        ),
+        session=_session(keys.session, tuple(_session(p) for p in keys.session.parts)),
         model=keys.model,
         prior=keys.prior,
         solver=SolverRecord(**keys.solver.model_dump()),
         parameters=tuple(
             ParameterEstimate(**{**p.model_dump(), "std": _float(p.std)}) for p in keys.parameters
+        ),
+        sensors=tuple(
+            ParameterEstimate(**{**p.model_dump(), "std": _float(p.std)}) for p in keys.sensors
         ),
         covariance=read_only(covariance),
         noise=NoiseRecord(
@@ -276,6 +288,9 @@ def load_calibration(path: str | Path) -> Calibration:
             PostureRecord(p.name, tuple(p.drives), tuple(p.passive)) for p in keys.postures
         ),
         setups=_setups(keys, str(file)),
+        gauges=tuple(
+            GaugeRecord(**{**g.model_dump(), "noise": _float(g.noise)}) for g in keys.gauges
+        ),
         version=keys.orthocal,
         path=file,
     )
@@ -401,6 +416,13 @@ def _residual(keys: _ResidualKeys) -> ResidualRow:
     for name in ("linear", "studentised", "unseen"):
         values[name] = _float(values[name])
     return ResidualRow(**values)
+
+
+def _session(keys: _PartKeys, parts: tuple[SessionRecord, ...] = ()) -> SessionRecord:
+    offsets = keys.controller_offsets
+    values = keys.model_dump(exclude={"parts"})
+    values["controller_offsets"] = None if offsets is None else tuple(offsets)
+    return SessionRecord(**values, parts=parts)
 
 
 def _setups(keys: _CalibrationKeys, file: str) -> tuple[SetupRecord, ...]:

@@ -17,8 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.identification.fit import SMALLEST_SIGMA, Fit
+from orthocal.identification.fit import Fit
 from orthocal.identification.uncertainty import Information, confidence_factor, project_out_zeros
+from orthocal.identification.weighting import SMALLEST_SIGMA
 from orthocal.measurement.gauge import Observations
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ the twists that errors make only those of placements with a free error are looke
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,16 +61,35 @@ class Expansion:
     drives: Array
     """Commanded coordinates, shape (n_postures, n_drives), [m, rad]."""
 
+    def scaled(self, tolerances: Array, noise: Array) -> Expansion:
+        """With what is not known of sensors by their tolerances, and readings by their noise.
+
+        Args:
+            tolerances: Of the unknowns, the last columns of the Jacobian, [SI].
+            noise: Of each entry's readings, as a multiple of the first gauge's, shape (n_entries,).
+        """
+        jacobian = self.jacobian
+        jacobian[:, jacobian.shape[1] - tolerances.size :] *= tolerances
+        if (noise == 1.0).all():
+            return self
+        return replace(
+            self,
+            reading=self.reading / noise,
+            opening=self.opening / noise,
+            jacobian=jacobian / noise[:, None],
+        )
+
     def follow(self, change: Array) -> Array:
         """Change of the passive coordinates that closes the loops, with θ̂ changed.
 
         Args:
-            change: dθ̂, shape (n_free,).
+            change: dθ̂, shape (n_free,); what is of sensors moves nothing.
 
         Returns:
             Shape (n_postures, n_passive), [m, rad].
         """
         result = np.array(self.correction)
+        change = change[: self.slopes.twists.shape[1]]
         twists = self.slopes.twists @ change
         offsets, gains = self.slopes.offsets @ change, self.slopes.gains @ change
         rows, columns = self.pattern
@@ -116,7 +135,8 @@ class Expander:
         observations: What is read where.
         groups: The same by their sensors' expressions.
         drives: Commanded coordinates of all postures, shape (n_postures, n_drives), [m, rad].
-        zero_drives: Those of the mechanical zero, shape (n_drives,), [m, rad].
+        zero_drives: Those of the mechanical zero while each setup stood, shape (n_setups,
+            n_drives), [m, rad].
         used: Which components of twists any free error moves, shape (n_twists,).
     """
 
@@ -142,14 +162,22 @@ class Expander:
         self._closing = _Scatter.of(compiled.sparse_slopes.pattern(twists), place)
         self._reading = [_Scatter.of(g.reading.slopes.pattern("by_twists"), place) for g in groups]
 
-    def __call__(self, machine: Machine, slopes: Slopes, passive: Array) -> Expansion:
+    def __call__(
+        self, machine: Machine, slopes: Slopes, passive: Array, unknowns: Array
+    ) -> Expansion:
         """Expand about a machine, with what errors do to it, and passive coordinates.
+
+        Args:
+            machine: The machine.
+            slopes: What tolerances of the free errors do to it.
+            passive: Shape (n_postures, n_passive), [m, rad].
+            unknowns: Those of the sensors, shape (n_unknowns,), [SI].
 
         Raises:
             LinAlgError: If a posture is singular.
         """
         n, n_free = self._observations.size, slopes.offsets.shape[1]
-        reading, opening = np.empty(n), np.empty(n)
+        reading, opening, by_unknowns = np.empty(n), np.empty(n), np.zeros((n, unknowns.size))
         jacobian, correction = np.empty((n, n_free)), np.zeros_like(passive)
         by_twists = _Chain.of(slopes.twists[self._used])
         zero = machine.drives(self._zero_drives)
@@ -162,14 +190,16 @@ class Expander:
             inverse = -_inverse(g_q)
             correction[part.postures] = (inverse @ g[..., None])[..., 0]
             closings.append((part.postures, inverse, g_a, nonzeros[:, self._closing.chosen]))
-            rows = self._read(part, actuated, q, machine.placements, zero)
+            rows = self._read(part, actuated, q, machine.placements, zero, unknowns)
+            by_unknowns[part.entries.reshape(-1)] = rows.by_unknowns
             pull = rows.by_passive.reshape(k, m, -1) @ inverse
             twists = rows.by_twists.reshape(k, m, -1)
             if self._used.size:
                 twists += pull @ self._closing.dense(nonzeros, g.shape[1])
             by_drives = rows.by_actuated.reshape(k, m, -1) + pull @ g_a
             at_zero = rows.by_zero.reshape(k, m, -1)
-            commanded = by_drives * drives[:, None, :] + at_zero * self._zero_drives
+            stood = self._zero_drives[self._observations.setup[part.entries]]
+            commanded = by_drives * drives[:, None, :] + at_zero * stood
             found = (by_drives + at_zero) @ slopes.offsets + commanded @ slopes.gains
             jacobian[part.entries] = found
             if self._used.size:
@@ -179,31 +209,45 @@ class Expander:
             opening[part.entries] = (pull @ g[..., None])[..., 0]
         pattern = self._closing.rows, self._used[self._closing.columns]
         return Expansion(
-            reading, opening, jacobian, correction, tuple(closings), pattern, slopes, self._drives
+            reading,
+            opening,
+            np.hstack([jacobian, by_unknowns]),
+            correction,
+            tuple(closings),
+            pattern,
+            slopes,
+            self._drives,
         )
 
     def _read(
-        self, part: Part, actuated: Array, passive: Array, placements: Array, zero: Array
+        self,
+        part: Part,
+        actuated: Array,
+        passive: Array,
+        placements: Array,
+        zero: Array,
+        unknowns: Array,
     ) -> _Rows:
         """Readings of a part and their slopes by all that moves them."""
         k, m = part.entries.shape
         n_d, n_p = actuated.shape[1], passive.shape[1]
-        sizes = (n_d, n_p, self._used.size, n_d)
+        sizes = (n_d, n_p, self._used.size, n_d, unknowns.size)
         result = _Rows(np.empty(k * m), *(np.zeros((k * m, size)) for size in sizes))
         for index, where, own in part.members:
             group, at = self._groups[index], where // m
-            h, h_a, h_q, nonzeros, h_z, _ = group.reading.slopes(
+            h, h_a, h_q, nonzeros, h_z, h_u = group.reading.slopes(
                 actuated[at],
                 passive[at],
                 placements,
-                np.broadcast_to(zero, (at.size, n_d)),
+                zero[group.setups[own]],
                 group.constants[own],
-                np.zeros((at.size, 0)),
+                unknowns[group.unknowns[own]],
             )
             result.reading[where] = h[:, 0]
             result.by_actuated[where] = h_a[:, 0]
             result.by_passive[where] = h_q[:, 0]
             result.by_zero[where] = h_z[:, 0]
+            result.by_unknowns[where[:, None], group.unknowns[own]] = h_u[:, 0]
             scatter = self._reading[index]
             if scatter.chosen.size:
                 result.by_twists[where[:, None], scatter.columns] = nonzeros[:, scatter.chosen]
@@ -219,6 +263,7 @@ class _Rows:
     by_passive: Array
     by_twists: Array
     by_zero: Array
+    by_unknowns: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,7 +280,9 @@ class _Scatter:
         """The nonzeros of columns that have a place."""
         rows, columns = pattern
         chosen = np.flatnonzero(place[columns] >= 0)
-        return _Scatter(chosen, rows[chosen], place[columns[chosen]], int(place.max(initial=-1)) + 1)
+        return _Scatter(
+            chosen, rows[chosen], place[columns[chosen]], int(place.max(initial=-1)) + 1
+        )
 
     def dense(self, nonzeros: Array, n_rows: int) -> Array:
         """Matrices of nonzeros, shape (k, n_rows, n_columns) of (k, nnz)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,19 +23,22 @@ from orthocal.identification.uncertainty import (
     decompose,
     estimate_noise,
     estimate_repeatability,
-    noise_floor,
+    marginalise,
     project_out_zeros,
     require_identifiable,
+)
+from orthocal.identification.weighting import (
+    SMALLEST_SIGMA,
+    GaugeReadings,
+    first_noise,
+    leverages,
+    split_by_gauge,
+    stated_sigma,
+    weigh_gauges,
 )
 from orthocal.measurement.session import Session
 
 Array = NDArray[np.float64]
-
-SIGMA_WITHOUT_WORD = 10e-6
-"""Standard deviation of a reading assumed at first where nothing tells it, [m]."""
-
-SMALLEST_SIGMA = 1e-9
-"""Standard deviation of a reading below which readings count as perfect, [m]."""
 
 SIGMA_SETTLED = 0.03
 """Relative change of sigma below which it needs no further solution: beside a prior it moves no
@@ -70,7 +74,10 @@ class Fit:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of a reading by which the solution was weighted, [m]."""
+        """Standard deviation of a reading by which the solution was weighted, [m].
+
+        With several gauges, that of the first.
+        """
         if math.isfinite(self.noise.sigma):
             return max(self.noise.sigma, SMALLEST_SIGMA)
         return first_sigma(self.problem.session, (math.nan, 0))
@@ -89,6 +96,11 @@ class Fit:
     def weights(self) -> Array:
         """How much of a square each entry counted, shape (n_entries,): 1 without a robust loss."""
         return self.loss.weight(self.residual / self.sigma)
+
+    @property
+    def machine_information(self) -> Information:
+        """What the readings say of the machine, sensors known to their tolerances."""
+        return marginalise(self.information, self.problem.n_machine, sigma=self.sigma)
 
     @property
     def independent_readings(self) -> int:
@@ -142,6 +154,9 @@ def fit_problem(
         ClosureError: If the machine cannot reach a posture.
     """
     began = time.perf_counter()
+    groups = split_by_gauge(problem.session, problem.observations)
+    if len(groups) > 1 and (problem.noise == 1.0).all():
+        problem = problem.with_noise(first_noise(problem.session, problem.observations))
     linearisation = linearise_at_reference(problem)
     require_determined(problem, linearisation.information)
     repeatability = estimate_repeatability(problem.values, problem.observations)
@@ -168,9 +183,18 @@ def fit_problem(
         held = solution.at_bound != 0
         noise = _noise(program, residual, information, sigma, repeatability, held=held)
         found = max(noise.sigma, SMALLEST_SIGMA)
-        if not _matters(program) or _settled(found, sigma):
+        weights = problem.noise
+        if len(groups) > 1:
+            weights = _weigh(problem, groups, residual, jacobian, information, sigma, held)
+        balanced = bool(np.abs(weights / problem.noise - 1.0).max() < SIGMA_SETTLED)
+        if balanced and (not _matters(program) or _settled(found, sigma)):
             break
-        sigma, first, passive = found, solution.theta, solution.passive
+        first, passive = solution.theta, solution.passive
+        if balanced:
+            sigma = found
+            continue
+        problem = problem.with_noise(weights)
+        program, linearisation = program.with_problem(problem), linearise_at_reference(problem)
     require_assembly(problem, solution, robust=program.options.loss.robust)
     weight = max(noise.sigma, SMALLEST_SIGMA) if math.isfinite(noise.sigma) else sigma
     return Fit(
@@ -187,6 +211,28 @@ def fit_problem(
         jacobian=jacobian,
         information=information,
     )
+
+
+def _weigh(
+    problem: CalibrationProblem,
+    groups: Sequence[GaugeReadings],
+    residual: Array,
+    jacobian: Array,
+    information: Information,
+    sigma: float,
+    held: NDArray[np.bool_],
+) -> Array:
+    """Noise of each entry over the first gauge's, as the solution leaves it, (n_entries,)."""
+    covariance = information.covariance(sigma=sigma, precision=problem.prior_precision, held=held)
+    found = weigh_gauges(
+        groups,
+        problem.observations,
+        residual=residual * problem.noise,
+        leverage=leverages(jacobian, problem.observations, covariance, sigma),
+        values=problem.values * problem.noise,
+        sigma=sigma * problem.noise,
+    )
+    return np.asarray(found / found[groups[0].entries][0])
 
 
 def require_assembly(problem: CalibrationProblem, solution: Solution, *, robust: bool) -> None:
@@ -240,12 +286,7 @@ def _linearised_sigma(
 
 def first_sigma(session: Session, repeatability: tuple[float, int]) -> float:
     """What a reading's standard deviation is taken to be before there is a solution, [m]."""
-    cycles_sigma, cycles_dof = repeatability
-    gauge = session.gauge
-    floor = noise_floor(gauge.sigma, gauge.resolution)
-    if cycles_dof > 0:
-        return max(cycles_sigma, floor, SMALLEST_SIGMA)
-    return max(gauge.sigma or SIGMA_WITHOUT_WORD, floor)
+    return stated_sigma(session.gauge, repeatability)
 
 
 def require_determined(problem: CalibrationProblem, information: Information) -> None:

@@ -38,6 +38,14 @@ class ReadingPiece:
     """Entries of the observations that are of it, shape (n,)."""
     table: Array
     """Constants of their setups, shape (n, n_constants)."""
+    setups: Indices
+    """Their setups, shape (n,)."""
+    unknown_index: Indices
+    """Which free parameters their sensors' unknowns are, shape (n, n_unknowns)."""
+    unknowns: ca.SX
+    """Those, shape (n_unknowns,), [SI]."""
+    by_unknowns: ca.SX
+    """∂h by them, shape (1, n_unknowns)."""
     passive_index: Indices
     """Which passive coordinates it depends on."""
     theta_index: Indices
@@ -60,7 +68,7 @@ class ReadingPiece:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectExpressions:
-    """Closures and readings as expressions of θ̂ itself, for second derivatives."""
+    """Closures and readings as expressions of the machine's θ̂ itself, for second derivatives."""
 
     theta: ca.SX
     passive: ca.SX
@@ -71,5 +79,7 @@ class DirectExpressions:
     """ĝ, shape (closure_rows,)."""
     constants: tuple[ca.SX, ...]
     """Constants of a setup, by sensor group."""
+    unknowns: tuple[ca.SX, ...]
+    """What is not known of a sensor, by sensor group, [SI]."""
     readings: tuple[ca.SX, ...]
     """h by sensor group, [m]."""

@@ -35,9 +35,11 @@ from orthocal.kinematics.symbolic import SymbolicRobot
 from orthocal.measurement.gauge import (
     Observations,
     SensorGroup,
+    SensorUnknowns,
     build_observations,
     drive_table,
     group_sensors,
+    sensor_unknowns,
 )
 from orthocal.measurement.session import Session
 from orthocal.robot.model import Robot, closure_row_units, coordinate_units
@@ -58,23 +60,35 @@ READINGS_AT_ONCE = 1024
 class CalibrationProblem:
     """Readings of a session, and the error parameters they are to determine.
 
+    Its free parameters are errors of the machine, then what is not known of its sensors. Readings
+    count by their noise: all that is told of entries is in metres of the first gauge, in which
+    every reading has the same standard deviation.
+
     Args:
-        session: The session.
-        selection: What is free, and what is known of it beforehand.
+        session: The session, or several that were joined.
+        selection: Which errors of the machine are free, and what is known of them beforehand.
+        noise: Standard deviation of each entry's readings, as a multiple of the first gauge's,
+            shape (n_entries,); 1 by default.
 
     Raises:
         RobotError: If closure rows of the robot depend on each other.
     """
 
-    def __init__(self, session: Session, selection: Selection) -> None:
+    def __init__(
+        self, session: Session, selection: Selection, *, noise: Array | None = None
+    ) -> None:
         self.session = session
         self.robot = session.robot
+        self.machine_selection = selection
+        self.unknowns: SensorUnknowns = sensor_unknowns(session)
+        selection = selection.with_known(self.unknowns.parameters)
         self.selection = selection
         self.free = selection.names
         self.parameters = selection.parameters
         self.fixed = dict(selection.fixed)
         _require_independent_rows(self.robot)
         self.observations: Observations = build_observations(session)
+        self.noise = np.ones(self.observations.size) if noise is None else noise
         self.drives = drive_table(session)
         self.theta_scale = selection.tolerances
         self.prior_precision = selection.prior.astype(np.float64)
@@ -91,6 +105,22 @@ class CalibrationProblem:
         other.session = self.session.with_values(np.asarray(values, dtype=np.float64))
         other.__dict__.pop("values", None)
         return other
+
+    def with_noise(self, noise: Array) -> CalibrationProblem:
+        """The same problem with other standard deviations; nothing is built again.
+
+        Args:
+            noise: As a multiple of the first gauge's, shape (n_entries,).
+        """
+        other = copy.copy(self)
+        other.noise = noise
+        other.__dict__.pop("values", None)
+        return other
+
+    @property
+    def n_machine(self) -> int:
+        """Number of free parameters that are errors of the machine: the first ones."""
+        return len(self.machine_selection.parameters)
 
     @property
     def n_free(self) -> int:
@@ -126,8 +156,8 @@ class CalibrationProblem:
 
     @cached_property
     def values(self) -> Array:
-        """Readings as single ones, shape (n_entries,), [m]."""
-        return self.observations.values(self.session.values)
+        """Readings as single ones, shape (n_entries,), [m of the first gauge]."""
+        return self.observations.values(self.session.values) / self.noise
 
     @cached_property
     def zero_incidence(self) -> Array:
@@ -139,7 +169,7 @@ class CalibrationProblem:
     @cached_property
     def assembly(self) -> Assembly:
         """Closes the loops for given values of the free parameters."""
-        return Assembly(self.robot, free=self.free, fixed=self.fixed)
+        return Assembly(self.robot, free=self.machine_selection.names, fixed=self.fixed)
 
     def close(self, theta: ArrayLike, *, start: Array | None = None) -> Array:
         """Passive coordinates of every posture, shape (n_postures, n_passive), [m, rad].
@@ -148,7 +178,8 @@ class CalibrationProblem:
             ClosureError: If the machine with these errors cannot reach a posture.
         """
         names = list(self.session.postures)
-        return self.assembly.close(self.drives, theta=theta, start=start, names=names)
+        machine = self._of_machine(theta)
+        return self.assembly.close(self.drives, theta=machine, start=start, names=names)
 
     @cached_property
     def machine_map(self) -> MachineMap:
@@ -181,13 +212,14 @@ class CalibrationProblem:
             drives, passive = self._posture_symbols()
             zero = ca.SX.sym("zero", len(self.robot.drives))
             constants = ca.SX.sym("constants", group.constants.shape[1])
-            h, h_a, h_q, h_t, h_z, _ = group.reading.expression(
+            unknowns = ca.SX.sym("unknowns", group.unknowns.shape[1])
+            h, h_a, h_q, h_t, h_z, h_u = group.reading.expression(
                 shared.actuated(drives),
                 passive * self.passive_scale,
                 shared.placements,
                 shared.actuated(zero),
                 constants,
-                ca.SX(0, 1),
+                unknowns,
             )
             by_theta = shared.chain(h_t, h_a, drives) + shared.chain(ca.SX(*h_t.shape), h_z, zero)
             by_theta, by_passive = ca.sparsify(by_theta), ca.sparsify(h_q)
@@ -198,6 +230,10 @@ class CalibrationProblem:
                     group=k,
                     entries=group.entries,
                     table=group.constants,
+                    setups=group.setups,
+                    unknown_index=self.n_machine + group.unknowns,
+                    unknowns=unknowns,
+                    by_unknowns=h_u,
                     passive_index=used,
                     theta_index=theta_index,
                     passive=passive[used.tolist()],
@@ -213,10 +249,10 @@ class CalibrationProblem:
 
     @cached_property
     def direct(self) -> DirectExpressions:
-        """Closures and readings as expressions of θ̂ itself."""
+        """Closures and readings as expressions of the machine's θ̂ itself."""
         robot = self.robot
         drives, passive = self._posture_symbols()
-        theta, zero = ca.SX.sym("theta", self.n_free), ca.SX.sym("zero", len(robot.drives))
+        theta, zero = ca.SX.sym("theta", self.n_machine), ca.SX.sym("zero", len(robot.drives))
         errors = self._errors(theta)
         machine, at_zero = (
             SymbolicRobot(robot, drives=d, passive=p, errors=errors)
@@ -226,7 +262,7 @@ class CalibrationProblem:
             )
         )
         setups = list(self.session.setups.values())
-        constants, readings = [], []
+        constants, unknowns, readings = [], [], []
         for group in self.sensor_groups:
             sensor = setups[int(self.observations.setup[group.entries[0]])].sensor
             frames = sensor.frames(robot)
@@ -235,9 +271,10 @@ class CalibrationProblem:
                 [machine.frame_pose(f) for f in frames.in_posture],
                 [at_zero.frame_pose(f) for f in frames.at_zero],
                 own,
-                ca.SX(0, 1),
+                ca.SX.sym("unknowns", group.unknowns.shape[1]),
             )
             constants.append(own)
+            unknowns.append(view.unknowns)
             readings.append(sensor.expression(view, robot))
         scale = closure_row_units(robot) / LENGTH_SCALE
         return DirectExpressions(
@@ -247,19 +284,22 @@ class CalibrationProblem:
             zero,
             machine.closure_residual() * scale,
             tuple(constants),
+            tuple(unknowns),
             tuple(readings),
         )
 
     def predict(self, theta: ArrayLike, passive: Array | None = None) -> Array:
-        """Readings h(q(θ), θ) of all entries, gauge zeros at 0, shape (n_entries,), [m]."""
+        """Readings h(q(θ), θ) of all entries, gauge zeros at 0.
+
+        Shape (n_entries,), [m of the first gauge].
+        """
         q = self.close(theta) if passive is None else passive
-        machine = self.assembly.machine(theta)
+        machine, unknowns = self.assembly.machine(self._of_machine(theta)), self._of_sensors(theta)
         result = np.empty(self.observations.size)
         for group in self.sensor_groups:
-            for entries, constants in group.parts(READINGS_AT_ONCE):
-                at = self.observations.posture[entries]
-                result[entries] = self._read(group, constants, at, machine, q)
-        return result
+            for entries, part in group.parts(READINGS_AT_ONCE):
+                result[entries] = self._read(group, part, machine, q, unknowns)
+        return np.asarray(result / self.noise)
 
     def linearise(self, theta: ArrayLike, passive: Array | None = None) -> tuple[Array, Array]:
         """Readings and identification Jacobian at given parameters.
@@ -272,8 +312,8 @@ class CalibrationProblem:
             passive: Passive coordinates with closed loops at theta; closed here by default.
 
         Returns:
-            Readings, shape (n_entries,), [m], and dh/dθ̂, shape (n_entries, n_free),
-            [m per tolerance].
+            Readings, shape (n_entries,), [m of the first gauge], and dh/dθ̂, shape (n_entries,
+            n_free), [the same per tolerance].
 
         Raises:
             ClosureError: If the machine with these errors cannot reach a posture.
@@ -292,7 +332,9 @@ class CalibrationProblem:
         Raises:
             LinAlgError: If a posture is singular.
         """
-        return self._expander(*self._machine_and_slopes(theta), passive)
+        unknowns = self._of_sensors(theta)
+        found = self._expander(*self._machine_and_slopes(theta), passive, unknowns)
+        return found.scaled(self.theta_scale[self.n_machine :], self.noise)
 
     @cached_property
     def _expander(self) -> Expander:
@@ -308,12 +350,22 @@ class CalibrationProblem:
         )
 
     def split_errors(self, theta: ArrayLike) -> dict[str, float]:
-        """Parameter name to value, free and fixed, [SI]."""
-        return {**self.fixed, **dict(zip(self.free, np.asarray(theta).tolist(), strict=True))}
+        """Errors of the machine, free and fixed: name to value, [SI]."""
+        names, values = self.machine_selection.names, self._of_machine(theta).tolist()
+        return {**self.fixed, **dict(zip(names, values, strict=True))}
+
+    def _of_machine(self, theta: ArrayLike) -> Array:
+        return np.asarray(theta, dtype=np.float64)[: self.n_machine]
+
+    def _of_sensors(self, theta: ArrayLike) -> Array:
+        """What is not known of sensors; 0 where only the machine's errors are given."""
+        given = np.asarray(theta, dtype=np.float64)[self.n_machine :]
+        return given if given.size else np.zeros(self.n_free - self.n_machine)
 
     def _errors(self, theta: ca.SX) -> dict[str, ca.SX | float]:
         errors: dict[str, ca.SX | float] = dict(self.fixed)
-        errors.update({name: theta[i] * self.theta_scale[i] for i, name in enumerate(self.free)})
+        names = self.machine_selection.names
+        errors.update({name: theta[i] * self.theta_scale[i] for i, name in enumerate(names)})
         return errors
 
     def _posture_symbols(self) -> tuple[ca.SX, ca.SX]:
@@ -338,30 +390,34 @@ class CalibrationProblem:
 
     @cached_property
     def _columns(self) -> Array:
-        """What one tolerance of each free parameter adds to all errors, (n_errors, n_free)."""
-        return self.compiled.errors.columns(self.free) * self.theta_scale
+        """What one tolerance of each free error adds to all of them, (n_errors, n_machine)."""
+        selection = self.machine_selection
+        return self.compiled.errors.columns(selection.names) * selection.tolerances
 
     def _machine_and_slopes(self, theta: ArrayLike) -> tuple[Machine, Slopes]:
         """The machine, and what tolerances of the free parameters do to it."""
-        errors = self.assembly.errors(theta)
-        return self.assembly.machine(theta), self.compiled.errors.slopes(errors, self._columns)
+        machine = self._of_machine(theta)
+        errors = self.assembly.errors(machine)
+        return self.assembly.machine(machine), self.compiled.errors.slopes(errors, self._columns)
 
     def _read(
         self,
         group: SensorGroup,
-        constants: Array,
-        postures: Indices,
+        part: slice,
         machine: Machine,
         passive: Array,
+        unknowns: Array,
     ) -> Array:
+        """Readings of part of a group, in their own metres, shape (n,)."""
+        postures = self.observations.posture[group.entries[part]]
         zero = machine.drives(self.session.zero_drives)
         (h,) = group.reading.value(
             machine.drives(self.drives[postures]),
             passive[postures],
             machine.placements,
-            np.tile(zero, (postures.size, 1)),
-            constants,
-            np.zeros((postures.size, 0)),
+            zero[group.setups[part]],
+            group.constants[part],
+            unknowns[group.unknowns[part]],
         )
         return np.asarray(h[:, 0])
 

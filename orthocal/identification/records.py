@@ -46,6 +46,8 @@ class SessionRecord:
     """[m]."""
     controller_offsets: tuple[float, ...] | None
     """Offsets active in the controller, [m, rad]; None where not stated."""
+    parts: tuple[SessionRecord, ...] = ()
+    """The sessions that were joined into this one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,6 +159,8 @@ class ResidualRow:
     """The same for the calibrated machine, [m]."""
     line: int | None
     """Line in the CSV."""
+    file: str | None
+    """The CSV, where it is not that of the session."""
     studentised: float
     """Error of the row as all others see it, in its standard deviations; NaN if they do not."""
     influence: float
@@ -210,6 +214,22 @@ class PostureRecord:
     """Commanded drive coordinates, controller offsets taken off, [m, rad]."""
     passive: tuple[float, ...]
     """Passive coordinates of the calibrated machine, [m, rad]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GaugeRecord:
+    """A gauge that was read."""
+
+    name: str
+    """"" for an only one."""
+    sigma: float | None
+    """Standard deviation of a reading as stated, [m]."""
+    resolution: float | None
+    """[m]."""
+    noise: float
+    """Standard deviation of a reading as found, [m]; NaN if nothing tells."""
+    readings: int
+    """Of it, differences taken apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

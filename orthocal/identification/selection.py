@@ -60,6 +60,18 @@ class Selection:
         """One standard deviation of each free parameter, shape (n_free,), [SI]."""
         return np.array([p.tolerance for p in self.parameters])
 
+    def with_known(self, parameters: Sequence[Parameter]) -> Selection:
+        """The same with further parameters, each known to its tolerance beforehand."""
+        n = len(parameters)
+        return replace(
+            self,
+            parameters=(*self.parameters, *parameters),
+            prior=np.append(self.prior, np.ones(n, dtype=bool)),
+            mean=read_only(np.append(self.mean, np.zeros(n))),
+            lower=read_only(np.append(self.lower, np.full(n, -np.inf))),
+            upper=read_only(np.append(self.upper, np.full(n, np.inf))),
+        )
+
     def keep(self, names: Sequence[str]) -> Selection:
         """The same with only some of the parameters free, none with a prior; the others are 0."""
         index = [self.names.index(name) for name in names]

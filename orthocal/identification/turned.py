@@ -158,7 +158,9 @@ def _likelihood_refitted(fit: Fit, others: OtherErrors, values: Array, sigma: fl
 def _is_flat(problem: CalibrationProblem) -> NDArray[np.bool_]:
     """Parameters of which nothing is known beforehand: without a prior, and all offsets."""
     elementary = problem.robot.parameters.elementary
-    offset = [elementary[p.terms[0][0]].kind == "offset" for p in problem.parameters]
+    offset = [
+        bool(p.terms) and elementary[p.terms[0][0]].kind == "offset" for p in problem.parameters
+    ]
     return np.asarray((problem.prior_precision == 0.0) | np.array(offset, dtype=bool))
 
 

@@ -283,6 +283,24 @@ def _inverse_square(matrix: Array) -> Array:
     return np.asarray(half @ half.T)
 
 
+def marginalise(information: Information, kept: int, *, sigma: float) -> Information:
+    """What readings say of the first parameters, the others known to their tolerances at most.
+
+    Args:
+        information: Of all parameters.
+        kept: How many are kept.
+        sigma: Standard deviation of a reading, [m].
+    """
+    count = information.factor.shape[1] - kept
+    if not count:
+        return information
+    rows = np.vstack([information.factor / sigma, np.zeros((count, kept + count))])
+    rows[-count:, kept:] = np.eye(count)
+    taken, _ = np.linalg.qr(rows[:, kept:])
+    left = rows[:, :kept] - taken @ (taken.T @ rows[:, :kept])
+    return _information(sigma * left)
+
+
 def decompose(jacobian: Array, observations: Observations) -> Information:
     """Decompose an identification Jacobian.
 
@@ -290,7 +308,10 @@ def decompose(jacobian: Array, observations: Observations) -> Information:
         jacobian: dh/dθ̂, shape (n_entries, n_free), [m per tolerance].
         observations: Which zero each entry has.
     """
-    factor = project_out_zeros(jacobian, observations)
+    return _information(project_out_zeros(jacobian, observations))
+
+
+def _information(factor: Array) -> Information:
     if len(factor) > 2 * factor.shape[1]:  # same singular values, far fewer rows
         factor = np.asarray(np.linalg.qr(factor, mode="r"))
     _, values, directions = np.linalg.svd(factor, full_matrices=True)

@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import ParameterError
-from orthocal.identification.fit import SMALLEST_SIGMA, Fit
+from orthocal.identification.fit import Fit
 from orthocal.identification.problem import CalibrationProblem
 from orthocal.identification.selection import Selection
 from orthocal.identification.uncertainty import project_out_zeros
+from orthocal.identification.weighting import SMALLEST_SIGMA
 from orthocal.kinematics.symbolic import hangs_on
 from orthocal.robot.model import Robot, read_only
 
@@ -104,7 +105,8 @@ def find_other_errors(fit: Fit, *, spoken_for: Collection[str] = ()) -> OtherErr
     problem = fit.problem
     parameters = problem.robot.parameters
     # of a sum the first error is what it is told by: the others still differ from it
-    taken = {parameters[n].terms[0][0] for n in (*problem.free, *problem.fixed, *spoken_for)}
+    own = problem.machine_selection.names
+    taken = {parameters[n].terms[0][0] for n in (*own, *problem.fixed, *spoken_for)}
     names = [
         n
         for n in machine_errors(problem.robot)
@@ -123,28 +125,29 @@ def find_other_errors(fit: Fit, *, spoken_for: Collection[str] = ()) -> OtherErr
         upper=read_only(np.full(len(names), np.inf)),
         fixed=problem.split_errors(fit.solution.theta),
     )
-    others = CalibrationProblem(problem.session, selection)
-    _, jacobian = others.linearise(np.zeros(len(names)), fit.solution.passive)
-    return OtherErrors(
-        tuple(names), read_only(selection.tolerances), read_only(project_out_zeros(jacobian, o))
-    )
+    others = CalibrationProblem(problem.session, selection, noise=problem.noise)
+    at = np.append(np.zeros(len(names)), fit.solution.theta[problem.n_machine :])
+    _, jacobian = others.linearise(at, fit.solution.passive)
+    slopes = project_out_zeros(jacobian[:, : len(names)], o)
+    return OtherErrors(tuple(names), read_only(selection.tolerances), read_only(slopes))
 
 
 def measure_unmodelled(fit: Fit, others: OtherErrors) -> Unmodelled:
     """What errors of the machine that were not free do to an estimate."""
     problem = fit.problem
     if not others.names:
-        return Unmodelled((), read_only([]), read_only(np.zeros((problem.n_free, 0))), 0.0)
+        return Unmodelled((), read_only([]), read_only(np.zeros((problem.n_machine, 0))), 0.0)
     o, sigma = problem.observations, max(fit.sigma, SMALLEST_SIGMA)
     slopes = project_out_zeros(fit.jacobian, o)
     inverse = fit.information.covariance(
         sigma=sigma, precision=problem.prior_precision, held=fit.held
     )
+    n = problem.n_machine
     scaled = inverse @ (slopes.T @ others.slopes) / sigma**2
     left = o.rows(others.slopes - slopes @ scaled)
     return Unmodelled(
         names=others.names,
         tolerances=others.tolerances,
-        leakage=read_only(scaled * problem.theta_scale[:, None] / others.tolerances),
+        leakage=read_only((scaled * problem.theta_scale[:, None] / others.tolerances)[:n]),
         residual_rms=float(np.sqrt((left**2).sum() / len(left))),
     )

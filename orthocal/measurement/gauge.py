@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from orthocal.kinematics.assembly import Assembly, nominal_assembly
 from orthocal.kinematics.compiled import compiled_robot, zero_poses
 from orthocal.measurement.session import Session
+from orthocal.robot.parameters import Parameter
 from orthocal.sensors.compiled import CompiledReading, compile_reading
 from orthocal.sensors.protocol import Contact
 
@@ -47,6 +48,18 @@ class Observations:
     def size(self) -> int:
         """Number of entries."""
         return self.setup.size
+
+    def only(self, chosen: NDArray[np.bool_]) -> Observations:
+        """Some of the entries: which setup, posture and zero they have; no rows."""
+        none = np.empty(0, dtype=np.int64)
+        return replace(
+            self,
+            setup=self.setup[chosen],
+            posture=self.posture[chosen],
+            zero=self.zero[chosen],
+            plus=none,
+            minus=none,
+        )
 
     def rows(self, entries: Array) -> Array:
         """Rows of the session from values of the entries, shape (n_rows, ...)."""
@@ -162,20 +175,51 @@ class SensorGroup:
     reading: CompiledReading
     entries: Indices
     """Shape (n,)."""
+    setups: Indices
+    """Their setups, shape (n,)."""
     constants: Array
     """Of their setups, shape (n, n_constants)."""
+    unknowns: Indices
+    """Which of the session's unknowns are theirs, shape (n, n_unknowns)."""
 
-    def parts(self, size: int) -> Iterator[tuple[Indices, Array]]:
-        """Entries and constants, not more than so many at a time."""
+    def parts(self, size: int) -> Iterator[tuple[Indices, slice]]:
+        """Entries, and where they are in the group, not more than so many at a time."""
         for first in range(0, self.entries.size, size):
             part = slice(first, first + size)
-            yield self.entries[part], self.constants[part]
+            yield self.entries[part], part
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorUnknowns:
+    """What of a session's sensors is not known exactly."""
+
+    parameters: tuple[Parameter, ...]
+    """Named after their setups, or after what several share; they add to no error of a machine."""
+    of_setup: tuple[tuple[int, ...], ...]
+    """Which of them each setup has, in the order of its sensor's."""
+
+
+def sensor_unknowns(session: Session) -> SensorUnknowns:
+    """The unknowns of all setups that are read."""
+    found: dict[str, Parameter] = {}
+    places = []
+    read = {r.setup for r in session.readings}
+    for setup in session.setups.values():
+        own = []
+        for unknown in setup.sensor.unknowns if setup.name in read else ():
+            owner = unknown.shared_by or f"setup.{setup.name}"
+            name = f"{owner}.{unknown.name}"
+            found.setdefault(name, Parameter(name, unknown.unit, unknown.tolerance, ()))
+            own.append(list(found).index(name))
+        places.append(tuple(own))
+    return SensorUnknowns(tuple(found.values()), tuple(places))
 
 
 def group_sensors(session: Session, observations: Observations) -> tuple[SensorGroup, ...]:
     """Entries by the expression that they are readings of."""
     robot = session.robot
     setups = list(session.setups.values())
+    unknowns = sensor_unknowns(session).of_setup
     found: dict[int, tuple[CompiledReading, list[int]]] = {}
     for i in np.unique(observations.setup).tolist():
         reading = compile_reading(robot, setups[i].sensor)
@@ -184,8 +228,11 @@ def group_sensors(session: Session, observations: Observations) -> tuple[SensorG
     for reading, members in found.values():
         entries = np.flatnonzero(np.isin(observations.setup, members))
         constants = {i: setups[i].sensor.constants(robot) for i in members}
-        table = np.array([constants[i] for i in observations.setup[entries].tolist()])
-        groups.append(SensorGroup(reading, entries, table))
+        of_entry = observations.setup[entries]
+        table = np.array([constants[i] for i in of_entry.tolist()])
+        own = np.array([unknowns[i] for i in of_entry.tolist()], dtype=np.int64)
+        own = own.reshape(entries.size, -1)
+        groups.append(SensorGroup(reading, entries, of_entry, table, own))
     return tuple(groups)
 
 
@@ -195,6 +242,7 @@ def predict_entries(
     errors: Mapping[str, float] | None = None,
     *,
     passive: Array | None = None,
+    unknowns: Array | None = None,
 ) -> Array:
     """Readings that a machine with given errors shows, gauge zeros at 0, shape (n,), [m].
 
@@ -203,6 +251,7 @@ def predict_entries(
         observations: Which setup is read in which posture.
         errors: Parameter name to value, [unit of the parameter].
         passive: Passive coordinates of every posture, if they are known, [m, rad].
+        unknowns: Those of the sensors, in the order of `sensor_unknowns`, [SI]; 0 by default.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
@@ -214,6 +263,8 @@ def predict_entries(
         passive = assembly.close(drives, names=list(session.postures))
     machine = assembly.machine()
     actuated, zero = machine.drives(drives), machine.drives(session.zero_drives)
+    if unknowns is None:
+        unknowns = np.zeros(len(sensor_unknowns(session).parameters))
     result = np.empty(observations.size)
     for group in group_sensors(session, observations):
         at = observations.posture[group.entries]
@@ -221,9 +272,9 @@ def predict_entries(
             actuated[at],
             passive[at],
             machine.placements,
-            np.tile(zero, (at.size, 1)),
+            zero[group.setups],
             group.constants,
-            np.zeros((at.size, 0)),
+            unknowns[group.unknowns],
         )
         result[group.entries] = h[:, 0]
     return result

@@ -28,6 +28,9 @@ MOST_READINGS = 50_000
 """Readings of a session or a plan: four times the largest that was tried, by hand a month's work.
 A calibration takes 10 kB for each."""
 
+MOST_GAUGES = 100
+"""Gauges of a session."""
+
 GaugeLength = Annotated[PositiveNumber, Field(le=COARSEST_MM)]
 GaugeEnd = Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)]
 
@@ -104,7 +107,12 @@ class SessionKeys(_Keys):
     robot: str
     title: str = ""
     source: str = ""
-    gauge: GaugeKeys = GaugeKeys()
+    gauge: GaugeKeys | None = None
+    """Of a session with one gauge."""
+    gauges: Annotated[dict[Name, GaugeKeys], Field(min_length=1, max_length=MOST_GAUGES)] | None = (
+        None
+    )
+    """Of a session with several; its setups name theirs."""
     postures: Annotated[dict[Name, PostureKeys], Field(min_length=1, max_length=MOST_POSTURES)]
     controller: ControllerKeys | None = None
     setups: Annotated[dict[Name, dict[str, Any]], Field(min_length=1, max_length=MOST_SETUPS)]
@@ -112,3 +120,9 @@ class SessionKeys(_Keys):
     cycles: Annotated[int, Field(ge=1, le=1000)] = 1
     """In a plan: how often the postures are gone through."""
     readings: str | None = None
+
+    @model_validator(mode="after")
+    def _one_form_of_gauges(self) -> SessionKeys:
+        if self.gauge is not None and self.gauges is not None:
+            raise ValueError("found gauge and gauges; expected one of them")
+        return self

@@ -53,6 +53,11 @@ class Setup:
 
     name: str
     sensor: Sensor
+    gauge: str = ""
+    """Name of what shows its readings, among the session's gauges."""
+    active: Array | None = None
+    """Offsets that were active in the controller while it stood, shape (n_drives,), [m, rad]; those
+    of the session where not given."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +73,8 @@ class Reading:
     """[m]."""
     line: int | None
     """Line in the CSV, for messages."""
+    file: Path | None = None
+    """The CSV; that of the session where not given."""
 
     @property
     def label(self) -> str:
@@ -84,7 +91,8 @@ class Session:
     """As the file names it."""
     title: str
     source: str
-    gauge: Gauge
+    gauges: Mapping[str, Gauge]
+    """Name to gauge; an only one may have the name ""."""
     postures: Mapping[str, Posture]
     setups: Mapping[str, Setup]
     readings: tuple[Reading, ...]
@@ -94,6 +102,18 @@ class Session:
     """The session.yaml, or None for a session that is not from a file."""
     readings_path: Path | None
     sha256: str
+    parts: tuple[Session, ...] = ()
+    """The sessions that were joined into this one."""
+
+    @property
+    def gauge(self) -> Gauge:
+        """The gauge; of several the first, by which the others' noise is measured."""
+        return next(iter(self.gauges.values()))
+
+    def with_gauge(self, gauge: Gauge) -> Session:
+        """The same session with another gauge instead of all of its own."""
+        setups = {name: replace(s, gauge="") for name, s in self.setups.items()}
+        return replace(self, gauges={"": gauge}, setups=setups)
 
     @property
     def active_offsets(self) -> Array:
@@ -104,8 +124,13 @@ class Session:
 
     @property
     def zero_drives(self) -> Array:
-        """Commanded drive coordinates of the mechanical zero, shape (n_drives,), [m, rad]."""
-        return self.robot.drive_zero - self.active_offsets
+        """Commanded drive coordinates of the mechanical zero while each setup stood.
+
+        Shape (n_setups, n_drives), [m, rad].
+        """
+        own = [s.active for s in self.setups.values()]
+        active = [self.active_offsets if a is None else a for a in own]
+        return np.asarray(self.robot.drive_zero - np.array(active))
 
     @property
     def values(self) -> Array:
@@ -119,9 +144,10 @@ class Session:
 
     def where(self, reading: Reading) -> str:
         """File and line of a reading, for messages."""
-        if self.readings_path is None or reading.line is None:
+        file = reading.file or self.readings_path
+        if file is None or reading.line is None:
             return f"reading {reading.label}"
-        return f"{self.readings_path}:{reading.line}"
+        return f"{file}:{reading.line}"
 
     def _repr_html_(self) -> str:
         """In a notebook: the setups and what was read in each."""

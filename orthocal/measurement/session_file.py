@@ -23,6 +23,7 @@ from orthocal.measurement.gauge import locate_contacts
 from orthocal.measurement.schema import (
     LARGEST_READING_MM,
     MOST_READINGS,
+    GaugeKeys,
     SessionKeys,
 )
 from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
@@ -154,22 +155,19 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         raise
     require_given_zero(robot, f"{file}: robot")
     offsets = build_offsets(keys.controller, robot, f"{file}: controller")
+    gauges = _build_gauges(keys)
     setups = {}
-    for name, (_, sensor) in read.items():
-        sensor.require_fit(robot, where=f"{file}: setups.{name}")
-        setups[name] = Setup(name, sensor)
+    for name, (setup, sensor) in read.items():
+        where = f"{file}: setups.{name}"
+        sensor.require_fit(robot, where=where)
+        setups[name] = Setup(name, sensor, _gauge_of(setup, gauges, where))
     _check_planned_postures(file, keys, read)
-    g = keys.gauge
     return Session(
         robot=robot,
         robot_reference=keys.robot,
         title=keys.title,
         source=keys.source,
-        gauge=Gauge(
-            None if g.sigma_mm is None else g.sigma_mm * 1e-3,
-            None if g.resolution_mm is None else g.resolution_mm * 1e-3,
-            None if g.range_mm is None else (g.range_mm[0] * 1e-3, g.range_mm[1] * 1e-3),
-        ),
+        gauges=gauges,
         postures=_build_postures(keys, robot, offsets, file),
         setups=setups,
         readings=(),
@@ -178,6 +176,36 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         readings_path=None,
         sha256="",
     )
+
+
+def _build_gauges(keys: SessionKeys) -> dict[str, Gauge]:
+    given = keys.gauges or {"": keys.gauge or GaugeKeys()}
+    return {
+        name: Gauge(
+            None if g.sigma_mm is None else g.sigma_mm * 1e-3,
+            None if g.resolution_mm is None else g.resolution_mm * 1e-3,
+            None if g.range_mm is None else (g.range_mm[0] * 1e-3, g.range_mm[1] * 1e-3),
+        )
+        for name, g in given.items()
+    }
+
+
+def _gauge_of(setup: SetupKeys, gauges: Mapping[str, Gauge], where: str) -> str:
+    """Name of a setup's gauge."""
+    if setup.gauge is None:
+        if len(gauges) > 1:
+            raise SessionError(
+                f"is missing; expected one of {', '.join(gauges)}", where=f"{where}.gauge"
+            )
+        return next(iter(gauges))
+    if setup.gauge not in gauges or not setup.gauge:
+        named = ", ".join(name for name in gauges if name)
+        raise SessionError(
+            f"'{setup.gauge}' is not a gauge; "
+            + (f"gauges: {named}" if named else "the session names none under `gauges`"),
+            where=f"{where}.gauge",
+        )
+    return setup.gauge
 
 
 def _check_planned_postures(file: Path, keys: SessionKeys, read: _Setups) -> None:
@@ -316,7 +344,7 @@ def _read_readings(path: Path, content: bytes, plan: Session) -> tuple[Reading, 
         seen[key] = line
         if len(readings) >= MOST_READINGS:
             raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(path))
-        _check_range(value, plan.gauge, bool(minus), where)
+        _check_range(value, plan.gauges[plan.setups[setup].gauge], bool(minus), where)
         _check_form(reading, raw, joined, where)
         readings.append(reading)
     if not readings:

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from orthocal.files import write_files
-from orthocal.measurement.session import Session
+from orthocal.measurement.session import Gauge, Session
 from orthocal.robot.loading import packaged_robots
 from orthocal.sensors.registry import write_sensor
 from orthocal.units import tidy, to_mm
@@ -28,15 +28,11 @@ def session_document(session: Session, *, readings: str = "readings.csv") -> dic
         document["title"] = session.title
     if session.source:
         document["source"] = session.source
-    gauge = session.gauge
-    entries = {
-        "sigma_mm": None if gauge.sigma is None else to_mm(gauge.sigma),
-        "resolution_mm": None if gauge.resolution is None else to_mm(gauge.resolution),
-        "range_mm": None if gauge.range is None else [to_mm(v) for v in gauge.range],
-    }
-    entries = {k: v for k, v in entries.items() if v is not None}
-    if entries:
-        document["gauge"] = entries
+    gauges = {name: _gauge_document(g) for name, g in session.gauges.items()}
+    if "" not in gauges:
+        document["gauges"] = gauges
+    elif gauges[""]:
+        document["gauge"] = gauges[""]
     document["postures"] = {
         p.name: {
             p.form: [tidy(np.rad2deg(v)) if p.form == "joints_deg" else to_mm(v) for v in p.values]
@@ -45,9 +41,21 @@ def session_document(session: Session, *, readings: str = "readings.csv") -> dic
     }
     if session.controller_offsets is not None:
         document["controller"] = _offsets_document(session)
-    document["setups"] = {s.name: write_sensor(s.sensor) for s in session.setups.values()}
+    document["setups"] = {
+        s.name: {**write_sensor(s.sensor), **({"gauge": s.gauge} if s.gauge else {})}
+        for s in session.setups.values()
+    }
     document["readings"] = readings
     return document
+
+
+def _gauge_document(gauge: Gauge) -> dict[str, Any]:
+    entries = {
+        "sigma_mm": None if gauge.sigma is None else to_mm(gauge.sigma),
+        "resolution_mm": None if gauge.resolution is None else to_mm(gauge.resolution),
+        "range_mm": None if gauge.range is None else [to_mm(v) for v in gauge.range],
+    }
+    return {k: v for k, v in entries.items() if v is not None}
 
 
 def _offsets_document(session: Session) -> dict[str, list[float]]:

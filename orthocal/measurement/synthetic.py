@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from orthocal.arguments import require_kind, require_names, require_numbers, require_seed
 from orthocal.documents import Number, parse_number, read_yaml, validate
 from orthocal.errors import ParameterError, SessionError
-from orthocal.measurement.gauge import build_observations, predict_entries
+from orthocal.measurement.gauge import build_observations, predict_entries, sensor_unknowns
 from orthocal.measurement.session import Session
 from orthocal.robot.model import Robot
 from orthocal.units import to_mm
@@ -36,6 +36,8 @@ class SimulatedSession:
     """Parameter name to true value, [SI]."""
     zeros: Mapping[str, float]
     """Setup to the true zero of its gauge, [m]."""
+    unknowns: Mapping[str, float] = field(default_factory=dict)
+    """What of the sensors is not known exactly: name to true value, [SI]."""
 
 
 def draw_errors(
@@ -103,14 +105,14 @@ def simulate_session(
         raise ValueError(f"sigma: found {sigma!r}; expected a number of at least 0")
     rng = np.random.default_rng(seed)
     observations = build_observations(plan)
-    entries = predict_entries(plan, observations, errors)
+    unknown = sensor_unknowns(plan).parameters
+    drawn = np.zeros(len(unknown))
+    if unknown and not exact:
+        drawn = rng.normal(size=len(unknown)) * [p.tolerance for p in unknown]
+    entries = predict_entries(plan, observations, errors, unknowns=drawn)
+    gauges = [plan.gauges[s.gauge] for s in plan.setups.values()]
+    deviation = np.array([_noise_of(plan, s.gauge, sigma, exact) for s in plan.setups.values()])
     # the dial is set where its setup begins
-    deviation = plan.gauge.sigma if sigma is None else sigma
-    if deviation is None and not exact:
-        raise SessionError(
-            "is missing: the noise to simulate is not known",
-            where="gauge.sigma_mm" if plan.path is None else f"{plan.path}: gauge.sigma_mm",
-        )
     zeros = dict.fromkeys(plan.setups, 0.0)
     for i, name in enumerate(zeros):
         zeros[name] = -float(entries[observations.setup == i][:1].sum())
@@ -118,13 +120,16 @@ def simulate_session(
             zeros[name] += round(float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO)), 6)
     entries = entries + np.array(list(zeros.values()))[observations.setup]
     if not exact:
-        entries = entries + (deviation or 0.0) * rng.normal(size=observations.size)
-        if plan.gauge.resolution is not None:
-            entries = np.round(entries / plan.gauge.resolution) * plan.gauge.resolution
+        entries = entries + deviation[observations.setup] * rng.normal(size=observations.size)
+        for i, gauge in enumerate(gauges):
+            if gauge.resolution is not None:
+                own = observations.setup == i
+                entries[own] = np.round(entries[own] / gauge.resolution) * gauge.resolution
     rows = observations.rows(entries)
-    limits = plan.gauge.range
-    if limits is not None:
-        for reading, value in zip(plan.readings, rows, strict=True):
+    for reading, value in zip(plan.readings, rows, strict=True):
+        gauge_name = plan.setups[reading.setup].gauge
+        limits = plan.gauges[gauge_name].range
+        if limits is not None:
             lowest, highest = (
                 limits if reading.minus is None else (limits[0] - limits[1], limits[1] - limits[0])
             )
@@ -132,17 +137,36 @@ def simulate_session(
                 raise SessionError(
                     f"the simulated reading {reading.label} is {value * 1e3:.3f} mm; the gauge's "
                     f"range ends at {(lowest if value < lowest else highest) * 1e3:g} mm",
-                    where=None if plan.path is None else f"{plan.path}: gauge.range_mm",
+                    where=_where(plan, gauge_name, "range_mm") if plan.path is not None else None,
                 )
     session = replace(
         plan.with_values(rows),
-        gauge=replace(plan.gauge, resolution=None) if exact else plan.gauge,
+        gauges={
+            name: replace(g, resolution=None) if exact else g for name, g in plan.gauges.items()
+        },
         title=plan.title if plan.title.startswith("Simulated") else f"Simulated: {plan.title}",
         source=f"Simulated by orthocal, not measured (seed {seed})",
         path=None,
         readings_path=None,
     )
-    return SimulatedSession(session, dict(errors), zeros)
+    found = {p.name: float(v) for p, v in zip(unknown, drawn, strict=True)}
+    return SimulatedSession(session, dict(errors), zeros, found)
+
+
+def _noise_of(plan: Session, gauge: str, sigma: float | None, exact: bool) -> float:
+    """Standard deviation that a gauge's readings are simulated with, [m]."""
+    deviation = plan.gauges[gauge].sigma if sigma is None else sigma
+    if deviation is None and not exact:
+        raise SessionError(
+            "is missing: the noise to simulate is not known",
+            where=_where(plan, gauge, "sigma_mm"),
+        )
+    return deviation or 0.0
+
+
+def _where(plan: Session, gauge: str, key: str) -> str:
+    path = f"gauges.{gauge}.{key}" if gauge else f"gauge.{key}"
+    return path if plan.path is None else f"{plan.path}: {path}"
 
 
 class _TruthKeys(BaseModel):
@@ -150,6 +174,7 @@ class _TruthKeys(BaseModel):
 
     errors: Annotated[dict[str, Number], Field(min_length=1)]
     zeros_mm: dict[str, Number] = {}
+    sensors: dict[str, Number] = {}
 
 
 def load_errors(path: str | Path, robot: Robot) -> dict[str, float]:
@@ -243,5 +268,13 @@ def truth_document(simulated: SimulatedSession) -> str:
         "errors": errors,
         "zeros_mm": {name: to_mm(value) for name, value in simulated.zeros.items()},
     }
+    if simulated.unknowns:
+        of_sensors = {p.name: p for p in sensor_unknowns(simulated.session).parameters}
+        document["sensors"] = {
+            f"{name}_{of_sensors[name].edge_unit}": float(
+                f"{value * of_sensors[name].edge_factor:.9g}"
+            )
+            for name, value in simulated.unknowns.items()
+        }
     head = "# The truth behind the simulated readings beside this file. No calibration reads it.\n"
     return head + str(yaml.safe_dump(document, sort_keys=False, default_flow_style=False))

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from orthocal.errors import ClosureError, NotIdentifiableError, RobotError, SolverError
 from orthocal.identification.calibrate import assemble_calibration
 from orthocal.identification.calibration import Calibration
-from orthocal.identification.fit import SMALLEST_SIGMA, Fit, fit_problem, require_determined
+from orthocal.identification.fit import Fit, fit_problem, require_determined
 from orthocal.identification.linear import Linearisation
 from orthocal.identification.options import SolverOptions
 from orthocal.identification.problem import CalibrationProblem
 from orthocal.identification.uncertainty import decompose, project_out_zeros
+from orthocal.identification.weighting import SMALLEST_SIGMA
 from orthocal.study.accuracy import ErrorSize, ToolAccuracy, assess_tool
 
 Array = NDArray[np.float64]
@@ -162,7 +163,7 @@ def _score(fit: Fit, linearisation: Linearisation, method: Method, noise: float)
     return Score(
         model=problem.selection.label,
         method=method,
-        estimates=dict(zip(problem.free, theta.tolist(), strict=True)),
+        estimates=dict(zip(problem.machine_selection.names, theta.tolist(), strict=False)),
         residuals=rows,
         rms=float(np.sqrt(np.mean(rows**2))),
         chi_square=square / noise**2,

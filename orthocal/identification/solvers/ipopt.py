@@ -198,7 +198,7 @@ class NonlinearProgram:
         left_out: ArrayLike | None = None,
         widening: float = 1.0,
     ) -> Array:
-        """The program's parameters p: readings, their weights, σ, the prior's scale, the width.
+        """The program's parameters p: readings, weights, noise, σ, the prior's scale, the width.
 
         Args:
             sigma: Standard deviation of one reading, [m].
@@ -212,7 +212,7 @@ class NonlinearProgram:
             weights[np.asarray(left_out, dtype=np.int64)] = LEFT_OUT
         weighted, scale = _weighting(sigma)
         width = self.options.loss.width * widening * sigma / weighted
-        return np.concatenate([y, weights, [weighted, scale, width]])
+        return np.concatenate([y, weights, self.problem.noise, [weighted, scale, width]])
 
     def functions(self) -> dict[str, ca.Function]:
         """The program's functions of (x, p[, lam_f, lam_g]), for checks of their derivatives."""
@@ -244,14 +244,14 @@ class NonlinearProgram:
         n = n_fixed + k * self._n_passive
         x = ca.MX.sym("x", n)
         entries = problem.observations.size
-        p = ca.MX.sym("p", 2 * entries + 3)
+        p = ca.MX.sym("p", 3 * entries + 3)
         lam_f = ca.MX.sym("lam_f")
         lam_g = ca.MX.sym("lam_g", k * problem.robot.closure_rows)
         theta = x[: self._n_theta]
-        prior = p[2 * entries + 1] * ca.DM(problem.prior_precision)
+        prior = p[3 * entries + 1] * ca.DM(problem.prior_precision)
         from_mean = theta - ca.DM(problem.prior_mean / problem.theta_scale)
 
-        shared = list(self._shared_call(theta))
+        shared = list(self._shared_call(theta[: problem.n_machine]))
         objective = 0.5 * ca.dot(prior * from_mean, from_mean)
         gradient, hessian = SparseSum(n, 1), SparseSum(n, n)
         diagonal = np.arange(self._n_theta)
@@ -321,9 +321,10 @@ class NonlinearProgram:
         gradient: SparseSum,
         hessian: SparseSum,
     ) -> ca.MX:
-        """Add the readings of one leg to gradient and Hessian; returns their objective.
+        """Add the readings of one kind to gradient and Hessian; returns their objective.
 
-        Local variables are u = (θ̂, ẑ, q̂) in the order that they have in x.
+        Local variables are (θ̂, û, ẑ, q̂) in the order that they have in x, û what is not known of
+        the sensor.
         """
         problem, o = self.problem, self.problem.observations
         count, n_t = piece.entries.size, piece.theta_index.size
@@ -331,21 +332,26 @@ class NonlinearProgram:
         variables = np.hstack(
             [
                 np.tile(piece.theta_index, (count, 1)),
+                piece.unknown_index,
                 (self._n_theta + o.zero[piece.entries])[:, None],
                 self._passive_variables(postures, piece.passive_index),
             ]
         )
-        local = variables[:, n_t:]
+        local, n_u = variables[:, n_t:], piece.unknown_index.shape[1]
+        tolerances = ca.DM(problem.theta_scale[piece.unknown_index].T)
         own = [
-            x[local[:, 0].tolist()].T,
-            ca.reshape(x[local[:, 1:].reshape(-1).tolist()], -1, count),
+            ca.reshape(x[local[:, :n_u].reshape(-1).tolist()], n_u, count),
+            ca.MX(tolerances),
+            x[local[:, n_u].tolist()].T,
+            ca.reshape(x[local[:, n_u + 1 :].reshape(-1).tolist()], -1, count),
             p[piece.entries.tolist()].T,
             p[(o.size + piece.entries).tolist()].T,
+            p[(2 * o.size + piece.entries).tolist()].T,
             ca.MX(ca.DM(problem.drives[postures].T)),
-            ca.MX(ca.DM(np.tile(problem.session.zero_drives[:, None], count))),
+            ca.MX(ca.DM(problem.session.zero_drives[piece.setups].T)),
             ca.MX(ca.DM(piece.table.T)),
         ]
-        common = [p[2 * o.size], p[2 * o.size + 2], *shared]
+        common = [p[3 * o.size], p[3 * o.size + 2], *shared]
         arguments = [*own, *common]
         masks = [*(False for _ in own), *(True for _ in common)]
         functions = self._reading_functions(piece)
@@ -360,17 +366,27 @@ class NonlinearProgram:
         rows, columns = _triangle(n_t)
         hessian.add(piece.theta_index[rows], piece.theta_index[columns], lam_f * summed)
         rows, columns = _rest_of_triangle(variables.shape[1], n_t)
-        hessian.add(variables[:, rows], variables[:, columns], lam_f * ca.vec(rest))
+        rows, columns = variables[:, rows], variables[:, columns]
+        # unknowns that setups share may come in any order
+        upper = np.minimum(rows, columns), np.maximum(rows, columns)
+        hessian.add(*upper, lam_f * ca.vec(rest))
         return total
 
     def _reading_functions(self, piece: ReadingPiece) -> dict[str, ca.Function]:
         """Objective, gradient (by θ̂; by ẑ and q̂) and Hessian (θ̂ with θ̂; the rest) of one."""
         zero, y, weight = ca.SX.sym("zero"), ca.SX.sym("y"), ca.SX.sym("weight")
         sigma, width, loss = ca.SX.sym("sigma"), ca.SX.sym("width"), self.options.loss
-        n_t = piece.theta_index.size
-        residual = (y - piece.reading - zero * LENGTH_SCALE) / sigma
-        slope = -ca.horzcat(piece.by_theta, LENGTH_SCALE, piece.by_passive) / sigma
-        slope = ca.densify(slope)
+        n_t, n_u = piece.theta_index.size, piece.unknowns.numel()
+        noise, scaled = ca.SX.sym("noise"), ca.SX.sym("scaled", n_u)
+        tolerances = ca.SX.sym("tolerances", n_u)
+        residual = (y - piece.reading / noise - zero * LENGTH_SCALE) / sigma
+        slope = -ca.horzcat(
+            piece.by_theta / noise,
+            piece.by_unknowns @ ca.diag(tolerances) / noise,
+            LENGTH_SCALE,
+            piece.by_passive / noise,
+        )
+        slope = ca.densify(slope / sigma)
         pull = weight * loss.slope(residual, width)
         gradient = (pull * slope).T
         exact = self.options.hessian == "exact"
@@ -379,8 +395,8 @@ class NonlinearProgram:
         bend = loss.curvature(residual, width) if exact else loss.secant(residual, width)
         second = weight * bend * (slope.T @ slope)
         if exact:
-            second += pull * self._reading_curvature(piece) / -sigma
-        inputs = [zero, piece.passive, y, weight]
+            second += pull * self._reading_curvature(piece, tolerances) / (-sigma * noise)
+        inputs = [scaled, tolerances, zero, piece.passive, y, weight, noise]
         inputs += [piece.drives, piece.zero, piece.constants, sigma, width]
         inputs += self.problem.machine_map.symbols
 
@@ -393,25 +409,38 @@ class NonlinearProgram:
             "gradient": [gradient[:n_t], gradient[n_t:]],
             "hessian": [pick(*triangle[0]), pick(*triangle[1])],
         }
+        own = scaled * tolerances
         return {
-            name: ca.Function(f"{name}_{piece.group}", inputs, [ca.densify(v) for v in values])
+            name: ca.Function(
+                f"{name}_{piece.group}",
+                inputs,
+                [ca.densify(ca.substitute(v, piece.unknowns, own) if n_u else v) for v in values],
+            )
             for name, values in outputs.items()
         }
 
-    def _reading_curvature(self, piece: ReadingPiece) -> ca.SX:
-        """Second derivatives of h by u = (θ̂, ẑ, q̂), in the variables of the piece."""
+    def _reading_curvature(self, piece: ReadingPiece, tolerances: ca.SX) -> ca.SX:
+        """Second derivatives of h by (θ̂, û, ẑ, q̂), in the variables of the piece."""
         direct = self.problem.direct
         theta = direct.theta[piece.theta_index.tolist()]
         passive = direct.passive[piece.passive_index.tolist()]
-        u = ca.vertcat(theta, ca.SX.sym("zero"), passive)
+        unknowns, constants = direct.unknowns[piece.group], direct.constants[piece.group]
+        u = ca.vertcat(theta, unknowns, ca.SX.sym("zero"), passive)
         second, _ = ca.hessian(direct.readings[piece.group], u)
+        n_t, n = theta.numel(), u.numel()
+        scale = ca.diag(
+            ca.vertcat(ca.SX.ones(n_t), tolerances, ca.SX.ones(n - n_t - unknowns.numel()))
+        )
         function = ca.Function(
             "curvature",
-            [direct.theta, passive, direct.drives, direct.zero, direct.constants[piece.group]],
+            [direct.theta, unknowns, passive, direct.drives, direct.zero, constants],
             [ca.densify(second)],
         )
         theta = self.problem.machine_map.symbols[0]
-        return function(theta, piece.passive, piece.drives, piece.zero, piece.constants)
+        found = function(
+            theta, piece.unknowns, piece.passive, piece.drives, piece.zero, piece.constants
+        )
+        return scale @ found @ scale
 
     def _add_closures(
         self, x: ca.MX, lam_g: ca.MX, shared: list[ca.MX], hessian: SparseSum
@@ -438,7 +467,7 @@ class NonlinearProgram:
         postures = np.arange(k)
         variables = np.hstack(
             [
-                np.tile(np.arange(self._n_theta), (k, 1)),
+                np.tile(np.arange(problem.n_machine), (k, 1)),
                 self._passive_variables(postures, np.arange(n_p)),
             ]
         )
@@ -459,7 +488,7 @@ class NonlinearProgram:
         u = ca.vertcat(direct.theta, direct.passive)
         second = ca.triu(ca.hessian(ca.dot(multiplier, direct.closure), u)[0])
         rows, columns = (np.array(v) for v in second.sparsity().get_triplet())
-        summed_part = columns < self._n_theta
+        summed_part = columns < self.problem.n_machine
         function = ca.Function(
             "closure_hessian",
             [direct.passive, direct.drives, direct.theta, multiplier],

@@ -1,0 +1,103 @@
+"""Several sessions as one: each keeps its zeros, its gauges and the offsets that were active."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+from orthocal.characters import composed
+from orthocal.errors import SessionError
+from orthocal.measurement.session import Posture, Session, Setup
+
+Value = TypeVar("Value")
+
+
+def join_sessions(sessions: Sequence[Session]) -> Session:
+    """One session of all readings of several on the same robot.
+
+    Setups, postures and gauges are named after their session. What the controller corrects is
+    that of the last session: it is what the next offsets come on top of.
+
+    Args:
+        sessions: In the order in which they were measured; one alone stays what it is.
+
+    Raises:
+        SessionError: If there are none, or of different robots.
+    """
+    if not sessions:
+        raise SessionError("there is no session to join")
+    if len(sessions) == 1:
+        return sessions[0]
+    last = sessions[-1]
+    for session in sessions:
+        if session.robot.sha256 != last.robot.sha256:
+            raise SessionError(
+                f"is of robot '{session.robot.name}'; another session is of '{last.robot.name}', "
+                "or of another version of it",
+                where=None if session.path is None else str(session.path),
+            )
+    labels = _labels(sessions)
+    parts = [_rename(session, label) for session, label in zip(sessions, labels, strict=True)]
+    return replace(
+        last,
+        title=" + ".join(s.title for s in sessions if s.title),
+        source="; ".join(dict.fromkeys(s.source for s in sessions if s.source)),
+        gauges=_merged(p.gauges for p in parts),
+        postures=_merged(p.postures for p in parts),
+        setups=_merged(p.setups for p in parts),
+        readings=tuple(r for p in parts for r in p.readings),
+        path=None,
+        readings_path=None,
+        sha256="",
+        parts=tuple(sessions),
+    )
+
+
+def _merged(mappings: Iterable[Mapping[str, Value]]) -> dict[str, Value]:
+    return {name: value for mapping in mappings for name, value in mapping.items()}
+
+
+def _labels(sessions: Sequence[Session]) -> list[str]:
+    """A name for each session: its folder's, or its number; all different."""
+    names = []
+    for i, session in enumerate(sessions, start=1):
+        folder = "" if session.path is None else session.path.resolve().parent.name
+        plain = "".join("_" if c.isspace() or c in ',;"/' else c for c in composed(folder))
+        names.append(plain or f"session-{i}")
+    if len(set(names)) == len(names):
+        return names
+    return [f"{name}-{i}" for i, name in enumerate(names, start=1)]
+
+
+def _rename(session: Session, label: str) -> Session:
+    """With setups, postures and gauges that carry the session's name, and its offsets with them."""
+
+    def named(name: str) -> str:
+        return f"{label}/{name}" if name else label
+
+    active = session.active_offsets
+
+    def setup(s: Setup) -> Setup:
+        own = active if s.active is None else s.active
+        return replace(s, name=named(s.name), gauge=named(s.gauge), active=own)
+
+    def posture(p: Posture) -> Posture:
+        return replace(p, name=named(p.name))
+
+    return replace(
+        session,
+        gauges={named(name): gauge for name, gauge in session.gauges.items()},
+        setups={named(s.name): setup(s) for s in session.setups.values()},
+        postures={named(p.name): posture(p) for p in session.postures.values()},
+        readings=tuple(
+            replace(
+                r,
+                setup=named(r.setup),
+                posture=named(r.posture),
+                minus=None if r.minus is None else named(r.minus),
+                file=r.file or session.readings_path,
+            )
+            for r in session.readings
+        ),
+    )

@@ -1,0 +1,162 @@
+"""A sensor that orthocal has never heard of, in one file: nothing else has to know it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from tolerances import SAME_OPTIMUM
+from tool_coordinate import ToolCoordinate
+
+from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
+from orthocal.cli import app
+from orthocal.identification.problem import build_problem
+from orthocal.identification.solvers.eliminated import EliminatedProgram
+from orthocal.identification.solvers.ipopt import NonlinearProgram
+from orthocal.measurement.gauge import build_observations, predict_entries
+from orthocal.measurement.session_file import load_session
+from orthocal.measurement.session_output import write_session
+from orthocal.output.report.page import build_report
+from orthocal.sensors import registry
+
+TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
+
+PLAN = """robot: orthoglide
+title: tool and legs
+gauges:
+  fine: {sigma_mm: 0.002, resolution_mm: 0.001, range_mm: [-200, 200]}
+  dial: {sigma_mm: 0.01, resolution_mm: 0.01}
+postures:
+  zero: {tcp_mm: [0, 0, 0]}
+  x_max: {tcp_mm: [60, 0, 0]}
+  x_min: {tcp_mm: [-100, 0, 0]}
+  y_max: {tcp_mm: [0, 60, 0]}
+  y_min: {tcp_mm: [0, -100, 0]}
+  z_max: {tcp_mm: [0, 0, 60]}
+  corner: {tcp_mm: [50, -40, 30]}
+  other: {tcp_mm: [-50, 40, -60]}
+controller: {offsets_mm: [0, 0, 0]}
+setups:
+  tx: {sensor: tool, tool: x, slope_tolerance: 0.002, dial: d, gauge: fine}
+  ty: {sensor: tool, tool: y, slope_tolerance: 0.002, dial: d, gauge: fine}
+  tz: {sensor: tool, tool: z, slope_tolerance: 0.003, gauge: fine}
+  yx: {leg: x, direction: y, section: {fraction: 0.5}, gauge: dial, postures: [zero, x_max, x_min]}
+  zy: {leg: y, direction: z, section: {fraction: 0.5}, gauge: dial, postures: [zero, y_max, y_min]}
+cycles: 2
+"""
+
+
+@pytest.fixture(autouse=True)
+def known():
+    registry.register_sensor(ToolCoordinate)
+    yield
+    registry._KINDS.pop(ToolCoordinate.kind)
+
+
+@pytest.fixture
+def plan(tmp_path):
+    (tmp_path / "plan.yaml").write_text(PLAN)
+    return load_plan(tmp_path / "plan.yaml")
+
+
+def test_its_readings_are_those_of_the_tool(plan):
+    o = build_observations(plan)
+    found = predict_entries(plan, o, TRUTH, unknowns=np.array([1e-3, -2e-3]))
+    from orthocal.kinematics.assembly import Assembly
+
+    drives = np.array([p.drives for p in plan.postures.values()])
+    tool = Assembly(plan.robot, fixed=TRUTH).forward(drives)
+    for setup, slope in enumerate((1e-3, 1e-3, -2e-3)):
+        own = o.setup == setup
+        expected = tool[o.posture[own], setup] * (1.0 + slope)
+        assert np.abs(found[own] - expected).max() < 1e-12
+
+
+def test_what_is_not_known_of_it_is_identified_beside_the_machine(plan):
+    """Slopes of 2 and 3 in a thousand at 0.16 m of travel read to 2 µm: told to some 1e-5."""
+    simulated = simulate_session(plan, TRUTH, seed=4)
+    assert set(simulated.unknowns) == {"dial.d.slope", "setup.tz.slope"}
+    result = calibrate(simulated.session)
+    for p in result.sensors:
+        assert 0.0 < p.std < 0.2 * p.tolerance
+        assert abs(p.value - simulated.unknowns[p.name]) < 4.0 * p.std
+    for name, value in TRUTH.items():
+        assert abs(result[name].value - value) < 4.0 * result[name].std
+    assert [p.name for p in result.free] == list(TRUTH)
+
+
+def test_its_deviations_are_those_of_many_simulated_calibrations(plan):
+    """Offsets and slopes, both drawn: z scores of 60 calibrations."""
+    scores = []
+    for seed in range(60):
+        simulated = simulate_session(plan, TRUTH, seed=seed)
+        result = calibrate(simulated.session, options=SolverOptions(solver="eliminated"))
+        truth = {**TRUTH, **simulated.unknowns}
+        estimates = (*result.free, *result.sensors)
+        scores.append([(p.value - truth[p.name]) / p.std for p in estimates])
+    spread = np.sqrt(np.mean(np.square(scores), axis=0))
+    assert spread == pytest.approx(1.0, abs=0.3)  # 3 standard deviations of a spread of 60
+
+
+@pytest.mark.parametrize("model", ["offsets", "full"])
+@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
+def test_both_solvers_find_one_optimum(plan, model, hessian):
+    session = simulate_session(plan, TRUTH, seed=1).session
+    problem = build_problem(session, model=model)
+    given = {"sigma": 2e-6}
+    ours = EliminatedProgram(problem).solve(**given)
+    ipopts = NonlinearProgram(problem, options=SolverOptions(hessian=hessian)).solve(**given)
+    assert ours.theta.size == problem.n_machine + 2
+    assert np.abs(ours.theta - ipopts.theta).max() < SAME_OPTIMUM
+    assert np.abs((ours.theta - ipopts.theta) / problem.theta_scale).max() < 1e-6
+
+
+def test_its_slope_is_central_differences(plan):
+    problem = build_problem(simulate_session(plan, TRUTH, seed=1).session, model="lengths")
+    theta = np.append(0.3 * problem.theta_scale[:-2], [1.5e-3, -1e-3])
+    _, jacobian = problem.linearise(theta)
+    for i in (0, 4, problem.n_free - 2, problem.n_free - 1):
+        step = np.zeros(problem.n_free)
+        step[i] = 1e-2 * problem.theta_scale[i]
+        slope = (problem.predict(theta + step) - problem.predict(theta - step)) / 2e-2
+        assert np.abs(jacobian[:, i] - slope).max() < 1e-9
+
+
+def test_it_is_written_and_read(plan, tmp_path):
+    simulated = simulate_session(plan, TRUTH, seed=1)
+    path = write_session(simulated.session, tmp_path / "s")
+    again = load_session(path)
+    assert [s.sensor for s in again.setups.values()] == [s.sensor for s in plan.setups.values()]
+    assert [s.gauge for s in again.setups.values()] == ["fine"] * 3 + ["dial"] * 2
+    result = calibrate(again)
+    result.save(tmp_path / "calibration.json")
+    loaded = load_calibration(tmp_path / "calibration.json")
+    assert json.loads(loaded.to_json()) == json.loads(result.to_json())
+    assert [p.name for p in loaded.sensors] == ["dial.d.slope", "setup.tz.slope"]
+    assert loaded.robot.name == "orthoglide"
+
+
+def test_it_is_told_reported_and_drawn(plan, tmp_path, capsys):
+    path = write_session(simulate_session(plan, TRUTH, seed=1).session, tmp_path / "s")
+    app(["calibrate", str(path), "--out", str(tmp_path / "out")], standalone_mode=False)
+    told = capsys.readouterr().out
+    assert "legs x, y and tool" in told
+    report = build_report(load_calibration(tmp_path / "out"))
+    assert "dial.d.slope" in report
+    app(
+        ["view", str(tmp_path / "out"), "--html", str(tmp_path / "v.html")], standalone_mode=False
+    )
+    assert "tool" in (tmp_path / "v.html").read_text()
+
+
+def test_what_does_not_fit_is_refused_by_key(tmp_path):
+    from orthocal.errors import SessionError
+
+    spoilt = PLAN.replace("tool: z", "tool: w")
+    (tmp_path / "plan.yaml").write_text(spoilt)
+    with pytest.raises(SessionError, match=r"plan.yaml: setups.tz.tool: found 'w'"):
+        load_plan(tmp_path / "plan.yaml")
+    (tmp_path / "plan.yaml").write_text(PLAN.replace("sensor: tool, tool: z", "sensor: laser"))
+    with pytest.raises(SessionError, match=r"setups.tz.sensor: found 'laser'; expected one of leg"):
+        load_plan(tmp_path / "plan.yaml")
