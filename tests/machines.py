@@ -26,7 +26,8 @@ def reading_by_pinocchio(session, machine, setup, posture):
     root, tip = (place(machine, posture.drives, f) for f in (leg.root, leg.tip))
     plane, from_root = sensor.plane(machine)
     if from_root:
-        plane = plane + leg.axis @ place(machine, session.zero_drives, leg.root)
+        zero = session.zero_drives[list(session.setups).index(setup.name)]
+        plane = plane + leg.axis @ place(machine, zero, leg.root)
     along = (plane - leg.axis @ root) / (leg.axis @ (tip - root))
     return float(np.dot(DIRECTIONS[sensor.direction], root + along * (tip - root)))
 

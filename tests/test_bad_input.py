@@ -196,7 +196,8 @@ SESSION_KEY_CASES = [
         "key-unknown-in-setup",
         "xy: {leg:",
         "xy: {legs:",
-        ": setups.xy.legs: unknown key; known keys: leg, direction, section, postures",
+        ": setups.xy.legs: unknown key; known keys: sensor, gauge, postures, "
+        "leg, direction, section",
     ),
     session(
         "key-unknown-in-section",

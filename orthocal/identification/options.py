@@ -52,7 +52,12 @@ class SolverOptions:
             value = getattr(self, name)
             if not (isinstance(value, int) and 0 <= value <= MOST_ITERATIONS):
                 raise ValueError(f"{name} is {value!r}; expected a whole number of at least 0")
-        for what, kinds in (("solver", SolverKind), ("hessian", Hessian)):
-            value, names = getattr(self, what), get_args(kinds)
-            if value not in names:
-                raise OrthocalError(f"the {what} is {value!r}; expected one of {', '.join(names)}")
+        _require_one_of(self.hessian, get_args(Hessian), "Hessian", ValueError)
+        _require_one_of(self.solver, get_args(SolverKind), "solver", OrthocalError)
+
+
+def _require_one_of(
+    value: object, names: tuple[str, ...], what: str, error: type[Exception]
+) -> None:
+    if value not in names:
+        raise error(f"the {what} is {value!r}; expected one of {', '.join(names)}")

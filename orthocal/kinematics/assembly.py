@@ -107,9 +107,12 @@ class _System:
         return self._shortest_step(residuals, jacobians)
 
     def _shortest_step(self, residuals: Array, jacobians: Array) -> Array:
-        inverse = np.linalg.pinv(jacobians, rcond=1e-10)
-        with np.errstate(over="ignore"):  # steps without end are dropped by who asks
-            return np.asarray(-(inverse @ residuals[..., None])[..., 0])
+        steps = np.full((len(residuals), self.n_x), np.nan)  # no step: dropped by who asks
+        usable = np.isfinite(jacobians).all(axis=(1, 2))
+        inverse = np.linalg.pinv(jacobians[usable], rcond=1e-10)
+        with np.errstate(over="ignore"):  # likewise
+            steps[usable] = -(inverse @ residuals[usable][..., None])[..., 0]
+        return steps
 
     def describe(self, x: Array, p: Array, machine: Machine) -> str:
         """By how much the rows of one posture are open, in words."""
@@ -517,7 +520,7 @@ def _newton(
                 break
         active = active[moved]
         active = active[worst[active] >= tolerance]
-    closed = np.flatnonzero(worst < tolerance)
+    closed = np.flatnonzero((worst < tolerance) & np.isfinite(jacobians).all(axis=(1, 2)))
     if closed.size and system.n_x:  # what is left goes too: residual and slope are at hand
         step = system.step(residuals[closed], jacobians[closed])
         small = np.abs(step).max(axis=1) < LAST_STEP

@@ -111,7 +111,7 @@ class PeerProblem:
         self.tolerances = np.array([robot.parameters[n].tolerance for n in names])
         self.evaluations = 0
         self._readings = session.values
-        self._zero_drives = session.zero_drives
+        self._zero_drives = session.zero_drives[0]  # one session
 
         postures = {name: k for k, name in enumerate(session.postures)}
         setups = {name: k for k, name in enumerate(session.setups)}

@@ -131,7 +131,7 @@ def test_as_many_parameters_as_readings_leave_sigma_to_the_gauge(experiment_2):
     assert result.noise.source == "gauge"
     assert math.isinf(result.dof)
     assert result.sigma == pytest.approx(0.02e-3 * math.sqrt(2.0))
-    silent = calibrate(replace(few, gauge=replace(few.gauge, sigma=None)))
+    silent = calibrate(few.with_gauge(replace(few.gauge, sigma=None)))
     assert silent.noise.source == "unknown"
     assert math.isnan(silent.free[0].std)
 
@@ -147,7 +147,7 @@ def test_beside_a_prior_sigma_is_settled_with_the_solution(root):
     """Readings of 50 µm said to be of 5: the residuals win, and the weights with them."""
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     rows = tuple(r for r in plan.readings if r.cycle == 1)
-    plan = replace(plan, readings=rows, gauge=replace(plan.gauge, sigma=5e-6, resolution=None))
+    plan = replace(plan, readings=rows).with_gauge(replace(plan.gauge, sigma=5e-6, resolution=None))
     session = simulate_session(plan, {**TRUTH, "x_leg.length": 2e-4}, seed=2, sigma=50e-6).session
     result = calibrate(session, model="lengths")
     assert result.noise.source == "residuals"

@@ -44,7 +44,7 @@ def readings(root):
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     rows = tuple(r for r in plan.readings if r.cycle == 1)
     session = simulate_session(replace(plan, readings=rows), TRUTH, seed=5).session
-    return replace(session, gauge=Gauge(None, None, None))  # the residuals alone tell the noise
+    return session.with_gauge(Gauge(None, None, None))  # the residuals alone tell the noise
 
 
 @pytest.mark.parametrize("form", ["readings", "differences", "Table 1"])
@@ -93,12 +93,12 @@ def test_studentised_residuals_of_noise_are_students(root, form):
     """Over many sessions: a variance of dof/(dof − 2), and rarely anything suspicious."""
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     rows = tuple(r for r in plan.readings if r.cycle == 1)
-    plan = replace(plan, readings=rows, gauge=replace(plan.gauge, resolution=None))
+    plan = replace(plan, readings=rows).with_gauge(replace(plan.gauge, resolution=None))
     values, alarms = [], 0
     problem = None
     for seed in range(30):
         session = simulate_session(plan, TRUTH, seed=seed).session
-        session = replace(session, gauge=Gauge(None, None, None))
+        session = session.with_gauge(Gauge(None, None, None))
         if form == "differences":
             session = differences_of(session)
         problem = build_problem(session)
@@ -155,7 +155,7 @@ def test_without_word_on_the_noise_nothing_is_suspicious(experiment_2):
     """Three rows for three offsets, and no gauge: nothing tells."""
     rows = tuple(experiment_2.readings[i] for i in (2, 0, 4))
     gauge = replace(experiment_2.gauge, sigma=None)
-    session = replace(experiment_2, readings=rows, gauge=gauge)
+    session = replace(experiment_2, readings=rows).with_gauge(gauge)
     result = calibrate(session)
     assert np.isinf(result.critical)
     assert all(np.isnan(r.studentised) for r in result.residuals)

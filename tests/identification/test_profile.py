@@ -81,7 +81,9 @@ def test_beside_a_prior_it_is_that_of_the_posterior(root):
 
 def test_without_noise_or_a_free_parameter_there_is_none(experiment_2):
     rows = tuple(experiment_2.readings[i] for i in (2, 0, 4))
-    session = replace(experiment_2, readings=rows, gauge=replace(experiment_2.gauge, sigma=None))
+    session = replace(experiment_2, readings=rows).with_gauge(
+        replace(experiment_2.gauge, sigma=None)
+    )
     with pytest.raises(NotIdentifiableError, match="nothing tells the noise"):
         calibrate(session, profile=["x_slide.offset"])
     with pytest.raises(ParameterError, match="no free parameter to find the interval of"):

@@ -79,7 +79,10 @@ def test_linearisation_error_grows_with_the_square_of_the_offsets(experiment_2, 
 def test_a_negative_direction_turns_the_sign(raw_cycles):
     o = build_observations(raw_cycles)
     errors = {"x_slide.offset": 1e-3}
-    turned = {n: replace(s, direction=f"-{s.direction}") for n, s in raw_cycles.setups.items()}
+    turned = {
+        n: replace(s, sensor=replace(s.sensor, direction=f"-{s.sensor.direction}"))
+        for n, s in raw_cycles.setups.items()
+    }
     there = predict_entries(replace(raw_cycles, setups=turned), o, errors)
     assert np.abs(there + predict_entries(raw_cycles, o, errors)).max() < KINEMATICS
 
@@ -134,8 +137,12 @@ def test_differences_are_taken_apart_into_readings_with_a_zero_each(tmp_path, ro
 
 
 def test_contacts_move_along_the_leg_with_the_posture(raw_cycles):
-    contacts = locate_contacts(raw_cycles)
-    length = 0.31025
-    assert contacts["yx", "zero"] == pytest.approx(0.5, abs=KINEMATICS)
-    assert contacts["yx", "x_max"] == pytest.approx(0.5 + 0.06 / length, abs=1e-9)
-    assert contacts["yx", "x_min"] == pytest.approx(0.5 - 0.10 / length, abs=1e-9)
+    postures, contact = locate_contacts(raw_cycles)["yx"]
+    assert postures == ["zero", "x_max", "x_min"]
+    # the plane at half the X-leg, whose tip is 40 mm from the tool; the root moves with its slide
+    leg = raw_cycles.robot.legs["x"]
+    assert contact.points @ leg.axis == pytest.approx([-0.195125] * 3, abs=KINEMATICS)
+    assert contact.points[:, 1:] == pytest.approx(np.zeros((3, 2)), abs=KINEMATICS)
+    assert contact.problems == ["", "", ""]
+    assert (contact.along == leg.axis).all()
+    assert contact.direction.tolist() == [0.0, 1.0, 0.0]

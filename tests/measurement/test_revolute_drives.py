@@ -219,7 +219,7 @@ def test_square_means_within_a_degree(root, tmp_path, degrees, good):
     robot = write_fivebar(root, tmp_path / "rails", drop=drop)
     plan = write_plan(tmp_path / "plan", robot)
     if good:
-        assert load_plan(plan).setups["ya"].direction == "y"
+        assert load_plan(plan).setups["ya"].sensor.direction == "y"
     else:
         with pytest.raises(SessionError, match=r"'y' is at 88\.9° to leg a"):
             load_plan(plan)

@@ -117,8 +117,8 @@ def test_any_session_survives_a_round_trip(tmp_path_factory, fraction, direction
     session = load_session(write(folder / "a", setup, head, rows))
     again = load_session(write_session(session, folder / "b", decimals=12))
     assert np.abs(again.values - session.values).max() < 1e-14
-    assert again.setups["yx"].direction == direction
-    assert abs(again.setups["yx"].section.value - fraction) < 1e-11
+    assert again.setups["yx"].sensor.direction == direction
+    assert abs(again.setups["yx"].sensor.section.value - fraction) < 1e-11
     assert np.abs(again.active_offsets - session.active_offsets).max() < 1e-14
 
 

@@ -55,7 +55,7 @@ def test_one_seed_one_session(plan):
 
 
 def test_noise_zeros_and_rounding_are_as_asked(plan):
-    fine = replace(plan, gauge=replace(plan.gauge, resolution=None))
+    fine = plan.with_gauge(replace(plan.gauge, resolution=None))
     predicted = predict_entries(plan, build_observations(plan), ERRORS)
     residuals = []
     for seed in range(40):

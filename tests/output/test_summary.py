@@ -184,13 +184,13 @@ def test_readings_that_do_not_repeat_are_to_be_read_again(raw_cycles):
 
 def test_noise_that_only_the_residuals_tell_does_not_confirm_the_model(raw_cycles):
     once = tuple(r for r in raw_cycles.readings if r.cycle == 1)
-    silent = replace(raw_cycles, readings=once, gauge=replace(raw_cycles.gauge, sigma=None))
+    silent = replace(raw_cycles, readings=once).with_gauge(replace(raw_cycles.gauge, sigma=None))
     text = advise(calibrate(silent))
     assert text.startswith("Enter these, and measure again: only what remains says how large")
 
 
 def test_without_word_or_check_it_is_said(experiment_2):
-    silent = replace(experiment_2, gauge=replace(experiment_2.gauge, sigma=None))
+    silent = experiment_2.with_gauge(replace(experiment_2.gauge, sigma=None))
     three = replace(silent, readings=silent.readings[1:4])
     assert "nothing tells how far they can be trusted" in advise(calibrate(three))
     given = replace(experiment_2, readings=experiment_2.readings[1:4])

@@ -144,9 +144,7 @@ def test_it_is_told_reported_and_drawn(plan, tmp_path, capsys):
     assert "legs x, y and tool" in told
     report = build_report(load_calibration(tmp_path / "out"))
     assert "dial.d.slope" in report
-    app(
-        ["view", str(tmp_path / "out"), "--html", str(tmp_path / "v.html")], standalone_mode=False
-    )
+    app(["view", str(tmp_path / "out"), "--html", str(tmp_path / "v.html")], standalone_mode=False)
     assert "tool" in (tmp_path / "v.html").read_text()
 
 

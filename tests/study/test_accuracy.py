@@ -293,7 +293,9 @@ def test_remaining_errors_add_up_to_what_is_not_known(root):
 
 def test_without_noise_nothing_is_said_of_what_is_not_known(experiment_2):
     rows = tuple(experiment_2.readings[i] for i in (2, 0, 4))
-    session = replace(experiment_2, readings=rows, gauge=replace(experiment_2.gauge, sigma=None))
+    session = replace(experiment_2, readings=rows).with_gauge(
+        replace(experiment_2.gauge, sigma=None)
+    )
     assert assess_tool(calibrate(session)).after is None
 
 
@@ -313,7 +315,7 @@ FULL = ["*", "!frame.*", "!*.scale", "!*_leg.length"]
 def test_machines_that_are_worse_than_their_tolerances_are_found_to_be(root, times):
     """Errors drawn at so many times their tolerances, over many machines."""
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
-    wide = replace(plan, gauge=replace(plan.gauge, range=None))
+    wide = plan.with_gauge(replace(plan.gauge, range=None))
     count, found = 40, []
     for seed in range(count):
         drawn = draw_errors(plan.robot, FULL, seed=seed)

@@ -148,7 +148,7 @@ def test_readings_that_leave_an_offset_open_support_nothing(raw_cycles):
 
 
 def test_without_word_on_the_noise_it_says_so(experiment_2):
-    session = replace(experiment_2, gauge=replace(experiment_2.gauge, sigma=None))
+    session = experiment_2.with_gauge(replace(experiment_2.gauge, sigma=None))
     found = compare_models(session, models=["offsets"])
     assert found.verdict.model_error is None
     assert found.verdict.exit_code == 0

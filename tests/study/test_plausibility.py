@@ -52,10 +52,10 @@ def test_readings_in_inches_are_noticed(session):
 def test_readings_in_inches_of_a_dial_in_inches_leave_too_little(session):
     """Rounded to what the session says: only what remains tells."""
     rows = [r.value for r in session.readings]
-    coarse = replace(session, gauge=replace(session.gauge, resolution=1e-6))
+    coarse = session.with_gauge(replace(session.gauge, resolution=1e-6))
     again = coarse.with_values(np.round(np.array(rows) / 25.4, 6))
     assert kinds(calibrate(again)) == []  # finer steps stated: nothing contradicts
-    stated = replace(session, gauge=replace(session.gauge, resolution=0.5e-3))
+    stated = session.with_gauge(replace(session.gauge, resolution=0.5e-3))
     smooth = stated.with_values(np.array(rows) / 25.4)
     assert "smooth" in kinds(calibrate(smooth))
 
@@ -133,13 +133,13 @@ def test_a_leg_of_250_metres_is_refused(tmp_path):
 
 def test_a_sigma_in_micrometres_is_noticed_and_computed_readings_are_no_scatter(root):
     session = load_session(root / "examples/raw-cycles")
-    coarse = replace(session, gauge=replace(session.gauge, sigma=10e-3))
+    coarse = session.with_gauge(replace(session.gauge, sigma=10e-3))
     words = [d.words for d in find_doubts(calibrate(coarse)) if d.kind == "coarse"]
     assert len(words) == 1
     assert "The σ given for the gauge, 10 mm" in words[0]
     assert not [d for d in find_doubts(calibrate(session)) if d.kind == "coarse"]
     same = session.with_values(np.zeros(len(session.readings)))
-    same = replace(same, gauge=replace(same.gauge, sigma=10e-6, resolution=None))
+    same = same.with_gauge(replace(same.gauge, sigma=10e-6, resolution=None))
     assert not [d for d in find_doubts(calibrate(same)) if d.kind == "coarse"]
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from machines import place, reading_by_pinocchio
@@ -96,7 +94,7 @@ def test_perfect_readings_give_the_tool_where_they_determine_it(machines):
     """Points and directions whose posterior is below 0.3 µm are right to 1 µm."""
     m, problem = machines, machines.problem
     truth = m.draw(7)
-    plan = replace(m.plan, gauge=Gauge(None, None, None))  # nothing is rounded
+    plan = m.plan.with_gauge(Gauge(None, None, None))  # nothing is rounded
     session = plan.with_values(problem.observations.rows(problem.predict(truth)))
     fit = fit_problem(build_problem(session, model="full", tolerances=OFFSETS))
     accuracy = assess_tool(assemble_calibration(fit), m.workspace)

@@ -110,18 +110,23 @@ class NonlinearProgram:
                 widening=widening,
             )
 
+        exact = self.options.hessian == "exact"
         try:
             return run(self)
         except SolverError:
-            if not self._can_be_exact:
+            if self.problem.observations.size > MOST_EXACT or (
+                exact and not self.options.loss.robust
+            ):
                 raise
-        try:
-            return run(self._exact)
-        except SolverError:
-            if not self.options.loss.robust:
-                raise
+        program = self if exact else self._exact
+        if not exact:
+            try:
+                return run(program)
+            except SolverError:
+                if not self.options.loss.robust:
+                    raise
         for widening in WIDENINGS:  # nearly squares first, then as wanted
-            solution = run(self._exact, widening)
+            solution = run(program, widening)
             start, start_passive = solution.theta, solution.passive
         return solution
 
@@ -217,11 +222,6 @@ class NonlinearProgram:
     def functions(self) -> dict[str, ca.Function]:
         """The program's functions of (x, p[, lam_f, lam_g]), for checks of their derivatives."""
         return dict(self._functions)
-
-    @property
-    def _can_be_exact(self) -> bool:
-        few = self.problem.observations.size <= MOST_EXACT
-        return few and self.options.hessian != "exact"
 
     @cached_property
     def _exact(self) -> NonlinearProgram:

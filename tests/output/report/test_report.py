@@ -197,8 +197,8 @@ def test_texts_of_strangers_are_text(raw_cycles):
 def test_report_of_what_nothing_tells(raw_cycles):
     """One setup with a prior: no cross-validation, and no gauge that tells the noise."""
     rows = tuple(r for r in raw_cycles.readings if r.setup == "yx" and r.cycle == 1)
-    session = replace(
-        raw_cycles, readings=rows, gauge=replace(raw_cycles.gauge, sigma=None, resolution=None)
+    session = replace(raw_cycles, readings=rows).with_gauge(
+        replace(raw_cycles.gauge, sigma=None, resolution=None)
     )
     found = calibrate(session, model="full")
     assert not np.isfinite([r.unseen for r in found.residuals]).any()

@@ -174,7 +174,7 @@ def test_machine_without_deviation_needs_no_ghost(root):
     assert not links(scene, drawing.GHOST)
     assert scene.exaggeration == 1.0
     assert "where the controller takes it to be" in " ".join(scene.facts)
-    assert "no gauge has seen anything" in scene.headline
+    assert "No gauge has seen any deviation" in scene.headline
 
 
 def test_offsets_that_are_active_are_in_the_ghost(root):

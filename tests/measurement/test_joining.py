@@ -1,0 +1,164 @@
+"""Several sessions in one problem: zeros and noise of each their own, one machine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
+from orthocal.errors import SessionError
+from orthocal.identification.problem import build_problem
+from orthocal.identification.solvers.eliminated import EliminatedProgram
+from orthocal.identification.solvers.ipopt import NonlinearProgram
+from orthocal.measurement.joining import join_sessions
+from orthocal.measurement.session_file import load_session
+from orthocal.measurement.session_output import write_session
+
+TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
+
+
+@pytest.fixture(scope="module")
+def sweep(root):
+    return load_session(root / "examples/sweep")
+
+
+def half(session, setups):
+    """The session's readings of some setups, the others never stood."""
+    return replace(
+        session,
+        setups={n: s for n, s in session.setups.items() if n in setups},
+        readings=tuple(r for r in session.readings if r.setup in setups),
+        sha256="",
+    )
+
+
+@pytest.mark.parametrize("solver", ["ipopt", "eliminated"])
+@pytest.mark.parametrize("model", ["offsets", "full"])
+def test_two_halves_are_the_whole(sweep, model, solver):
+    """Setups in two sessions of one gauge, without its σ: what they find is what one finds.
+
+    With one noise for both: it is estimated for each session, and fixed here by stating it.
+    """
+    names = list(sweep.setups)
+    stated = sweep.with_gauge(replace(sweep.gauge, sigma=0.5e-3, resolution=None))
+    parts = [half(stated, names[:3]), half(stated, names[3:])]
+    options = SolverOptions(solver=solver)
+    whole = calibrate(stated, model=model, options=options)
+    joined = calibrate(parts, model=model, options=options)
+    assert whole.noise.source == joined.noise.source == "gauge"
+    for p, q in zip(whole.free, joined.free, strict=True):
+        assert q.value == pytest.approx(p.value, abs=1e-9 * p.tolerance)
+        assert q.std == pytest.approx(p.std, rel=1e-9)
+    assert [r.measured for r in joined.residuals] == [r.measured for r in whole.residuals]
+    left = np.array([[r.residual for r in c.residuals] for c in (whole, joined)])
+    assert np.abs(left[0] - left[1]).max() < 1e-12
+
+
+def test_a_session_counted_twice_halves_the_variance(raw_cycles):
+    stated = raw_cycles.with_gauge(replace(raw_cycles.gauge, sigma=50e-6, resolution=None))
+    once, twice = calibrate(stated), calibrate([stated, stated])
+    assert twice.covariance == pytest.approx(0.5 * once.covariance, rel=1e-7)
+    for p, q in zip(once.free, twice.free, strict=True):
+        assert q.value == pytest.approx(p.value, abs=1e-12)
+    assert len(twice.setups) == 2 * len(once.setups)
+
+
+def test_offsets_that_were_active_may_differ(root):
+    """Monday without any, Tuesday with Monday's: together they tell one machine."""
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    monday = simulate_session(plan, TRUTH, exact=True).session
+    entered = plan.with_controller([1.1e-3, -0.7e-3, 0.4e-3])
+    tuesday = simulate_session(entered, TRUTH, exact=True).session
+    found = calibrate([monday, tuesday])
+    for name, value in TRUTH.items():
+        assert found[name].value == pytest.approx(value, abs=1e-9)
+    # what is entered next comes on top of what is active now
+    assert found.active_offsets.tolist() == [1.1e-3, -0.7e-3, 0.4e-3]
+    wrong = tuesday.with_controller(np.zeros(3))  # the readings contradict that
+    assert calibrate([monday, wrong]).rms_after > 5e-5 > 1e-8 > found.rms_after
+
+
+def test_noise_is_told_for_each_session(root):
+    """A dial of 5 µm and one of 40: as each alone is found, and the better one counts more."""
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    plan = plan.with_gauge(replace(plan.gauge, sigma=None, resolution=None))
+    fine = simulate_session(plan, TRUTH, seed=1, sigma=5e-6).session
+    coarse = simulate_session(plan, TRUTH, seed=2, sigma=40e-6).session
+    found = calibrate([coarse, fine])
+    assert [g.noise for g in found.gauges] == [
+        pytest.approx(calibrate(s).noise.reading_sigma, rel=0.1) for s in (coarse, fine)
+    ]
+    assert found.gauges[0].noise == pytest.approx(40e-6, rel=0.4)
+    assert found.gauges[1].noise == pytest.approx(5e-6, rel=0.4)
+    alone = calibrate(fine)
+    for p, q in zip(alone.free, found.free, strict=True):
+        assert q.std < p.std
+        assert q.std > 0.9 * p.std
+        assert abs(q.value - p.value) < 0.5 * p.std
+    # were both to count alike, the coarse one would decide
+    same = build_problem(join_sessions([coarse, fine]))
+    alike = EliminatedProgram(same).solve(sigma=1e-5).theta
+    assert np.abs(alike - [p.value for p in found.free]).max() > found.free[0].std
+
+
+def test_deviations_of_mixed_sessions_are_those_of_many(root):
+    """Offsets from a coarse and a fine session: z scores of 80 calibrations."""
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    plan = plan.with_gauge(replace(plan.gauge, sigma=None, resolution=None))
+    scores = []
+    for seed in range(80):
+        pair = [
+            simulate_session(plan, TRUTH, seed=2 * seed + i, sigma=s).session
+            for i, s in enumerate((40e-6, 5e-6))
+        ]
+        found = calibrate(pair, options=SolverOptions(solver="eliminated"))
+        scores.append([(p.value - TRUTH[p.name]) / p.std for p in found.free])
+    assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.0, abs=0.2)
+
+
+def test_both_solvers_weigh_gauges_alike(root):
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    pair = [
+        simulate_session(plan, TRUTH, seed=i, sigma=s).session for i, s in enumerate((2e-5, 5e-6))
+    ]
+    problem = build_problem(join_sessions(pair), model="lengths")
+    problem = problem.with_noise(np.repeat([1.0, 0.25], problem.observations.size // 2))
+    for loss in ("squares", "huber"):
+        from orthocal.identification.loss import Loss
+
+        options = SolverOptions(loss=Loss(loss))
+        ours = EliminatedProgram(problem, options=options).solve(sigma=2e-5)
+        for hessian in ("gauss-newton", "exact"):
+            given = replace(options, hessian=hessian)
+            ipopts = NonlinearProgram(problem, options=given).solve(sigma=2e-5)
+            difference = np.abs(ours.theta - ipopts.theta) / problem.theta_scale
+            assert difference.max() < 1e-6
+            assert np.abs(ours.zeros - ipopts.zeros).max() < 1e-9
+
+
+def test_what_is_joined_is_written_read_and_found_again(root, tmp_path):
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    for i, day in enumerate(("monday", "tuesday")):
+        write_session(simulate_session(plan, TRUTH, seed=i).session, tmp_path / day)
+    found = calibrate([tmp_path / "monday", tmp_path / "tuesday"])
+    assert {s.name.split("/")[0] for s in found.setups} == {"monday", "tuesday"}
+    assert found.where(found.residuals[-1]).startswith(str(tmp_path / "tuesday/readings.csv:"))
+    found.save(tmp_path / "calibration.json")
+    again = load_calibration(tmp_path / "calibration.json")
+    assert again.to_document() == found.to_document()
+    assert [p.path for p in again.session.parts] == [
+        str(tmp_path / day / "session.yaml") for day in ("monday", "tuesday")
+    ]
+    assert again.where(again.residuals[0]).startswith(str(tmp_path / "monday/readings.csv:"))
+
+
+def test_only_sessions_of_one_robot_are_joined(root):
+    sessions = [load_session(root / "examples/raw-cycles")]
+    other = replace(sessions[0], robot=replace(sessions[0].robot, sha256="another"))
+    with pytest.raises(SessionError, match="another session is of 'orthoglide', or of another"):
+        join_sessions([*sessions, other])
+    with pytest.raises(SessionError, match="no session"):
+        join_sessions([])
+    assert join_sessions(sessions) is sessions[0]
