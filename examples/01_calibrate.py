@@ -7,7 +7,7 @@ import orthocal
 TABLE_1 = Path(__file__).parent / "table1"
 
 session = orthocal.load_session(TABLE_1 / "experiment-2")
-calibration = orthocal.calibrate(session, model="offsets")
+calibration = orthocal.calibrate(session, "offsets")
 print(orthocal.summarize(calibration))
 
 # Where the tool really is when the encoders show the mechanical zero, in mm.

@@ -17,7 +17,7 @@ from orthocal.measurement.synthetic import load_errors
 from orthocal.study.accuracy import assess_tool, find_remaining_errors
 
 EXAMPLES = Path(__file__).parent
-TOLERANCES = {"*.offset": 2e-3}  # the workshop's word for its offsets, one sigma, in m
+TOLERANCES = {"*.offset_mm": 2.0}  # the workshop's word for its offsets, one sigma
 
 robot = orthocal.load_robot("orthoglide")
 space = cube(robot)  # ±60 mm around the mechanical zero
@@ -43,7 +43,7 @@ print(f"{'nominal':26}{'':>10}{'':>10}{error_at_tool(Assembly(robot).forward(dri
 results = {}
 for name, session in sessions.items():
     for model in ("offsets", "full"):
-        result = orthocal.calibrate(session, model=model, tolerances=TOLERANCES)
+        result = orthocal.calibrate(session, orthocal.Choice(model=model, tolerances=TOLERANCES))
         promised = 1e6 * assess_tool(result, space).after.sizes.aligned.rms
         achieved = error_at_tool(result.forward(drives))
         label = f"{name}, {model}"

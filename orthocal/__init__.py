@@ -14,6 +14,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Calibration": "orthocal.identification.calibration",
+    "Choice": "orthocal.identification.choice",
     "LiveScene": "orthocal.output.view.live",
     "Loss": "orthocal.identification.loss",
     "OrthocalError": "orthocal.errors",
@@ -39,6 +40,7 @@ _HOMES = {
 
 __all__ = [
     "Calibration",
+    "Choice",
     "LiveScene",
     "Loss",
     "OrthocalError",
@@ -67,6 +69,7 @@ if TYPE_CHECKING:
     from orthocal.identification.calibrate import calibrate
     from orthocal.identification.calibration import Calibration
     from orthocal.identification.calibration_file import load_calibration
+    from orthocal.identification.choice import Choice
     from orthocal.identification.loss import Loss
     from orthocal.identification.options import SolverOptions
     from orthocal.measurement.session import Session

@@ -184,8 +184,7 @@ def calibrate(
     """Identify the errors of a machine from a session of readings."""
     from orthocal.files import require_writable, write_files
     from orthocal.identification.calibrate import calibrate as run
-    from orthocal.identification.loss import Loss
-    from orthocal.identification.options import SolverOptions
+    from orthocal.identification.choice import Choice
     from orthocal.identification.selection import read_bounds, read_known, read_tolerances
     from orthocal.measurement.session_file import load_session
     from orthocal.output.summary import print_summary
@@ -196,15 +195,18 @@ def calibrate(
     parameters = loaded.robot.parameters
     result = run(
         loaded,
-        model=model,
-        free=_globs(free),
-        prior=prior,
-        known=read_known(known or [], parameters, where="--known"),
-        tolerances=read_tolerances(tolerance or [], parameters, where="--tolerance"),
-        bounds=read_bounds(bound or [], parameters, where="--bound"),
-        base=base,
+        Choice(
+            model=model,
+            free=_globs(free),
+            prior=prior,
+            known=read_known(known or [], parameters, where="--known"),
+            tolerances=read_tolerances(tolerance or [], parameters, where="--tolerance"),
+            bounds=read_bounds(bound or [], parameters, where="--bound"),
+            base=base,
+        ),
+        loss=loss,  # type: ignore[arg-type] # checked there
+        solver=solver,  # type: ignore[arg-type] # likewise
         profile=_globs(profile),
-        options=SolverOptions(solver=solver, loss=Loss(loss)),  # type: ignore[arg-type] # checked there
     )
     if json:
         _out(result.to_json().rstrip("\n"))

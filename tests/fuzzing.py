@@ -98,7 +98,7 @@ def lay_out(folder: Path) -> None:
     (folder / "points.csv").write_text(POINTS, encoding="utf-8")
     simulated = simulate_session(load_plan(folder / "plan.yaml"), {"x_slide.offset": 5e-4})
     write_session(simulated.session, folder)
-    calibrate(load_session(folder), model="full").save(folder / "calibration.json")
+    calibrate(load_session(folder), "full").save(folder / "calibration.json")
 
 
 # ---- mutation
@@ -308,7 +308,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     if kind in ("session", "readings"):
         session = load_session(folder)
         if deep:
-            calibration = calibrate(session, model=rng.choice((None, "full")))
+            calibration = calibrate(session, rng.choice((None, "full")))
             path = calibration.save(folder / "out.json")
             found = load_calibration(path)
             assert found.to_document() == calibration.to_document()

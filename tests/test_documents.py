@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 
-from orthocal import calibrate, load_calibration, load_session
+from orthocal import Choice, calibrate, load_calibration, load_session
 from orthocal.documents import (
     MOST_CSV_ROWS,
     MOST_JSON_VALUES,
@@ -202,7 +202,7 @@ def test_a_calibration_of_nothing(document, tmp_path):
 @pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles"])
 def test_every_calibration_that_is_written_is_read_as_the_same(model, name, root, tmp_path):
     """18 readings beside 126 errors leave a hundredth of a degree of freedom, for example."""
-    calibration = calibrate(root / "examples" / name, model=model)
+    calibration = calibrate(root / "examples" / name, model)
     found = load_calibration(calibration.save(tmp_path / "calibration.json"))
     assert found.to_document() == calibration.to_document()
 
@@ -216,7 +216,7 @@ def test_the_smallest_numbers_that_a_session_takes_are_read_again(root, tmp_path
     assert small != text
     (tmp_path / "session.yaml").write_text(small, encoding="utf-8")
     calibration = calibrate(
-        load_session(tmp_path), tolerances={"*.offset": 1e-9}, model="offsets", prior=True
+        load_session(tmp_path), Choice(tolerances={"*.offset_m": 1e-9}, model="offsets", prior=True)
     )
     found = load_calibration(calibration.save(tmp_path / "calibration.json"))
     assert found.to_document() == calibration.to_document()

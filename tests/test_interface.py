@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from orthocal import (
+    Choice,
     LiveScene,
     SolverOptions,
     assess_tool,
@@ -23,7 +24,7 @@ from orthocal import (
     validate_calibration,
     write_report,
 )
-from orthocal.errors import OrthocalError
+from orthocal.errors import OrthocalError, ParameterError
 from orthocal.kinematics.assembly import Assembly
 from orthocal.study.accuracy import Workspace
 
@@ -53,18 +54,58 @@ ARGUMENTS = [
     ({"bounds": {"x_slide.offset": 5}}, "expected a name and 2 numbers"),
     ({"bounds": {"x_slide.offset": (1, 2, 3)}}, "expected a name and 2 numbers"),
     ({"bounds": {"x_slide.offset": ("a", "b")}}, "expected a name and 2 numbers"),
+    ({"prior": "x"}, "found a str; expected True or False as prior or base"),
+    ({"base": "x"}, "found a str; expected True or False as prior or base"),
+]
+"""Of a choice."""
+
+OTHER_ARGUMENTS = [
+    ({"choice": 5}, "found a int; expected a Choice, or the name of a model"),
     ({"profile": 5}, "profile: found 5; expected a list of names or globs"),
-    ({"options": 5}, "found a int; expected SolverOptions(...)"),
-    ({"options": {}}, "found a dict; expected SolverOptions(...)"),
+    ({"solver": 5}, "found a int; expected a solver's name, or SolverOptions(...)"),
+    ({"solver": {}}, "found a dict; expected a solver's name, or SolverOptions(...)"),
+    ({"loss": 5}, "found a int; expected a loss's name, or Loss(...)"),
     ({"start": [1]}, "found the shape (1,); expected 3 free parameters to start from a row"),
     ({"start": "a"}, "found str; expected 3 free parameters to start from a row"),
     ({"start": [0.0, 0.0, np.nan]}, "expected 3 finite numbers to start from"),
-    ({"prior": "x"}, "found a str; expected True or False as prior or base"),
-    ({"base": "x"}, "found a str; expected True or False as prior or base"),
 ]
 
 
 @pytest.mark.parametrize(("arguments", "message"), ARGUMENTS, ids=lambda v: str(v)[:40])
+def test_arguments_of_a_choice(arguments, message):
+    with pytest.raises((TypeError, ValueError), match=re.escape(message)):
+        Choice(**arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"known": {"x_slide.offset": 2}},
+        {"known": {"x_slide.offset": (2, 0.1)}},
+        {"tolerances": {"*.offset": 2}},
+        {"bounds": {"x_slide.offset": (-2, 2)}},
+    ],
+)
+def test_millimetres_cannot_pass_for_metres(arguments, experiment_2):
+    """2 where 2 mm is meant: a number without its unit is refused, and its key is named."""
+    (kind,) = arguments
+    with pytest.raises(ParameterError, match=rf"{kind}: '.*offset' carries no unit; expected one"):
+        calibrate(experiment_2, Choice(**arguments))
+    angles = {"known": {"x_slide.offset_mrad": 2.0}}
+    with pytest.raises(ParameterError, match="has the wrong unit; x_slide.offset is in mm"):
+        calibrate(experiment_2, Choice(**angles))
+
+
+def test_a_choice_in_any_unit_is_the_same_choice(experiment_2):
+    found = [
+        calibrate(experiment_2, Choice(known={f"y_slide.offset_{u}": v})).covariance
+        for u, v in (("mm", (0.5, 0.1)), ("um", (500.0, 100.0)), ("m", (0.5e-3, 0.1e-3)))
+    ]
+    for other in found[1:]:
+        assert other == pytest.approx(found[0], rel=1e-9)
+
+
+@pytest.mark.parametrize(("arguments", "message"), OTHER_ARGUMENTS, ids=lambda v: str(v)[:40])
 def test_arguments_of_calibrate(arguments, message, experiment_2):
     with pytest.raises((TypeError, ValueError), match=re.escape(message)):
         calibrate(experiment_2, **arguments)

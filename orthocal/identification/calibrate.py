@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal import __version__
-from orthocal.arguments import require_kind, require_names, require_numbers
+from orthocal.arguments import require_kind, require_names
 from orthocal.errors import ClosureError, NotIdentifiableError, ParameterError
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.calibration_file import require_loadable
+from orthocal.identification.choice import Choice
 from orthocal.identification.cross_validation import predict_unseen
 from orthocal.identification.diagnostics import Diagnostics, diagnose_readings
 from orthocal.identification.fit import Fit, first_sigma, fit_problem
@@ -25,9 +26,9 @@ from orthocal.identification.identifiability import (
     find_base_parameters,
 )
 from orthocal.identification.linear import Linearisation, linearise_at_reference
-from orthocal.identification.loss import Loss
-from orthocal.identification.options import SolverOptions
-from orthocal.identification.problem import CalibrationProblem, build_problem
+from orthocal.identification.loss import Loss, LossKind
+from orthocal.identification.options import SolverKind, SolverOptions
+from orthocal.identification.problem import CalibrationProblem
 from orthocal.identification.profile import profile_interval
 from orthocal.identification.records import (
     GaugeRecord,
@@ -40,7 +41,7 @@ from orthocal.identification.records import (
     SetupRecord,
     SolverRecord,
 )
-from orthocal.identification.selection import Known, Selection
+from orthocal.identification.selection import Selection
 from orthocal.identification.turned import find_turned_setup
 from orthocal.identification.uncertainty import (
     Information,
@@ -71,33 +72,23 @@ MAX_BASE_ROUNDS = 8
 
 def calibrate(
     session: Session | str | Path | Sequence[Session | str | Path],
+    choice: Choice | str | None = None,
     *,
-    model: str | None = None,
-    free: Sequence[str] = (),
-    prior: bool | None = None,
-    known: Mapping[str, Known] | None = None,
-    tolerances: Mapping[str, float] | None = None,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    base: bool = False,
+    loss: Loss | LossKind | None = None,
+    solver: SolverOptions | SolverKind = "ipopt",
     profile: Sequence[str] = (),
-    options: SolverOptions | None = None,
     start: ArrayLike | None = None,
 ) -> Calibration:
     """Identify the errors of a machine from a session, exactly, with their uncertainty.
 
     Args:
         session: The session, or the path to one; or several, which are fitted together.
-        model: A model of the robot's YAML: `offsets` (the default), `lengths`, `full` or one's own.
-        free: Names or globs that are free too, or instead where no model is named; '!' takes out.
-        prior: Whether tolerances act as a prior; by default not where only offsets are free.
-        known: Name to a known value, which is then held, or to a value and its standard
-            deviation, which then act as prior, [SI].
-        tolerances: Name or glob to another standard deviation than the robot's, [SI].
-        bounds: Name or glob to lowest and highest value, ±inf for open, [SI].
-        base: Identify base parameters instead, without any prior: of what the readings cannot
-            tell apart one parameter stays, and stands for the whole combination.
+        choice: Which errors are free, and what is known of them; or the name of a model. Offsets
+            by default.
+        loss: What a residual costs: `squares` (the default), `huber`, or one with its own width.
+        solver: `ipopt` on the whole program, the reference; `eliminated`, the same optimum sooner;
+            `linearised`, as the paper; or one with its own settings.
         profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
-        options: Which solver, how it is run, and what a residual costs.
         start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
             solution.
 
@@ -110,37 +101,18 @@ def calibrate(
         ValueError: If there are not as many free parameters to start from as there are.
     """
     session = _gather(session)
-    require_names(free, argument="free")
     require_names(profile, argument="profile")
-    require_numbers(known or {}, argument="known", counts=(1, 2))
-    require_numbers(tolerances or {}, argument="tolerances")
-    require_numbers(bounds or {}, argument="bounds", counts=(2,))
-    require_kind(options, (SolverOptions, type(None)), expected="SolverOptions(...)")
-    require_kind(model, (str, type(None)), expected="the name of a model")
-    for value in (prior, base):
-        require_kind(value, (bool, type(None)), expected="True or False as prior or base")
-    problem = build_problem(
-        session,
-        model=model,
-        free=free,
-        prior=prior,
-        known=known,
-        tolerances=tolerances,
-        bounds=bounds,
-    )
+    require_kind(choice, (Choice, str, type(None)), expected="a Choice, or the name of a model")
+    chosen = choice if isinstance(choice, Choice) else Choice(choice)
+    options = _solver_options(solver, loss)
+    problem = CalibrationProblem(session, chosen.select(session.robot.parameters))
     if start is not None:
         start, _ = as_rows(start, problem.n_free, "free parameters to start from")
         if start.shape != (1, problem.n_free) or not np.isfinite(start).all():
             raise ValueError(f"expected {problem.n_free} finite numbers to start from")
         start = start[0]
     whole = None
-    if base:
-        own = [n for n, v in (known or {}).items() if isinstance(v, tuple)]
-        if prior or own:
-            raise ParameterError(
-                "base parameters are identified without any prior"
-                + (f"; give {', '.join(own)} as known without ±" if own else "")
-            )
+    if chosen.base:
         whole = problem
         fit = _fit_base(whole, options=options, start=start)
     else:
@@ -148,6 +120,17 @@ def calibrate(
     profiled = _match_profiled(fit.problem, profile)
     intervals = {name: profile_interval(fit, name) for name in profiled}
     return assemble_calibration(fit, whole=whole, intervals=intervals)
+
+
+def _solver_options(
+    solver: SolverOptions | SolverKind, loss: Loss | LossKind | None
+) -> SolverOptions:
+    require_kind(solver, (SolverOptions, str), expected="a solver's name, or SolverOptions(...)")
+    require_kind(loss, (Loss, str, type(None)), expected="a loss's name, or Loss(...)")
+    options = solver if isinstance(solver, SolverOptions) else SolverOptions(solver=solver)
+    if loss is None:
+        return options
+    return replace(options, loss=loss if isinstance(loss, Loss) else Loss(loss))
 
 
 def _gather(given: Session | str | Path | Sequence[Session | str | Path]) -> Session:

@@ -14,7 +14,7 @@ from orthocal.characters import composed
 from orthocal.documents import parse_number
 from orthocal.errors import ParameterError
 from orthocal.robot.model import read_only
-from orthocal.robot.parameters import Parameter, ParameterSet, Unit, split_unit
+from orthocal.robot.parameters import Parameter, ParameterSet, Unit
 
 Array = NDArray[np.float64]
 Known = float | tuple[float, float]
@@ -164,28 +164,32 @@ def select_parameters(
 def read_known(texts: Sequence[str], parameters: ParameterSet, *, where: str) -> dict[str, Known]:
     """Known values from texts such as x_leg.length_mm=0.12 or x_leg.length_mm=0.12±0.02.
 
+    As `Choice` takes them: a key with its unit to a number, or to two.
+
     Raises:
         ParameterError: If a text does not fit.
     """
     result: dict[str, Known] = {}
+    names: set[str] = set()
     for text in texts:
         key, number = _split(text, "NAME=VALUE or NAME=VALUE±TOLERANCE", where)
         value, sign, spread = number.replace("+/-", "±").replace("+-", "±").partition("±")
         try:
-            name, si = parameters.read_quantity(key, _number(value, where, key))
+            own = _number(value, where, key)
+            name, _ = parameters.read_quantity(key, own)
         except ParameterError as e:
             raise ParameterError(e.problem, where=e.where or where) from None
-        if name in result:
+        if name in names:
             raise ParameterError(f"'{name}' is given twice", where=where)
-        factor = split_unit(key)[2]
-        result[name] = (si, _number(spread, where, key) * factor) if sign else si
+        names.add(name)
+        result[key] = (own, _number(spread, where, key)) if sign else own
     return result
 
 
 def read_tolerances(
     texts: Sequence[str], parameters: ParameterSet, *, where: str
 ) -> dict[str, float]:
-    """Tolerances from texts such as *.offset_mm=2.
+    """Tolerances from texts such as *.offset_mm=2, as `Choice` takes them.
 
     Raises:
         ParameterError: If a text does not fit.
@@ -193,15 +197,17 @@ def read_tolerances(
     result = {}
     for text in texts:
         key, number = _split(text, "NAME=VALUE", where)
-        glob, factor = _read_glob(key, parameters, where)
-        result[glob] = _number(number, where, key) * factor
+        _check_glob(key, parameters, where)
+        result[key] = _number(number, where, key)
     return result
 
 
 def read_bounds(
     texts: Sequence[str], parameters: ParameterSet, *, where: str
 ) -> dict[str, tuple[float, float]]:
-    """Bounds from texts such as x_slide.offset_mm=-2:2; either side may be left open.
+    """Bounds from texts such as x_slide.offset_mm=-2:2, as `Choice` takes them.
+
+    Either side may be left open.
 
     Raises:
         ParameterError: If a text does not fit.
@@ -213,12 +219,12 @@ def read_bounds(
         low, colon, high = numbers.partition(":")
         if not colon:
             raise ParameterError(f"found '{text}'; expected {form}", where=where)
-        glob, factor = _read_glob(key, parameters, where)
+        _check_glob(key, parameters, where)
         if not (low.strip() or high.strip()):
             raise ParameterError(f"found '{text}'; expected {form}", where=where)
-        result[glob] = (
-            _number(low, where, key) * factor if low.strip() else -math.inf,
-            _number(high, where, key) * factor if high.strip() else math.inf,
+        result[key] = (
+            _number(low, where, key) if low.strip() else -math.inf,
+            _number(high, where, key) if high.strip() else math.inf,
         )
     return result
 
@@ -234,18 +240,12 @@ def _number(text: str, where: str, name: str) -> float:
     return parse_number(text.strip(), where=where, name=name, error=ParameterError)
 
 
-def _read_glob(key: str, parameters: ParameterSet, where: str) -> tuple[str, float]:
-    """Glob and factor to SI of a key with its unit; what it matches must be in that unit."""
+def _check_glob(key: str, parameters: ParameterSet, where: str) -> None:
+    """Refuse a key without its unit, or with another than what it matches."""
     try:
-        glob, unit, factor = split_unit(key)
-        for name in parameters.select([glob]):
-            if parameters[name].unit != unit:
-                raise ParameterError(
-                    f"'{key}' has the wrong unit; {name} is in {parameters[name].edge_unit}"
-                )
+        parameters.read_glob(key)
     except ParameterError as e:
         raise ParameterError(e.problem, where=where) from None
-    return glob, factor
 
 
 def _match_free(parameters: ParameterSet, glob: str, free: Sequence[str]) -> list[str]:

@@ -54,7 +54,8 @@ def draw_errors(
         patterns: Names or globs of the parameters to draw; '!' takes out. Of a sum and the errors
             that it is made of only these are drawn.
         seed: Of the random numbers.
-        tolerances: Name or glob to another standard deviation than the robot's, [SI].
+        tolerances: Name or glob with its unit, such as *.offset_mm, to another standard deviation
+            than the robot's.
 
     Raises:
         ParameterError: If a pattern matches nothing.
@@ -71,7 +72,8 @@ def draw_errors(
         for n in chosen
         if len(parameters[n].terms) == 1 or not {t for t, _ in parameters[n].terms} & set(chosen)
     )
-    own = {n: value for g, value in (tolerances or {}).items() for n in parameters.select([g])}
+    given = parameters.read_tolerances(tolerances or {})
+    own = {n: value for g, value in given.items() for n in parameters.select([g])}
     return {
         name: float(rng.normal() * own.get(name, parameters[name].tolerance)) for name in chosen
     }

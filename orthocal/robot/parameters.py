@@ -33,8 +33,10 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 UNIT_SUFFIXES: dict[str, tuple[Unit, float]] = {
     "_mm": ("m", 1e-3),
     "_um": ("m", 1e-6),
+    "_m": ("m", 1.0),
     "_mrad": ("rad", 1e-3),
     "_deg": ("rad", 0.017453292519943295),
+    "_rad": ("rad", 1.0),
     "_ppm": ("1", 1e-6),
 }
 """Suffix of a name in a file to unit and factor to SI."""
@@ -171,6 +173,36 @@ class ParameterSet:
             )
         _check_unit(key, unit, self[name])
         return name, value * factor
+
+    def read_glob(self, key: str) -> tuple[str, float]:
+        """Glob and factor to SI of a key that carries its unit, such as *.offset_mm.
+
+        Raises:
+            ParameterError: If the suffix is missing, or of another unit than what the glob matches.
+        """
+        glob, unit, factor = split_unit(key)
+        for name in self.select([glob]):
+            if self[name].unit != unit:
+                raise ParameterError(
+                    f"'{key}' has the wrong unit; {name} is in {self[name].edge_unit}"
+                )
+        return glob, factor
+
+    def read_tolerances(self, given: Mapping[str, float]) -> dict[str, float]:
+        """Names or globs with their units to numbers, as names or globs to numbers in SI.
+
+        Raises:
+            ParameterError: If a name or unit is unknown.
+        """
+        require_numbers(given, argument="tolerances")
+        result = {}
+        for key, value in given.items():
+            try:
+                glob, factor = self.read_glob(key)
+            except ParameterError as e:
+                raise ParameterError(e.problem, where=e.where or "tolerances") from None
+            result[glob] = value * factor
+        return result
 
     def expand(self, values: Mapping[str, float]) -> dict[str, float]:
         """Elementary errors that parameter values amount to; only those that are not zero.

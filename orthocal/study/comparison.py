@@ -85,7 +85,8 @@ def compare_models(
     Args:
         session: The session.
         models: Models of the robot's YAML; all by default.
-        tolerances: Name or glob to another standard deviation than the robot's, [SI].
+        tolerances: Name or glob with its unit, such as *.offset_mm, to another standard deviation
+            than the robot's.
         repeat: Another session of the same rows: whether what remains repeats.
         options: Which solver, and how it is run.
 
@@ -112,10 +113,11 @@ def compare_models(
     noise = find_known_noise(session)
     cycles = len({r.cycle for r in session.readings}) > 1
     parameters = session.robot.parameters
+    given = parameters.read_tolerances(tolerances or {})
     results, undetermined = [], []
     for model in dict.fromkeys(models or parameters.models):
         free = set(parameters.select_model(model))
-        own = {g: v for g, v in (tolerances or {}).items() if free & set(parameters.select([g]))}
+        own = {g: v for g, v in given.items() if free & set(parameters.select([g]))}
         problem = build_problem(session, model=model, tolerances=own)
         try:
             results.append(score_model(problem, noise=noise.sigma, options=options))

@@ -127,7 +127,7 @@ def resimulate(session: Session, *, seed: int) -> Session:
         session.robot,
         parameters.models[MODEL],
         seed=seed,
-        tolerances={f"{axis}_slide.offset": OFFSET_SIGMA for axis in plans.AXES},
+        tolerances={f"{axis}_slide.offset_m": OFFSET_SIGMA for axis in plans.AXES},
     )
     return simulate_session(session, errors, seed=seed, sigma=SIGMA).session
 

@@ -11,6 +11,7 @@ import pytest
 from tolerances import CLOSED_FORM, KINEMATICS
 
 from orthocal import (
+    Choice,
     calibrate,
     load_calibration,
     load_plan,
@@ -34,7 +35,7 @@ def result(raw_cycles):
 @pytest.mark.parametrize("model", ["offsets", "lengths"])
 @pytest.mark.parametrize("example", ["raw-cycles", "table1/experiment-2", "table1/experiment-3"])
 def test_the_file_gives_the_same_object_back(root, tmp_path, example, model):
-    calibration = calibrate(load_session(root / "examples" / example), model=model)
+    calibration = calibrate(load_session(root / "examples" / example), model)
     again = load_calibration(calibration.save(tmp_path / "calibration.json"))
     assert again.to_document() == calibration.to_document()
     assert again.to_json() == calibration.to_json()
@@ -149,7 +150,7 @@ def test_beside_a_prior_sigma_is_settled_with_the_solution(root):
     rows = tuple(r for r in plan.readings if r.cycle == 1)
     plan = replace(plan, readings=rows).with_gauge(replace(plan.gauge, sigma=5e-6, resolution=None))
     session = simulate_session(plan, {**TRUTH, "x_leg.length": 2e-4}, seed=2, sigma=50e-6).session
-    result = calibrate(session, model="lengths")
+    result = calibrate(session, "lengths")
     assert result.noise.source == "residuals"
     assert 25e-6 < result.sigma < 100e-6
     assert result.prior
@@ -182,8 +183,7 @@ def test_every_doubt_of_an_offset_is_in_what_is_entered(root):
 def test_what_a_bound_or_a_known_value_holds_is_not_proved(experiment_2):
     bounded = calibrate(
         experiment_2,
-        bounds={"x_slide.offset": (-0.2e-3, 2e-3)},
-        known={"y_slide.offset": 0.5e-3},
+        Choice(bounds={"x_slide.offset_m": (-0.2e-3, 2e-3)}, known={"y_slide.offset_m": 0.5e-3}),
     )
     held = {e.drive: e.held for e in find_entries(bounded)}
     assert held == {"x_slide": "lower bound", "y_slide": "known", "z_slide": None}
@@ -198,7 +198,7 @@ def test_what_a_bound_or_a_known_value_holds_is_not_proved(experiment_2):
 
 def test_students_factor_counts_for_what_the_readings_told(experiment_2):
     """Three degrees of freedom say nothing of a length that only its prior tells."""
-    result = calibrate(experiment_2, model="lengths")
+    result = calibrate(experiment_2, "lengths")
     names = [p.name for p in result.free]
     bias = np.sqrt(np.diag(result.unmodelled.bias_covariance))
     for name, factor in (("x_leg.length", 1.96), ("x_slide.offset", result.confidence_factor)):
@@ -213,16 +213,16 @@ def test_cycles_that_are_all_equal_scatter_by_the_resolution(raw_cycles):
     first = {(r.setup, r.posture): r.value for r in raw_cycles.readings if r.cycle == 1}
     values = [first[r.setup, r.posture] for r in raw_cycles.readings]
     for model in ("offsets", "full"):
-        result = calibrate(raw_cycles.with_values(values), model=model)
+        result = calibrate(raw_cycles.with_values(values), model)
         assert result.noise.cycles_sigma == pytest.approx(0.01e-3 / np.sqrt(12.0))
         assert np.isfinite(result.covariance).all()
         assert "unknown" not in summarize(result)
-    zero = calibrate(raw_cycles.with_values(np.zeros(len(values))), model="full")
+    zero = calibrate(raw_cycles.with_values(np.zeros(len(values))), "full")
     assert zero["x_slide.offset"].std > 0.1e-3  # one with other errors, as its tolerance says
 
 
 def test_one_free_parameter_alone(experiment_2):
     rows = experiment_2.readings[:1]
-    result = calibrate(replace(experiment_2, readings=rows), base=True)
+    result = calibrate(replace(experiment_2, readings=rows), Choice(base=True))
     assert len(result.free) == 1
     assert np.isfinite(result.covariance).all()

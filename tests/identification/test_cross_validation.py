@@ -23,10 +23,10 @@ FIRST_ORDER = 2e-3
 def test_leaving_a_setup_out_is_solving_without_it(root, session, model):
     """Against Ipopt, which solves again without every setup in turn."""
     loaded = load_session(root / "examples" / session)
-    unseen = np.array([r.unseen for r in calibrate(loaded, model=model).residuals])
+    unseen = np.array([r.unseen for r in calibrate(loaded, model).residuals])
     solved = compare_models(loaded, models=[model])[model].exact.unseen
     assert np.abs(unseen - solved).max() < FIRST_ORDER * np.abs(solved).max()
-    fitted = [r.residual for r in calibrate(loaded, model=model).residuals]
+    fitted = [r.residual for r in calibrate(loaded, model).residuals]
     assert np.linalg.norm(unseen) > 1.05 * np.linalg.norm(fitted)
 
 
@@ -40,7 +40,7 @@ def test_a_setup_that_the_others_do_not_determine_has_no_prediction(raw_cycles):
 
 def test_one_setup_alone_predicts_nothing(raw_cycles):
     rows = tuple(r for r in raw_cycles.readings if r.setup == "yx")
-    result = calibrate(replace(raw_cycles, readings=rows), model="lengths")
+    result = calibrate(replace(raw_cycles, readings=rows), "lengths")
     assert all(np.isnan(r.unseen) for r in result.residuals)
 
 

@@ -116,7 +116,7 @@ def test_a_wrong_reading_is_named_with_file_and_line(root):
     row = 77
     values = session.values.copy()
     values[row] += 0.060e-3
-    result = calibrate(session.with_values(values), model="full")
+    result = calibrate(session.with_values(values), "full")
     assert [r.line for r in result.suspicious][:1] == [session.readings[row].line]
     assert session.readings[row].line == row + 2 + _comment_lines(root / "examples/sweep")
     text = " ".join(explain_fit(result))
@@ -131,7 +131,7 @@ def _comment_lines(folder):
 
 
 def test_a_sound_session_has_no_suspicious_readings(root, experiment_2):
-    assert calibrate(root / "examples/sweep", model="full").suspicious == ()
+    assert calibrate(root / "examples/sweep", "full").suspicious == ()
     assert calibrate(experiment_2).suspicious == ()
 
 
@@ -143,7 +143,7 @@ def test_hubers_loss_is_hardly_moved_by_a_wrong_reading(root):
     values[4] += 0.2e-3
     spoilt = session.with_values(values)
     squares = calibrate(spoilt)
-    huber = calibrate(spoilt, options=SolverOptions(loss=Loss("huber")))
+    huber = calibrate(spoilt, solver=SolverOptions(loss=Loss("huber")))
     offsets = [np.array([p.value for p in r.free]) for r in (sound, squares, huber)]
     assert np.abs(offsets[2] - offsets[0]).max() < 0.15 * np.abs(offsets[1] - offsets[0]).max()
     assert huber.noise.reading_sigma < 0.6 * squares.noise.reading_sigma
@@ -169,10 +169,10 @@ def test_only_the_wrong_reading_is_suspicious(root, model):
     values = session.values.copy()
     values[row] *= -1.0
     spoilt = session.with_values(values)
-    sound = calibrate(session, model=model)
+    sound = calibrate(session, model)
     distances = []
     for loss in ("huber", "squares"):
-        result = calibrate(spoilt, model=model, options=SolverOptions(loss=Loss(loss)))
+        result = calibrate(spoilt, model, solver=SolverOptions(loss=Loss(loss)))
         assert [r.line for r in result.suspicious] == [session.readings[row].line]
         distances.append(result["z_slide.offset"].value - sound["z_slide.offset"].value)
     assert abs(distances[0]) < 0.1 * abs(distances[1])
@@ -200,8 +200,8 @@ def test_hubers_loss_converges_on_few_readings(root, experiment):
     session = load_session(root / f"examples/table1/experiment-{experiment}")
     options = SolverOptions(loss=Loss("huber"))
     for model in ("offsets", "lengths"):
-        found = calibrate(session, model=model, options=options)
-        plain = calibrate(session, model=model)
+        found = calibrate(session, model, solver=options)
+        plain = calibrate(session, model)
         gap = [a.value - b.value for a, b in zip(found.free, plain.free, strict=True)]
         assert np.abs(gap).max() < 2.0 * plain["x_slide.offset"].std
     assert not any("Linearising" in s for s in explain_fit(found))
@@ -209,7 +209,7 @@ def test_hubers_loss_converges_on_few_readings(root, experiment):
 
 def test_when_most_readings_are_contradicted_it_is_the_model(experiment_2):
     """Six readings and tolerances that this machine is twice as bad as."""
-    result = calibrate(experiment_2, model="full")
+    result = calibrate(experiment_2, "full")
     text = " ".join(explain_fit(result))
     assert "it is the model or the tolerances, not single readings" in text
     assert "none is left to check the model" in text

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import lsq_linear
 from tolerances import SAME_OPTIMUM
 
-from orthocal import SolverOptions, calibrate, load_plan, simulate_session
+from orthocal import Choice, SolverOptions, calibrate, load_plan, simulate_session
 from orthocal.identification.fit import fit_problem
 from orthocal.identification.linear import linearise_at_reference
 from orthocal.identification.loss import Loss
@@ -48,8 +48,8 @@ def test_a_bound_holds_a_parameter_and_the_others_make_up_for_it(session):
 
 
 def test_a_parameter_at_its_bound_has_no_deviation_and_others_hold_with_it_there(session):
-    bounded = calibrate(session, bounds={"x_slide.offset": (-1e-3, 0.9e-3)})
-    known = calibrate(session, known={"x_slide.offset": 0.9e-3})
+    bounded = calibrate(session, Choice(bounds={"x_slide.offset_m": (-1e-3, 0.9e-3)}))
+    known = calibrate(session, Choice(known={"x_slide.offset_m": 0.9e-3}))
     p = bounded["x_slide.offset"]
     assert p.at_bound == "upper"
     assert p.std == 0.0
@@ -61,7 +61,7 @@ def test_a_parameter_at_its_bound_has_no_deviation_and_others_hold_with_it_there
 
 def test_bounds_that_do_not_bind_change_nothing(session):
     free = calibrate(session)
-    bounded = calibrate(session, bounds={"*.offset": (-5e-3, 5e-3)})
+    bounded = calibrate(session, Choice(bounds={"*.offset_m": (-5e-3, 5e-3)}))
     for a, b in zip(free.free, bounded.free, strict=True):
         assert a.value == pytest.approx(b.value, abs=SAME_OPTIMUM)
         assert a.std == pytest.approx(b.std, rel=1e-6)
@@ -70,9 +70,9 @@ def test_bounds_that_do_not_bind_change_nothing(session):
 
 def test_a_parameter_beside_its_bound_is_not_held_by_it(experiment_2):
     """y is best at −0.0948 mm while x and z are held: 5 µm from a bound that does not hold it."""
-    narrow = calibrate(experiment_2, bounds={"*.offset": (-1e-4, 1e-4)})
-    others = {f"{k}_slide.offset": (-1e-4, 1e-4) for k in "xz"}
-    free = calibrate(experiment_2, bounds=others)
+    narrow = calibrate(experiment_2, Choice(bounds={"*.offset_m": (-1e-4, 1e-4)}))
+    others = {f"{k}_slide.offset_m": (-1e-4, 1e-4) for k in "xz"}
+    free = calibrate(experiment_2, Choice(bounds=others))
     assert [p.at_bound for p in narrow.free] == ["lower", None, "lower"]
     found, expected = narrow["y_slide.offset"], free["y_slide.offset"]
     assert found.value == pytest.approx(expected.value, abs=1e-8)
@@ -135,13 +135,13 @@ def plan_with_truth(plan):
 
 def test_nothing_to_move_is_explained(plan):
     """The platform's own placement is seen by no reading of leg x alone."""
-    result = calibrate(plan_with_truth(plan), free=["frame.tcp.*"])
+    result = calibrate(plan_with_truth(plan), Choice(free=["frame.tcp.*"]))
     assert any("no reading depends on any free parameter" in s for s in explain_fit(result))
     assert set(result.identifiability.unseen) == {p.name for p in result.free}
 
 
 def test_iterations_and_times_are_told(session):
-    result = calibrate(session, model="full")
+    result = calibrate(session, "full")
     assert result.solver.status == "Solve_Succeeded"
     assert result.solver.iterations >= 1
     assert result.solver.seconds_build > 0.0
@@ -159,7 +159,7 @@ def test_correlations_are_those_of_the_covariance(session):
 
 
 def test_how_much_the_readings_said_of_each_parameter(session):
-    result = calibrate(session, model="lengths")
+    result = calibrate(session, "lengths")
     p = result["x_leg.length"]
     assert p.data_share == pytest.approx(1.0 - (p.std / p.tolerance) ** 2)
     assert np.isnan(calibrate(session)["x_slide.offset"].data_share)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthocal import calibrate, load_plan, load_session, simulate_session
+from orthocal import Choice, calibrate, load_plan, load_session, simulate_session
 from orthocal.errors import ParameterError
 from orthocal.identification.identifiability import (
     Combination,
@@ -170,7 +170,7 @@ def test_what_the_sweep_takes_for_one_the_lines_tell_apart(jacobians):
 def test_a_leg_length_that_only_the_zero_posture_would_show_is_one_with_the_offset(root):
     """Known in words from a session: the swivel's place along the slide is an offset."""
     session = load_session(root / "examples/raw-cycles")
-    result = calibrate(session, free=["*.offset", "x_swivel.x"], prior=True)
+    result = calibrate(session, Choice(free=["*.offset", "x_swivel.x"], prior=True))
     words = [c.words for c in result.identifiability.alike]
     assert words == ["x_slide.offset and x_swivel.x: only their difference"]
 
@@ -180,7 +180,7 @@ def test_base_parameters_without_prior_are_the_sums_of_the_truth(root):
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     truth = {"x_slide.offset": 0.4e-3, "y_slide.offset": -0.3e-3, "x_swivel.x": 0.1e-3}
     session = simulate_session(plan, truth, exact=True).session
-    result = calibrate(session, free=["*.offset", "x_swivel.x"], base=True)
+    result = calibrate(session, Choice(free=["*.offset", "x_swivel.x"], base=True))
     assert result.base
     assert not result.prior
     assert len(result.free) == 3
@@ -195,8 +195,8 @@ def test_base_parameters_without_prior_are_the_sums_of_the_truth(root):
 def test_base_and_prior_based_solutions_predict_the_same(root):
     """Where the prior is weak beside the readings, both describe the readings alike."""
     session = load_session(root / "examples/sweep")
-    base = calibrate(session, model="full", base=True)
-    prior = calibrate(session, model="full", tolerances={"*.offset": 2e-3})
+    base = calibrate(session, Choice(model="full", base=True))
+    prior = calibrate(session, Choice(model="full", tolerances={"*.offset_m": 2e-3}))
     gap = [a.predicted - b.predicted for a, b in zip(base.residuals, prior.residuals, strict=True)]
     assert np.sqrt(np.mean(np.square(gap))) < 0.4 * prior.sigma
     assert len(base.free) < 30
@@ -206,9 +206,9 @@ def test_base_and_prior_based_solutions_predict_the_same(root):
 def test_base_parameters_have_no_prior(root):
     session = load_session(root / "examples/raw-cycles")
     with pytest.raises(ParameterError, match="without any prior"):
-        calibrate(session, model="full", base=True, prior=True)
+        calibrate(session, Choice(model="full", base=True, prior=True))
     with pytest.raises(ParameterError, match=r"give x_leg\.length as known without ±"):
-        calibrate(session, known={"x_leg.length": (1e-4, 1e-5)}, base=True)
+        calibrate(session, Choice(known={"x_leg.length_m": (1e-4, 1e-5)}, base=True))
 
 
 def test_readings_that_tell_nothing_leave_no_base(raw_cycles):
@@ -216,16 +216,16 @@ def test_readings_that_tell_nothing_leave_no_base(raw_cycles):
     from orthocal.errors import NotIdentifiableError
 
     with pytest.raises(NotIdentifiableError, match="tell none of the free parameters"):
-        calibrate(replace(raw_cycles, readings=rows), base=True)
+        calibrate(replace(raw_cycles, readings=rows), Choice(base=True))
 
 
 def test_the_base_parameters_of_table_1_are_the_three_offsets(experiment_2):
     """What six readings with that scatter tell of 126 errors is what the paper identifies."""
-    base = calibrate(experiment_2, model="full", base=True)
+    base = calibrate(experiment_2, Choice(model="full", base=True))
     offsets = calibrate(experiment_2)
     assert [p.name for p in base.free] == [p.name for p in offsets.free]
     for a, b in zip(base.free, offsets.free, strict=True):
         assert a.value == pytest.approx(b.value, abs=1e-9)
         assert a.std == pytest.approx(b.std, rel=1e-6)
     assert base.spare_readings == 3
-    assert calibrate(experiment_2, model="full").spare_readings == 0
+    assert calibrate(experiment_2, "full").spare_readings == 0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from orthocal import calibrate, load_session
+from orthocal import Choice, calibrate, load_session
 from orthocal.errors import NotIdentifiableError, ParameterError
 from orthocal.identification.fit import fit_problem
 from orthocal.identification.problem import build_problem
@@ -63,7 +63,7 @@ def test_where_the_problem_bends_it_is_not_symmetric(experiment_2):
 def test_a_bound_ends_an_interval(experiment_2):
     result = calibrate(
         experiment_2,
-        bounds={"x_slide.offset": (-1e-3, 0.5e-3)},
+        Choice(bounds={"x_slide.offset_m": (-1e-3, 0.5e-3)}),
         profile=["x_slide.offset"],
     )
     assert result["x_slide.offset"].interval == pytest.approx((-1e-3, 0.5e-3))
@@ -71,7 +71,7 @@ def test_a_bound_ends_an_interval(experiment_2):
 
 def test_beside_a_prior_it_is_that_of_the_posterior(root):
     session = load_session(root / "examples/raw-cycles")
-    result = calibrate(session, model="lengths", profile=["x_leg.length"])
+    result = calibrate(session, "lengths", profile=["x_leg.length"])
     p = result["x_leg.length"]
     i = [q.name for q in result.free].index(p.name)
     bias = np.sqrt(result.unmodelled.bias_covariance[i, i])

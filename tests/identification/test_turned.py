@@ -37,8 +37,8 @@ def test_a_setup_with_its_sign_turned_is_found(root, session, model, setup):
     All others read the same, turned or not; sigma, which weighs a prior, is that of the turned one.
     """
     right = load_session(root / "examples" / session)
-    assert calibrate(right, model=model).turned is None
-    found = calibrate(turn(right, setup), model=model).turned
+    assert calibrate(right, model).turned is None
+    found = calibrate(turn(right, setup), model).turned
     assert found.name == setup
     sigma = fit_problem(build_problem(turn(right, setup), model=model)).sigma
     problem = build_problem(right, model=model)

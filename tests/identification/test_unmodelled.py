@@ -90,7 +90,7 @@ def test_a_machine_has_all_errors_of_its_parts(orthoglide, biglide):
 
 def test_the_full_model_leaves_out_what_is_at_the_ends_of_rods_and_in_the_drives(plan):
     session = simulate_session(plan, {"x_slide.offset": 1e-3}, seed=1).session
-    found = calibrate(session, model="full").unmodelled
+    found = calibrate(session, "full").unmodelled
     assert set(found.names) == set(machine_errors(plan.robot)) - set(
         plan.robot.parameters.select_model("full")
     )
@@ -100,7 +100,7 @@ def test_the_full_model_leaves_out_what_is_at_the_ends_of_rods_and_in_the_drives
 def test_with_a_sum_free_its_parts_may_still_differ(plan):
     """A leg's length is told by its coupler; the second rod may be longer than the first."""
     session = simulate_session(plan, {"x_slide.offset": 1e-3}, seed=1).session
-    found = calibrate(session, model="lengths").unmodelled
+    found = calibrate(session, "lengths").unmodelled
     assert "x_coupler.x" not in found.names
     assert "frame.x_rod_b_tip.x" in found.names
 

@@ -45,8 +45,8 @@ def test_two_halves_are_the_whole(sweep, model, solver):
     stated = sweep.with_gauge(replace(sweep.gauge, sigma=0.5e-3, resolution=None))
     parts = [half(stated, names[:3]), half(stated, names[3:])]
     options = SolverOptions(solver=solver)
-    whole = calibrate(stated, model=model, options=options)
-    joined = calibrate(parts, model=model, options=options)
+    whole = calibrate(stated, model, solver=options)
+    joined = calibrate(parts, model, solver=options)
     assert whole.noise.source == joined.noise.source == "gauge"
     for p, q in zip(whole.free, joined.free, strict=True):
         assert q.value == pytest.approx(p.value, abs=1e-9 * p.tolerance)
@@ -113,7 +113,7 @@ def test_deviations_of_mixed_sessions_are_those_of_many(root):
             simulate_session(plan, TRUTH, seed=2 * seed + i, sigma=s).session
             for i, s in enumerate((40e-6, 5e-6))
         ]
-        found = calibrate(pair, options=SolverOptions(solver="eliminated"))
+        found = calibrate(pair, solver=SolverOptions(solver="eliminated"))
         scores.append([(p.value - TRUTH[p.name]) / p.std for p in found.free])
     assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.0, abs=0.2)
 

@@ -17,7 +17,7 @@ NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?")
 
 @pytest.fixture(scope="module")
 def results(experiment_2):
-    calibration = calibrate(experiment_2, model="full")
+    calibration = calibrate(experiment_2, "full")
     unstated = replace(experiment_2, controller_offsets=None)
     return {
         "offsets": calibrate(experiment_2),

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from orthocal import calibrate, load_session, summarize
+from orthocal import Choice, calibrate, load_session, summarize
 from orthocal.output.explanation import advise, explain_fit
 
 
@@ -93,7 +93,7 @@ def test_one_wrong_sign_among_cycles_is_pointed_at(raw_cycles):
 
 
 def test_a_prior_marks_what_the_readings_leave_open(root):
-    result = calibrate(load_session(root / "examples/table1/experiment-2"), model="lengths")
+    result = calibrate(load_session(root / "examples/table1/experiment-2"), "lengths")
     text = summarize(result)
     assert line(text, "x_leg.length").split()[4] == "0%"
     assert line(text, "x_slide.offset").split()[4] == "99%"
@@ -198,4 +198,4 @@ def test_without_word_or_check_it_is_said(experiment_2):
 
 
 def test_nothing_is_advised_where_no_offset_was_identified(raw_cycles):
-    assert advise(calibrate(raw_cycles, free=["x_leg.length"])) == ""
+    assert advise(calibrate(raw_cycles, Choice(free=["x_leg.length"]))) == ""

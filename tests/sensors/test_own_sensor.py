@@ -91,7 +91,7 @@ def test_its_deviations_are_those_of_many_simulated_calibrations(plan):
     scores = []
     for seed in range(60):
         simulated = simulate_session(plan, TRUTH, seed=seed)
-        result = calibrate(simulated.session, options=SolverOptions(solver="eliminated"))
+        result = calibrate(simulated.session, solver=SolverOptions(solver="eliminated"))
         truth = {**TRUTH, **simulated.unknowns}
         estimates = (*result.free, *result.sensors)
         scores.append([(p.value - truth[p.name]) / p.std for p in estimates])

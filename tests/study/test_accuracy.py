@@ -12,6 +12,7 @@ from derivatives import assert_derivative
 from machines import place, write_orthoglide
 
 from orthocal import (
+    Choice,
     calibrate,
     compare_models,
     draw_errors,
@@ -233,7 +234,9 @@ def test_a_robot_without_a_tool_is_refused(fivebar):
 
 @pytest.fixture(scope="module")
 def calibrated(root):
-    return calibrate(root / "examples/sweep", model="lengths", tolerances={"*.offset": 2e-3})
+    return calibrate(
+        root / "examples/sweep", Choice(model="lengths", tolerances={"*.offset_m": 2e-3})
+    )
 
 
 def test_where_the_tool_is_now_by_pinocchio(calibrated):
@@ -261,10 +264,10 @@ def test_what_is_entered_is_in_where_the_tool_is_then(calibrated):
 def test_offsets_alone_are_as_good_as_the_machines_are(root):
     """What is promised of them, whatever scatters; all errors but those of rods' ends and drives
     are in the independent model's 0.102 and 0.045 mm."""
-    found = assess_tool(calibrate(root / "examples/sweep", tolerances={"*.offset": 2e-3}))
+    found = assess_tool(calibrate(root / "examples/sweep", Choice(tolerances={"*.offset_m": 2e-3})))
     assert found.after.sizes.relative.rms * 1e3 == pytest.approx(0.102, rel=0.05)
     assert found.after.sizes.aligned.rms * 1e3 == pytest.approx(0.045, rel=0.06)
-    full = calibrate(root / "examples/sweep", model="full", tolerances={"*.offset": 2e-3})
+    full = calibrate(root / "examples/sweep", Choice(model="full", tolerances={"*.offset_m": 2e-3}))
     # the same model's bound with all errors, fitted to their full model (0.0127), is below this
     assert 0.0120 < assess_tool(full).after.sizes.aligned.rms * 1e3 < 0.0145
 
@@ -277,14 +280,18 @@ def test_the_truth_behind_the_examples_is_where_it_should_be(root):
     drives = Assembly(robot).inverse(space.points)
     real = Assembly(robot, fixed=truth).forward(drives)
     for name, model, largest in (("sweep", "offsets", 2.0), ("lines", "full", 1.5)):
-        result = calibrate(root / f"examples/{name}", model=model, tolerances={"*.offset": 2e-3})
+        result = calibrate(
+            root / f"examples/{name}", Choice(model=model, tolerances={"*.offset_m": 2e-3})
+        )
         error = space.remove_motion(result.forward(drives) - real, space.points)
         found = np.sqrt(space.weights @ (error**2).sum(axis=1))
         assert found < largest * assess_tool(result, space).after.sizes.aligned.rms
 
 
 def test_remaining_errors_add_up_to_what_is_not_known(root):
-    result = calibrate(root / "examples/sweep", model="full", tolerances={"*.offset": 2e-3})
+    result = calibrate(
+        root / "examples/sweep", Choice(model="full", tolerances={"*.offset_m": 2e-3})
+    )
     found = assess_tool(result)
     parts = find_remaining_errors(result, found, count=177)
     assert np.sqrt(sum(p.rms**2 for p in parts)) == pytest.approx(found.after.sizes.aligned.rms)

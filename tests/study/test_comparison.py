@@ -17,7 +17,7 @@ from orthocal.identification.solvers.ipopt import NonlinearProgram
 from orthocal.identification.uncertainty import project_out_zeros
 from orthocal.study.comparison import compare_models
 
-OFFSETS = {"*.offset": 2e-3}
+OFFSETS = {"*.offset_mm": 2.0}
 
 
 @pytest.fixture(scope="module")

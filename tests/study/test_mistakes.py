@@ -115,7 +115,7 @@ def test_the_column_beside_it(plan, machines):
     """The identified offsets of a full model, entered instead of those that belong there."""
     errors, _ = machines[0]
     session = simulate_session(plan, errors, seed=3).session
-    calibration = calibrate(session, model="full")
+    calibration = calibrate(session, "full")
     entries = find_entries(calibration)
     identified = np.array([e.identified for e in entries])
     right = entered_offsets(calibration)

@@ -73,7 +73,7 @@ def test_sound_sessions_raise_no_doubt(plan, seed):
     errors = {n: 1.5e-3 * rng.normal() for n in TRUTH}
     found = simulate_session(plan, errors, seed=seed, sigma=sigma).session
     for model in ("offsets", "lengths"):
-        assert kinds(calibrate(found, model=model)) == []
+        assert kinds(calibrate(found, model)) == []
 
 
 def test_the_machines_size_is_printed(session):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from machines import place, reading_by_pinocchio
 
-from orthocal import calibrate, draw_errors, load_plan, load_session
+from orthocal import Choice, calibrate, draw_errors, load_plan, load_session
 from orthocal.identification.calibrate import assemble_calibration
 from orthocal.identification.fit import fit_problem
 from orthocal.identification.problem import build_problem
@@ -19,7 +19,7 @@ from orthocal.measurement.session import Gauge
 from orthocal.study.accuracy import assess_tool, measure_uncertainty
 
 SIGMA = 5e-6
-OFFSETS = {"*.offset": 2e-3}
+OFFSETS = {"*.offset_mm": 2.0}
 MACHINES = {"sweep": 100, "lines": 40}
 """What the sweep leaves open is a handful of directions: the error of 20 machines scatters by 13 %,
 that of 100 by 6 %. Of 200 machines it is 1.03 and 0.98 of what is predicted."""
@@ -115,7 +115,7 @@ def test_perfect_readings_give_the_tool_where_they_determine_it(machines):
 def test_the_calibrated_machine_in_pinocchio_shows_what_the_calibration_predicts(root):
     """All 126 errors in the placements of a pin.Model: its readings and its tool, to 1e-9 m."""
     session = load_session(root / "examples/sweep")
-    result = calibrate(session, model="full", tolerances=OFFSETS)
+    result = calibrate(session, Choice(model="full", tolerances=OFFSETS))
     machine = session.robot.with_errors(result.errors)
     zeros = {s.name: s.zero for s in result.setups}
     for row in result.residuals[::6]:

@@ -10,6 +10,7 @@ import pytest
 from tolerances import THREE_DECIMALS_MM
 
 from orthocal import (
+    Choice,
     calibrate,
     load_plan,
     load_session,
@@ -94,7 +95,7 @@ def test_a_session_with_other_offsets_is_no_validation(table1):
 
 
 def test_offsets_that_were_not_identified_need_not_be_the_controllers(table1):
-    calibration = calibrate(table1[2], free=["x_slide.offset", "z_slide.offset"])
+    calibration = calibrate(table1[2], Choice(free=["x_slide.offset", "z_slide.offset"]))
     entered = [calibration.errors.get(f"{leg}_slide.offset", 0.0) for leg in "xyz"]
     stated = with_offsets(table1[3], np.array(entered))
     assert validate_calibration(calibration, stated).offsets_stated
@@ -128,7 +129,7 @@ def test_a_calibration_of_all_errors_is_confirmed_with_its_offsets_entered(root)
     plan = load_plan(root / "examples/lines/plan.yaml")
     truth = load_errors(root / "examples/lines/truth.yaml", plan.robot)
     session = load_session(root / "examples/lines")
-    calibration = calibrate(session, model="full", tolerances={"*.offset": 2e-3})
+    calibration = calibrate(session, Choice(model="full", tolerances={"*.offset_m": 2e-3}))
     offsets = np.array([e.enter for e in find_entries(calibration)])
     entered = with_offsets(plan, offsets)
     again = simulate_session(entered, truth, seed=99).session

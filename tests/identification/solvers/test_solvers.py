@@ -125,7 +125,7 @@ def test_the_linearised_solver_takes_a_robust_loss(root):
 def test_a_calibration_says_by_which_solver_it_was_found(root, tmp_path):
     session = load_session(root / "examples/table1/experiment-2")
     found = {
-        kind: calibrate(session, options=SolverOptions(solver=kind))
+        kind: calibrate(session, solver=SolverOptions(solver=kind))
         for kind in ("ipopt", "eliminated", "linearised")
     }
     for kind, result in found.items():

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from orthocal import calibrate, load_session
+from orthocal import Choice, calibrate, load_session
 from orthocal.output import layout
 from orthocal.output.report import figure as style
 from orthocal.output.report import parameter_plots, reading_plots
@@ -55,7 +55,7 @@ def table1(experiment_2):
 
 @pytest.fixture(scope="module")
 def sweep(root):
-    return calibrate(load_session(root / "examples/sweep"), model="full")
+    return calibrate(load_session(root / "examples/sweep"), "full")
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def raw(raw_cycles):
 
 @pytest.fixture(scope="module")
 def bound(experiment_2):
-    return calibrate(experiment_2, bounds={"x_slide.offset": (-0.1e-3, 0.1e-3)})
+    return calibrate(experiment_2, Choice(bounds={"x_slide.offset_m": (-0.1e-3, 0.1e-3)}))
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def unknown(root, tmp_path_factory):
     (folder / "session.yaml").write_text(text.replace("sigma_mm: 0.02, ", ""))
     rows = (source / "readings.csv").read_text().splitlines()
     (folder / "readings.csv").write_text("\n".join(rows[:2]) + "\n")
-    return calibrate(load_session(folder), model="full")
+    return calibrate(load_session(folder), "full")
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from rich.console import Group
 from rich.panel import Panel
 from rich.text import Text
 
-from orthocal import calibrate, load_calibration, load_session
+from orthocal import Choice, calibrate, load_calibration, load_session
 from orthocal.markup import items, paragraph, table
 from orthocal.output.layout import add_row, bullets, section, table_of
 from orthocal.output.report.page import build_report
@@ -119,10 +119,12 @@ def test_provenance_says_what_was_given_beside_the_readings(root, read):
     assert ["Given beside the readings", "nothing: the robot's own tolerances hold"] in read.rows
     found = calibrate(
         root / "examples/raw-cycles",
-        model="lengths",
-        tolerances={"*.offset": 2e-3},
-        known={"x_leg.length": 0.12e-3, "y_leg.length": (0.05e-3, 0.02e-3)},
-        bounds={"z_slide.offset": (-1e-3, 2e-3)},
+        Choice(
+            model="lengths",
+            tolerances={"*.offset_m": 2e-3},
+            known={"x_leg.length_m": 0.12e-3, "y_leg.length_m": (0.05e-3, 0.02e-3)},
+            bounds={"z_slide.offset_m": (-1e-3, 2e-3)},
+        ),
     )
     rows = Reader(build_report(found)).rows
     offsets = [f"{leg}_slide.offset 2 mm instead of 5" for leg in "xyz"]
@@ -148,7 +150,7 @@ def test_scene_is_embedded_whole(read):
 
 
 def test_full_model_says_what_the_offsets_leave(root):
-    found = calibrate(load_session(root / "examples/sweep"), model="full")
+    found = calibrate(load_session(root / "examples/sweep"), "full")
     page = build_report(found)
     assert "once the offsets above are entered" in page
     read = Reader(page)
@@ -200,7 +202,7 @@ def test_report_of_what_nothing_tells(raw_cycles):
     session = replace(raw_cycles, readings=rows).with_gauge(
         replace(raw_cycles.gauge, sigma=None, resolution=None)
     )
-    found = calibrate(session, model="full")
+    found = calibrate(session, "full")
     assert not np.isfinite([r.unseen for r in found.residuals]).any()
     page = build_report(found)
     assert "No setup can be predicted from the others" in page
@@ -233,7 +235,7 @@ def test_calibration_in_a_notebook(calibration):
 
 
 def test_calibration_with_many_parameters_lists_its_offsets(root):
-    found = calibrate(load_session(root / "examples/sweep"), model="full")
+    found = calibrate(load_session(root / "examples/sweep"), "full")
     read = Reader(found._repr_html_())
     assert [r[0] for r in read.rows[1:]] == ["x_slide.offset", "y_slide.offset", "z_slide.offset"]
     assert "and 123 more parameters" in " ".join(read.text["p"])

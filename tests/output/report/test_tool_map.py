@@ -10,7 +10,7 @@ import pytest
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 
-from orthocal import calibrate, load_plan, simulate_session
+from orthocal import Choice, calibrate, load_plan, simulate_session
 from orthocal.kinematics.workspace import Workspace, cube
 from orthocal.output.report import figure as style
 from orthocal.output.report import tool_map
@@ -31,7 +31,7 @@ WHICH = ("now", "left", "unknown")
 
 @pytest.fixture(scope="module")
 def table1(experiment_2):
-    return calibrate(experiment_2, model="lengths", prior=True)
+    return calibrate(experiment_2, Choice(model="lengths", prior=True))
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,7 @@ def scene(calibration):
 
 @pytest.fixture(scope="module")
 def full(root):
-    return calibrate(load_session(root / "examples/sweep"), model="full")
+    return calibrate(load_session(root / "examples/sweep"), "full")
 
 
 def world(scene, path):
