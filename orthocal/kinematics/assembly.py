@@ -40,6 +40,9 @@ SINGULAR_BELOW = 1e-5
 singular posture Newton stops where the residual, quadratic in the distance, is below CLOSED: a
 smaller ratio would not be seen. The Orthoglide has 1/20 to 1/60."""
 
+SURELY = 0.1
+"""Part of the bound at which rounding errors of an inverse are of no account."""
+
 TOO_FAR = 1e3
 """A Newton step that goes farther comes from rows that depend on each other, [m or rad]."""
 
@@ -427,7 +430,10 @@ class Assembly:
             return
         solved = np.flatnonzero(np.isfinite(passive).all(axis=1))
         _, jacobians = system.evaluate(passive[solved], drives[solved], machine)
-        values = np.linalg.svd(jacobians / system.units, compute_uv=False)
+        scaled = jacobians / system.units
+        doubtful = ~_far_from_singular(scaled)
+        solved, scaled = solved[doubtful], scaled[doubtful]
+        values = np.linalg.svd(scaled, compute_uv=False)
         smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
         largest = values.max(axis=1, initial=0.0)  # without closures there are no values
         ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), solved.shape)
@@ -443,6 +449,21 @@ class Assembly:
                 raise error
             failures[i] = error
             passive[i] = np.nan
+
+
+def _far_from_singular(matrices: Array) -> NDArray[np.bool_]:
+    """Whether the ratio of singular values is above SINGULAR_BELOW for sure, shape (K,).
+
+    By Frobenius' norm it is at least 1/(|A| |A⁻¹|), which takes half the time.
+    """
+    if matrices.shape[1] != matrices.shape[2] or not matrices.size:
+        return np.zeros(len(matrices), dtype=np.bool_)
+    try:
+        inverses = np.linalg.inv(matrices)
+    except np.linalg.LinAlgError:
+        return np.zeros(len(matrices), dtype=np.bool_)
+    sizes = np.linalg.norm(matrices, axis=(1, 2)) * np.linalg.norm(inverses, axis=(1, 2))
+    return np.asarray(sizes < SURELY / SINGULAR_BELOW)
 
 
 @lru_cache(maxsize=4)

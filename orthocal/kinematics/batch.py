@@ -35,29 +35,20 @@ class BatchFunction:
         matrices: Sequence[str] = (),
         sparse: Sequence[str] = (),
     ) -> None:
-        symbols = [function.sx_in(i) for i in range(function.n_in())]
-        found = function.call(symbols)
-        names = function.name_out()
-        outputs = [
-            ca.densify(ca.vertcat(*y.nonzeros()) if name in sparse else y)
-            for name, y in zip(names, found, strict=True)
-        ]
-        self._patterns = {
-            name: tuple(np.array(v, dtype=np.int64) for v in y.sparsity().get_triplet())
-            for name, y in zip(names, found, strict=True)
-            if name in sparse
-        }
-        self._function = ca.Function(
-            function.name(), symbols, outputs, function.name_in(), function.name_out()
-        )
+        self._function = dense(function, sparse=sparse)
         self._shared = [function.index_in(name) for name in shared]
-        self._shapes = [self._function.size_out(i) for i in range(function.n_out())]
+        self._sparse = frozenset(sparse)
+        self._shapes = [
+            (function.nnz_out(i), 1) if name in self._sparse else function.size_out(i)
+            for i, name in enumerate(function.name_out())
+        ]
         self._matrices = [function.index_out(name) for name in matrices]
         self._maps: dict[int, ca.Function] = {}
 
     def pattern(self, name: str) -> tuple[Indices, Indices]:
         """Rows and columns of the nonzeros of a sparse output, shape (nnz,) each."""
-        rows, columns = self._patterns[name]
+        sparsity = self._function.sparsity_out(self._function.index_out(name))
+        rows, columns = (np.array(v, dtype=np.int64) for v in sparsity.get_triplet())
         return rows, columns
 
     def __call__(self, *inputs: ArrayLike) -> tuple[Array, ...]:
@@ -102,3 +93,16 @@ class BatchFunction:
                 f"{self._function.name()}_{size}", "serial", size, self._shared, []
             )
         return self._maps[size]
+
+
+def dense(function: ca.Function, *, sparse: Sequence[str] = ()) -> ca.Function:
+    """The same function with dense outputs, but for some."""
+    names = function.name_out()
+    if all(n in sparse or function.sparsity_out(i).is_dense() for i, n in enumerate(names)):
+        return function
+    symbols = [function.sx_in(i) for i in range(function.n_in())]
+    found = function.call(symbols)
+    outputs = [
+        y if name in sparse else ca.densify(y) for name, y in zip(names, found, strict=True)
+    ]
+    return ca.Function(function.name(), symbols, outputs, function.name_in(), names)
