@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -235,7 +236,9 @@ class _Scatter:
         """The nonzeros of columns that have a place."""
         rows, columns = pattern
         chosen = np.flatnonzero(place[columns] >= 0)
-        return _Scatter(chosen, rows[chosen], place[columns[chosen]], int(place.max(initial=-1)) + 1)
+        return _Scatter(
+            chosen, rows[chosen], place[columns[chosen]], int(place.max(initial=-1)) + 1
+        )
 
     def dense(self, nonzeros: Array, n_rows: int) -> Array:
         """Matrices of nonzeros, shape (k, n_rows, n_columns) of (k, nnz)."""
@@ -248,7 +251,7 @@ class _Scatter:
 class _Chain:
     """Rows by twists to rows by θ̂: each error moves a placement or a few."""
 
-    matrix: object
+    matrix: Any
 
     @staticmethod
     def of(slopes: Array) -> _Chain:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 
-
 from orthocal.errors import ClosureError, NotIdentifiableError, SolverError
 from orthocal.identification.fit import Fit
 from orthocal.identification.uncertainty import confidence_factor

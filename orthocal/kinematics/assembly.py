@@ -49,6 +49,10 @@ TOO_FAR = 1e3
 LAST_STEP = 1e-6
 """A step from closed loops that goes farther is that of a nearly singular posture, [m or rad]."""
 
+SOLUTIONS_REMEMBERED = 4
+MOST_REMEMBERED = 1000
+"""Solutions that an assembly keeps, of at most so many postures: what asks for one asks again."""
+
 MAX_NEWTON_STEPS = 30
 SMALLEST_CONTINUATION_STEP = 1.0 / 512.0
 LARGEST_CONTINUATION_MOVE = 0.3
@@ -148,6 +152,7 @@ class Assembly:
         self._columns = self._compiled.errors.columns(self.free)
         others = {k: v for k, v in (fixed or {}).items() if k not in self.free}
         self._fixed = self._compiled.errors.expand(others)
+        self._recent: dict[tuple[object, ...], Array] = {}
 
     def close(
         self,
@@ -181,10 +186,39 @@ class Assembly:
         """
         d, single = as_rows(drives, len(self.robot.drives), "drive coordinates")
         machine = self.machine(theta)
-        passive = self._solve(self._closing, d, machine, start, names, failures)
-        if not allow_free:
-            self._refuse_singular(d, passive, machine, names, failures)
+        if start is not None or failures is not None:
+            passive = self._close(d, machine, start, names, failures, allow_free=allow_free)
+        else:
+            passive = self._once(
+                ("close", allow_free, d.tobytes(), *(part.tobytes() for part in machine)),
+                lambda: self._close(d, machine, None, names, None, allow_free=allow_free),
+            )
         return passive[0] if single else passive
+
+    def _close(
+        self,
+        drives: Array,
+        machine: Machine,
+        start: ArrayLike | None,
+        names: Sequence[str] | None,
+        failures: Failures | None,
+        *,
+        allow_free: bool,
+    ) -> Array:
+        passive = self._solve(self._closing, drives, machine, start, names, failures)
+        if not allow_free:
+            self._refuse_singular(drives, passive, machine, names, failures)
+        return passive
+
+    def _once(self, key: tuple[object, ...], solve: Callable[[], Array]) -> Array:
+        """What was solved for the same numbers a moment ago, or is now."""
+        if key in self._recent:
+            return np.array(self._recent[key])
+        found = solve()
+        if len(found) <= MOST_REMEMBERED:
+            recent = [*self._recent.items(), (key, np.array(found))]
+            self._recent = dict(recent[-SOLUTIONS_REMEMBERED:])
+        return found
 
     def forward(
         self,
@@ -239,7 +273,14 @@ class Assembly:
             RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
         p, single = as_rows(points, len(self._require_tcp().coordinates), "coordinates")
-        x = self._solve(self._inverting, p, self.machine(theta), None, names, failures)
+        machine = self.machine(theta)
+        if failures is not None:
+            x = self._solve(self._inverting, p, machine, None, names, failures)
+        else:
+            x = self._once(
+                ("inverse", p.tobytes(), *(part.tobytes() for part in machine)),
+                lambda: self._solve(self._inverting, p, machine, None, names, None),
+            )
         drives = x[:, : len(self.robot.drives)]
         return drives[0] if single else drives
 

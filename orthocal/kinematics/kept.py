@@ -9,11 +9,11 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from functools import lru_cache
+from importlib.metadata import version
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
-import pinocchio as pin
 
 from orthocal import cache
 from orthocal.robot.model import Robot
@@ -78,4 +78,5 @@ def _code() -> str:
     for folder in _BUILT_BY:
         for path in sorted((root / folder).glob("*.py")):
             digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
-    return f"casadi {ca.__version__} pinocchio {pin.__version__} code {digest.hexdigest()}"
+    versions = f"casadi {version('casadi')} pinocchio {version('pin')}"
+    return f"{versions} code {digest.hexdigest()}"
