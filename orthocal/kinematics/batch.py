@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from orthocal.kinematics.lanes import LaneFunction, list_instructions, pays
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -65,8 +68,28 @@ class BatchFunction:
         """
         arrays = [np.asarray(a, dtype=np.float64) for a in inputs]
         count = next(len(a) for i, a in enumerate(arrays) if i not in self._shared)
-        results = [np.empty((count, c, r)) for r, c in self._shapes]
-        flat = [y.reshape(count, -1) for y in results]
+        lanes = self._by_numba if pays(self._function.n_instructions(), count) else None
+        if lanes is not None:
+            flat = lanes(arrays, self._shared, count)
+        else:
+            flat = self._by_casadi(arrays, count)
+        results = [y.reshape(count, c, r) for y, (r, c) in zip(flat, self._shapes, strict=True)]
+        return tuple(
+            np.asarray(
+                y[:, 0, :] if shape[1] == 1 and i not in self._matrices else y.transpose(0, 2, 1)
+            )
+            for i, (y, shape) in enumerate(zip(results, self._shapes, strict=True))
+        )
+
+    @cached_property
+    def _by_numba(self) -> LaneFunction | None:
+        """The same by numba; None where that does not know one of its operations."""
+        listing = list_instructions(self._function)
+        return None if listing is None else LaneFunction(listing, self._shared)
+
+    def _by_casadi(self, arrays: list[Array], count: int) -> list[Array]:
+        """Nonzeros of each output, shape (count, nnz)."""
+        flat = [np.empty((count, self._function.nnz_out(i))) for i in range(len(self._shapes))]
         first = 0
         for size in SIZES:
             if count - first < size:
@@ -82,12 +105,7 @@ class BatchFunction:
                 for found, y in zip(lanes.outputs, flat, strict=True):
                     y[part] = found
                 first += size
-        return tuple(
-            np.asarray(
-                y[:, 0, :] if shape[1] == 1 and i not in self._matrices else y.transpose(0, 2, 1)
-            )
-            for i, (y, shape) in enumerate(zip(results, self._shapes, strict=True))
-        )
+        return flat
 
     def _lanes(self, size: int) -> _Lanes:
         """So many points at once; memory of their own for each thread."""
