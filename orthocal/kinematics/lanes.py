@@ -200,6 +200,7 @@ class LaneFunction:
             listing.table,
             listing.constants,
             listing.n_work,
+            LANE,
             self._is_shared,
             self._place,
             x,
@@ -226,6 +227,7 @@ def _run(
     table: Any,  # noqa: ANN401 - arrays that numba compiles for
     constants: Any,  # noqa: ANN401
     n_work: int,
+    width: int,
     is_shared: Any,  # noqa: ANN401
     place: Any,  # noqa: ANN401
     x: Any,  # noqa: ANN401
@@ -233,108 +235,109 @@ def _run(
     result: Any,  # noqa: ANN401
 ) -> None:
     """Take each instruction for a lane of points; the codes are those of _OPERATIONS."""
-    work = np.zeros(32 * n_work)
+    work, shown = np.zeros((n_work, width)), np.zeros((result.shape[1], width))
     count = x.shape[0]
-    for first in range(0, count, 32):
-        size = min(32, count - first)
+    for first in range(0, count, width):
+        size = min(width, count - first)
         for k in range(table.shape[0]):
             code, to, i, j = table[k, 0], table[k, 1], table[k, 2], table[k, 3]
             if code == 2:
-                for lane in range(size):
-                    result[first + lane, to] = work[32 * i + lane]
+                for lane in range(width):
+                    shown[to, lane] = work[i, lane]
                 continue
-            w = 32 * to
             if code == 1:
                 if is_shared[i]:
                     value = p[place[i]]
-                    for lane in range(32):
-                        work[w + lane] = value
+                    for lane in range(width):
+                        work[to, lane] = value
                 else:
                     column = place[i]
                     for lane in range(size):
-                        work[w + lane] = x[first + lane, column]
+                        work[to, lane] = x[first + lane, column]
                 continue
             if code == 0:
                 value = constants[k]
-                for lane in range(32):
-                    work[w + lane] = value
+                for lane in range(width):
+                    work[to, lane] = value
                 continue
-            a, b = 32 * i, 32 * j
             if code == 6:
-                for lane in range(32):
-                    work[w + lane] = work[a + lane] * work[b + lane]
+                for lane in range(width):
+                    work[to, lane] = work[i, lane] * work[j, lane]
             elif code == 4:
-                for lane in range(32):
-                    work[w + lane] = work[a + lane] + work[b + lane]
+                for lane in range(width):
+                    work[to, lane] = work[i, lane] + work[j, lane]
             elif code == 5:
-                for lane in range(32):
-                    work[w + lane] = work[a + lane] - work[b + lane]
+                for lane in range(width):
+                    work[to, lane] = work[i, lane] - work[j, lane]
             elif code == 8:
-                for lane in range(32):
-                    work[w + lane] = -work[a + lane]
+                for lane in range(width):
+                    work[to, lane] = -work[i, lane]
             elif code == 28:
-                for lane in range(32):
-                    work[w + lane] = work[b + lane] if work[a + lane] != 0.0 else 0.0
+                for lane in range(width):
+                    work[to, lane] = work[j, lane] if work[i, lane] != 0.0 else 0.0
             elif code == 9:
-                for lane in range(32):
-                    work[w + lane] = work[a + lane] * work[a + lane]
+                for lane in range(width):
+                    work[to, lane] = work[i, lane] * work[i, lane]
             elif code == 7:
-                for lane in range(32):
-                    work[w + lane] = work[a + lane] / work[b + lane]
+                for lane in range(width):
+                    work[to, lane] = work[i, lane] / work[j, lane]
             elif code == 10:
-                for lane in range(32):
-                    work[w + lane] = 2.0 * work[a + lane]
+                for lane in range(width):
+                    work[to, lane] = 2.0 * work[i, lane]
             elif code == 11:
-                for lane in range(32):
-                    work[w + lane] = 1.0 / work[a + lane]
+                for lane in range(width):
+                    work[to, lane] = 1.0 / work[i, lane]
             elif code == 3:
-                for lane in range(32):
-                    work[w + lane] = work[a + lane]
+                for lane in range(width):
+                    work[to, lane] = work[i, lane]
             elif code == 12:
-                for lane in range(32):
-                    work[w + lane] = np.sqrt(work[a + lane])
+                for lane in range(width):
+                    work[to, lane] = np.sqrt(work[i, lane])
             elif code == 13:
-                for lane in range(32):
-                    work[w + lane] = np.sin(work[a + lane])
+                for lane in range(width):
+                    work[to, lane] = np.sin(work[i, lane])
             elif code == 14:
-                for lane in range(32):
-                    work[w + lane] = np.cos(work[a + lane])
+                for lane in range(width):
+                    work[to, lane] = np.cos(work[i, lane])
             elif code == 15:
-                for lane in range(32):
-                    work[w + lane] = np.tan(work[a + lane])
+                for lane in range(width):
+                    work[to, lane] = np.tan(work[i, lane])
             elif code == 16:
-                for lane in range(32):
-                    work[w + lane] = np.arcsin(work[a + lane])
+                for lane in range(width):
+                    work[to, lane] = np.arcsin(work[i, lane])
             elif code == 17:
-                for lane in range(32):
-                    work[w + lane] = np.arccos(work[a + lane])
+                for lane in range(width):
+                    work[to, lane] = np.arccos(work[i, lane])
             elif code == 18:
-                for lane in range(32):
-                    work[w + lane] = np.arctan(work[a + lane])
+                for lane in range(width):
+                    work[to, lane] = np.arctan(work[i, lane])
             elif code == 19:
-                for lane in range(32):
-                    work[w + lane] = np.arctan2(work[a + lane], work[b + lane])
+                for lane in range(width):
+                    work[to, lane] = np.arctan2(work[i, lane], work[j, lane])
             elif code == 20:
-                for lane in range(32):
-                    work[w + lane] = abs(work[a + lane])
+                for lane in range(width):
+                    work[to, lane] = abs(work[i, lane])
             elif code == 21:
-                for lane in range(32):
-                    work[w + lane] = 1.0 if work[a + lane] < work[b + lane] else 0.0
+                for lane in range(width):
+                    work[to, lane] = 1.0 if work[i, lane] < work[j, lane] else 0.0
             elif code == 22:
-                for lane in range(32):
-                    work[w + lane] = 1.0 if work[a + lane] <= work[b + lane] else 0.0
+                for lane in range(width):
+                    work[to, lane] = 1.0 if work[i, lane] <= work[j, lane] else 0.0
             elif code == 23:
-                for lane in range(32):
-                    work[w + lane] = 1.0 if work[a + lane] == work[b + lane] else 0.0
+                for lane in range(width):
+                    work[to, lane] = 1.0 if work[i, lane] == work[j, lane] else 0.0
             elif code == 24:
-                for lane in range(32):
-                    work[w + lane] = 1.0 if work[a + lane] != work[b + lane] else 0.0
+                for lane in range(width):
+                    work[to, lane] = 1.0 if work[i, lane] != work[j, lane] else 0.0
             elif code == 25:
-                for lane in range(32):
-                    work[w + lane] = 1.0 if work[a + lane] == 0.0 else 0.0
+                for lane in range(width):
+                    work[to, lane] = 1.0 if work[i, lane] == 0.0 else 0.0
             elif code == 26:
-                for lane in range(32):
-                    work[w + lane] = 1.0 if work[a + lane] != 0.0 and work[b + lane] != 0.0 else 0.0
+                for lane in range(width):
+                    work[to, lane] = 1.0 if work[i, lane] != 0.0 and work[j, lane] != 0.0 else 0.0
             elif code == 27:
-                for lane in range(32):
-                    work[w + lane] = 1.0 if work[a + lane] != 0.0 or work[b + lane] != 0.0 else 0.0
+                for lane in range(width):
+                    work[to, lane] = 1.0 if work[i, lane] != 0.0 or work[j, lane] != 0.0 else 0.0
+        for lane in range(size):
+            for to in range(result.shape[1]):
+                result[first + lane, to] = shown[to, lane]
