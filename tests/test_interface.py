@@ -92,7 +92,7 @@ def test_millimetres_cannot_pass_for_metres(arguments, experiment_2):
     with pytest.raises(ParameterError, match=rf"{kind}: '.*offset' carries no unit; expected one"):
         calibrate(experiment_2, Choice(**arguments))
     angles = {"known": {"x_slide.offset_mrad": 2.0}}
-    with pytest.raises(ParameterError, match="has the wrong unit; x_slide.offset is in mm"):
+    with pytest.raises(ParameterError, match=r"has the wrong unit; x_slide\.offset is in mm"):
         calibrate(experiment_2, Choice(**angles))
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -295,7 +296,7 @@ class _Scatter:
 class _Chain:
     """Rows by twists to rows by θ̂: each error moves a placement or a few."""
 
-    matrix: object
+    matrix: Any
 
     @staticmethod
     def of(slopes: Array) -> _Chain:

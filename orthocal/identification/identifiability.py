@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from orthocal.identification.uncertainty import RANK_THRESHOLD, Information
 from orthocal.robot.parameters import Parameter
@@ -171,6 +170,11 @@ def find_base_parameters(
     """
     if not np.any(factor):
         return ()
+    sizes = np.linalg.svd(factor, compute_uv=False)
+    if len(sizes) == factor.shape[1] and sizes[-1] > threshold * (1.0 + 1e-9):
+        return tuple(Combination(((p.name, 1.0),)) for p in parameters)  # each is told by itself
+    from scipy import linalg
+
     r, order = linalg.qr(factor, mode="r", pivoting=True)
     diagonal = np.abs(np.diag(r))
     count = int((diagonal > threshold).sum())

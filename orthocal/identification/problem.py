@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
@@ -180,6 +180,15 @@ class CalibrationProblem:
         names = list(self.session.postures)
         machine = self._of_machine(theta)
         return self.assembly.close(self.drives, theta=machine, start=start, names=names)
+
+    @cached_property
+    def reference_passive(self) -> Array:
+        """Passive coordinates of every posture at the reference, (n_postures, n_passive).
+
+        Raises:
+            ClosureError: If the reference machine cannot reach a posture.
+        """
+        return self.close(self.reference)
 
     @cached_property
     def machine_map(self) -> MachineMap:
@@ -445,6 +454,7 @@ def build_problem(
     return CalibrationProblem(session, selection)
 
 
+@lru_cache(maxsize=4)
 def _require_independent_rows(robot: Robot) -> None:
     """Refuse closures with rows that depend on others: as constraints they cannot all be met.
 

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import math
 
-from scipy.optimize import brentq
-
 from orthocal.errors import ClosureError, NotIdentifiableError, SolverError
 from orthocal.identification.fit import Fit
 from orthocal.identification.uncertainty import confidence_factor
@@ -93,4 +91,6 @@ def _find_end(fit: Fit, index: int, factor: float, side: float) -> float:
             status="no interval",
             iterations=MAX_DOUBLINGS,
         )
+    from scipy.optimize import brentq
+
     return centre + side * float(brentq(rise, inside, outside, xtol=SETTLED * std))

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, special
+from scipy import special
 
 from orthocal.errors import NotIdentifiableError
 from orthocal.measurement.gauge import Observations
@@ -69,8 +69,7 @@ def project_out_zeros(
     """
     flat = values.reshape(len(values), -1)
     own = np.ones(len(values)) if weights is None else weights
-    totals = np.zeros((observations.n_zeros, flat.shape[1]))
-    np.add.at(totals, observations.zero, flat * own[:, None])
+    totals = observations.sum_by_zero(flat, own)
     counts = np.bincount(observations.zero, own, minlength=observations.n_zeros)
     means = totals / np.where(counts > 0.0, counts, 1.0)[:, None]
     return np.asarray((flat - means[observations.zero]).reshape(values.shape))
@@ -279,7 +278,7 @@ def _inverse_square(matrix: Array) -> Array:
         return np.zeros((0, 0))
     if diagonal.min() <= np.finfo(np.float64).eps * diagonal.max():
         return np.full((len(r), len(r)), np.inf)
-    half = linalg.solve_triangular(r, np.eye(len(r)))
+    half = np.linalg.solve(r, np.eye(len(r)))
     return np.asarray(half @ half.T)
 
 

@@ -40,11 +40,18 @@ SINGULAR_BELOW = 1e-5
 singular posture Newton stops where the residual, quadratic in the distance, is below CLOSED: a
 smaller ratio would not be seen. The Orthoglide has 1/20 to 1/60."""
 
+SURELY = 0.1
+"""Part of the bound at which rounding errors of an inverse are of no account."""
+
 TOO_FAR = 1e3
 """A Newton step that goes farther comes from rows that depend on each other, [m or rad]."""
 
 LAST_STEP = 1e-6
 """A step from closed loops that goes farther is that of a nearly singular posture, [m or rad]."""
+
+SOLUTIONS_REMEMBERED = 4
+MOST_REMEMBERED = 1000
+"""Solutions that an assembly keeps, of at most so many postures: what asks for one asks again."""
 
 MAX_NEWTON_STEPS = 30
 SMALLEST_CONTINUATION_STEP = 1.0 / 512.0
@@ -148,6 +155,7 @@ class Assembly:
         self._columns = self._compiled.errors.columns(self.free)
         others = {k: v for k, v in (fixed or {}).items() if k not in self.free}
         self._fixed = self._compiled.errors.expand(others)
+        self._recent: dict[tuple[object, ...], Array] = {}
 
     def close(
         self,
@@ -181,10 +189,39 @@ class Assembly:
         """
         d, single = as_rows(drives, len(self.robot.drives), "drive coordinates")
         machine = self.machine(theta)
-        passive = self._solve(self._closing, d, machine, start, names, failures)
-        if not allow_free:
-            self._refuse_singular(d, passive, machine, names, failures)
+        if start is not None or failures is not None:
+            passive = self._close(d, machine, start, names, failures, allow_free=allow_free)
+        else:
+            passive = self._once(
+                ("close", allow_free, d.tobytes(), *(part.tobytes() for part in machine)),
+                lambda: self._close(d, machine, None, names, None, allow_free=allow_free),
+            )
         return passive[0] if single else passive
+
+    def _close(
+        self,
+        drives: Array,
+        machine: Machine,
+        start: ArrayLike | None,
+        names: Sequence[str] | None,
+        failures: Failures | None,
+        *,
+        allow_free: bool,
+    ) -> Array:
+        passive = self._solve(self._closing, drives, machine, start, names, failures)
+        if not allow_free:
+            self._refuse_singular(drives, passive, machine, names, failures)
+        return passive
+
+    def _once(self, key: tuple[object, ...], solve: Callable[[], Array]) -> Array:
+        """What was solved for the same numbers a moment ago, or is now."""
+        if key in self._recent:
+            return np.array(self._recent[key])
+        found = solve()
+        if len(found) <= MOST_REMEMBERED:
+            recent = [*self._recent.items(), (key, np.array(found))]
+            self._recent = dict(recent[-SOLUTIONS_REMEMBERED:])
+        return found
 
     def forward(
         self,
@@ -239,7 +276,14 @@ class Assembly:
             RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
         p, single = as_rows(points, len(self._require_tcp().coordinates), "coordinates")
-        x = self._solve(self._inverting, p, self.machine(theta), None, names, failures)
+        machine = self.machine(theta)
+        if failures is not None:
+            x = self._solve(self._inverting, p, machine, None, names, failures)
+        else:
+            x = self._once(
+                ("inverse", p.tobytes(), *(part.tobytes() for part in machine)),
+                lambda: self._solve(self._inverting, p, machine, None, names, None),
+            )
         drives = x[:, : len(self.robot.drives)]
         return drives[0] if single else drives
 
@@ -430,7 +474,10 @@ class Assembly:
             return
         solved = np.flatnonzero(np.isfinite(passive).all(axis=1))
         _, jacobians = system.evaluate(passive[solved], drives[solved], machine)
-        values = np.linalg.svd(jacobians / system.units, compute_uv=False)
+        scaled = jacobians / system.units
+        doubtful = ~_far_from_singular(scaled)
+        solved, scaled = solved[doubtful], scaled[doubtful]
+        values = np.linalg.svd(scaled, compute_uv=False)
         smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
         largest = values.max(axis=1, initial=0.0)  # without closures there are no values
         ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), solved.shape)
@@ -446,6 +493,21 @@ class Assembly:
                 raise error
             failures[i] = error
             passive[i] = np.nan
+
+
+def _far_from_singular(matrices: Array) -> NDArray[np.bool_]:
+    """Whether the ratio of singular values is above SINGULAR_BELOW for sure, shape (K,).
+
+    By Frobenius' norm it is at least 1/(|A| |A⁻¹|), which takes half the time.
+    """
+    if matrices.shape[1] != matrices.shape[2] or not matrices.size:
+        return np.zeros(len(matrices), dtype=np.bool_)
+    try:
+        inverses = np.linalg.inv(matrices)
+    except np.linalg.LinAlgError:
+        return np.zeros(len(matrices), dtype=np.bool_)
+    sizes = np.linalg.norm(matrices, axis=(1, 2)) * np.linalg.norm(inverses, axis=(1, 2))
+    return np.asarray(sizes < SURELY / SINGULAR_BELOW)
 
 
 @lru_cache(maxsize=4)

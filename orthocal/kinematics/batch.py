@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.kinematics.lanes import LaneFunction, list_instructions, pays
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-CHUNK = 256
-"""Points evaluated in one call; bounds the memory and the number of maps that are built."""
+SIZES = (32, 8, 1)
+"""Points evaluated in one call, the largest first: few maps are built, and what they read and write
+stays near."""
 
 
 class BatchFunction:
@@ -35,29 +40,20 @@ class BatchFunction:
         matrices: Sequence[str] = (),
         sparse: Sequence[str] = (),
     ) -> None:
-        symbols = [function.sx_in(i) for i in range(function.n_in())]
-        found = function.call(symbols)
-        names = function.name_out()
-        outputs = [
-            ca.densify(ca.vertcat(*y.nonzeros()) if name in sparse else y)
-            for name, y in zip(names, found, strict=True)
-        ]
-        self._patterns = {
-            name: tuple(np.array(v, dtype=np.int64) for v in y.sparsity().get_triplet())
-            for name, y in zip(names, found, strict=True)
-            if name in sparse
-        }
-        self._function = ca.Function(
-            function.name(), symbols, outputs, function.name_in(), function.name_out()
-        )
+        self._function = dense(function, sparse=sparse)
         self._shared = [function.index_in(name) for name in shared]
-        self._shapes = [self._function.size_out(i) for i in range(function.n_out())]
+        self._sparse = frozenset(sparse)
+        self._shapes = [
+            (function.nnz_out(i), 1) if name in self._sparse else function.size_out(i)
+            for i, name in enumerate(function.name_out())
+        ]
         self._matrices = [function.index_out(name) for name in matrices]
-        self._maps: dict[int, ca.Function] = {}
+        self._local = threading.local()
 
     def pattern(self, name: str) -> tuple[Indices, Indices]:
         """Rows and columns of the nonzeros of a sparse output, shape (nnz,) each."""
-        rows, columns = self._patterns[name]
+        sparsity = self._function.sparsity_out(self._function.index_out(name))
+        rows, columns = (np.array(v, dtype=np.int64) for v in sparsity.get_triplet())
         return rows, columns
 
     def __call__(self, *inputs: ArrayLike) -> tuple[Array, ...]:
@@ -70,23 +66,14 @@ class BatchFunction:
             Each output with shape (K, rows, columns), or (K, rows) for a column vector; `matrices`
             keep their one column; sparse ones have shape (K, nnz).
         """
-        arrays = [np.ascontiguousarray(a, dtype=np.float64) for a in inputs]
+        arrays = [np.asarray(a, dtype=np.float64) for a in inputs]
         count = next(len(a) for i, a in enumerate(arrays) if i not in self._shared)
-        results = [np.empty((count, c, r)) for r, c in self._shapes]
-        for first in range(0, count, CHUNK):
-            size = min(CHUNK, count - first)
-            part = slice(first, first + size)
-            buffer, trigger = self._map(size).buffer()
-            held = [
-                a if i in self._shared else np.ascontiguousarray(a[part])
-                for i, a in enumerate(arrays)
-            ]
-            # casadi's type information describes the C++ call, with a pointer and a size
-            for i, a in enumerate(held):
-                buffer.set_arg(i, memoryview(a.reshape(-1)))  # type: ignore[call-arg,arg-type]
-            for i, result in enumerate(results):
-                buffer.set_res(i, memoryview(result[part].reshape(-1)))  # type: ignore[call-arg,arg-type]
-            trigger()
+        lanes = self._by_numba if pays(self._function.n_instructions(), count) else None
+        if lanes is not None:
+            flat = lanes(arrays, self._shared, count)
+        else:
+            flat = self._by_casadi(arrays, count)
+        results = [y.reshape(count, c, r) for y, (r, c) in zip(flat, self._shapes, strict=True)]
         return tuple(
             np.asarray(
                 y[:, 0, :] if shape[1] == 1 and i not in self._matrices else y.transpose(0, 2, 1)
@@ -94,11 +81,73 @@ class BatchFunction:
             for i, (y, shape) in enumerate(zip(results, self._shapes, strict=True))
         )
 
-    def _map(self, size: int) -> ca.Function:
-        if size == 1:
-            return self._function
-        if size not in self._maps:
-            self._maps[size] = self._function.map(
-                f"{self._function.name()}_{size}", "serial", size, self._shared, []
-            )
-        return self._maps[size]
+    @cached_property
+    def _by_numba(self) -> LaneFunction | None:
+        """The same by numba; None where that does not know one of its operations."""
+        listing = list_instructions(self._function)
+        return None if listing is None else LaneFunction(listing, self._shared)
+
+    def _by_casadi(self, arrays: list[Array], count: int) -> list[Array]:
+        """Nonzeros of each output, shape (count, nnz)."""
+        flat = [np.empty((count, self._function.nnz_out(i))) for i in range(len(self._shapes))]
+        first = 0
+        for size in SIZES:
+            if count - first < size:
+                continue
+            lanes = self._lanes(size)
+            lanes.share({i: arrays[i] for i in self._shared})
+            own = [(i, a) for i, a in enumerate(arrays) if i not in self._shared]
+            while count - first >= size:
+                part = slice(first, first + size)
+                for i, a in own:
+                    lanes.inputs[i][...] = a[part]
+                lanes.trigger()
+                for found, y in zip(lanes.outputs, flat, strict=True):
+                    y[part] = found
+                first += size
+        return flat
+
+    def _lanes(self, size: int) -> _Lanes:
+        """So many points at once; memory of their own for each thread."""
+        if not hasattr(self._local, "lanes"):
+            self._local.lanes = {}
+        lanes: dict[int, _Lanes] = self._local.lanes
+        if size not in lanes:
+            lanes[size] = _Lanes(self._function, size, self._shared)
+        return lanes[size]
+
+
+class _Lanes:
+    """A function mapped over a number of points, with memory that it reads from and writes to."""
+
+    def __init__(self, function: ca.Function, size: int, shared: list[int]) -> None:
+        name = f"{function.name()}_{size}"
+        mapped = function if size == 1 else function.map(name, "serial", size, shared, [])
+        self._shared = shared
+        self._buffer, self.trigger = mapped.buffer()
+        self.inputs = [
+            np.zeros((1 if i in shared else size, function.nnz_in(i)))
+            for i in range(function.n_in())
+        ]
+        self.outputs = [np.zeros((size, function.nnz_out(i))) for i in range(function.n_out())]
+        # casadi's type information describes the C++ call, with a pointer and a size
+        for i, a in enumerate(self.inputs):
+            self._buffer.set_arg(i, memoryview(a.reshape(-1)))  # type: ignore[call-arg,arg-type]
+        for i, a in enumerate(self.outputs):
+            self._buffer.set_res(i, memoryview(a.reshape(-1)))  # type: ignore[call-arg,arg-type]
+
+    def share(self, values: dict[int, Array]) -> None:
+        """Set the inputs that are the same at every point."""
+        for i, value in values.items():
+            self.inputs[i][0] = value
+
+
+def dense(function: ca.Function, *, sparse: Sequence[str] = ()) -> ca.Function:
+    """The same function with dense outputs, but for some."""
+    names = function.name_out()
+    if all(n in sparse or function.sparsity_out(i).is_dense() for i, n in enumerate(names)):
+        return function
+    symbols = [function.sx_in(i) for i in range(function.n_in())]
+    found = function.call(symbols)
+    outputs = [y if name in sparse else ca.densify(y) for name, y in zip(names, found, strict=True)]
+    return ca.Function(function.name(), symbols, outputs, function.name_in(), names)

@@ -9,7 +9,7 @@ than differentiating the expressions, and as exact.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from orthocal.kinematics.batch import BatchFunction
 from orthocal.kinematics.error_map import ErrorMap, error_map
+from orthocal.kinematics.kept import kept_function
 from orthocal.kinematics.symbolic import Pose, SymbolicTree, hangs_on, log6
 from orthocal.robot.model import Closure, Robot, closure_row_units, joint_axis
 
@@ -123,21 +124,25 @@ class CompiledRobot:
     @cached_property
     def closing(self) -> BatchFunction:
         """(actuated, passive, placements) to g, ∂g by the passive coordinates."""
-        by_joints, _ = self.closure_slopes
-        by_passive = by_joints[:, self.robot.passive_index.tolist()]
-        return self._batch("closing", [self.closure, by_passive], matrices=1)
+
+        def outputs() -> list[ca.SX]:
+            by_joints, _ = self.closure_slopes
+            return [self.closure, by_joints[:, self.robot.passive_index.tolist()]]
+
+        return self._batch("closing", outputs, matrices=(1,))
 
     @cached_property
     def inverting(self) -> BatchFunction:
         """(actuated, passive, placements) to g, ∂g by actuated, by passive; tool, ∂ likewise."""
-        robot = self.robot
-        assert robot.tcp is not None
-        frame = robot.frame_id(robot.tcp.frame)
-        rows = [self._wrench_row(frame, force=ca.SX(np.eye(3)[i]))[0] for i in range(3)]
-        tool = ca.vertcat(*rows)
-        g, _ = self.closure_slopes
-        outputs = [self.closure, *self._split(g), self.tree.frame_pose(frame).position]
-        return self._batch("inverting", [*outputs, *self._split(tool)], matrices=(1, 2, 4, 5))
+
+        def outputs() -> list[ca.SX]:
+            rows = [self._wrench_row(frame, force=ca.SX(np.eye(3)[i]))[0] for i in range(3)]
+            g, _ = self.closure_slopes
+            tool = self.tree.frame_pose(frame).position
+            return [self.closure, *self._split(g), tool, *self._split(ca.vertcat(*rows))]
+
+        frame = self._tool_frame()
+        return self._batch("inverting", outputs, matrices=(1, 2, 4, 5))
 
     @cached_property
     def slopes(self) -> BatchFunction:
@@ -148,17 +153,16 @@ class CompiledRobot:
     @cached_property
     def sparse_slopes(self) -> BatchFunction:
         """The same, of ∂g by twists the nonzeros alone."""
-        first, second, twists = (self.expressions.name_out(i) for i in range(1, 4))
-        return BatchFunction(
-            self.expressions, shared=["placements"], matrices=[first, second], sparse=[twists]
-        )
+        return self._batch("sparse_slopes", self._slope_outputs, matrices=(1, 2), sparse=(3,))
 
     @cached_property
     def expressions(self) -> ca.Function:
         """The same with sparse rows, to be put into other expressions."""
+        return self._kept("slopes", self._slope_outputs, sparse=(0, 1, 2, 3))
+
+    def _slope_outputs(self) -> list[ca.SX]:
         joints, twists = self.closure_slopes
-        outputs = [self.closure, *self._split(joints), twists]
-        return self._function("slopes", outputs)
+        return [self.closure, *self._split(joints), twists]
 
     # ---- frames
 
@@ -166,28 +170,38 @@ class CompiledRobot:
         """(actuated, passive, placements) to the position of a frame, [m]."""
         index = self.robot.frame_id(frame)
         if index not in self._positions:
-            self._positions[index] = self._batch("frame", [self.tree.frame_pose(index).position])
+            self._positions[index] = self._batch(
+                f"frame_{index}", lambda: [self.tree.frame_pose(index).position]
+            )
         return self._positions[index]
 
     def pose(self, frame: str) -> BatchFunction:
         """(actuated, passive, placements) to the pose of a frame, shape (4, 4), [1, m]."""
         index = self.robot.frame_id(frame)
         if index not in self._poses:
-            pose = self.tree.frame_pose(index)
-            rows = ca.vertcat(ca.horzcat(pose.rotation, pose.position), ca.SX([[0, 0, 0, 1]]))
-            self._poses[index] = self._batch("pose", [rows])
+            self._poses[index] = self._batch(f"pose_{index}", lambda: [self._homogeneous(index)])
         return self._poses[index]
+
+    def _homogeneous(self, frame: int) -> ca.SX:
+        pose = self.tree.frame_pose(frame)
+        return ca.vertcat(ca.horzcat(pose.rotation, pose.position), ca.SX([[0, 0, 0, 1]]))
 
     @cached_property
     def tool(self) -> BatchFunction:
         """(actuated, passive, placements) to the tool, ∂ by actuated, by passive and by twists."""
+
+        def outputs() -> list[ca.SX]:
+            rows = [self._wrench_row(frame, force=ca.SX(np.eye(3)[i])) for i in range(3)]
+            joints = self._split(ca.vertcat(*(j for j, _ in rows)))
+            twists = ca.vertcat(*(t for _, t in rows))
+            return [self.tree.frame_pose(frame).position, *joints, twists]
+
+        frame = self._tool_frame()
+        return self._batch("tool", outputs, matrices=(1, 2, 3))
+
+    def _tool_frame(self) -> int:
         assert self.robot.tcp is not None
-        frame = self.robot.frame_id(self.robot.tcp.frame)
-        rows = [self._wrench_row(frame, force=ca.SX(np.eye(3)[i])) for i in range(3)]
-        joints = self._split(ca.vertcat(*(j for j, _ in rows)))
-        twists = ca.vertcat(*(t for _, t in rows))
-        position = self.tree.frame_pose(frame).position
-        return self._batch("tool", [position, *joints, twists], matrices=(1, 2, 3))
+        return self.robot.frame_id(self.robot.tcp.frame)
 
     def wrench_row(
         self, frame: int, *, force: ca.SX, moment: ca.SX | None = None
@@ -280,19 +294,34 @@ class CompiledRobot:
         return [by_joints[:, columns] for columns in index]
 
     def _batch(
-        self, name: str, outputs: list[ca.SX], *, matrices: int | tuple[int, ...] = ()
+        self,
+        name: str,
+        outputs: Callable[[], list[ca.SX]],
+        *,
+        matrices: tuple[int, ...] = (),
+        sparse: tuple[int, ...] = (),
     ) -> BatchFunction:
-        function = self._function(name, outputs)
-        chosen = (matrices,) if isinstance(matrices, int) else matrices
+        function = self._kept(name, outputs, sparse=sparse)
         return BatchFunction(
-            function, shared=["placements"], matrices=[function.name_out(i) for i in chosen]
+            function,
+            shared=["placements"],
+            matrices=[f"y{i}" for i in matrices],
+            sparse=[f"y{i}" for i in sparse],
         )
 
-    def _function(self, name: str, outputs: list[ca.SX]) -> ca.Function:
-        names = [f"y{i}" for i in range(len(outputs))]
-        return ca.Function(
-            name, self.symbols, outputs, ["actuated", "passive", "placements"], names
-        )
+    def _kept(
+        self, name: str, outputs: Callable[[], list[ca.SX]], *, sparse: tuple[int, ...]
+    ) -> ca.Function:
+        """A function of the symbols; its outputs are expressed only where it is not kept."""
+
+        def build() -> ca.Function:
+            found = outputs()
+            values = [y if i in sparse else ca.densify(y) for i, y in enumerate(found)]
+            inputs = ["actuated", "passive", "placements"]
+            labels = [f"y{i}" for i in range(len(values))]
+            return ca.Function(name, self.symbols, values, inputs, labels)
+
+        return kept_function(self.robot, name, build)
 
 
 @lru_cache(maxsize=4)

@@ -61,6 +61,17 @@ class Observations:
             minus=none,
         )
 
+    def sum_by_zero(self, values: Array, weights: Array) -> Array:
+        """Weighted sums of those with the same zero, shape (n_zeros, m) of (n, m)."""
+        order = np.argsort(self.zero, kind="stable")
+        starts = np.searchsorted(self.zero[order], np.arange(self.n_zeros))
+        result = np.zeros((self.n_zeros, values.shape[1]))
+        used = np.append(starts[1:], self.size) > starts
+        weighted = (values * weights[:, None])[order]
+        if weighted.size:
+            result[used] = np.add.reduceat(weighted, starts[used], axis=0)
+        return result
+
     def rows(self, entries: Array) -> Array:
         """Rows of the session from values of the entries, shape (n_rows, ...)."""
         taken = np.where(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import logging
 import math
@@ -10,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import IO, Any
 
@@ -17,6 +19,7 @@ import numpy as np
 import pinocchio as pin
 from lxml import etree
 
+from orthocal import cache
 from orthocal.characters import composed
 from orthocal.documents import LARGEST_NUMBER, read_text
 from orthocal.errors import RobotError
@@ -67,6 +70,8 @@ LARGEST_URDF = 16 * 2**20
 
 MOST_ELEMENTS = 20_000
 """XML elements of a URDF; a humanoid with its hands has some thousands."""
+
+_YES = b"yes"
 
 MOST_JOINTS = 400
 """Joints, fixed ones too: urdfdom calls itself for every one in a chain, until its stack ends."""
@@ -348,6 +353,16 @@ def _numbers(element: Any, key: str, count: int, where: str) -> list[float] | No
 
 
 def _validate_with_yourdfpy(text: str, path: Path) -> None:
+    """Refuse what yourdfpy does not accept; what it did accept is remembered, for its import."""
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    accepted = f"yourdfpy {version('yourdfpy')} accepts {digest}"
+    if cache.recall(accepted) == _YES:
+        return
+    _ask_yourdfpy(text, path)
+    cache.keep(accepted, _YES)
+
+
+def _ask_yourdfpy(text: str, path: Path) -> None:
     import yourdfpy
 
     logging.getLogger("yourdfpy").setLevel(logging.CRITICAL)

@@ -8,7 +8,7 @@ m is moved by whatever carries it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache, partial
 
 import casadi as ca
 import numpy as np
@@ -16,11 +16,14 @@ from numpy.typing import NDArray
 
 from orthocal.kinematics.batch import BatchFunction
 from orthocal.kinematics.compiled import compiled_robot
+from orthocal.kinematics.kept import kept_function
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Frames, Sensor, View
 
 Array = NDArray[np.float64]
+
+INPUTS = ["actuated", "passive", "placements", "zero", "constants", "unknowns"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +63,16 @@ class _Pattern:
             len(sensor.unknowns),
         )
 
+    @property
+    def words(self) -> str:
+        """What distinguishes it from other patterns of the robot."""
+        return repr(self._key[1:])
+
+    @cached_property
+    def expressions(self) -> tuple[list[ca.SX], list[ca.SX]]:
+        """Inputs and outputs of its functions."""
+        return _express(self)
+
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Pattern) and self._key == other._key
 
@@ -69,6 +82,31 @@ class _Pattern:
 
 @lru_cache(maxsize=256)
 def _compile(pattern: _Pattern) -> CompiledReading:
+    value, slopes = (
+        kept_function(pattern.robot, f"{name} {pattern.words}", partial(build, pattern))
+        for name, build in (("reading", _build_value), ("reading slopes", _build_slopes))
+    )
+    rows = [name for name in slopes.name_out() if name not in ("h", "by_twists")]
+    return CompiledReading(
+        value=BatchFunction(value, shared=["placements"]),
+        slopes=BatchFunction(slopes, shared=["placements"], matrices=rows, sparse=["by_twists"]),
+        expression=slopes,
+    )
+
+
+def _build_value(pattern: _Pattern) -> ca.Function:
+    inputs, outputs = pattern.expressions
+    return ca.Function("h", inputs, [ca.densify(outputs[0])], INPUTS, ["h"])
+
+
+def _build_slopes(pattern: _Pattern) -> ca.Function:
+    inputs, outputs = pattern.expressions
+    labels = ["h", *(f"by_{n}" for n in ("actuated", "passive", "twists", "zero", "unknowns"))]
+    return ca.Function("slopes", inputs, outputs, INPUTS, labels)
+
+
+def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
+    """Inputs and outputs: h; ∂h by actuated, passive, twists, zero drives and unknowns."""
     robot, sensor = pattern.robot, pattern.sensor
     here = compiled_robot(robot)
     there = here.at_zero
@@ -106,20 +144,7 @@ def _compile(pattern: _Pattern) -> CompiledReading:
         else:
             by_actuated, by_passive = by_actuated + actuated, by_passive + passive
     inputs = [*here.symbols, there.actuated, constants, unknowns]
-    names = ["actuated", "passive", "placements", "zero", "constants", "unknowns"]
-    outputs = [value, by_actuated, by_passive, by_twists, by_zero, by_unknowns]
-    labels = ["h", *(f"by_{n}" for n in ("actuated", "passive", "twists", "zero", "unknowns"))]
-    slopes = ca.Function("slopes", inputs, outputs, names, labels)
-    return CompiledReading(
-        value=BatchFunction(ca.Function("h", inputs, [value], names, ["h"]), shared=["placements"]),
-        slopes=BatchFunction(
-            slopes,
-            shared=["placements"],
-            matrices=[name for name in labels[1:] if name != "by_twists"],
-            sparse=["by_twists"],
-        ),
-        expression=slopes,
-    )
+    return inputs, [value, by_actuated, by_passive, by_twists, by_zero, by_unknowns]
 
 
 def _pull(h: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:

@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.records import ControllerEntry, ParameterEstimate
@@ -154,6 +153,8 @@ def _solve_in_order(first: Array, second: Array, first_rows: Array, second_rows:
     Directions of X are told apart by how much of what they do by `second` they do by `first`.
     """
     square = second.T @ second
+    from scipy import linalg
+
     ratios, directions = linalg.eigh(first.T @ first, square)
     told = ratios > DECIDED**2
     kept = directions[:, told]

@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special
 
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.records import ResidualRow, root_mean_square, rows_by_setup
+
+Array = NDArray[np.float64]
 
 FINER = 1e-3
 """Part of a step of the gauge by which a reading may miss it: rounding of numbers."""
@@ -36,6 +39,9 @@ COMPUTED = 1e-7
 
 TINY = 2e-3
 """Part of the largest distance of postures below which no two are meant to be apart."""
+
+MANY_PLACES = 500
+"""Postures above which their distances are not all computed."""
 
 DIFFERENT = 5.0
 """Tolerances of a length by which legs of one machine may differ by intent."""
@@ -152,9 +158,7 @@ def _tiny(calibration: Calibration) -> Doubt | None:
     places, first = np.unique(drives, axis=0, return_index=True)
     if len(places) < 3:
         return None
-    from scipy.spatial import KDTree
-
-    gaps = np.asarray(KDTree(places).query(places, k=2)[0])[:, 1]
+    gaps = _nearest(places)
     largest = float(np.linalg.norm(np.ptp(places, axis=0)))
     near = np.flatnonzero(gaps < TINY * largest)
     if not near.size:
@@ -166,6 +170,17 @@ def _tiny(calibration: Calibration) -> Doubt | None:
         f"Posture '{name}' is {gaps[worst] * 1e3:.2g} mm from another one, where postures "
         f"are up to {largest * 1e3:.0f} mm apart: is it in mm, not in metres?",
     )
+
+
+def _nearest(places: Array) -> Array:
+    """Distance of each place from the one next to it, shape (n,) of (n, 3)."""
+    if len(places) > MANY_PLACES:
+        from scipy.spatial import KDTree
+
+        return np.asarray(KDTree(places).query(places, k=2)[0])[:, 1]
+    apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    return np.asarray(apart.min(axis=1))
 
 
 def _legs(calibration: Calibration) -> Doubt | None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from orthocal.errors import ParameterError
+from orthocal.identification.choice import Choice
 from orthocal.identification.selection import (
     read_bounds,
     read_known,
@@ -103,12 +104,22 @@ def test_texts_carry_their_units(parameters):
         parameters,
         where="--known",
     )
-    assert known["x_leg.length"] == pytest.approx((0.12e-3, 0.02e-3))
-    assert known["x_coupler.rx"] == pytest.approx((-0.5e-3, 0.1e-3))
-    assert known["y_leg.length"] == pytest.approx(7e-6)
-    assert read_tolerances(["*.offset_mm=2"], parameters, where="-") == {"*.offset": 2e-3}
-    bounds = read_bounds(["x_slide.offset_mm=-2:", "*.rx_mrad=:1"], parameters, where="-")
-    assert bounds == {"x_slide.offset": (-2e-3, np.inf), "*.rx": (-np.inf, 1e-3)}
+    tolerances = read_tolerances(["*.offset_mm=2"], parameters, where="-")
+    bounds = read_bounds(["x_slide.offset_mm=-2:", "x_coupler.rx_mrad=:1"], parameters, where="-")
+    choice = Choice("lengths", known=known, tolerances=tolerances, bounds=bounds)
+    selection = choice.select(parameters)
+    at = dict(zip(selection.names, range(len(selection.names)), strict=True))
+    for name, mean, spread in (
+        ("x_leg.length", 0.12e-3, 0.02e-3),
+        ("x_coupler.rx", -0.5e-3, 0.1e-3),
+        ("x_slide.offset", 0.0, 2e-3),
+    ):
+        assert selection.mean[at[name]] == pytest.approx(mean)
+        assert selection.tolerances[at[name]] == pytest.approx(spread)
+    assert selection.fixed == {"y_leg.length": pytest.approx(7e-6)}
+    slide, coupler = at["x_slide.offset"], at["x_coupler.rx"]
+    assert (selection.lower[slide], selection.upper[slide]) == (-2e-3, np.inf)
+    assert (selection.lower[coupler], selection.upper[coupler]) == (-np.inf, 1e-3)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg
 
+from orthocal.identification.expansion import Expansion
 from orthocal.identification.loss import Loss
 from orthocal.identification.problem import CalibrationProblem
 from orthocal.identification.solvers.program import LEFT_OUT
@@ -102,6 +102,31 @@ class Task:
         closed = problem.close(si, start=passive)
         return self._state(theta, closed, (self.values - problem.predict(si, closed)) / self.sigma)
 
+    def begin(self, theta: ArrayLike | None, passive: Array | None) -> tuple[State, Expansion]:
+        """The problem where a solver begins; arguments as for `Program.solve`.
+
+        Raises:
+            ClosureError: If the machine cannot reach a posture there.
+        """
+        problem, at = self.problem, self.start(theta)
+        if passive is None:
+            passive = problem.reference_passive
+            if not np.array_equal(at * problem.theta_scale, problem.reference):
+                passive = problem.close(at * problem.theta_scale, start=passive)
+        else:
+            passive = problem.close(at * problem.theta_scale, start=passive)
+        expansion = self.expand(at, passive)
+        return self.near(at, passive, expansion), expansion
+
+    def expand(self, theta: Array, passive: Array) -> Expansion:
+        """Readings to first order about some θ̂ and passive coordinates near closed loops."""
+        return self.problem.expand(theta * self.problem.theta_scale, passive)
+
+    def near(self, theta: Array, passive: Array, expansion: Expansion) -> State:
+        """The problem at some θ̂, its loops closed to first order."""
+        predicted = expansion.reading + expansion.opening
+        return self._state(theta, passive, (self.values - predicted) / self.sigma)
+
     def moved(self, state: State, jacobian: Array, change: Array) -> State:
         """The problem to first order at another θ̂; arguments as for `step`."""
         return self._state(state.theta + change, state.passive, state.deviation - jacobian @ change)
@@ -135,7 +160,9 @@ class Task:
     def _change(self, at: State, jacobian: Array, weights: Array) -> Array:
         """Newton's step with given weights, within the bounds, shape (n_free,)."""
         centred = self._centre(jacobian, weights)
-        square = centred.T @ (centred * weights[:, None])
+        if (weights != 1.0).any():
+            centred *= np.sqrt(weights)[:, None]
+        square = centred.T @ centred
         square[np.diag_indices_from(square)] += self.problem.prior_precision
         return self._solve(square, -self.slope(at, jacobian), at.theta)
 
@@ -166,6 +193,8 @@ class Task:
         scaled = (square * np.outer(scale, scale))[np.ix_(order, order)]
         target = (pull * scale)[order]
         step = np.empty_like(theta)
+        from scipy import linalg
+
         try:
             factor = linalg.cholesky(scaled, lower=True).T
         except linalg.LinAlgError:  # not told by anything: the least change
@@ -191,15 +220,15 @@ class Task:
     def _centre(self, values: Array, weights: Array) -> Array:
         """Rows less the weighted mean of those that share their zero, shape as given."""
         o = self.problem.observations
-        order = np.argsort(o.zero, kind="stable")
-        starts = np.searchsorted(o.zero[order], np.arange(o.n_zeros))
-        totals = np.add.reduceat((values * weights[:, None])[order], starts, axis=0)
+        totals = o.sum_by_zero(values, weights)
         sums = np.bincount(o.zero, weights, minlength=o.n_zeros)
         return np.asarray(values - (totals / sums[:, None])[o.zero])
 
 
 def _bounded(factor: Array, target: Array, low: Array, high: Array) -> Array:
     """The s that minimises ‖R s − t‖ within bounds, R upper triangular, shape (n,)."""
+    from scipy import linalg
+
     free = linalg.solve_triangular(factor, target)
     if ((free >= low) & (free <= high)).all():
         return np.asarray(free)

@@ -1,0 +1,82 @@
+"""CasADi functions of a robot, built once and kept on disk.
+
+They are kept by all that they depend on: the robot as it was loaded, the code that builds them, and
+the versions of CasADi and Pinocchio.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+
+from orthocal import cache
+from orthocal.robot.model import Robot
+
+_BUILT_BY = ("kinematics", "sensors", "robot")
+"""Folders with the code that builds functions."""
+
+
+def kept_function(robot: Robot, name: str, build: Callable[[], ca.Function]) -> ca.Function:
+    """A function of a robot: as kept on disk, or built and kept.
+
+    Args:
+        robot: The robot.
+        name: Of the function, and all that distinguishes it from others of the robot.
+        build: Builds it.
+    """
+    key = f"function {name}\n{fingerprint(robot)}\n{_code()}"
+    content = cache.recall(key)
+    if content is not None:
+        try:
+            return ca.Function.deserialize(content.decode("ascii"))
+        except (RuntimeError, ValueError):  # of a casadi that was built otherwise
+            pass
+    function = build()
+    try:
+        text = function.serialize()
+    except RuntimeError:
+        return function
+    cache.keep(key, text.encode("ascii"))
+    return function
+
+
+@lru_cache(maxsize=16)
+def fingerprint(robot: Robot) -> str:
+    """A digest of all that a robot's functions depend on."""
+    parts = [
+        robot.model.saveToString(),
+        repr(robot.closures),
+        repr(robot.drives),
+        repr(robot.tcp),
+        repr(
+            [
+                (leg.name, leg.root, leg.tip, leg.root_driven, np.asarray(leg.axis).tolist())
+                for leg in robot.legs.values()
+            ]
+        ),
+        repr([d.hex() for d in robot.zero.tolist()]),
+        repr(robot.drive_index.tolist()),
+        repr(robot.passive_index.tolist()),
+        repr([float(v).hex() for v in robot.drive_gain]),
+        repr(tuple(robot.parameters.elementary.values())),
+        float(robot.characteristic_length).hex(),
+    ]
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+@lru_cache(maxsize=1)
+def _code() -> str:
+    """Versions, and a digest of the code that builds functions."""
+    digest = hashlib.sha256()
+    root = Path(__file__).parents[1]
+    for folder in _BUILT_BY:
+        for path in sorted((root / folder).glob("*.py")):
+            digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    versions = f"casadi {version('casadi')} pinocchio {version('pin')}"
+    return f"{versions} code {digest.hexdigest()}"
