@@ -14,9 +14,11 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Calibration": "orthocal.identification.calibration",
+    "CalibrationProblem": "orthocal.identification.problem",
     "Choice": "orthocal.identification.choice",
     "LiveScene": "orthocal.output.view.live",
     "Loss": "orthocal.identification.loss",
+    "NonlinearProgram": "orthocal.identification.solvers.ipopt",
     "OrthocalError": "orthocal.errors",
     "Robot": "orthocal.robot.model",
     "Scene": "orthocal.output.view.scene",
@@ -40,9 +42,11 @@ _HOMES = {
 
 __all__ = [
     "Calibration",
+    "CalibrationProblem",
     "Choice",
     "LiveScene",
     "Loss",
+    "NonlinearProgram",
     "OrthocalError",
     "Robot",
     "Scene",
@@ -72,6 +76,8 @@ if TYPE_CHECKING:
     from orthocal.identification.choice import Choice
     from orthocal.identification.loss import Loss
     from orthocal.identification.options import SolverOptions
+    from orthocal.identification.problem import CalibrationProblem
+    from orthocal.identification.solvers.ipopt import NonlinearProgram
     from orthocal.measurement.session import Session
     from orthocal.measurement.session_file import load_plan, load_session
     from orthocal.measurement.session_output import write_session

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -51,6 +51,21 @@ CONVERGED = frozenset({"Solve_Succeeded"})
 COMPLEMENTARITY = 1e-11
 """Multiplier of a bound times the distance to it, both scaled, at most. A parameter within the root
 of that of its bound is said to be held by it, whether it is or not: 16 nm of an offset of 5 mm."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expressions:
+    """A nonlinear program as expressions."""
+
+    variables: ca.MX
+    """x: θ̂, gauge zeros and the passive coordinates of every posture, scaled."""
+    parameters: ca.MX
+    """p: readings, their weights and noise."""
+    objective: ca.MX
+    constraints: ca.MX
+    """0 where all loops are closed."""
+    errors: dict[str, ca.MX]
+    """Free parameter to its value, [SI]."""
 
 
 class NonlinearProgram:
@@ -150,19 +165,7 @@ class NonlinearProgram:
             lower[: self._n_theta] * problem.theta_scale,
             upper[: self._n_theta] * problem.theta_scale,
         )
-        passive = problem.close(theta, start=start_passive)
-        residual = (values - problem.predict(theta, passive)) / sigma
-        o = problem.observations
-        loss = self.options.loss
-        wide = replace(loss, width=loss.width * widening)
-        zeros = sigma * wide.centres(residual, o.zero, o.n_zeros, weights=np.ones(o.size))
-        x0 = np.concatenate(
-            [
-                theta / problem.theta_scale,
-                zeros / LENGTH_SCALE,
-                (passive / problem.passive_scale).reshape(-1),
-            ]
-        )
+        x0 = self.begin(theta, sigma=sigma, values=values, passive=start_passive, widening=widening)
         p = self.pack(sigma=sigma, values=values, left_out=left_out, widening=widening)
         began = time.perf_counter()
         with noticed_interrupt():
@@ -194,6 +197,55 @@ class NonlinearProgram:
             closure=float(closures) * LENGTH_SCALE,
             at_bound=_at_bound(x[: self._n_theta], pull, lower, upper, held),
         )
+
+    def begin(
+        self,
+        theta: ArrayLike | None = None,
+        *,
+        sigma: float,
+        values: Array | None = None,
+        passive: Array | None = None,
+        widening: float = 1.0,
+    ) -> Array:
+        """The program's variables x with closed loops and the best zeros for some parameters.
+
+        Args:
+            theta: Free parameters, shape (n_free,), [SI]; what the controller already corrects by
+                default.
+            sigma: Standard deviation of one reading, [m].
+            values: Readings as single ones, shape (n_entries,), [m]; the session's by default.
+            passive: Passive coordinates to start closing the loops from.
+            widening: What the width of a robust loss is multiplied by.
+
+        Raises:
+            ClosureError: If the machine cannot reach a posture.
+        """
+        problem, o, loss = self.problem, self.problem.observations, self.options.loss
+        at = problem.reference if theta is None else np.asarray(theta, dtype=np.float64)
+        closed = problem.close(at, start=passive)
+        y = problem.values if values is None else values
+        residual = (y - problem.predict(at, closed)) / sigma
+        wide = replace(loss, width=loss.width * widening)
+        zeros = sigma * wide.centres(residual, o.zero, o.n_zeros, weights=np.ones(o.size))
+        return np.concatenate(
+            [
+                at / problem.theta_scale,
+                zeros / LENGTH_SCALE,
+                (closed / problem.passive_scale).reshape(-1),
+            ]
+        )
+
+    def expressions(self) -> Expressions:
+        """The program as expressions of CasADi, for terms and constraints of one's own.
+
+        `begin` and `pack` give values of its variables and parameters.
+        """
+        nlp = self._functions["nlp"]
+        x, p = ca.MX.sym("x", nlp.size1_in(0)), ca.MX.sym("p", nlp.size1_in(1))
+        objective, constraints = nlp(x, p)
+        scale = self.problem.theta_scale
+        errors = {name: x[i] * float(scale[i]) for i, name in enumerate(self.problem.free)}
+        return Expressions(x, p, objective, constraints, errors)
 
     def pack(
         self,
