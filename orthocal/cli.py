@@ -56,7 +56,8 @@ def main() -> None:
     """Run the command line; no traceback ever reaches a user.
 
     Exit codes: 0 done, 1 a solve did not converge or an output cannot be written, 2 bad input,
-    3 some rows of a table cannot be reached, 70 a bug of ours, 130 Ctrl-C; `compare` has more.
+    3 some rows of a table cannot be reached, or what was found is not to be entered, or is not
+    confirmed, 70 a bug of ours, 130 Ctrl-C; `compare` has more.
     """
     # small matrices only: more threads would but get in each other's way
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -179,16 +180,30 @@ def calibrate(
         typer.Option(help="Folder for calibration.json and report.html; made if need be."),
     ] = None,
     json: Json = False,
-    all_rows: AllRows = False,
+    details: Annotated[
+        bool, typer.Option("--details", help="Print all that is known, not the answer alone.")
+    ] = False,
+    all_rows: Annotated[
+        bool,
+        typer.Option(
+            "--all", help="--details with every reading, parameter and group, however many."
+        ),
+    ] = False,
 ) -> None:
-    """Identify the errors of a machine from a session of readings."""
+    """Identify the errors of a machine from a session of readings: what to enter, and whether.
+
+    Exit code 3: what was identified is not to be entered, for the reason that is printed; all
+    outputs are written all the same.
+    """
     from orthocal.files import require_writable, write_files
     from orthocal.identification.calibrate import calibrate as run
     from orthocal.identification.loss import Loss
     from orthocal.identification.options import SolverOptions
     from orthocal.identification.selection import read_bounds, read_known, read_tolerances
     from orthocal.measurement.session_file import load_session
+    from orthocal.output.printed_json import calibration_json
     from orthocal.output.summary import print_summary
+    from orthocal.study.findings.calibration import decide_entering
 
     if out is not None:
         require_writable(out, ("calibration.json", "report.html"))
@@ -207,15 +222,17 @@ def calibrate(
         options=SolverOptions(solver=solver, loss=Loss(loss)),  # type: ignore[arg-type] # checked there
     )
     if json:
-        _out(result.to_json().rstrip("\n"))
+        _out(calibration_json(result).rstrip("\n"))
     else:
-        print_summary(result, all_rows=all_rows)
+        print_summary(result, details=details, all_rows=all_rows)
     if out is not None:
         from orthocal.output.report.page import build_report
 
         files = {"calibration.json": result.to_json(), "report.html": build_report(result)}
         write_files(out, files)
         _note(f"Wrote {out / 'calibration.json'} and {out / 'report.html'}")
+    if code := decide_entering(result).exit_code:
+        raise typer.Exit(code)
 
 
 @app.command()

@@ -42,6 +42,7 @@ MOST_PLACES = 20
 DIFFERENT = 5.0
 """Tolerances of a length by which legs of one machine may differ by intent."""
 
+
 def find_doubts(calibration: Calibration) -> tuple[Finding, ...]:
     """What is odd, the gravest first."""
     found = (

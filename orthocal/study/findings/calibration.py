@@ -22,8 +22,8 @@ from orthocal.study.plausibility import find_doubts
 from orthocal.study.wording import joined
 
 CONFIRM = (
-    "Enter these, measure again with them active, and hold the new session against this: "
-    "`orthocal validate`."
+    "Measure again with these in the controller, and hold the new session against this "
+    "calibration: `orthocal validate`."
 )
 
 _GRAVITY: dict[Severity, int] = {"stops": 0, "warns": 1, "informs": 2}
@@ -40,6 +40,8 @@ def decide_entering(calibration: Calibration) -> Decision:
 
 def find_findings(calibration: Calibration) -> tuple[Finding, ...]:
     """All that is recognised in a calibration, the gravest first, else in the order of deciding."""
+    at_tool = find_at_tool(calibration)
+    promised = [f for f in at_tool if f.kind == "at the tool"]
     found = [
         *find_turned(calibration),
         *find_tolerances(calibration),
@@ -50,8 +52,8 @@ def find_findings(calibration: Calibration) -> tuple[Finding, ...]:
         *find_check(calibration),
         *find_no_offset(calibration),
         *find_standstill(calibration),
-        *find_worth(calibration),
-        *find_at_tool(calibration),
+        *find_worth(calibration, promised),
+        *at_tool,
         *find_controller(calibration),
         *find_trust(calibration),
         *find_held(calibration),
@@ -87,8 +89,8 @@ def _decide(calibration: Calibration) -> Decision:
     why = first_of(findings, "nothing to check by") or first_of(
         findings, "model error", "noise not known apart", "gauge overstated", "fits"
     )
-    reason = "" if why is None else why.text
-    return Decision("enter", reason, CONFIRM, findings)
+    reason, more = ("", "") if why is None else (why.text, why.action)
+    return Decision("enter", reason, f"{CONFIRM} {more}".strip(), findings)
 
 
 def _decision(answer: Answer, lead: Finding, findings: tuple[Finding, ...]) -> Decision:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
-from orthocal.errors import ClosureError, RobotError
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.uncertainty import confidence_factor
-from orthocal.study.accuracy import assess_remaining, assess_tool, expect_after_offsets
 from orthocal.study.entering import find_entries
 from orthocal.study.findings.finding import Finding, places_of
-from orthocal.study.wording import joined, mm, plain, um
+from orthocal.study.wording import joined, mm, plain
 
 STANDSTILL = 1e-6
 """Part of a tolerance by which a parameter must move to have moved."""
@@ -52,31 +51,29 @@ def find_standstill(calibration: Calibration) -> list[Finding]:
     ]
 
 
-def find_worth(calibration: Calibration) -> list[Finding]:
-    """Whether entering would do more than exchange one value for another within its ±."""
+def find_worth(calibration: Calibration, at_tool: Sequence[Finding]) -> list[Finding]:
+    """Whether entering would do more than exchange one value for another within its ±.
+
+    Args:
+        calibration: The calibration.
+        at_tool: What the tool is good for, where that is known.
+    """
     entries = [e for e in find_entries(calibration) if e.held is None]
     if not entries or not all(abs(e.change) <= e.std for e in entries):
         return []
     numbers = {"largest_change_over_std": max(abs(e.change) / e.std for e in entries if e.std > 0)}
-    tool = ""
-    try:
-        accuracy = assess_tool(calibration)
-        expected = expect_after_offsets(calibration, accuracy)
-    except (ClosureError, RobotError):  # no tool to decide by
-        expected = None
-    if expected is not None:
-        remaining, _ = assess_remaining(calibration, accuracy)
-        unknown = math.nan if remaining is None else remaining.sizes.headline.rms
-        now = math.hypot(accuracy.measure(accuracy.deviation).headline.rms, unknown)
+    words = ""
+    for found in at_tool:
+        now, expected = (found.numbers[k] for k in ("expected_as_it_is_um", "expected_um"))
         if not now <= WORTHWHILE * expected:
             return []
-        tool = f", and the tool would be as good as it is ({um(expected)} µm)"
-        numbers |= {"now_um": now * 1e6, "expected_um": expected * 1e6}
+        words = ", and to enter them would not make the tool better"
+        numbers |= {"expected_as_it_is_um": now, "expected_um": expected}
     return [
         Finding(
             "nothing worth changing",
             "informs",
-            f"No offset differs by more than its ± from what the controller has{tool}.",
+            f"No offset differs by more than its ± from what the controller has{words}.",
             "Leave the offsets as they are.",
             numbers,
             places_of(*(e.drive for e in entries)),

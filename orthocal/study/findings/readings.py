@@ -51,7 +51,7 @@ def find_turned(calibration: Calibration) -> list[Finding]:
 
 
 def stands_out(calibration: Calibration) -> tuple[ResidualRow, ...]:
-    """Rows that all others contradict, the worst first; none where it is not they that are wrong."""
+    """Rows that all others contradict, the worst first; none where they are too many for that."""
     rows = calibration.suspicious
     return rows if len(rows) <= MANY_SUSPICIOUS * len(calibration.residuals) else ()
 

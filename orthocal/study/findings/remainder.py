@@ -16,7 +16,6 @@ FAR_BEYOND = 4.0
 """Times the tolerances beyond which it is readings or description that are wrong."""
 
 
-
 def find_tolerances(calibration: Calibration) -> list[Finding]:
     """Whether more remains than a machine within its tolerances would leave."""
     excess = find_excess(calibration)
@@ -116,7 +115,7 @@ def find_remainder(calibration: Calibration) -> list[Finding]:
             "informs",
             "Only what remains says how large the noise is, so error of the model, or of a whole "
             "setup, would look like noise.",
-            "Measure again with these entered; repeat readings in cycles, or give gauge.sigma_mm.",
+            "Repeat readings in cycles, or give gauge.sigma_mm.",
             {"sigma_mm": calibration.sigma * 1e3},
         )
     ]
@@ -154,7 +153,8 @@ def _beyond_cycles(calibration: Calibration) -> Finding:
         f"What remains is {ratio:.1f} times what repeated cycles scatter by "
         f"({mm(noise.cycles_sigma)} mm a reading): it is error of the model{_blame(calibration)}; "
         "not noise.",
-        numbers={
+        _larger_model(calibration),
+        {
             "sigma_mm": noise.residual_sigma * 1e3,
             "scatter_mm": noise.cycles_sigma * 1e3,
             "times": ratio,
@@ -180,7 +180,8 @@ def _against_gauge(calibration: Calibration, gauge: float) -> Finding:
             f"What remains, σ = {mm(calibration.sigma)} mm of {row}, is {times(ratio)} what the "
             f"gauge itself would leave ({mm(gauge * factor)} mm): it is error of the model"
             f"{_blame(calibration)}; not noise of the gauge.{stays}",
-            numbers=numbers,
+            _larger_model(calibration),
+            numbers,
         )
     if noise.chance_in_residuals(gauge) > 1.0 - BY_CHANCE:
         return Finding(
@@ -197,6 +198,13 @@ def _against_gauge(calibration: Calibration, gauge: float) -> Finding:
         "readings.",
         numbers=numbers,
     )
+
+
+def _larger_model(calibration: Calibration) -> str:
+    """What to do about error of the model that may be told by a larger one."""
+    if not calibration.only_offsets:
+        return ""
+    return "`orthocal compare` says whether the readings support a larger model."
 
 
 def _blame(calibration: Calibration) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from orthocal.errors import ClosureError, RobotError
 from orthocal.identification.calibration import Calibration
 from orthocal.study.accuracy import (
@@ -18,9 +20,10 @@ from orthocal.study.wording import um
 def find_at_tool(calibration: Calibration) -> list[Finding]:
     """What the tool is good for once the offsets are entered, over the cube that it reaches."""
     try:
-        return promise(calibration, assess_tool(calibration))
+        accuracy = assess_tool(calibration)
     except (ClosureError, RobotError) as e:
         return [Finding("out of reach", "informs", f"Nothing can be said of the tool: {e}.")]
+    return promise(calibration, accuracy)
 
 
 def promise(calibration: Calibration, accuracy: ToolAccuracy) -> list[Finding]:
@@ -35,6 +38,8 @@ def promise(calibration: Calibration, accuracy: ToolAccuracy) -> list[Finding]:
     if expected is None or remaining is None or not find_entries(calibration):
         return []
     known = remaining.sizes.headline.rms
+    left = accuracy.measure(accuracy.error_after_offsets).absolute.rms
+    off = accuracy.measure(accuracy.deviation).headline.rms
     text = (
         f"With the offsets entered the tool is good for {um(expected)} µm (r.m.s., shift and "
         "rotation out)"
@@ -47,10 +52,11 @@ def promise(calibration: Calibration, accuracy: ToolAccuracy) -> list[Finding]:
             "informs",
             f"{text}.",
             numbers={
-                "now_um": accuracy.measure(accuracy.deviation).headline.rms * 1e6,
                 "expected_um": expected * 1e6,
+                "expected_as_it_is_um": math.hypot(off, known) * 1e6,
+                "known_to_be_off_um": off * 1e6,
                 "all_errors_known_um": known * 1e6,
-                "absolute_um": remaining.sizes.absolute.rms * 1e6,
+                "expected_absolute_um": math.hypot(left, remaining.sizes.absolute.rms) * 1e6,
                 "times_tolerances": excess,
             },
         )

@@ -1,0 +1,17 @@
+"""Results as JSON on stdout: what was found, and beside it the decision and its findings."""
+
+from __future__ import annotations
+
+import json
+
+from orthocal.identification.calibration import Calibration
+from orthocal.study.findings.calibration import decide_entering
+
+
+def calibration_json(calibration: Calibration) -> str:
+    """A calibration as in calibration.json, with `decision` and `findings`, which follow from it.
+
+    It loads as a calibration, too; what follows is then found anew.
+    """
+    document = {**calibration.to_document(), **decide_entering(calibration).to_document()}
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
