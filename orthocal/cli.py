@@ -360,16 +360,18 @@ def validate(
     """
     from orthocal.identification.calibration_file import load_calibration
     from orthocal.measurement.session_file import load_session
+    from orthocal.output.printed_json import validation_json
     from orthocal.output.summary import print_summary
+    from orthocal.study.findings.validation import decide_validation
     from orthocal.study.validation import validate_calibration
 
     result = validate_calibration(load_calibration(calibration), load_session(session))
     if json:
-        _out(result.to_json().rstrip("\n"))
+        _out(validation_json(result).rstrip("\n"))
     else:
         print_summary(result, all_rows=all_rows)
-    if result.confirmed is False:
-        raise typer.Exit(3)
+    if code := decide_validation(result).exit_code:
+        raise typer.Exit(code)
 
 
 @app.command()

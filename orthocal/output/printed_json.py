@@ -6,6 +6,8 @@ import json
 
 from orthocal.identification.calibration import Calibration
 from orthocal.study.findings.calibration import decide_entering
+from orthocal.study.findings.validation import decide_validation
+from orthocal.study.validation import Validation
 
 
 def calibration_json(calibration: Calibration) -> str:
@@ -14,4 +16,10 @@ def calibration_json(calibration: Calibration) -> str:
     It loads as a calibration, too; what follows is then found anew.
     """
     document = {**calibration.to_document(), **decide_entering(calibration).to_document()}
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def validation_json(validation: Validation) -> str:
+    """A validation with its `decision` and `findings`."""
+    document = {**json.loads(validation.to_json()), **decide_validation(validation).to_document()}
     return json.dumps(document, indent=1, allow_nan=False) + "\n"

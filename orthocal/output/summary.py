@@ -14,6 +14,7 @@ from orthocal.output.entering import render_controller
 from orthocal.output.explanation import explain_fit
 from orthocal.output.heading import render_origin
 from orthocal.output.layout import bullets, print_rich, section, to_text
+from orthocal.output.report.rich_markup import to_markup
 from orthocal.output.tables import (
     render_fit,
     render_identifiability,
@@ -27,15 +28,19 @@ from orthocal.study.validation import Validation
 Result = Calibration | Validation | Comparison
 
 
-def summarize(result: Result, *, details: bool = False, all_rows: bool = False) -> str:
+def summarize(
+    result: Result, *, details: bool = False, all_rows: bool = False, html: bool = False
+) -> str:
     """A calibration, validation or comparison as plain text.
 
     Args:
         result: What to summarise.
         details: Of a calibration all that is known; else the short answer.
         all_rows: List every reading and parameter, however many there are: details, too.
+        html: As HTML, as a notebook shows it.
     """
-    return to_text(_render(result, details, all_rows))
+    content = _render(result, details, all_rows)
+    return to_markup(content) if html else to_text(content)
 
 
 def print_summary(result: Result, *, details: bool = False, all_rows: bool = False) -> None:
