@@ -203,7 +203,7 @@ def calibrate(
     from orthocal.measurement.session_file import load_session
     from orthocal.output.printed_json import calibration_json
     from orthocal.output.summary import print_summary
-    from orthocal.study.findings.calibration import decide_entering
+    from orthocal.study.findings.calibration import decide
 
     if out is not None:
         require_writable(out, ("calibration.json", "report.html"))
@@ -231,7 +231,7 @@ def calibrate(
         files = {"calibration.json": result.to_json(), "report.html": build_report(result)}
         write_files(out, files)
         _note(f"Wrote {out / 'calibration.json'} and {out / 'report.html'}")
-    if code := decide_entering(result).exit_code:
+    if code := decide(result).exit_code:
         raise typer.Exit(code)
 
 

@@ -11,7 +11,7 @@ from orthocal.output.entering import short_entry_table
 from orthocal.output.heading import render_subject
 from orthocal.output.layout import bullets, plain, short_name, signed
 from orthocal.study.accuracy import assess_tool
-from orthocal.study.findings.calibration import decide_entering
+from orthocal.study.findings.calibration import decide
 from orthocal.study.findings.decision import Decision
 from orthocal.study.findings.finding import Finding, Kind
 
@@ -46,13 +46,16 @@ def render_answer(calibration: Calibration, *, heading: bool = True) -> Renderab
         calibration: The calibration.
         heading: Whether to begin with what was measured, and of which machine.
     """
-    decision = decide_entering(calibration)
+    decision = decide(calibration)
     parts: list[RenderableType] = [render_subject(calibration), Text()] if heading else []
     parts += [_verdict(decision), Text()]
     if shows_entries(decision):
         parts += _indented(short_entry_table(calibration), Text(_how(calibration)))
         parts += [Text(), *_at_tool(calibration, decision)]
-    parts += _suspicious(decision)
+    listed = _suspicious(decision)
+    if listed and shows_entries(decision):
+        parts.append(Text())
+    parts += listed
     parts.append(bullets([f.text for f in _further(decision)]))
     if decision.action:
         parts.append(Text.assemble(("Next: ", "bold"), decision.action))
@@ -72,7 +75,7 @@ def _verdict(decision: Decision) -> Text:
 
 def _how(calibration: Calibration) -> str:
     """How to enter what the table lists, and what ± is."""
-    decision = decide_entering(calibration)
+    decision = decide(calibration)
     spread = (
         "±: one standard deviation of all that is not known, the machine's other errors at their "
         "tolerances."
@@ -106,7 +109,7 @@ def _at_tool(calibration: Calibration, decision: Decision) -> list[RenderableTyp
     if n["times_tolerances"] > 1.0:
         text += (
             f" Errors that were not identified are taken at {n['times_tolerances']:.1f} times "
-            "their tolerances, as the readings show them."
+            "their tolerances, for what remains of the readings."
         )
     if not calibration.only_offsets:
         text += f" In a controller that knows all errors: {_um(n['all_errors_known_um'])} µm."
@@ -140,9 +143,10 @@ def _suspicion(finding: Finding) -> str:
     n, place = finding.numbers, finding.places[0]
     line = "" if place.line is None else f"line {place.line}: "
     cycle = f", cycle {n['cycle']:.0f}" if n["cycle"] > 1 else ""
+    label = short_name(f"{place.setup} {place.posture}")
     return (
-        f"{line}{place.setup} {place.posture}{cycle} reads {signed(n['measured_mm'])} mm; the "
-        f"calibrated machine would show {signed(n['expected_mm'])} mm"
+        f"{line}{label}{cycle}: read {signed(n['measured_mm'])} mm, expected "
+        f"{signed(n['expected_mm'])} mm"
     )
 
 
@@ -158,6 +162,8 @@ def _further(decision: Decision) -> list[Finding]:
     ]
     if not shows_entries(decision) or decision.of_kind(*TOUCHES_NOTHING):
         found = [f for f in found if f.kind != "may stay"]
+    if decision.of_kind("turned setup"):
+        found = [f for f in found if f.kind != "suspicious setup"]
     return found[:MOST_FURTHER]
 
 

@@ -11,7 +11,7 @@ from orthocal.identification.records import ControllerEntry
 from orthocal.output.explanation import advise
 from orthocal.output.layout import add_row, plain, signed, table_of
 from orthocal.study.entering import find_entries
-from orthocal.study.findings.calibration import decide_entering
+from orthocal.study.findings.calibration import decide
 
 
 def render_controller(calibration: Calibration) -> RenderableType:
@@ -29,7 +29,7 @@ def entry_table(calibration: Calibration) -> Table:
 
 def short_entry_table(calibration: Calibration) -> Table:
     """What to enter, or to leave, with the ± of all that is not known."""
-    leave = decide_entering(calibration).answer == "nothing to enter"
+    leave = decide(calibration).answer == "nothing to enter"
     return _table(calibration, enter="found" if leave else "enter", spread="±", identified=None)
 
 
@@ -50,7 +50,7 @@ def _table(calibration: Calibration, *, enter: str, spread: str, identified: str
 
 def render_meaning(calibration: Calibration) -> list[RenderableType]:
     """What an offset is, and what these are for."""
-    decision = decide_entering(calibration)
+    decision = decide(calibration)
     notes = [_example(calibration, find_entries(calibration)[0])]
     notes += [found.text for found in decision.of_kind("controller not stated")]
     if not calibration.only_offsets:

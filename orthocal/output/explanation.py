@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from orthocal.identification.calibration import Calibration
-from orthocal.study.findings.calibration import decide_entering
+from orthocal.study.findings.calibration import decide
 from orthocal.study.findings.finding import Finding, Kind
 
 WORST_SUSPICIOUS = 5
@@ -25,7 +25,7 @@ ELSEWHERE: tuple[Kind, ...] = (
 
 def advise(calibration: Calibration) -> str:
     """Whether to enter what was identified, and why; empty where no offset was."""
-    decision = decide_entering(calibration)
+    decision = decide(calibration)
     if decision.of_kind("no offset"):
         return ""
     return f"{decision.headline} {decision.reason} {decision.action}".strip()
@@ -33,7 +33,7 @@ def advise(calibration: Calibration) -> str:
 
 def explain_fit(calibration: Calibration) -> list[str]:
     """Sentences on what remains, what linearisation costs, and what can be believed."""
-    found = [f for f in decide_entering(calibration).findings if f.kind not in ELSEWHERE]
+    found = [f for f in decide(calibration).findings if f.kind not in ELSEWHERE]
     sentences = []
     listed = False
     for finding in found:

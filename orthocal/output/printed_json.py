@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from orthocal.identification.calibration import Calibration
-from orthocal.study.findings.calibration import decide_entering
+from orthocal.study.findings.calibration import decide
 from orthocal.study.findings.validation import decide_validation
 from orthocal.study.validation import Validation
 
@@ -15,7 +15,7 @@ def calibration_json(calibration: Calibration) -> str:
 
     It loads as a calibration, too; what follows is then found anew.
     """
-    document = {**calibration.to_document(), **decide_entering(calibration).to_document()}
+    document = {**calibration.to_document(), **decide(calibration).to_document()}
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 

@@ -61,7 +61,7 @@ def test_it_says_what_to_type_and_what_to_believe(table1):
 
 
 def test_an_unstated_controller_is_said_to_be_so(root):
-    text = summarize(calibrate(load_session(root / "examples/table1/experiment-3")))
+    text = summarize(calibrate(load_session(root / "examples/table1/experiment-3")), details=True)
     assert "add to the present offset" in text
     assert "does not state the offsets that were active" in text
 

@@ -21,7 +21,7 @@ from orthocal import (
 )
 from orthocal.output.printed_json import calibration_json, validation_json
 from orthocal.study.accuracy import assess_tool, expect_after_offsets
-from orthocal.study.findings.calibration import decide_entering
+from orthocal.study.findings.calibration import decide
 from orthocal.study.findings.finding import Finding, Kind, Severity
 from orthocal.study.findings.validation import decide_validation
 
@@ -115,7 +115,7 @@ CASES = [
 @pytest.mark.parametrize("case", CASES)
 def test_one_decision_follows_from_the_gravest_finding(spoilt, case):
     calibration, answer, kind = spoilt[case]
-    found = decide_entering(calibration)
+    found = decide(calibration)
     assert found.answer == answer
     (lead,) = found.of_kind(kind)[:1]
     assert lead.text == found.reason or kind == "suspicious reading"
@@ -148,12 +148,12 @@ def test_findings_are_of_a_known_kind_with_units_and_load_again(spoilt, case, tm
     document["decision"] = {"answer": "enter"}
     path.write_text(json.dumps(document))
     loaded = load_calibration(path)
-    assert decide_entering(loaded).to_document() == decide_entering(calibration).to_document()
+    assert decide(loaded).to_document() == decide(calibration).to_document()
     assert "decision" not in loaded.to_document()
 
 
 def test_a_turned_setup_is_found_with_its_numbers_and_place(spoilt):
-    (found,) = decide_entering(spoilt["turned"][0]).of_kind("turned setup")
+    (found,) = decide(spoilt["turned"][0]).of_kind("turned setup")
     assert [p.setup for p in found.places] == ["zx"]
     assert found.numbers["as_read_rms_mm"] == pytest.approx(0.401, abs=0.001)
     assert found.numbers["turned_rms_mm"] == pytest.approx(0.008, abs=0.001)
@@ -164,14 +164,14 @@ def test_a_turned_setup_is_found_with_its_numbers_and_place(spoilt):
 def test_a_turned_setup_that_nothing_foretells_has_no_unknown_in_its_words(spoilt):
     calibration = spoilt["turned"][0]
     blind = replace(calibration.turned, as_read=math.nan, turned=math.nan)
-    (found,) = decide_entering(replace(calibration, turned=blind)).of_kind("turned setup")
+    (found,) = decide(replace(calibration, turned=blind)).of_kind("turned setup")
     assert "unknown" not in found.text
     assert "setup zx seem to have the wrong sign" in found.text
     assert found.to_document()["numbers"]["turned_rms_mm"] is None
 
 
 def test_a_suspicious_reading_is_found_with_file_and_line(spoilt, cycles):
-    (found,) = decide_entering(spoilt["one reading"][0]).of_kind("suspicious reading")
+    (found,) = decide(spoilt["one reading"][0]).of_kind("suspicious reading")
     (place,) = found.places
     row = cycles.readings[4]
     assert (place.setup, place.posture, place.line) == (row.setup, row.posture, row.line)
@@ -185,7 +185,7 @@ def test_where_readings_stand_out_they_are_to_be_looked_at_before_a_setup(root):
     """A single wrong sign of 14 mm is far beyond all tolerances, and it is its own reason."""
     session = load_session(root / "examples/lines")
     row = next(i for i, r in enumerate(session.readings) if r.value > 13.5e-3)
-    found = decide_entering(calibrate(off(session, row, -2.0 * session.values[row])))
+    found = decide(calibrate(off(session, row, -2.0 * session.values[row])))
     assert found.answer == "do not enter"
     assert found.action == "Look at the readings first that all others contradict."
     assert [f.places[0].line for f in found.of_kind("suspicious reading")] == [
@@ -194,7 +194,7 @@ def test_where_readings_stand_out_they_are_to_be_looked_at_before_a_setup(root):
 
 
 def test_when_most_are_contradicted_no_reading_is_accused(table1):
-    found = decide_entering(calibrate(table1[2], model="full"))
+    found = decide(calibrate(table1[2], model="full"))
     assert not found.of_kind("suspicious reading")
     (many,) = found.of_kind("many contradicted")
     assert many.numbers["of"] == 6.0
@@ -203,7 +203,7 @@ def test_when_most_are_contradicted_no_reading_is_accused(table1):
 
 def test_the_tool_is_promised_what_the_assessment_says(spoilt):
     calibration, *_ = spoilt["full"]
-    (found,) = decide_entering(calibration).of_kind("at the tool")
+    (found,) = decide(calibration).of_kind("at the tool")
     accuracy = assess_tool(calibration)
     expected = expect_after_offsets(calibration, accuracy)
     assert found.numbers["expected_um"] == pytest.approx(expected * 1e6)
@@ -218,7 +218,7 @@ def test_offsets_are_left_alone_only_where_that_costs_nothing(cycles, plan):
     calibration = calibrate(simulate_session(plan, errors, seed=3).session)
     stds = calibration.total_std
     assert all(abs(p.value) < s for p, s in zip(calibration.free, stds, strict=True))
-    found = decide_entering(calibration)
+    found = decide(calibration)
     assert found.answer == "enter"
     n = found.of_kind("at the tool")[0].numbers
     assert n["expected_as_it_is_um"] > 1.05 * n["expected_um"]
@@ -226,7 +226,7 @@ def test_offsets_are_left_alone_only_where_that_costs_nothing(cycles, plan):
 
 def test_a_robot_without_a_tool_is_out_of_reach(table1):
     bare = replace(table1[2], robot=replace(table1[2].robot, tcp=None))
-    found = decide_entering(calibrate(bare))
+    found = decide(calibrate(bare))
     assert found.answer == "enter"
     (reach,) = found.of_kind("out of reach")
     assert "no tool centre point" in reach.text
@@ -235,16 +235,16 @@ def test_a_robot_without_a_tool_is_out_of_reach(table1):
 
 def test_what_a_bound_holds_and_what_is_not_stated_is_found(table1):
     bounded = calibrate(table1[3], bounds={"x_slide.offset": (-1e-3, -0.5e-3)})
-    found = decide_entering(bounded)
+    found = decide(bounded)
     (held,) = found.of_kind("held by a bound")
     assert held.places[0].parameter == "x_slide.offset"
     assert held.numbers == {"value_mm": pytest.approx(-0.5)}
     assert "upper bound, -0.5 mm" in held.text
     assert found.of_kind("controller not stated")
-    assert not decide_entering(calibrate(table1[2])).of_kind("controller not stated")
+    assert not decide(calibrate(table1[2])).of_kind("controller not stated")
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_sound_machines_are_never_accused(plan, seed):
     """Before their offsets were entered and, with all other errors as they are, after."""
     fleet = Fleet(plan)
@@ -254,7 +254,7 @@ def test_sound_machines_are_never_accused(plan, seed):
         errors = dict(zip(fleet.machine.free, values, strict=True))
         session = simulate_session(plan, errors, seed=seed).session
         for model in ("offsets", "full"):
-            found = decide_entering(calibrate(session, model=model))
+            found = decide(calibrate(session, model=model))
             graver = [f.kind for f in found.findings if f.severity != "informs"]
             assert graver == []
             assert found.answer in ("enter", "nothing to enter")

@@ -41,7 +41,7 @@ from orthocal.output.tables import (
 from orthocal.output.view.drawing import draw_scene
 from orthocal.output.view.scene import frame_of
 from orthocal.study.accuracy import ToolAccuracy, assess_tool, find_excess
-from orthocal.study.findings.calibration import decide_entering
+from orthocal.study.findings.calibration import decide
 
 FEW_ROWS = 40
 """Readings up to which the list of all is open."""
@@ -135,7 +135,7 @@ def _verdict(calibration: Calibration) -> str:
         f"largest was {mm(calibration.largest_before)} mm and is {mm(calibration.largest_after)} "
         "mm."
     )
-    decision = decide_entering(calibration)
+    decision = decide(calibration)
     answer = to_markup(render_answer(calibration, heading=False))
     # what the answer has left out: what was found, though it is not to be entered
     meaning = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from orthocal.arguments import require_kind
 from orthocal.identification.calibration import Calibration
 from orthocal.study.entering import find_entries
 from orthocal.study.findings.decision import Answer, Decision, first_of
@@ -29,12 +30,13 @@ CONFIRM = (
 _GRAVITY: dict[Severity, int] = {"stops": 0, "warns": 1, "informs": 2}
 
 
-def decide_entering(calibration: Calibration) -> Decision:
+def decide(calibration: Calibration) -> Decision:
     """Whether to enter what was identified, why, what to do next, and all that was found.
 
     One decision follows from the findings: what stops decides, then what warns, then whether
     anything is worth changing; of what is alike grave the first in the order of `find_findings`.
     """
+    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     return calibration.remember("decision", lambda: _decide(calibration))
 
 

@@ -61,7 +61,8 @@ def find_worth(calibration: Calibration, at_tool: Sequence[Finding]) -> list[Fin
     entries = [e for e in find_entries(calibration) if e.held is None]
     if not entries or not all(abs(e.change) <= e.std for e in entries):
         return []
-    numbers = {"largest_change_over_std": max(abs(e.change) / e.std for e in entries if e.std > 0)}
+    ratios = [abs(e.change) / e.std for e in entries if e.std > 0.0]
+    numbers = {"largest_change_over_std": max(ratios, default=0.0)}
     words = ""
     for found in at_tool:
         now, expected = (found.numbers[k] for k in ("expected_as_it_is_um", "expected_um"))

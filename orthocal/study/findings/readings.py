@@ -92,7 +92,7 @@ def _suspicion(calibration: Calibration, row: ResidualRow) -> Finding:
         f"{calibration.where(row)}: {row.label}{cycle}, reads {signed(row.measured * 1e3)} mm, "
         f"{row.studentised:+.1f} of its σ from what all others say; without it {row.influenced} "
         f"would change by {row.influence:.1f} of its σ.",
-        "Look at it, read it again if it is wrong, and calibrate again.",
+        "Look at what stands out, read it again if it is wrong, and calibrate again.",
         numbers={
             "measured_mm": row.measured * 1e3,
             "expected_mm": row.predicted * 1e3,

@@ -27,8 +27,13 @@ def find_tolerances(calibration: Calibration) -> list[Finding]:
         "left_rms_mm": calibration.rms_after * 1e3,
         "tolerated_rms_mm": calibration.unmodelled.residual_rms * 1e3,
     }
-    if excess <= FAR_BEYOND:
-        text += ": this machine seems to be as much worse than its tolerances."
+    if calibration.turned is not None or excess <= FAR_BEYOND:
+        if calibration.turned is not None:
+            text += ", with setups as they were read."
+        elif stands_out(calibration):
+            text += ": readings that all others contradict may be why."
+        else:
+            text += ": this machine seems to be as much worse than its tolerances."
         return [Finding("tolerances exceeded", "informs", text, numbers=numbers)]
     text += (
         ": a sign, a row or a setup is wrong, or the machine is as much worse and wants adjusting "
