@@ -19,7 +19,7 @@ from orthocal.identification.calibration import Calibration
 from orthocal.markup import escape, heading, items, paragraph, table
 from orthocal.output.accuracy import render_tool
 from orthocal.output.answer import render_answer, shows_entries
-from orthocal.output.entering import render_controller, render_meaning
+from orthocal.output.entering import entry_table, render_meaning
 from orthocal.output.explanation import explain_fit
 from orthocal.output.heading import render_heading
 from orthocal.output.layout import bullets, mm, plain, signed
@@ -41,6 +41,7 @@ from orthocal.output.tables import (
 from orthocal.output.view.drawing import draw_scene
 from orthocal.output.view.scene import frame_of
 from orthocal.study.accuracy import ToolAccuracy, assess_tool, find_excess
+from orthocal.study.entering import find_entries
 from orthocal.study.findings.calibration import decide
 
 FEW_ROWS = 40
@@ -137,12 +138,12 @@ def _verdict(calibration: Calibration) -> str:
     )
     decision = decide(calibration)
     answer = to_markup(render_answer(calibration, heading=False))
-    # what the answer has left out: what was found, though it is not to be entered
-    meaning = (
-        Group(*render_meaning(calibration))
-        if shows_entries(decision)
-        else render_controller(calibration)
-    )
+    meaning = Group()
+    if find_entries(calibration):
+        # what the answer leaves out: where the sliders are, and what is not to be entered
+        told_all = shows_entries(decision) and calibration.only_offsets
+        listed = [] if told_all else [entry_table(calibration)]
+        meaning = Group(*listed, *render_meaning(calibration))
     return (
         answer
         + heading("What these numbers are", level=3)
