@@ -27,6 +27,7 @@ _HOMES = {
     "assess_tool": "orthocal.study.accuracy",
     "calibrate": "orthocal.identification.calibrate",
     "compare_models": "orthocal.study.comparison",
+    "decide": "orthocal.study.findings.calibration",
     "draw_errors": "orthocal.measurement.synthetic",
     "draw_scene": "orthocal.output.view.drawing",
     "load_calibration": "orthocal.identification.calibration_file",
@@ -55,6 +56,7 @@ __all__ = [
     "assess_tool",
     "calibrate",
     "compare_models",
+    "decide",
     "draw_errors",
     "draw_scene",
     "load_calibration",
@@ -91,6 +93,7 @@ if TYPE_CHECKING:
     from orthocal.robot.model import Robot
     from orthocal.study.accuracy import assess_tool
     from orthocal.study.comparison import compare_models
+    from orthocal.study.findings.calibration import decide
     from orthocal.study.validation import validate_calibration
 
 

@@ -56,7 +56,8 @@ def main() -> None:
     """Run the command line; no traceback ever reaches a user.
 
     Exit codes: 0 done, 1 a solve did not converge or an output cannot be written, 2 bad input,
-    3 some rows of a table cannot be reached, 70 a bug of ours, 130 Ctrl-C; `compare` has more.
+    3 some rows of a table cannot be reached, or what was found is not to be entered, or is not
+    confirmed, 70 a bug of ours, 130 Ctrl-C; `compare` has more.
     """
     # small matrices only: more threads would but get in each other's way
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -179,15 +180,29 @@ def calibrate(
         typer.Option(help="Folder for calibration.json and report.html; made if need be."),
     ] = None,
     json: Json = False,
-    all_rows: AllRows = False,
+    details: Annotated[
+        bool, typer.Option("--details", help="Print all that is known, not the answer alone.")
+    ] = False,
+    all_rows: Annotated[
+        bool,
+        typer.Option(
+            "--all", help="--details with every reading, parameter and group, however many."
+        ),
+    ] = False,
 ) -> None:
-    """Identify the errors of a machine from a session of readings."""
+    """Identify the errors of a machine from a session of readings: what to enter, and whether.
+
+    Exit code 3: what was identified is not to be entered, for the reason that is printed; all
+    outputs are written all the same.
+    """
     from orthocal.files import require_writable, write_files
     from orthocal.identification.calibrate import calibrate as run
     from orthocal.identification.choice import Choice
     from orthocal.identification.selection import read_bounds, read_known, read_tolerances
     from orthocal.measurement.session_file import load_session
+    from orthocal.output.printed_json import calibration_json
     from orthocal.output.summary import print_summary
+    from orthocal.study.findings.calibration import decide
 
     if out is not None:
         require_writable(out, ("calibration.json", "report.html"))
@@ -209,15 +224,17 @@ def calibrate(
         profile=_globs(profile),
     )
     if json:
-        _out(result.to_json().rstrip("\n"))
+        _out(calibration_json(result).rstrip("\n"))
     else:
-        print_summary(result, all_rows=all_rows)
+        print_summary(result, details=details, all_rows=all_rows)
     if out is not None:
         from orthocal.output.report.page import build_report
 
         files = {"calibration.json": result.to_json(), "report.html": build_report(result)}
         write_files(out, files)
         _note(f"Wrote {out / 'calibration.json'} and {out / 'report.html'}")
+    if code := decide(result).exit_code:
+        raise typer.Exit(code)
 
 
 @app.command()
@@ -345,16 +362,18 @@ def validate(
     """
     from orthocal.identification.calibration_file import load_calibration
     from orthocal.measurement.session_file import load_session
+    from orthocal.output.printed_json import validation_json
     from orthocal.output.summary import print_summary
+    from orthocal.study.findings.validation import decide_validation
     from orthocal.study.validation import validate_calibration
 
     result = validate_calibration(load_calibration(calibration), load_session(session))
     if json:
-        _out(result.to_json().rstrip("\n"))
+        _out(validation_json(result).rstrip("\n"))
     else:
         print_summary(result, all_rows=all_rows)
-    if result.confirmed is False:
-        raise typer.Exit(3)
+    if code := decide_validation(result).exit_code:
+        raise typer.Exit(code)
 
 
 @app.command()

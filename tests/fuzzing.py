@@ -312,7 +312,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
             path = calibration.save(folder / "out.json")
             found = load_calibration(path)
             assert found.to_document() == calibration.to_document()
-            summarize(found)
+            summarize(found, details=True)
             if rng.random() < 0.05:
                 draw_scene(found).to_html()
     elif kind == "plan":
@@ -333,7 +333,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
         if deep:
             calibration.save(folder / "out.json")
             assert load_calibration(folder / "out.json").to_document() == calibration.to_document()
-            summarize(calibration)
+            summarize(calibration, details=True)
             list(forward_rows(calibration, [[0.2, 0.2]]))
             list(inverse_rows(calibration, [[0.0, 0.0]]))
             for chunk in accuracy_rows(calibration, [[0.0, 0.0]]):

@@ -40,7 +40,7 @@ def experiment(root):
 def test_calibrate_prints_and_writes(orthocal, experiment, tmp_path):
     code, out, err = orthocal("calibrate", experiment, "--out", tmp_path / "new/folder")
     assert code == 0
-    assert "What to enter into the controller" in out
+    assert "Enter these, and measure again. What remains" in out
     folder = tmp_path / "new/folder"
     assert err == f"Wrote {folder / 'calibration.json'} and {folder / 'report.html'}\n"
     found = load_calibration(folder)
@@ -109,6 +109,73 @@ def test_calibrate_prints_json_alone_on_stdout(orthocal, experiment):
     document = json.loads(out)
     assert document["model"] == "lengths"
     assert len(document["parameters"]) == 6
+
+
+def turn_a_setup(root, folder):
+    """The example of three cycles with the readings of setup zx read with the wrong sign."""
+    folder.mkdir()
+    for name in ("session.yaml", "machine.yaml"):
+        (folder / name).write_text((root / "examples/raw-cycles" / name).read_text())
+    head, *rows = (root / "examples/raw-cycles/readings.csv").read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    for row in cells:
+        if row[0] == "zx":
+            row[-1] = f"{-float(row[-1]):.3f}"
+    (folder / "readings.csv").write_text("\n".join([head, *map(",".join, cells)]) + "\n")
+    return folder
+
+
+def test_what_is_not_to_be_entered_exits_3_with_all_that_was_asked_for(orthocal, root, tmp_path):
+    session = turn_a_setup(root, tmp_path / "turned")
+    code, out, err = orthocal("calibrate", session, "--out", tmp_path / "out")
+    assert code == 3
+    assert "Do not enter these. The readings of setup zx seem to have the wrong sign" in " ".join(
+        out.split()
+    )
+    assert err.startswith("Wrote ")
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"calibration.json", "report.html"}
+    load_calibration(tmp_path / "out")
+    code, out, err = orthocal("calibrate", session, "--json")
+    assert (code, err) == (3, "")
+    document = json.loads(out)
+    assert document["decision"]["answer"] == "do not enter"
+    assert document["decision"]["exit_code"] == 3
+    assert document["findings"][0]["kind"] == "turned setup"
+    assert document["findings"][0]["places"][0]["setup"] == "zx"
+    code, out, _ = orthocal("calibrate", session, "--details")
+    assert code == 3
+    assert "What was identified" in out
+
+
+def test_the_printed_json_holds_what_the_file_holds_and_the_decision(
+    orthocal, experiment, tmp_path
+):
+    code, out, _ = orthocal("calibrate", experiment, "--json", "--out", tmp_path)
+    assert code == 0
+    printed = json.loads(out)
+    written = json.loads((tmp_path / "calibration.json").read_text())
+    assert set(printed) - set(written) == {"decision", "findings"}
+    assert {k: printed[k] for k in written} == written
+    assert printed["decision"]["answer"] == "enter"
+    (tmp_path / "again.json").write_text(out)
+    assert orthocal("report", tmp_path / "again.json", "--out", tmp_path)[0] == 0
+
+
+def test_details_and_all_print_the_rest(orthocal, experiment):
+    _, short, _ = orthocal("calibrate", experiment)
+    _, details, _ = orthocal("calibrate", experiment, "--details")
+    _, everything, _ = orthocal("calibrate", experiment, "--all")
+    assert len(short.splitlines()) <= 40
+    assert "Readings before and after" not in short
+    assert "Readings before and after" in details
+    assert "scatter" in everything
+    assert len(everything) > len(details) > len(short)
+
+
+def test_help_says_what_exit_code_3_means(orthocal):
+    for command, words in (("calibrate", "is not to be entered"), ("validate", "it is not")):
+        text = " ".join(orthocal(command, "--help")[1].split())
+        assert words in text[text.index("3: ") :]
 
 
 def test_forward_and_inverse_undo_each_other(orthocal, experiment, tmp_path):
@@ -188,7 +255,7 @@ def test_what_is_free_known_and_bounded_by_option(orthocal, experiment, root):
 def test_base_parameters_and_hubers_loss_by_option(orthocal, root):
     code, out, _ = orthocal(
         "calibrate", root / "examples/raw-cycles", "--free", "*.offset,x_swivel.x", "--base",
-        "--loss", "huber",
+        "--loss", "huber", "--details",
     )  # fmt: skip
     assert code == 0
     assert "3 base parameters, no prior, Huber's loss" in out
@@ -203,6 +270,7 @@ def test_validate_holds_experiment_3_against_2(orthocal, experiment, tmp_path):
     assert "The calibration is confirmed" in out
     code, out, _ = orthocal("validate", tmp_path, new, "--json")
     assert json.loads(out)["as_expected"] is True
+    assert json.loads(out)["decision"]["answer"] == "confirmed"
 
 
 def test_simulate_writes_a_session_that_calibrates_back(orthocal, root, tmp_path):

@@ -60,8 +60,9 @@ def test_the_readmes_commands_run(root, tmp_path):
 @pytest.mark.parametrize(
     ("title", "command"),
     [
-        ("What was identified", "calibrate examples/table1/experiment-2"),
-        ("At the tool", "calibrate examples/table1/experiment-2"),
+        ("Calibration of orthoglide", "calibrate examples/table1/experiment-2"),
+        ("What was identified\n", "calibrate examples/table1/experiment-2 --details"),
+        ("At the tool\n", "calibrate examples/table1/experiment-2 --details"),
         ("Verdict", "compare examples/table1/experiment-2"),
     ],
 )
@@ -76,6 +77,8 @@ def test_the_readmes_printed_results_are_the_real_ones(root, title, command):
     printed = [line.rstrip() for line in done.stdout.splitlines()]
     for line in shown.splitlines():
         assert line.rstrip() in printed
+    if title.startswith("Calibration"):  # the whole of it
+        assert [line.rstrip() for line in shown.splitlines()] == printed
 
 
 def test_what_the_readme_says_of_the_papers_readings_is_what_the_example_prints():

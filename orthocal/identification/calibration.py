@@ -43,7 +43,6 @@ from orthocal.identification.uncertainty import (
 )
 from orthocal.identification.unmodelled import Unmodelled
 from orthocal.kinematics.assembly import Assembly, as_rows, find_beyond_travel
-from orthocal.markup import paragraph, table
 from orthocal.robot.model import Robot
 from orthocal.sensors.registry import write_sensor
 
@@ -52,9 +51,6 @@ Array = NDArray[np.float64]
 Found = TypeVar("Found")
 
 SCHEMA = "orthocal/calibration/3"
-
-FEW = 12
-"""Parameters up to which a notebook lists all."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -375,35 +371,10 @@ class Calibration:
         return Path(path)
 
     def _repr_html_(self) -> str:
-        """In a notebook: what was identified, how well, and what to enter."""
-        about = (
-            f"{len(self.residuals)} {'differences' if self.rows_are_differences else 'readings'}; "
-            f"r.m.s. {self.rms_before * 1e3:.3f} mm before, {self.rms_after * 1e3:.3f} mm after"
-        )
-        offsets = {f"{d.name}.offset" for d in self.robot.drives}
-        rows = []
-        for p, std in zip(self.free, self.total_std.tolist(), strict=True):
-            if p.name not in offsets and len(self.free) > FEW:
-                continue
-            numbers = (v * p.edge_factor for v in (p.linear, p.value, std))
-            cells = [
-                format(n, form) if math.isfinite(n) else "unknown"
-                for n, form in zip(numbers, ("+.3f", "+.3f", ".3f"), strict=True)
-            ]
-            rows.append((p.name, *cells, p.edge_unit))
-        headers = ("parameter", "linear", "exact", "± σ", "unit")
-        more = len(self.free) - len(rows)
-        return (
-            paragraph(f"Calibration of {self.robot_record.name}, model '{self.model}'")
-            + paragraph(self.session.title)
-            + table(headers, rows)
-            + (paragraph(f"and {more} more parameters") if more else "")
-            + paragraph(about)
-            + (paragraph("That is more than noise: measure again.") if self.has_model_error else "")
-            + paragraph(
-                "orthocal.summarize(…) says whether to enter these, draw_scene(…) shows it."
-            )
-        )
+        """In a notebook: the short answer."""
+        import orthocal  # what is shown follows in later stages
+
+        return orthocal.summarize(self, html=True)
 
     def _load_robot(self) -> Robot:
         robot = load_recorded_robot(self.robot_record, file=self.path)

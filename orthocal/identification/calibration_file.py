@@ -212,6 +212,10 @@ class _CalibrationKeys(_Keys):
     postures: Many[_PostureKeys]
     setups: Many[_SetupKeys]
     gauges: Many[_GaugeKeys]
+    decision: Any = None
+    """As `calibrate --json` prints it beside the rest: not read, it follows from that."""
+    findings: Any = None
+    """Likewise."""
 
 
 MAKE_ONE = "`orthocal calibrate SESSION --out FOLDER` makes one"

@@ -19,10 +19,11 @@ from orthocal.study.accuracy import (
     ToolAccuracy,
     assess_remaining,
     assess_tool,
-    expect_after_offsets,
     find_remaining_errors,
 )
 from orthocal.study.entering import find_entries
+from orthocal.study.findings.remainder import find_tolerances
+from orthocal.study.findings.tool import promise
 
 THREE_WAYS = (
     "With shift and rotation taken out, as a workpiece sees it that is aligned on the machine; "
@@ -90,33 +91,10 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
             "were not identified at their tolerances."
         )
     )
-    if excess > 1.0:
-        lines.append(
-            Text(
-                f"What remains of the readings is {excess:.1f} times what such errors would "
-                "leave: this machine seems to be as much worse than its tolerances."
-            )
-        )
-    promise = describe_promise(calibration, accuracy)
-    lines += [Text(line) for line in [*promise, *describe_remaining(calibration, accuracy)]]
+    lines += [Text(found.text) for found in find_tolerances(calibration)]
+    lines += [Text(found.text) for found in promise(calibration, accuracy)]
+    lines += [Text(line) for line in describe_remaining(calibration, accuracy)]
     return Group(*lines)
-
-
-def describe_promise(calibration: Calibration, accuracy: ToolAccuracy) -> list[str]:
-    """What the tool is good for once the offsets are entered, in a line; none if unknown."""
-    expected = expect_after_offsets(calibration, accuracy)
-    if expected is None or not find_entries(calibration):
-        return []
-    line = (
-        f"With the offsets entered the tool is good for {um(expected)} µm (r.m.s., shift and "
-        "rotation out)"
-    )
-    remaining, _ = assess_remaining(calibration, accuracy)
-    if calibration.only_offsets or remaining is None:
-        return [f"{line}."]
-    return [
-        f"{line}; in a controller that knows all errors, for {um(remaining.sizes.headline.rms)} µm."
-    ]
 
 
 def describe_remaining(calibration: Calibration, accuracy: ToolAccuracy) -> list[str]:

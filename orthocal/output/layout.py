@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import sys
 from collections.abc import Callable, Iterable
 
@@ -18,6 +17,13 @@ from rich.text import Text
 
 from orthocal.characters import printable
 from orthocal.identification.records import ResidualRow
+
+# numbers stand in tables as they stand in sentences
+from orthocal.study.wording import counted as counted
+from orthocal.study.wording import mm as mm
+from orthocal.study.wording import plain as plain
+from orthocal.study.wording import signed as signed
+from orthocal.study.wording import um as um
 
 MANY_ROWS = 60
 """Readings above which only the worst are listed, unless all are asked for."""
@@ -139,21 +145,6 @@ def _plain(cell: RenderableType) -> str:
     return cell.plain if isinstance(cell, Text) else str(cell)
 
 
-def mm(value: float) -> str:
-    """A length in mm, three decimals."""
-    return plain(value * 1e3)
-
-
-def plain(value: float, decimals: int = 3) -> str:
-    """A number, or the word unknown."""
-    return f"{value:.{decimals}f}" if math.isfinite(value) else "unknown"
-
-
-def signed(value: float, decimals: int = 3) -> str:
-    """A number with its sign, or the word unknown."""
-    return f"{value:+.{decimals}f}" if math.isfinite(value) else "unknown"
-
-
 def typeset(value: float, decimals: int = 3) -> str:
     """A number with its sign for a page or a picture: with a true minus, and zero without a sign.
 
@@ -164,17 +155,6 @@ def typeset(value: float, decimals: int = 3) -> str:
     rounded = round(value, decimals)
     text = signed(rounded, decimals) if rounded else plain(0.0, decimals)
     return text.replace("-", "−")
-
-
-def counted(count: int, noun: str) -> str:
-    """So many of something, in words: 1 reading, 2 readings."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
-
-
-def um(value: float) -> str:
-    """A length in µm, as many decimals as say something."""
-    size = value * 1e6
-    return f"{size:.0f}" if abs(size) >= 20.0 else f"{size:.1f}"
 
 
 def choose_rows(

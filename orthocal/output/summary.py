@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from rich.console import Group, RenderableType
+from rich.text import Text
 
 from orthocal.arguments import require_kind
 from orthocal.identification.calibration import Calibration
 from orthocal.output.accuracy import render_tool
+from orthocal.output.answer import MORE, render_answer
 from orthocal.output.comparison import render_comparison
+from orthocal.output.entering import render_controller
 from orthocal.output.explanation import explain_fit
+from orthocal.output.heading import render_origin
 from orthocal.output.layout import bullets, print_rich, section, to_text
+from orthocal.output.report.rich_markup import to_markup
 from orthocal.output.tables import (
-    render_controller,
     render_fit,
-    render_heading,
     render_identifiability,
     render_parameters,
     render_residuals,
@@ -25,35 +28,46 @@ from orthocal.study.validation import Validation
 Result = Calibration | Validation | Comparison
 
 
-def summarize(result: Result, *, all_rows: bool = False) -> str:
+def summarize(
+    result: Result, *, details: bool = False, all_rows: bool = False, html: bool = False
+) -> str:
     """A calibration, validation or comparison as plain text.
 
     Args:
         result: What to summarise.
-        all_rows: List every reading and parameter, however many there are.
+        details: Of a calibration all that is known; else the short answer.
+        all_rows: List every reading and parameter, however many there are: details, too.
+        html: As HTML, as a notebook shows it.
     """
-    return to_text(_render(result, all_rows))
+    content = _render(result, details, all_rows)
+    return to_markup(content) if html else to_text(content)
 
 
-def print_summary(result: Result, *, all_rows: bool = False) -> None:
+def print_summary(result: Result, *, details: bool = False, all_rows: bool = False) -> None:
     """Print a calibration, validation or comparison: in colour where there is a terminal."""
-    print_rich(_render(result, all_rows))
+    print_rich(_render(result, details, all_rows))
 
 
-def _render(result: Result, all_rows: bool) -> RenderableType:
+def _render(result: Result, details: bool, all_rows: bool) -> RenderableType:
     kinds = (Calibration, Comparison, Validation)
     require_kind(result, kinds, expected="a Calibration, a Comparison or a Validation")
     if isinstance(result, Calibration):
-        return render_calibration(result, all_rows=all_rows)
+        return render_calibration(result, details=details, all_rows=all_rows)
     if isinstance(result, Comparison):
         return render_comparison(result, all_rows=all_rows)
     return render_validation(result, all_rows=all_rows)
 
 
-def render_calibration(calibration: Calibration, *, all_rows: bool = False) -> RenderableType:
-    """A calibration as rich renderables."""
+def render_calibration(
+    calibration: Calibration, *, details: bool = False, all_rows: bool = False
+) -> RenderableType:
+    """A calibration as rich renderables: the short answer, and on demand all the rest."""
+    answer = render_answer(calibration)
+    if not (details or all_rows):
+        return Group(answer, Text(MORE))
     return Group(
-        render_heading(calibration),
+        answer,
+        section("How it was done", render_origin(calibration)),
         section("What was identified", render_parameters(calibration, all_rows=all_rows)),
         section("What the readings tell", render_identifiability(calibration, all_rows=all_rows)),
         section("Readings before and after", render_residuals(calibration, all_rows=all_rows)),

@@ -7,24 +7,10 @@ import math
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from orthocal.errors import ClosureError, RobotError
 from orthocal.identification.calibration import Calibration
-from orthocal.identification.records import ControllerEntry, ParameterEstimate, ResidualRow
-from orthocal.output.accuracy import describe_promise
-from orthocal.output.explanation import advise
-from orthocal.output.layout import (
-    add_row,
-    choose_rows,
-    counted,
-    list_places,
-    mm,
-    plain,
-    signed,
-    table_of,
-)
-from orthocal.study.accuracy import assess_tool
-from orthocal.study.entering import find_entries
-from orthocal.study.plausibility import describe_machine
+from orthocal.identification.records import ParameterEstimate, ResidualRow
+from orthocal.output.layout import add_row, choose_rows, counted, mm, plain, signed, table_of
+from orthocal.study.findings.parameters import FEW_NAMES, find_held, find_hidden
 
 MANY_PARAMETERS = 12
 """Parameters above which only those that the readings tell are listed."""
@@ -38,6 +24,9 @@ TOLD = 0.5
 MOST_TERMS = 5
 """Terms of a combination that are printed."""
 
+MOST_GROUPS = 6
+"""Groups that are not told apart that are listed."""
+
 MOST_PAIRS = 8
 """Correlated pairs that are listed."""
 
@@ -47,49 +36,6 @@ _SOURCES = {
     "gauge": "as given for the gauge",
     "unknown": "unknown",
 }
-
-
-def render_heading(calibration: Calibration, *, effort: bool = True) -> RenderableType:
-    """What was calibrated, from what and how, with what it took."""
-    session, solver = calibration.session, calibration.solver
-    kind = "difference" if calibration.rows_are_differences else "reading"
-    read = {r.setup for r in calibration.residuals}
-    setups = [s for s in calibration.setups if s.name in read]
-    idle = [s.name for s in calibration.setups if s.name not in read]
-    places = list_places(s.sensor.place for s in setups)
-    lines = [
-        Text(
-            f"Calibration of {calibration.robot_record.name}, model '{calibration.model}'",
-            style="bold",
-        ),
-        Text(session.title),
-    ]
-    if session.source:
-        lines.append(Text(f"Source: {session.source}"))
-    used = {r.posture for r in calibration.residuals} | {
-        r.minus for r in calibration.residuals if r.minus
-    }
-    lines.append(Text(f"Machine: {describe_machine(calibration)}"))
-    lines.append(
-        Text(
-            f"Measured: {counted(len(calibration.residuals), kind)} in "
-            f"{counted(len(used), 'posture')}, {counted(len(setups), 'setup')} on {places}"
-            + (f"; no reading of {', '.join(idle)}" if idle else "")
-        )
-    )
-    with_prior = sum(p.prior for p in calibration.free)
-    prior = "tolerances as prior" if with_prior else "no prior"
-    if 0 < with_prior < len(calibration.free):
-        prior = f"{with_prior} with a prior"
-    kind = "base parameter" if calibration.base else "parameter"
-    loss = ", Huber's loss" if solver.loss == "huber" else ""
-    took = (
-        f"; {solver.name}: {solver.status}, {counted(solver.iterations, 'iteration')}, "
-        f"{solver.seconds_build:.2f} + {solver.seconds_solve:.2f} s"
-    )
-    solved = f"Solved: {counted(len(calibration.free), kind)}, {prior}{loss}"
-    lines.append(Text(f"{solved}{took if effort else ''}"))
-    return Group(*lines)
 
 
 def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> RenderableType:
@@ -142,14 +88,7 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
     if held:
         values = ", ".join(f"{p.name} = {p.value * p.edge_factor:g} {p.edge_unit}" for p in held)
         notes.append(Text(f"Held at known values: {values}"))
-    bound = [f"{p.name} at its {p.at_bound} one" for p in c.free if p.at_bound]
-    if bound:
-        notes.append(
-            Text(
-                f"Held by a bound: {', '.join(bound)}. The readings want it beyond; it has no ± of "
-                "its own, and the others' ± holds with it there."
-            )
-        )
+    notes += [Text(found.text) for found in find_held(c)]
     if biased:
         words = "scatter: the part of it that the noise of the readings has." if all_rows else ""
         notes.append(
@@ -223,19 +162,19 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
             f"O5 {o['O5'] * 1e3:.3g} mm a tolerance: of {counted(found.rank, 'direction')}, and "
             "to be compared only with plans that see as many."
         )
-    shown = found.alike if all_rows else found.alike[:6]
-    lines += [f"Not told apart: {c.words}." for c in shown]
-    if len(shown) < len(found.alike):
-        lines.append(f"{len(found.alike) - len(shown)} more such groups; --all lists them.")
-    if found.unseen:
-        names = (
-            ", ".join(found.unseen) if all_rows or len(found.unseen) <= 6 else "--all lists them"
-        )
-        lines.append(
-            f"Below the noise: {counted(len(found.unseen), 'parameter')}, one tolerance of which "
-            "moves all "
-            f"readings together by less ({names})."
-        )
+    hidden = find_hidden(calibration)
+    alike = [f.text for f in hidden if f.kind == "not told apart"]
+    shown = alike if all_rows else alike[:MOST_GROUPS]
+    lines += shown
+    if len(shown) < len(alike):
+        lines.append(f"{len(alike) - len(shown)} more such groups; --all lists them.")
+    for below in (f for f in hidden if f.kind == "below the noise"):
+        names = [p.parameter or "" for p in below.places]
+        if len(names) <= FEW_NAMES:
+            lines.append(below.text)
+        else:
+            listed = ", ".join(names) if all_rows else "--all lists them"
+            lines.append(f"{below.text.removesuffix('.')} ({listed}).")
     sums = [c for c in found.base if len(c.terms) > 1]
     if calibration.base:
         most = None if all_rows else MOST_TERMS
@@ -320,65 +259,3 @@ def render_fit(calibration: Calibration) -> RenderableType:
             text += f", {mm(c.session.gauge_sigma * math.sqrt(2.0))} mm a difference"
         lines.append(Text(text))
     return Group(*lines)
-
-
-def render_controller(calibration: Calibration) -> RenderableType:
-    """What to enter into the controller."""
-    entries = find_entries(calibration)
-    if not entries:
-        return Text("Nothing: no offset was identified.")
-    stated = entries[0].active is not None
-    others = not calibration.only_offsets
-    enter = ("active now", "enter") if stated else ("add to the present offset",)
-    table = table_of("drive", *enter, "± σ", *(["identified"] if others else []), "unit")
-    for e in entries:
-        factor = e.edge_factor
-        now = [] if e.active is None else [signed(e.active * factor)]
-        spread = e.held or plain(e.std * factor)
-        own = [signed(e.identified * factor)] if others else []
-        add_row(table, e.drive, *now, signed(e.enter * factor), spread, *own, e.edge_unit)
-    notes = [Text(_example(calibration, entries[0]))]
-    if not stated:
-        notes.append(
-            Text(
-                "The session does not state the offsets that were active: there is no `controller`."
-            )
-        )
-    if others:
-        notes.append(
-            Text(
-                "For a controller that takes offsets and nothing else: these leave the least error "
-                "at the tool of work that is aligned on the machine (shift and rotation taken "
-                "out), making up for a part of the other errors; ± says how well that is known. "
-                "The identified ones are where the sliders really are: for what knows all errors "
-                "(`orthocal inverse`)."
-            )
-        )
-        notes += [Text(line) for line in _promise(calibration)]
-    return Group(Text(advise(calibration)), table, *notes)
-
-
-def _promise(calibration: Calibration) -> list[str]:
-    """What the tool is good for with the offsets entered, where that can be said."""
-    try:
-        return describe_promise(calibration, assess_tool(calibration))
-    except (ClosureError, RobotError):  # there is no tool to speak of
-        return []
-
-
-def _example(calibration: Calibration, entry: ControllerEntry) -> str:
-    """What an offset is, by the first drive at its mechanical zero."""
-    drive = next(d for d in calibration.robot.drives if d.name == entry.drive)
-    factor, unit = drive.edge_factor, drive.edge_unit
-    whole = "the whole offset, in place of the active one" if entry.active is not None else "more"
-    at, really = drive.zero * factor, (drive.zero + entry.identified) * factor
-    if entry.active is None:
-        return (
-            "An offset is what to add to the encoder's coordinate to get the slider's true one; "
-            f"these are what to add {whole}."
-        )
-    return (
-        f"An offset is what to add to the encoder's coordinate to get the slider's true one: with "
-        f"{drive.name}'s encoder at {at:.3f} {unit} its slider is at {really:.3f} {unit}. Enter "
-        f"{whole}."
-    )

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +10,7 @@ from scipy import special
 
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.records import ResidualRow, root_mean_square, rows_by_setup
+from orthocal.study.findings.finding import Finding, Place, place_of
 
 Array = NDArray[np.float64]
 
@@ -42,23 +41,14 @@ TINY = 2e-3
 
 MANY_PLACES = 500
 """Postures above which their distances are not all computed."""
+MOST_PLACES = 20
+"""Places of a finding that are kept; how many there are is a number of it."""
 
 DIFFERENT = 5.0
 """Tolerances of a length by which legs of one machine may differ by intent."""
 
-Oddity = Literal["finer", "smooth", "coarse", "tiny", "postures", "legs"]
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Doubt:
-    """Something that may be wrong with the session or with the robot's description."""
-
-    kind: Oddity
-    words: str
-    """What was found, and what it may mean; a sentence or two."""
-
-
-def find_doubts(calibration: Calibration) -> tuple[Doubt, ...]:
+def find_doubts(calibration: Calibration) -> tuple[Finding, ...]:
     """What is odd, the gravest first."""
     found = (
         _postures(calibration),
@@ -71,7 +61,7 @@ def find_doubts(calibration: Calibration) -> tuple[Doubt, ...]:
     return tuple(doubt for doubt in found if doubt is not None)
 
 
-def _postures(calibration: Calibration) -> Doubt | None:
+def _postures(calibration: Calibration) -> Finding | None:
     """Postures that would be another machine's: there the nominal one would show far more."""
     seen = []
     for rows in rows_by_setup(calibration.residuals).values():
@@ -83,15 +73,18 @@ def _postures(calibration: Calibration) -> Doubt | None:
     if deviation < LEAST_UNSUITED or deviation < UNSUITED * measured:
         return None
     lengths = _leg_words(calibration.robot_record.legs)
-    return Doubt(
-        "postures",
+    return Finding(
+        "wrong size",
+        "stops",
         f"In these postures the robot with {lengths} would have shown the gauge "
         f"{deviation * 1e3:.1f} mm (r.m.s.) that it did not see: the postures are those of a "
-        "machine of another size, or the robot is. Check `robot` and the joint coordinates.",
+        "machine of another size, or the robot is.",
+        "Check `robot` and the joint coordinates.",
+        numbers={"foretold_rms_mm": deviation * 1e3, "measured_rms_mm": measured * 1e3},
     )
 
 
-def _finer(calibration: Calibration) -> Doubt | None:
+def _finer(calibration: Calibration) -> Finding | None:
     """Readings between the steps of the gauge: another unit, or another gauge."""
     step = calibration.session.gauge_resolution
     if not step:
@@ -105,16 +98,19 @@ def _finer(calibration: Calibration) -> Doubt | None:
     if len(finer) * 2 < len(calibration.residuals):
         return None
     first = finer[0]
-    return Doubt(
-        "finer",
+    return Finding(
+        "finer than the dial",
+        "warns",
         f"{len(finer)} of {len(calibration.residuals)} readings are finer than the gauge's "
         f"resolution of {step * 1e3:g} mm, the first in {calibration.where(first)} "
-        f"({first.measured * 1e3:.6g} mm): are they in mm, not in inches, and is the resolution "
-        "right?",
+        f"({first.measured * 1e3:.6g} mm).",
+        "Make sure that they are in mm, not in inches, and that the resolution is right.",
+        numbers={"finer": float(len(finer)), "resolution_mm": step * 1e3},
+        places=tuple(place_of(calibration, r) for r in finer[:MOST_PLACES]),
     )
 
 
-def _smooth(calibration: Calibration) -> Doubt | None:
+def _smooth(calibration: Calibration) -> Finding | None:
     """Residuals that are smaller than rounding to the gauge's steps leaves."""
     step, noise = calibration.session.gauge_resolution, calibration.noise
     if not step or not noise.residual_dof > 0.5:
@@ -130,29 +126,39 @@ def _smooth(calibration: Calibration) -> Doubt | None:
     chance = float(special.chdtr(dof, dof * (noise.residual_sigma / least) ** 2))
     if chance > BY_CHANCE:
         return None
-    return Doubt(
-        "smooth",
+    return Finding(
+        "too little left",
+        "warns",
         f"What remains, {noise.residual_sigma * 1e6:.2g} µm, is less than rounding to the gauge's "
         f"resolution of {step * 1e3:g} mm leaves ({least * 1e6:.2g} µm): the readings are in "
         "another unit than mm, were computed, or the dial did not move.",
+        "Make sure that the readings are what the dial showed, in mm.",
+        numbers={
+            "left_um": noise.residual_sigma * 1e6,
+            "rounding_um": least * 1e6,
+            "resolution_mm": step * 1e3,
+        },
     )
 
 
-def _coarse(calibration: Calibration) -> Doubt | None:
+def _coarse(calibration: Calibration) -> Finding | None:
     """A σ far above what repeated readings scatter by, or what remains: in another unit."""
     given, noise = calibration.session.gauge_sigma, calibration.noise
     scatter = noise.cycles_sigma if noise.cycles_dof >= FEWEST else noise.residual_sigma
     dof = noise.cycles_dof if noise.cycles_dof >= FEWEST else noise.residual_dof
     if given is None or dof < FEWEST or not COMPUTED < TOO_COARSE * scatter < given:
         return None  # readings without any scatter were computed
-    return Doubt(
-        "coarse",
+    return Finding(
+        "sigma too coarse",
+        "warns",
         f"The σ given for the gauge, {given * 1e3:g} mm, is {given / scatter:.0f} times what its "
-        f"readings scatter by ({scatter * 1e3:.2g} mm): is gauge.sigma_mm in mm?",
+        f"readings scatter by ({scatter * 1e3:.2g} mm).",
+        "Make sure that gauge.sigma_mm is in mm.",
+        numbers={"given_mm": given * 1e3, "scatter_mm": scatter * 1e3, "times": given / scatter},
     )
 
 
-def _tiny(calibration: Calibration) -> Doubt | None:
+def _tiny(calibration: Calibration) -> Finding | None:
     """Postures hardly away from another one, beside far ones: given in metres."""
     drives = np.array([p.drives for p in calibration.postures])
     places, first = np.unique(drives, axis=0, return_index=True)
@@ -165,10 +171,14 @@ def _tiny(calibration: Calibration) -> Doubt | None:
         return None
     worst = near[first[near].argmax()]
     name = calibration.postures[int(first[worst])].name
-    return Doubt(
-        "tiny",
+    return Finding(
+        "posture too near",
+        "warns",
         f"Posture '{name}' is {gaps[worst] * 1e3:.2g} mm from another one, where postures "
-        f"are up to {largest * 1e3:.0f} mm apart: is it in mm, not in metres?",
+        f"are up to {largest * 1e3:.0f} mm apart.",
+        "Make sure that it is in mm, not in metres.",
+        numbers={"gap_mm": float(gaps[worst]) * 1e3, "largest_mm": largest * 1e3},
+        places=(Place(posture=name),),
     )
 
 
@@ -183,7 +193,7 @@ def _nearest(places: Array) -> Array:
     return np.asarray(apart.min(axis=1))
 
 
-def _legs(calibration: Calibration) -> Doubt | None:
+def _legs(calibration: Calibration) -> Finding | None:
     """Legs that are not of one length, on a machine whose drives are all alike."""
     legs = calibration.robot_record.legs
     drives = {(d.unit, d.zero, d.lower, d.upper) for d in calibration.robot.drives}
@@ -193,10 +203,12 @@ def _legs(calibration: Calibration) -> Doubt | None:
     tolerance = _length_tolerance(calibration)
     if max(lengths) - min(lengths) < DIFFERENT * tolerance:
         return None
-    return Doubt(
-        "legs",
-        f"The machine's legs are not of one length ({_leg_words(legs)}): was its size changed in "
-        "every place of the URDF?",
+    return Finding(
+        "legs differ",
+        "warns",
+        f"The machine's legs are not of one length ({_leg_words(legs)}).",
+        "Make sure that its size was changed in every place of the URDF.",
+        numbers={f"{name}_mm": length * 1e3 for name, length in legs},
     )
 
 

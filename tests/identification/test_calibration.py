@@ -187,7 +187,7 @@ def test_what_a_bound_or_a_known_value_holds_is_not_proved(experiment_2):
     )
     held = {e.drive: e.held for e in find_entries(bounded)}
     assert held == {"x_slide": "lower bound", "y_slide": "known", "z_slide": None}
-    text = summarize(bounded)
+    text = summarize(bounded, details=True)
     entered = text[text.index("What to enter into the controller") :]
     assert "lower bound" in entered
     assert "known" in entered
@@ -216,7 +216,7 @@ def test_cycles_that_are_all_equal_scatter_by_the_resolution(raw_cycles):
         result = calibrate(raw_cycles.with_values(values), model)
         assert result.noise.cycles_sigma == pytest.approx(0.01e-3 / np.sqrt(12.0))
         assert np.isfinite(result.covariance).all()
-        assert "unknown" not in summarize(result)
+        assert "unknown" not in summarize(result, details=True)
     zero = calibrate(raw_cycles.with_values(np.zeros(len(values))), "full")
     assert zero["x_slide.offset"].std > 0.1e-3  # one with other errors, as its tolerance says
 

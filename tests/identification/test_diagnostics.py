@@ -182,7 +182,7 @@ def test_readings_of_a_wrong_setup_are_said_to_be_of_one(root):
     session = load_session(root / "examples/lines")
     sign = np.where([r.setup == "yx" for r in session.readings], -1.0, 1.0)
     text = " ".join(explain_fit(calibrate(session.with_values(sign * session.values))))
-    assert "All are of setup yx: look at its sign, direction and section first." in text
+    assert "suspicious readings are of setup yx. Look at its sign, direction and section" in text
 
 
 def test_errors_that_make_no_machine_are_refused(readings):

@@ -28,9 +28,10 @@ def results(experiment_2):
 
 
 @pytest.mark.parametrize("width", [40, 60, 80, 100])
+@pytest.mark.parametrize("details", [True, False], ids=["details", "answer"])
 @pytest.mark.parametrize("name", ["offsets", "full", "validation", "comparison"])
-def test_no_number_is_cut_however_narrow_it_gets(name, width, results):
-    content = _render(results[name], True)
+def test_no_number_is_cut_however_narrow_it_gets(name, details, width, results):
+    content = _render(results[name], details, details)
     wide, narrow = to_text(content, width=400), to_text(content, width=width)
     assert max(len(line) for line in narrow.splitlines()) <= width
     assert not re.search(r"\d…|\.…", narrow)

@@ -21,13 +21,13 @@ def line(text, beginning):
 
 
 def test_linear_and_exact_stand_side_by_side(table1):
-    row = line(summarize(table1), "y_slide.offset").split()
+    row = line(summarize(table1, details=True), "y_slide.offset").split()
     assert row[1:4] == ["+0.599", "+0.592", "0.517"]
     assert row[-3:] == ["-0.0067", "-0.013", "mm"]
 
 
 def test_every_reading_is_listed_before_and_after(table1):
-    text = summarize(table1)
+    text = summarize(table1, details=True)
     assert line(text, "zx").split() == [
         "zx",
         "x_max",
@@ -45,7 +45,7 @@ def test_every_reading_is_listed_before_and_after(table1):
 
 
 def test_sigma_is_held_against_the_gauges_own(table1):
-    text = " ".join(summarize(table1).split())
+    text = " ".join(summarize(table1, details=True).split())
     assert "σ of a difference: 0.276 mm, from the residuals, 3 degrees of freedom" in text
     assert "σ given for the gauge: 0.020 mm a reading, 0.028 mm a difference" in text
     assert (
@@ -54,14 +54,14 @@ def test_sigma_is_held_against_the_gauges_own(table1):
 
 
 def test_it_says_what_to_type_and_what_to_believe(table1):
-    text = summarize(table1)
+    text = summarize(table1, details=True)
     entered = text[text.index("What to enter into the controller") :]
     assert line(entered, "z_slide").split() == [*("z_slide", "+0.000", "-1.761", "0.519", "mm")]
     assert "Offsets that must change (95 %, with all that is not known): z_slide." in text
 
 
 def test_an_unstated_controller_is_said_to_be_so(root):
-    text = summarize(calibrate(load_session(root / "examples/table1/experiment-3")))
+    text = summarize(calibrate(load_session(root / "examples/table1/experiment-3")), details=True)
     assert "add to the present offset" in text
     assert "does not state the offsets that were active" in text
 
@@ -78,7 +78,7 @@ def test_cycles_that_cannot_explain_the_residuals_are_said_to_be_model_error(raw
             values[i] += 0.3e-3  # every time again
     result = calibrate(raw_cycles.with_values(values))
     assert result.noise.source == "residuals"
-    assert "times what repeated cycles scatter by" in explain_fit(result)[0]
+    assert "times what repeated cycles scatter by" in " ".join(explain_fit(result))
 
 
 def test_one_wrong_sign_among_cycles_is_pointed_at(raw_cycles):
@@ -94,7 +94,7 @@ def test_one_wrong_sign_among_cycles_is_pointed_at(raw_cycles):
 
 def test_a_prior_marks_what_the_readings_leave_open(root):
     result = calibrate(load_session(root / "examples/table1/experiment-2"), "lengths")
-    text = summarize(result)
+    text = summarize(result, details=True)
     assert line(text, "x_leg.length").split()[4] == "0%"
     assert line(text, "x_slide.offset").split()[4] == "99%"
     assert "told: how much of what the tolerance left open" in text
@@ -104,7 +104,7 @@ def test_a_prior_marks_what_the_readings_leave_open(root):
 def test_many_readings_are_cut_unless_all_are_asked_for(raw_cycles):
     result = calibrate(raw_cycles)
     long = replace(result, residuals=result.residuals * 3)
-    assert "The 20 largest of 162" in summarize(long)
+    assert "The 20 largest of 162" in summarize(long, details=True)
     assert "The 20 largest" not in summarize(long, all_rows=True)
 
 
@@ -113,7 +113,7 @@ def test_names_from_files_are_not_markup(table1):
     rows = (replace(table1.residuals[0], setup="[red]y"), *table1.residuals[1:])
     setups = tuple(replace(s, name="[red]y") if s.name == first else s for s in table1.setups)
     titled = replace(table1.session, title="[bold]x[/nonsense]")
-    text = summarize(replace(table1, residuals=rows, setups=setups, session=titled))
+    text = summarize(replace(table1, residuals=rows, setups=setups, session=titled), details=True)
     assert "[red]y " in text
     assert "[bold]x[/nonsense]" in text
 
@@ -128,22 +128,27 @@ def turn(session, setup):
 
 def test_sound_readings_are_to_be_entered(raw_cycles):
     assert advise(calibrate(raw_cycles)) == (
-        "Enter these, and measure again to confirm them: what remains is what the noise of the "
-        "readings leaves."
+        "Enter these, and measure again. What remains is what repeated cycles scatter by: the "
+        "model fits. Measure again with these in the controller, and hold the new session against "
+        "this calibration: `orthocal validate`."
     )
 
 
 def test_error_of_the_model_is_to_be_measured_again(experiment_2):
-    assert advise(calibrate(experiment_2)).startswith("Enter these, and measure again: ")
+    text = advise(calibrate(experiment_2))
+    assert text.startswith("Enter these, and measure again. What remains, σ = 0.276 mm ")
+    assert "it is error of the model" in text
 
 
 def test_a_setup_of_the_wrong_sign_is_named_before_anything_is_entered(raw_cycles):
     text = advise(calibrate(turn(raw_cycles, "zx")))
     assert text.startswith(
-        "Do not enter these yet: the readings of setup zx seem to have the wrong"
+        "Do not enter these. The readings of setup zx seem to have the wrong sign."
     )
     assert "by 0.401 mm (r.m.s.); with the sign turned by 0.008 mm" in text
-    assert text in " ".join(summarize(calibrate(turn(raw_cycles, "zx"))).split())
+    for shown in (False, True):
+        summary = summarize(calibrate(turn(raw_cycles, "zx")), details=shown)
+        assert "Do not enter these. The readings of setup zx seem" in " ".join(summary.split())
 
 
 def test_readings_far_beyond_all_tolerances_are_not_to_be_entered(raw_cycles):
@@ -154,7 +159,7 @@ def test_readings_far_beyond_all_tolerances_are_not_to_be_entered(raw_cycles):
         for r in raw_cycles.readings
     ]
     text = advise(calibrate(raw_cycles.with_values(values)))
-    assert text.startswith("Do not enter these yet: what remains is ")
+    assert text.startswith("Do not enter these. What remains is ")
     assert "Look at setup zx first" in text
 
 
@@ -162,7 +167,11 @@ def test_one_wrong_reading_is_to_be_read_again(raw_cycles):
     values = raw_cycles.values.copy()
     values[4] += 0.2e-3
     text = advise(calibrate(raw_cycles.with_values(values)))
-    assert text == "Before you enter these read again: 1 reading contradicts all others."
+    setup = raw_cycles.readings[4].setup
+    assert text.startswith(
+        f"Check before you enter these. 1 reading contradicts all others (setup {setup})."
+    )
+    assert "read it again if it is wrong" in text
 
 
 def test_readings_that_do_not_repeat_are_to_be_read_again(raw_cycles):
@@ -176,17 +185,19 @@ def test_readings_that_do_not_repeat_are_to_be_read_again(raw_cycles):
     assert "They differ most at xz z_min: " in text
     where = f"readings.csv:{two.readings[wrong].line}."
     assert f"the one that stands apart is in {two.readings_path.parent}/{where}" in text
-    assert advise(replace(spoilt, critical=math.inf)) == (
-        "Before you enter these read xz z_min again: repeated readings of it differ by more than "
-        "the gauge's σ explains, as with a wrong sign or row."
-    )
+    text = advise(replace(spoilt, critical=math.inf))
+    assert text.startswith("Check before you enter these. Repeated readings scatter by ")
+    assert "They differ most at xz z_min: " in text
+    assert "Check these for a wrong sign or row before anything is entered" in text
 
 
 def test_noise_that_only_the_residuals_tell_does_not_confirm_the_model(raw_cycles):
     once = tuple(r for r in raw_cycles.readings if r.cycle == 1)
     silent = replace(raw_cycles, readings=once).with_gauge(replace(raw_cycles.gauge, sigma=None))
     text = advise(calibrate(silent))
-    assert text.startswith("Enter these, and measure again: only what remains says how large")
+    assert text.startswith(
+        "Enter these, and measure again. Only what remains says how large the noise is"
+    )
 
 
 def test_without_word_or_check_it_is_said(experiment_2):
@@ -194,7 +205,9 @@ def test_without_word_or_check_it_is_said(experiment_2):
     three = replace(silent, readings=silent.readings[1:4])
     assert "nothing tells how far they can be trusted" in advise(calibrate(three))
     given = replace(experiment_2, readings=experiment_2.readings[1:4])
-    assert "no reading is left to check them" in advise(calibrate(given))
+    text = advise(calibrate(given))
+    assert text.startswith("Check before you enter these. ")
+    assert "none is left to check the model: nothing says whether these are right" in text
 
 
 def test_nothing_is_advised_where_no_offset_was_identified(raw_cycles):

@@ -168,7 +168,7 @@ def test_a_machine_that_does_not_reach_60_mm_has_results_at_the_tool(tmp_path):
     found = assess_tool(result)
     # drives end 30 mm beyond the zero, and some µm of offsets belong into the controller
     assert found.workspace.half_side == pytest.approx(0.029)
-    text = " ".join(summarize(result).split())
+    text = " ".join(summarize(result, details=True).split())
     assert "Over a cube of ±29 mm around the zero." in text
     assert "missing" not in text
     compared = compare_models(session, models=["offsets", "lengths"])

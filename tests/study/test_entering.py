@@ -92,7 +92,7 @@ def test_what_is_promised_with_the_offsets_entered_is_kept(quarter):
         ):
             left[name].append(error_left(quarter, errors, offsets, space))
         left["promised"].append(expect_after_offsets(full, assess_tool(full)))
-        text = " ".join(summarize(full).split())
+        text = " ".join(summarize(full, details=True).split())
         assert "these leave the least error at the tool" in text
         assert "With the offsets entered the tool is good for" in text
     rms = {name: np.sqrt(np.mean(np.square(values))) for name, values in left.items()}

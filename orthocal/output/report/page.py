@@ -10,13 +10,18 @@ from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
+from rich.console import Group
+
 from orthocal.arguments import require_kind
 from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.files import write_file
 from orthocal.identification.calibration import Calibration
 from orthocal.markup import escape, heading, items, paragraph, table
 from orthocal.output.accuracy import render_tool
+from orthocal.output.answer import render_answer, shows_entries
+from orthocal.output.entering import entry_table, render_meaning
 from orthocal.output.explanation import explain_fit
+from orthocal.output.heading import render_heading
 from orthocal.output.layout import bullets, mm, plain, signed
 from orthocal.output.report.parameter_plots import (
     plot_correlations,
@@ -28,9 +33,7 @@ from orthocal.output.report.reading_plots import plot_residuals, plot_setups, pl
 from orthocal.output.report.rich_markup import to_markup
 from orthocal.output.report.tool_map import Field, plot_tool_map
 from orthocal.output.tables import (
-    render_controller,
     render_fit,
-    render_heading,
     render_identifiability,
     render_parameters,
     render_residuals,
@@ -38,6 +41,8 @@ from orthocal.output.tables import (
 from orthocal.output.view.drawing import draw_scene
 from orthocal.output.view.scene import frame_of
 from orthocal.study.accuracy import ToolAccuracy, assess_tool, find_excess
+from orthocal.study.entering import find_entries
+from orthocal.study.findings.calibration import decide
 
 FEW_ROWS = 40
 """Readings up to which the list of all is open."""
@@ -131,8 +136,18 @@ def _verdict(calibration: Calibration) -> str:
         f"largest was {mm(calibration.largest_before)} mm and is {mm(calibration.largest_after)} "
         "mm."
     )
+    decision = decide(calibration)
+    answer = to_markup(render_answer(calibration, heading=False))
+    meaning = Group()
+    if find_entries(calibration):
+        # what the answer leaves out: where the sliders are, and what is not to be entered
+        told_all = shows_entries(decision) and calibration.only_offsets
+        listed = [] if told_all else [entry_table(calibration)]
+        meaning = Group(*listed, *render_meaning(calibration))
     return (
-        to_markup(render_controller(calibration))
+        answer
+        + heading("What these numbers are", level=3)
+        + to_markup(meaning)
         + paragraph(told)
         + heading("What it means", level=3)
         + to_markup(bullets(explain_fit(calibration)))

@@ -154,6 +154,7 @@ def test_full_model_says_what_the_offsets_leave(root):
     page = build_report(found)
     assert "once the offsets above are entered" in page
     read = Reader(page)
+    assert ["drive", "active now", "enter", "± σ", "identified", "unit"] in read.rows
     assert (
         len([r for r in read.rows if len(r) > 5 and r[0] in {s.name for s in found.setups}]) == 162
     )
@@ -192,7 +193,7 @@ def test_texts_of_strangers_are_text(raw_cycles):
     assert frame.tags.count("script") == 3
     for part in (found._repr_html_(), session._repr_html_()):
         seen = Reader(part)
-        assert set(seen.tags) <= {"p", "table", "thead", "tbody", "tr", "th", "td"}
+        assert set(seen.tags) <= {"p", "table", "thead", "tbody", "tr", "th", "td", "ul", "li"}
         assert any(EVIL in t for t in seen.text["p"])
 
 
@@ -222,23 +223,26 @@ def test_robot_without_a_tool_has_a_report(experiment_2):
 
 def test_calibration_in_a_notebook(calibration):
     read = Reader(calibration._repr_html_())
-    assert read.rows[0] == ["parameter", "linear", "exact", "± σ", "unit"]
+    assert read.rows[0] == ["drive", "active now", "enter", "±", "unit"]
     entry = find_entries(calibration)[0]
-    p = calibration["x_slide.offset"]
     assert read.rows[1] == [
-        "x_slide.offset",
-        *(f"{v * 1e3:+.3f}" for v in (p.linear, p.value)),
+        "x_slide",
+        "+0.000",
+        f"{calibration['x_slide.offset'].value * 1e3:+.3f}",
         f"{entry.std * 1e3:.3f}",
         "mm",
     ]
-    assert "r.m.s. 0.622 mm before, 0.195 mm after" in " ".join(read.text["p"])
+    words = " ".join(read.text["p"])
+    assert "Enter these, and measure again. What remains, σ = 0.276 mm of a difference" in words
+    assert "it is error of the model" in words
+    assert "At the tool expect 118 µm" in words
 
 
-def test_calibration_with_many_parameters_lists_its_offsets(root):
+def test_calibration_with_many_parameters_lists_what_to_enter(root):
     found = calibrate(load_session(root / "examples/sweep"), "full")
     read = Reader(found._repr_html_())
-    assert [r[0] for r in read.rows[1:]] == ["x_slide.offset", "y_slide.offset", "z_slide.offset"]
-    assert "and 123 more parameters" in " ".join(read.text["p"])
+    assert [r[0] for r in read.rows[1:]] == ["x_slide", "y_slide", "z_slide"]
+    assert "In a controller that knows all errors: 12.8 µm" in " ".join(read.text["p"])
 
 
 def test_session_in_a_notebook(raw_cycles):

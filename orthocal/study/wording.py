@@ -1,0 +1,42 @@
+"""Numbers and lists as they stand in sentences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+
+def mm(value: float) -> str:
+    """A length in mm, three decimals."""
+    return plain(value * 1e3)
+
+
+def plain(value: float, decimals: int = 3) -> str:
+    """A number, or the word unknown."""
+    return f"{value:.{decimals}f}" if math.isfinite(value) else "unknown"
+
+
+def signed(value: float, decimals: int = 3) -> str:
+    """A number with its sign, or the word unknown."""
+    return f"{value:+.{decimals}f}" if math.isfinite(value) else "unknown"
+
+
+def um(value: float) -> str:
+    """A length in µm, as many decimals as say something."""
+    size = value * 1e6
+    return f"{size:.0f}" if abs(size) >= 20.0 else f"{size:.1f}"
+
+
+def counted(count: int, noun: str) -> str:
+    """So many of something, in words: 1 reading, 2 readings."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def times(ratio: float) -> str:
+    """How many times something is something else."""
+    return f"{ratio:.1f} times" if ratio < 3.0 else f"{ratio:.0f} times"
+
+
+def joined(names: Sequence[str], word: str = "and") -> str:
+    """Names as a list in a sentence: a, b and c."""
+    return f" {word} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
