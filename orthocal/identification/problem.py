@@ -162,7 +162,7 @@ class CalibrationProblem:
     @cached_property
     def machine_map(self) -> MachineMap:
         """What θ̂ makes of the machine, as functions of CasADi."""
-        return MachineMap(self.compiled.errors, fixed=self._fixed_errors, columns=self._columns)
+        return MachineMap(self.compiled.errors, fixed=self._fixed_errors, columns=self.columns)
 
     @cached_property
     def posture_piece(self) -> PosturePiece:
@@ -306,7 +306,7 @@ class CalibrationProblem:
     @cached_property
     def _expander(self) -> Expander:
         errors = self.compiled.errors
-        moved = errors.twists_of(self._columns.T).any(axis=0).reshape(-1, 6).any(axis=1)
+        moved = errors.twists_of(self.columns.T).any(axis=0).reshape(-1, 6).any(axis=1)
         return Expander(
             self.compiled,
             self.observations,
@@ -346,14 +346,14 @@ class CalibrationProblem:
         return self.compiled.errors.expand(self.fixed)
 
     @cached_property
-    def _columns(self) -> Array:
+    def columns(self) -> Array:
         """What one tolerance of each free parameter adds to all errors, (n_errors, n_free)."""
         return self.compiled.errors.columns(self.free) * self.theta_scale
 
     def _machine_and_slopes(self, theta: ArrayLike) -> tuple[Machine, Slopes]:
         """The machine, and what tolerances of the free parameters do to it."""
         errors = self.assembly.errors(theta)
-        return self.assembly.machine(theta), self.compiled.errors.slopes(errors, self._columns)
+        return self.assembly.machine(theta), self.compiled.errors.slopes(errors, self.columns)
 
     def _read(
         self,
