@@ -13,7 +13,7 @@ import orthocal
 
 STAGES = [
     *("characters", "arguments", "errors", "interrupts", "streams"),
-    *("files", "strict_yaml", "documents", "markup"),
+    *("files", "cache", "strict_yaml", "documents", "markup"),
     *(
         "robot",
         "kinematics",

@@ -207,7 +207,9 @@ class LaneFunction:
             p,
             result,
         )
-        return [result[:, a:b] for a, b in zip(listing.first_out, listing.first_out[1:], strict=False)]
+        return [
+            result[:, a:b] for a, b in zip(listing.first_out, listing.first_out[1:], strict=False)
+        ]
 
 
 @lru_cache(maxsize=1)

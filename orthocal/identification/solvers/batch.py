@@ -1,10 +1,9 @@
 """Many sets of readings of one plan, calibrated at once: the optimum of each, as alone.
 
 Where few parameters are free the readings are polynomials of them (`surrogate`), and Gauss-Newton
-is a product of small matrices for all sets together. Otherwise all machines are looked at together
-(`fleet`): the gradient of each is exact, the Hessian one for all (the chord method), and each step
-makes use of what the last ones changed (Anderson 1965). Sets that do not settle, or that a bound
-may hold, are solved one by one.
+is a product of small matrices for all sets together. Sets that do not settle, that leave the box of
+the polynomials, or that a bound may hold, are solved one by one, as are all where many parameters
+are free.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.identification.options import SolverOptions
 from orthocal.identification.problem import CalibrationProblem
 from orthocal.identification.solvers.eliminated import EliminatedProgram
-from orthocal.identification.solvers.fleet import POSTURES_AT_ONCE, Fleet
 from orthocal.identification.solvers.surrogate import MOST_PARAMETERS, Surrogate, find_surrogate
 
 Array = NDArray[np.float64]
@@ -26,9 +24,6 @@ SETTLED = 1e-8
 """Last step, [tolerances]."""
 
 MOST_STEPS = 30
-REMEMBERED = 4
-"""Steps that the next one makes use of."""
-
 SETS_AT_ONCE = 4096
 """Solved together by polynomials."""
 
@@ -95,10 +90,7 @@ class BatchProgram:
                 part = slice(first, first + SETS_AT_ONCE)
                 self._by_polynomials(about, y[part], start[part], found.part(part))
         else:
-            size = max(1, POSTURES_AT_ONCE // self.problem.n_postures)
-            for first in range(0, len(y), size):
-                part = slice(first, first + size)
-                self._by_chord(about, y[part], start[part], found.part(part))
+            found.alone[:] = True
         self._alone(y, sigma, found)
         scale = self.problem.theta_scale
         theta = np.where(found.alone[:, None], found.theta, found.theta * scale)
@@ -147,33 +139,6 @@ class BatchProgram:
         reading, _ = surrogate(np.where(done[:, None], theta, surrogate.centre))
         about.finish(y, theta, reading, done, found)
 
-    def _by_chord(self, about: _Shared, y: Array, theta: Array, found: _Found) -> None:
-        """The chord method, all machines looked at together."""
-        fleet = Fleet(self.problem, np.array(theta))
-        closed = fleet.close()
-        fleet.passive[~closed] = self.problem.reference_passive
-        memory = _Anderson()
-        done = np.zeros(len(y), dtype=np.bool_)
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            for _ in range(MOST_STEPS):
-                at = fleet.expand()
-                residual, _, _ = about.residual((y - at.reading) / about.sigma)
-                pull = fleet.pull(at, about.loss.influence(residual)) / about.sigma
-                plain = about.chord(fleet.theta, pull)
-                size = np.abs(plain).max(axis=1)
-                done = closed & (size <= SETTLED)
-                if done.all():
-                    break
-                step = np.where(done[:, None], 0.0, memory.step(fleet.theta, plain))
-                lost = ~np.isfinite(step).all(axis=1)
-                closed &= ~lost
-                step[lost] = 0.0
-                fleet.follow(at, step)
-                broken = ~np.isfinite(fleet.passive).all(axis=(1, 2))
-                fleet.passive[broken] = self.problem.reference_passive
-                closed &= ~broken
-        about.finish(y, fleet.theta, at.reading, done, found)
-
     def _alone(self, y: Array, sigma: float, found: _Found) -> None:
         """The sets that are left, one by one."""
         program = EliminatedProgram(self.problem, options=self.options)
@@ -186,35 +151,9 @@ class BatchProgram:
 def _settled(sizes: Array) -> NDArray[np.bool_]:
     """Whether the step after the last would change nothing; sizes of the last three, (3, n)."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        shrinking = np.fmax(sizes[0] / sizes[1], sizes[1] / sizes[2])
-    return np.asarray((sizes[0] <= SETTLED) | (sizes[0] * shrinking <= 0.1 * SETTLED))
-
-
-class _Anderson:
-    """Steps of a fixed-point iteration θ ← θ + f(θ), by those before (Anderson 1965)."""
-
-    def __init__(self) -> None:
-        self._thetas: list[Array] = []
-        self._steps: list[Array] = []
-
-    def step(self, theta: Array, plain: Array) -> Array:
-        """The step to take, shape (n_sets, n_free), of the plain one."""
-        self._thetas = [*self._thetas[-REMEMBERED:], np.array(theta)]
-        self._steps = [*self._steps[-REMEMBERED:], plain]
-        if len(self._steps) == 1:
-            return plain
-        changes = np.stack([b - a for a, b in _pairs(self._steps)], axis=1)
-        moves = np.stack([b - a for a, b in _pairs(self._thetas)], axis=1)
-        square = changes @ np.swapaxes(changes, 1, 2)
-        scale = np.trace(square, axis1=1, axis2=2)[:, None, None]
-        square = square + (1e-12 * scale + 1e-300) * np.eye(square.shape[1])
-        right = changes @ plain[..., None]
-        shares = np.linalg.solve(square, right)
-        return np.asarray(plain - ((moves + changes) * shares).sum(axis=1))
-
-
-def _pairs(items: list[Array]) -> list[tuple[Array, Array]]:
-    return list(zip(items, items[1:], strict=False))
+        last = np.where(np.isfinite(sizes[1]), sizes[0] / sizes[1], np.inf)
+        before = np.where(np.isfinite(sizes[2]), sizes[1] / sizes[2], 0.0)
+    return np.asarray((sizes[0] <= SETTLED) | (sizes[0] * np.maximum(last, before) <= SETTLED))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -294,10 +233,6 @@ class _Shared:
         pull = (self.loss.influence(residual)[:, None] @ jacobian)[:, 0]
         pull = pull - self._precision * (theta - self._mean)
         return np.asarray(np.linalg.solve(square, pull[..., None])[..., 0])
-
-    def chord(self, theta: Array, pull: Array) -> Array:
-        """Steps by the Hessian at the reference, of the pull of the residuals."""
-        return np.asarray((pull - self._precision * (theta - self._mean)) @ self._inverse)
 
     def finish(
         self, y: Array, theta: Array, reading: Array, done: NDArray[np.bool_], found: _Found
