@@ -193,7 +193,7 @@ class CalibrationProblem:
     @cached_property
     def machine_map(self) -> MachineMap:
         """What θ̂ makes of the machine, as functions of CasADi."""
-        return MachineMap(self.compiled.errors, fixed=self._fixed_errors, columns=self._columns)
+        return MachineMap(self.compiled.errors, fixed=self._fixed_errors, columns=self.columns)
 
     @cached_property
     def posture_piece(self) -> PosturePiece:
@@ -348,7 +348,7 @@ class CalibrationProblem:
     @cached_property
     def _expander(self) -> Expander:
         errors = self.compiled.errors
-        moved = errors.twists_of(self._columns.T).any(axis=0).reshape(-1, 6).any(axis=1)
+        moved = errors.twists_of(self.columns.T).any(axis=0).reshape(-1, 6).any(axis=1)
         return Expander(
             self.compiled,
             self.observations,
@@ -398,7 +398,7 @@ class CalibrationProblem:
         return self.compiled.errors.expand(self.fixed)
 
     @cached_property
-    def _columns(self) -> Array:
+    def columns(self) -> Array:
         """What one tolerance of each free error adds to all of them, (n_errors, n_machine)."""
         selection = self.machine_selection
         return self.compiled.errors.columns(selection.names) * selection.tolerances
@@ -407,7 +407,7 @@ class CalibrationProblem:
         """The machine, and what tolerances of the free parameters do to it."""
         machine = self._of_machine(theta)
         errors = self.assembly.errors(machine)
-        return self.assembly.machine(machine), self.compiled.errors.slopes(errors, self._columns)
+        return self.assembly.machine(machine), self.compiled.errors.slopes(errors, self.columns)
 
     def _read(
         self,

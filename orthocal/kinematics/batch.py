@@ -50,6 +50,12 @@ class BatchFunction:
         self._matrices = [function.index_out(name) for name in matrices]
         self._local = threading.local()
 
+    @cached_property
+    def unshared(self) -> BatchFunction:
+        """The same with inputs of their own at every point, shape (K, n) all of them."""
+        names = [self._function.name_out(i) for i in self._matrices]
+        return BatchFunction(self._function, matrices=names, sparse=tuple(self._sparse))
+
     def pattern(self, name: str) -> tuple[Indices, Indices]:
         """Rows and columns of the nonzeros of a sparse output, shape (nnz,) each."""
         sparsity = self._function.sparsity_out(self._function.index_out(name))

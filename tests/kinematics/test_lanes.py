@@ -1,0 +1,91 @@
+"""Functions run by numba give the numbers that CasADi gives, bit by bit."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from orthocal.kinematics import lanes
+from orthocal.kinematics.batch import BatchFunction
+from orthocal.kinematics.compiled import compiled_robot
+from orthocal.kinematics.lanes import Way, list_instructions, running
+
+needs_numba = pytest.mark.skipif(not lanes.is_installed(), reason="numba is not installed")
+
+
+def points(robot, count):
+    rng = np.random.default_rng(0)
+    errors = compiled_robot(robot).errors
+    drives = robot.drive_zero + 0.02 * rng.normal(size=(count, len(robot.drives)))
+    passive = robot.zero[robot.passive_index]
+    passive = passive + 0.2 * rng.normal(size=(count, passive.size))
+    return drives, passive, errors.placements(1e-2 * rng.normal(size=len(errors.names)))
+
+
+@needs_numba
+@pytest.mark.parametrize("name", ["orthoglide", "fivebar", "biglide"])
+@pytest.mark.parametrize("count", [1, 33])
+def test_both_ways_give_the_same_numbers(request, name, count):
+    robot = request.getfixturevalue(name)
+    compiled, where = compiled_robot(robot), points(robot, count)
+    for function in (compiled.closing, compiled.slopes, compiled.sparse_slopes, compiled.inverting):
+        with running(Way.CASADI):
+            expected = function(*where)
+        with running(Way.NUMBA):
+            found = function(*where)
+        for ours, theirs in zip(found, expected, strict=True):
+            assert ours.shape == theirs.shape
+            assert np.array_equal(ours, theirs)
+
+
+@needs_numba
+def test_inputs_of_their_own_are_the_same_as_shared_ones(orthoglide):
+    function, where = compiled_robot(orthoglide).closing, points(orthoglide, 40)
+    own = (*where[:2], np.tile(where[2], (40, 1)))
+    for way in (Way.CASADI, Way.NUMBA):
+        with running(way):
+            for a, b in zip(function(*where), function.unshared(*own), strict=True):
+                assert np.array_equal(a, b)
+
+
+@needs_numba
+def test_every_operation_is_casadis():
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    found = [
+        *(x + y, x - y, x * y, x / y, -x, x**2, 2.0 * x, 1.0 / x, ca.sqrt(ca.fabs(x)), ca.sin(x)),
+        *(ca.cos(x), ca.tan(x), ca.asin(x / 9), ca.acos(x / 9), ca.atan(x), ca.atan2(x, y)),
+        *(x < y, x <= y, x == y, x != y, ca.logic_not(x), ca.logic_and(x, y)),
+        *(ca.logic_or(x, y), ca.if_else(x < y, x, y), ca.SX(3.5), x),
+    ]
+    function = ca.Function("all", [x, y], [ca.densify(ca.vertcat(*found))])
+    assert list_instructions(function) is not None
+    rng = np.random.default_rng(1)
+    values = rng.normal(size=(2, 101, 1))
+    values[1, ::3], values[0, ::5] = values[0, ::3], 0.0
+    values[1, ::10] = 0.0
+    batch = BatchFunction(function)
+    with running(Way.CASADI):
+        (expected,) = batch(*values)
+    with running(Way.NUMBA):
+        (ours,) = batch(*values)
+    assert np.array_equal(ours, expected, equal_nan=True)
+
+
+def test_an_operation_that_is_not_known_is_left_to_casadi():
+    x = ca.SX.sym("x")
+    function = ca.Function("unknown", [x], [ca.erf(x)])
+    assert list_instructions(function) is None
+    with running(Way.NUMBA):
+        (found,) = BatchFunction(function)(np.ones((50, 1)))
+    assert found[0, 0] == float(ca.erf(1.0))
+
+
+def test_numba_is_not_imported_for_little(monkeypatch):
+    monkeypatch.setattr(lanes, "_spent", 0.0)
+    monkeypatch.setattr(lanes, "is_installed", lambda: True)
+    assert not lanes.pays(20_000, 1000)
+    assert lanes.pays(20_000, 30_000)
+    assert not lanes.pays(20_000, 1)
+    monkeypatch.setattr(lanes, "is_installed", lambda: False)
+    assert not lanes.pays(20_000, 10**9)
