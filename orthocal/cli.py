@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,6 +21,7 @@ from orthocal.interrupts import INTERRUPTED, ending_at_interrupt
 from orthocal.streams import ReaderGoneError, guarded_streams
 
 if TYPE_CHECKING:
+    from orthocal.measurement.session import Session
     from orthocal.output.view.scene import Scene
     from orthocal.study.rows import Chunk
 
@@ -110,7 +111,13 @@ def _version(
 
 @app.command()
 def calibrate(
-    session: SessionPath,
+    sessions: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SESSION...",
+            help="session.yaml, or the folder that holds it; several are fitted together.",
+        ),
+    ],
     model: Annotated[
         str | None,
         typer.Option(
@@ -190,7 +197,7 @@ def calibrate(
         ),
     ] = False,
 ) -> None:
-    """Identify the errors of a machine from a session of readings: what to enter, and whether.
+    """Identify the errors of a machine from sessions of readings: what to enter, and whether.
 
     Exit code 3: what was identified is not to be entered, for the reason that is printed; all
     outputs are written all the same.
@@ -199,14 +206,14 @@ def calibrate(
     from orthocal.identification.calibrate import calibrate as run
     from orthocal.identification.choice import Choice
     from orthocal.identification.selection import read_bounds, read_known, read_tolerances
-    from orthocal.measurement.session_file import load_session
+    from orthocal.measurement.joining import join_sessions
     from orthocal.output.printed_json import calibration_json
     from orthocal.output.summary import print_summary
     from orthocal.study.findings.calibration import decide
 
     if out is not None:
         require_writable(out, ("calibration.json", "report.html"))
-    loaded = load_session(session)
+    loaded = join_sessions(_load_each_once(sessions))
     parameters = loaded.robot.parameters
     result = run(
         loaded,
@@ -573,6 +580,26 @@ def simulate(
     comment = "Simulated readings, not measured. The truth behind them is in truth.yaml."
     path = write_session(simulated.session, out, comment=comment, extra=truth)
     _note(f"Wrote {path}, {len(simulated.session.readings)} simulated readings, and truth.yaml")
+
+
+def _load_each_once(paths: Sequence[Path]) -> list[Session]:
+    """Sessions; one that is named twice would count twice.
+
+    Raises:
+        SessionError: If one is the same as another.
+    """
+    from orthocal.measurement.session_file import load_session
+
+    found: list[Session] = []
+    for path in paths:
+        session = load_session(path)
+        if any(session.sha256 == other.sha256 for other in found):
+            raise SessionError(
+                "is the same session as one before it; its readings would count twice",
+                where=str(path),
+            )
+        found.append(session)
+    return found
 
 
 def _globs(texts: list[str] | None) -> list[str]:

@@ -353,3 +353,25 @@ def test_a_pipe_that_closes_early_is_no_error(root, experiment):
     done = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
     assert "Calibration of orthoglide" in done.stdout
     assert done.stderr == ""
+
+
+def test_several_sessions_are_fitted_together(orthocal, root, tmp_path):
+    plan, truth = root / "examples/raw-cycles/plan.yaml", root / "examples/raw-cycles/machine.yaml"
+    for seed, day in enumerate(("monday", "tuesday")):
+        orthocal("simulate", plan, "--errors", truth, "--seed", seed, "--out", tmp_path / day)
+    days = tmp_path / "monday", tmp_path / "tuesday"
+    code, out, _ = orthocal("calibrate", *days, "--details", "--out", tmp_path / "out")
+    assert code == 0
+    assert "108 readings in 14 postures, 12 setups on legs x, y, z" in out
+    lines = out.splitlines()
+    noise = {
+        day: next(line.split() for line in lines if f" {day} " in line)
+        for day in ("monday", "tuesday")
+    }
+    assert [row[1:3] for row in noise.values()] == [["54", "0.010"]] * 2
+    report = (tmp_path / "out/report.html").read_text()
+    assert "Gauges and sensors" in report
+    assert report.count("monday/session.yaml") == 1
+    code, out, err = orthocal("calibrate", days[0], days[1], days[0])
+    assert (code, out) == (2, "")
+    assert "monday: is the same session as one before it; its readings would count twice" in err

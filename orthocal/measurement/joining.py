@@ -41,7 +41,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     parts = [_rename(session, label) for session, label in zip(sessions, labels, strict=True)]
     return replace(
         last,
-        title=" + ".join(s.title for s in sessions if s.title),
+        title=" + ".join(dict.fromkeys(s.title for s in sessions if s.title)),
         source="; ".join(dict.fromkeys(s.source for s in sessions if s.source)),
         gauges=_merged(p.gauges for p in parts),
         postures=_merged(p.postures for p in parts),

@@ -15,6 +15,7 @@ from orthocal.output.explanation import explain_fit
 from orthocal.output.heading import render_origin
 from orthocal.output.layout import bullets, print_rich, section, to_text
 from orthocal.output.report.rich_markup import to_markup
+from orthocal.output.sensors import render_parts
 from orthocal.output.tables import (
     render_fit,
     render_identifiability,
@@ -72,6 +73,7 @@ def render_calibration(
         section("What the readings tell", render_identifiability(calibration, all_rows=all_rows)),
         section("Readings before and after", render_residuals(calibration, all_rows=all_rows)),
         section("How well it fits", render_fit(calibration)),
+        *(section("Gauges and sensors", part) for part in render_parts(calibration)),
         section("At the tool", render_tool(calibration)),
         section("What it means", bullets(explain_fit(calibration))),
         section("What to enter into the controller", render_controller(calibration)),

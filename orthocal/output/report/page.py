@@ -32,6 +32,7 @@ from orthocal.output.report.parameter_plots import (
 from orthocal.output.report.reading_plots import plot_residuals, plot_setups, plot_spread
 from orthocal.output.report.rich_markup import to_markup
 from orthocal.output.report.tool_map import Field, plot_tool_map
+from orthocal.output.sensors import render_parts
 from orthocal.output.tables import (
     render_fit,
     render_identifiability,
@@ -94,6 +95,7 @@ def build_report(calibration: Calibration) -> str:
         ("fit", "Does the model fit?", _fit(calibration)),
         ("residuals", "Readings before and after, the worst first", _residuals(calibration)),
         ("parameters", "What was identified", _parameters(calibration)),
+        *([("sensors", "Gauges and sensors", own)] if (own := _sensors(calibration)) else []),
         ("correlations", "What hangs together", _correlations(calibration)),
         ("identifiability", "What the readings can tell", _identifiability(calibration)),
         ("words", "What the words mean", items(GLOSSARY)),
@@ -222,6 +224,10 @@ def _parameters(calibration: Calibration) -> str:
     )
 
 
+def _sensors(calibration: Calibration) -> str:
+    return "".join(to_markup(part) for part in render_parts(calibration))
+
+
 def _correlations(calibration: Calibration) -> str:
     figure = plot_correlations(calibration)
     if not figure:
@@ -256,10 +262,16 @@ def _provenance(calibration: Calibration) -> str:
     rows: list[tuple[str, str]] = [
         ("Robot", f"{robot.name} ({robot.reference})"),
         ("its files, SHA-256", robot.sha256),
-        ("Session", session.title),
-        ("Source", session.source or "not stated"),
-        ("File", session.path or "none"),
-        ("its files, SHA-256", session.sha256 or "none"),
+        *(
+            row
+            for part in session.parts or (session,)
+            for row in (
+                ("Session", part.title),
+                ("Source", part.source or "not stated"),
+                ("File", part.path or "none"),
+                ("its files, SHA-256", part.sha256 or "none"),
+            )
+        ),
         ("Gauge", "σ not stated" if sigma is None else f"σ {plain(sigma * 1e3)} mm a reading"),
         ("Offsets active while measuring", active),
         (
