@@ -10,13 +10,13 @@ import pytest
 
 # as the command line does it: threads of small matrices get in each other's way
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# nothing that tests keep outlives them
-os.environ["ORTHOCAL_CACHE"] = tempfile.mkdtemp(prefix="orthocal-tests-")
-atexit.register(shutil.rmtree, os.environ["ORTHOCAL_CACHE"], ignore_errors=True)
-
 from orthocal import load_robot, load_session
 from orthocal.measurement.session import Session
 from orthocal.robot.model import Robot
+
+# nothing that tests keep outlives them
+os.environ["ORTHOCAL_CACHE"] = tempfile.mkdtemp(prefix="orthocal-tests-")
+atexit.register(shutil.rmtree, os.environ["ORTHOCAL_CACHE"], ignore_errors=True)
 
 ROOT = Path(__file__).parents[1]
 

@@ -108,16 +108,23 @@ class Loss:
             return np.asarray(total, dtype=np.float64)
 
         result = sums(values) / sums(np.ones_like(values))
+        low, high = np.full(count, np.inf), np.full(count, -np.inf)
+        np.minimum.at(low, group, values)
+        np.maximum.at(high, group, values)
         steepest = np.full(count, np.inf)
         for _ in range(MOST_STEPS if self.robust else 0):
             residual = values - result[group]
             pull = sums(self.influence(residual))
-            # by ρ'' as long as that brings it nearer; else by the secant, which always does
+            low, high = np.where(pull > 0.0, result, low), np.where(pull < 0.0, result, high)
+            # by ρ'' as long as that brings it nearer; else half of where it can be
             nearer = np.abs(pull) < 0.5 * steepest
-            bend = np.where(nearer, sums(self.bend(residual)), sums(self.weight(residual)))
-            steepest = np.where(nearer, np.abs(pull), np.inf)
-            result += pull / bend
-            if np.abs(pull / bend).max(initial=0.0) < SETTLED:
+            steepest = np.abs(pull)
+            newton = result + pull / np.maximum(sums(self.bend(residual)), 1e-300)
+            inside = nearer & (newton >= low) & (newton <= high)
+            found = np.where(inside, newton, 0.5 * (low + high))
+            found = np.where(pull == 0.0, result, found)
+            step, result = np.abs(found - result).max(initial=0.0), found
+            if step < SETTLED:
                 break
         return result
 

@@ -145,7 +145,8 @@ def _keep_apart(table: NDArray[np.int32]) -> int:
             last[values[k, column]] = k
         if makes[k]:
             holder[int(table[k, 1])] = k
-    place, free, n_places = np.full(count, -1), [], 0
+    place, n_places = np.full(count, -1), 0
+    free: list[int] = []
     for k in range(count):
         operands = {int(values[k, column]) for column in takes[k]}
         for column in takes[k]:

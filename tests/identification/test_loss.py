@@ -76,3 +76,15 @@ def test_nonsense_is_refused():
         Loss("cubes")
     with pytest.raises(OrthocalError, match="expected more than 0"):
         Loss("huber", width=0.0)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_centres_are_found_among_values_that_are_far_out(seed):
+    """A hundred standard deviations apart: steps by the curvature alone go to and fro there."""
+    rng = np.random.default_rng(seed)
+    values = rng.choice([1.0, 30.0, 1000.0], size=60) * rng.normal(size=60)
+    group, loss = np.arange(60) % 6, Loss("huber")
+    weights = rng.uniform(0.5, 2.0, size=60)
+    found = loss.centres(values, group, 6, weights=weights)
+    pull = np.bincount(group, weights * loss.influence(values - found[group]))
+    assert np.abs(pull).max() < 1e-9

@@ -29,7 +29,10 @@ def points(robot, count):
 def test_both_ways_give_the_same_numbers(request, name, count):
     robot = request.getfixturevalue(name)
     compiled, where = compiled_robot(robot), points(robot, count)
-    for function in (compiled.closing, compiled.slopes, compiled.sparse_slopes, compiled.inverting):
+    functions = [compiled.closing, compiled.slopes, compiled.sparse_slopes]
+    if robot.tcp is not None:
+        functions += [compiled.inverting, compiled.tool]
+    for function in functions:
         with running(Way.CASADI):
             expected = function(*where)
         with running(Way.NUMBA):

@@ -180,7 +180,9 @@ class _Found:
     def part(self, part: slice) -> _Found:
         """Views of some sets."""
         return _Found(
-            *(v[part] for v in (self.theta, self.zeros, self.objective)),
+            self.theta[part],
+            self.zeros[part],
+            self.objective[part],
             self.at_bound[part],
             self.alone[part],
         )

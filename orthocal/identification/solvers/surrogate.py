@@ -89,7 +89,7 @@ def find_surrogate(problem: CalibrationProblem, centre: Array, half: Array) -> S
         if found is None:
             return None
         terms = _products(_chebyshev(points, degree)[0], powers)
-        coefficients = np.linalg.lstsq(terms, found, rcond=None)[0]
+        coefficients = np.asarray(np.linalg.lstsq(terms, found, rcond=None)[0], dtype=np.float64)
         result = Surrogate(centre, half, powers, coefficients)
         if np.abs(result(centre + half * checked)[0] - expected).max() < EXACT:
             return result

