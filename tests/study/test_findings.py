@@ -193,6 +193,28 @@ def test_where_readings_stand_out_they_are_to_be_looked_at_before_a_setup(root):
     ]
 
 
+def test_slips_are_not_held_against_the_machine(root):
+    """Seven wrong readings leave more than its tolerances would: they are the reason, not it."""
+    session = load_session(root / "examples/lines")
+    values = session.values.copy()
+    values[[4, 50, 100, 150, 200, 220, 250]] += 0.5e-3
+    found = decide(calibrate(session.with_values(values)))
+    (beyond,) = found.of_kind("tolerances exceeded")
+    assert beyond.severity == "informs"
+    assert "this machine seems" not in beyond.text
+    assert "readings that all others contradict may be why" in beyond.text
+
+
+def test_a_turned_setup_is_the_only_reason_not_to_enter(root):
+    """What it leaves is its own doing: no other sign, row or machine is accused beside it."""
+    session = load_session(root / "examples/lines")
+    found = decide(calibrate(turned(session, "yx")))
+    assert [f.kind for f in found.findings if f.severity == "stops"] == ["turned setup"]
+    (beyond,) = found.of_kind("tolerances exceeded")
+    assert beyond.numbers["times_tolerances"] > 100.0
+    assert "machine is as much worse" not in beyond.text
+
+
 def test_when_most_are_contradicted_no_reading_is_accused(table1):
     found = decide(calibrate(table1[2], model="full"))
     assert not found.of_kind("suspicious reading")
