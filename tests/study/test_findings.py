@@ -72,7 +72,8 @@ def spoilt(cycles, table1):
     three = replace(table1[2], readings=table1[2].readings[1:4])
     huge = {"x_max": 2e-3, "x_min": -1e-3}
     leg = [r.value + huge.get(r.posture, 0.0) * (r.setup == "zx") for r in cycles.readings]
-    still = {"x_slide.offset": (0.0, 1e-12)}
+    exact = simulate_session(load_plan(cycles.path.with_name("plan.yaml")), {}, exact=True).session
+    still = replace(exact, gauge=replace(exact.gauge, resolution=None))
     return {
         "sound": (calibrate(cycles), "enter", "fits"),
         "model error": (calibrate(table1[2]), "enter", "model error"),
@@ -99,16 +100,21 @@ def spoilt(cycles, table1):
         ),
         "entered": (calibrate(table1[3]), "nothing to enter", "nothing worth changing"),
         "still": (
-            calibrate(cycles, free=["x_slide.offset"], bounds=still),
+            calibrate(still),
             "nothing to enter",
             "nothing moved",
+        ),
+        "bound": (
+            calibrate(cycles, bounds={"x_slide.offset": (-1e-3, 0.5e-3)}),
+            "check before entering",
+            "held by a bound",
         ),
     }
 
 
 CASES = [
     *("sound", "model error", "one cycle", "full", "turned", "one leg", "one reading", "inches"),
-    *("three readings", "no word", "no offset", "entered", "still"),
+    *("three readings", "no word", "no offset", "entered", "still", "bound"),
 ]
 
 
