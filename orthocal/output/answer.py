@@ -24,6 +24,9 @@ MOST_FURTHER = 4
 LONGEST_PATH = 60
 """Characters of a file's path that are shown where it has a line of its own."""
 
+LONGEST_LABEL = 24
+"""Characters of a setup and a posture that leave a suspicious reading on one line."""
+
 FURTHER: tuple[Kind, ...] = (
     "suspicious setup",
     "many contradicted",
@@ -143,7 +146,7 @@ def _suspicion(finding: Finding) -> str:
     n, place = finding.numbers, finding.places[0]
     line = "" if place.line is None else f"line {place.line}: "
     cycle = f", cycle {n['cycle']:.0f}" if n["cycle"] > 1 else ""
-    label = short_name(f"{place.setup} {place.posture}")
+    label = short_name(f"{place.setup} {place.posture}", LONGEST_LABEL)
     return (
         f"{line}{label}{cycle}: read {signed(n['measured_mm'])} mm, expected "
         f"{signed(n['expected_mm'])} mm"
