@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal import load_plan, simulate_session
+from orthocal.identification.options import SolverKind, SolverOptions
 from orthocal.identification.problem import build_problem
-from orthocal.identification.solvers.ipopt import NonlinearProgram
-from orthocal.identification.solvers.program import Solution
+from orthocal.identification.solvers.choice import build_program
+from orthocal.identification.solvers.program import Program, Solution
 from orthocal.measurement.session import Session
 from orthocal.measurement.synthetic import draw_errors
 
-sys.path.append(str(Path(__file__).parents[1] / "study"))
+sys.path.append(str(Path(__file__).parents[1]))
 
 import plans
 
@@ -77,7 +78,7 @@ class Timing:
 class Identification:
     """A program, its first two solutions and what they took."""
 
-    program: NonlinearProgram
+    program: Program
     first: Solution
     again: Solution
     timing: Timing
@@ -132,17 +133,18 @@ def resimulate(session: Session, *, seed: int) -> Session:
     return simulate_session(session, errors, seed=seed, sigma=SIGMA).session
 
 
-def identify(session: Session, other: Session) -> Identification:
+def identify(session: Session, other: Session, *, solver: SolverKind = "ipopt") -> Identification:
     """Build a program for a session, solve it, and solve it again for other readings.
 
     Args:
         session: The session.
         other: The same readings of another machine.
+        solver: Which one.
     """
     before = peak_memory()
     began = time.perf_counter()
     problem = build_problem(session, model=MODEL)
-    program = NonlinearProgram(problem)
+    program = build_program(problem, SolverOptions(solver=solver))
     built = time.perf_counter()
     first = program.solve(sigma=SIGMA)
     solved = time.perf_counter()
@@ -165,20 +167,21 @@ def identify(session: Session, other: Session) -> Identification:
     return Identification(program, first, again, timing)
 
 
-def measure(n_postures: int) -> Timing:
+def measure(n_postures: int, solver: SolverKind = "ipopt") -> Timing:
     """Time one identification.
 
     Args:
         n_postures: As for `simulate`.
+        solver: Which one.
     """
     session = simulate(n_postures)
-    return identify(session, resimulate(session, seed=2)).timing
+    return identify(session, resimulate(session, seed=2), solver=solver).timing
 
 
-def measure_apart(n_postures: int) -> Timing:
+def measure_apart(n_postures: int, solver: SolverKind = "ipopt") -> Timing:
     """Time one identification in a fresh process, whose peak of memory is its own."""
     with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(measure, n_postures).result()
+        return pool.submit(measure, n_postures, solver).result()
 
 
 def peak_memory() -> float:

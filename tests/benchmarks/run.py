@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from typing import get_args
 
 # as the command line does it, for the peer too: threads of small matrices get in each other's way
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -17,6 +18,8 @@ from peer import PeerProblem
 from rich import box
 from rich.console import Console
 from rich.table import Table
+
+from orthocal.identification.options import SolverKind
 
 SIZES = (SWEEP, 303, 1203)
 LARGE_SIZES = (3003, 10005)
@@ -86,7 +89,10 @@ def main() -> None:
     """Measure, and print the table."""
     parser = argparse.ArgumentParser(description="What identification takes.")
     parser.add_argument("--large", action="store_true", help="up to 100 050 readings as well")
-    sizes = SIZES + (LARGE_SIZES if parser.parse_args().large else ())
+    kinds = get_args(SolverKind)
+    parser.add_argument("--solver", choices=kinds, default="eliminated", help="which one")
+    arguments = parser.parse_args()
+    sizes = SIZES + (LARGE_SIZES if arguments.large else ())
     table = Table(box=box.SIMPLE, padding=(0, 0, 0, 1))
     for name in COLUMNS:
         table.add_column(name, justify="right", no_wrap=True)
@@ -95,7 +101,7 @@ def main() -> None:
         for n in sizes:
             status.update(f"measuring {n} postures")
             peer = time_peer(n) if n in PEER_SIZES else None
-            table.add_row(*format_row(measure_apart(n), peer))
+            table.add_row(*format_row(measure_apart(n, arguments.solver), peer))
     console.print(table, LEGEND)
 
 
