@@ -1,4 +1,4 @@
-"""Imports go one way, nothing prints outside cli.py and output/, and start-up stays lazy."""
+"""Imports go one way, nothing prints outside cli/ and output/, and start-up stays lazy."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import sys
 import numpy as np
 import pytest
 
-from orthocal import cli, load_calibration, load_session
+from orthocal import __version__, cli, load_calibration, load_session
 
 
 def run(monkeypatch, capsys, *words):
@@ -340,7 +340,7 @@ def test_a_bug_is_said_to_be_one(orthocal, experiment, monkeypatch):
 
 
 def test_version_and_help(orthocal):
-    assert orthocal("--version")[1].strip() == cli.orthocal.__version__
+    assert orthocal("--version")[1].strip() == __version__
     commands = ("calibrate", "compare", "accuracy", "validate", "forward", "inverse", "simulate")
     for command in commands:
         code, out, _ = orthocal(command, "--help")

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError, NotIdentifiableError, RobotError, SolverError
-from orthocal.identification.calibrate import assemble_calibration
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.fit import Fit, fit_problem, require_determined
 from orthocal.identification.linear import Linearisation
 from orthocal.identification.options import SolverOptions
 from orthocal.identification.problem import CalibrationProblem
+from orthocal.identification.recording import assemble_calibration
 from orthocal.identification.uncertainty import decompose, project_out_zeros
 from orthocal.identification.weighting import SMALLEST_SIGMA
 from orthocal.study.accuracy import ErrorSize, ToolAccuracy, assess_tool

@@ -17,9 +17,10 @@ from scipy import special
 
 from orthocal.arguments import require_kind
 from orthocal.errors import SessionError
-from orthocal.identification.calibrate import assemble_calibration, repeat_fit
+from orthocal.identification.calibrate import repeat_fit
 from orthocal.identification.calibration import Calibration
 from orthocal.identification.fit import Fit
+from orthocal.identification.recording import assemble_calibration
 from orthocal.identification.records import ControllerEntry, ResidualRow
 from orthocal.identification.uncertainty import (
     BY_CHANCE,

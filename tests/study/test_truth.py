@@ -7,9 +7,9 @@ import pytest
 from machines import place, reading_by_pinocchio
 
 from orthocal import Choice, calibrate, draw_errors, load_plan, load_session
-from orthocal.identification.calibrate import assemble_calibration
 from orthocal.identification.fit import fit_problem
 from orthocal.identification.problem import build_problem
+from orthocal.identification.recording import assemble_calibration
 from orthocal.identification.solvers.ipopt import NonlinearProgram
 from orthocal.identification.uncertainty import confidence_factor, decompose
 from orthocal.kinematics.assembly import Assembly

@@ -1,0 +1,66 @@
+"""The program, and what several of its commands take and do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from orthocal.errors import SessionError
+
+if TYPE_CHECKING:
+    from orthocal.measurement.session import Session
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="Calibrate Orthoglide-type parallel robots from dial-indicator readings.",
+)
+
+SessionPath = Annotated[
+    Path, typer.Argument(metavar="SESSION", help="session.yaml, or the folder that holds it.")
+]
+CalibrationPath = Annotated[
+    Path,
+    typer.Argument(metavar="CALIBRATION", help="calibration.json, or the folder that holds it."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+Tolerances = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="GLOB=VALUE",
+        help="Another tolerance than the robot's, such as '*.offset_mm=2'.",
+    ),
+]
+AllRows = Annotated[
+    bool, typer.Option("--all", help="List every reading, parameter and group, however many.")
+]
+
+
+def load_each_once(paths: Sequence[Path]) -> list[Session]:
+    """Sessions; one that is named twice would count twice.
+
+    Raises:
+        SessionError: If one is the same as another.
+    """
+    from orthocal.measurement.session_file import load_session
+
+    found: list[Session] = []
+    for path in paths:
+        session = load_session(path)
+        if any(session.sha256 == other.sha256 for other in found):
+            raise SessionError(
+                "is the same session as one before it; its readings would count twice",
+                where=str(path),
+            )
+        found.append(session)
+    return found
+
+
+def split_globs(texts: list[str] | None) -> list[str]:
+    """Globs of repeated options, each with commas between."""
+    return [glob.strip() for text in texts or [] for glob in text.split(",") if glob.strip()]

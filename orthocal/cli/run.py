@@ -1,0 +1,76 @@
+"""Running a command, and turning errors into exit codes."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated
+
+import typer
+
+import orthocal
+from orthocal.characters import printable
+
+# what registers the commands, in the order in which help lists them
+from orthocal.cli import calibrating, looking, trying, using  # noqa: F401
+from orthocal.cli.options import app
+from orthocal.cli.printing import put_note, put_out
+from orthocal.errors import OrthocalError
+from orthocal.interrupts import INTERRUPTED, ending_at_interrupt
+from orthocal.streams import ReaderGoneError, guarded_streams
+
+
+def main() -> None:
+    """Run the command line; no traceback ever reaches a user.
+
+    Exit codes: 0 done, 1 a solve did not converge or an output cannot be written, 2 bad input,
+    3 some rows of a table cannot be reached, or what was found is not to be entered, or is not
+    confirmed, 70 a bug of ours, 130 Ctrl-C; `compare` has more.
+    """
+    # small matrices only: more threads would but get in each other's way
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    with guarded_streams(), ending_at_interrupt():
+        code = _run()
+    sys.exit(code)
+
+
+def _run() -> int | str | None:
+    """Run the command; its exit code."""
+    code: int | str | None = 0
+    try:
+        try:
+            app()
+        except SystemExit as e:
+            code = e.code
+        sys.stdout.flush()
+    except ReaderGoneError:
+        pass
+    except OrthocalError as e:
+        put_note(f"orthocal: {e}")
+        code = e.exit_code
+    except KeyboardInterrupt:
+        code = INTERRUPTED
+    except MemoryError:
+        put_note("orthocal: there is not enough memory for an input of this size")
+        code = 1
+    except Exception as e:
+        if os.environ.get("ORTHOCAL_DEBUG"):
+            raise
+        put_note(
+            "orthocal: this is a bug of orthocal, not of your input: "
+            f"{printable(f'{type(e).__name__}: {e}')}\n"
+            "Set ORTHOCAL_DEBUG=1 to see where, and report it."
+        )
+        code = 70
+    return code
+
+
+@app.callback(invoke_without_command=True)
+def _version(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", is_eager=True)
+    ] = False,
+) -> None:
+    if version:
+        put_out(orthocal.__version__)
+        raise typer.Exit
