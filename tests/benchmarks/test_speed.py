@@ -35,8 +35,8 @@ PEER_OBJECTIVE = 1e-6
 0.0015 of its standard deviation away from the optimum costs as much."""
 
 FASTER = {"ipopt": 5.0, "eliminated": 15.0}
-"""Building included. 16 to 28 and 66 to 81 were measured on a busy machine: building does not depend on the
-session, and one solution of the smallest session is where it pays least."""
+"""Building included. 16 to 28 and 66 to 81 were measured on a busy machine: building does not
+depend on the session, and one solution of the smallest session is where it pays least."""
 
 FASTER_AGAIN = {"ipopt": 15.0, "eliminated": 30.0}
 """Once the program is built. 40 to 82 and 101 to 116 were measured."""
