@@ -35,22 +35,22 @@ PEER_OBJECTIVE = 1e-6
 0.0015 of its standard deviation away from the optimum costs as much."""
 
 FASTER = {"ipopt": 5.0, "eliminated": 15.0}
-"""Building included. 28 and 81 were measured on a busy machine: building does not depend on the
-session, and one solution of the smallest session is where it pays least."""
+"""Building included. 16 to 28 and 66 to 81 were measured on a busy machine: building does not
+depend on the session, and one solution of the smallest session is where it pays least."""
 
 FASTER_AGAIN = {"ipopt": 15.0, "eliminated": 30.0}
-"""Once the program is built. 82 and 116 were measured."""
+"""Once the program is built. 40 to 82 and 101 to 116 were measured."""
 
 BESIDE_IPOPT = 1.5
 """Building and solving by Ipopt over that by the eliminated solver, in the largest session. 2.6
-were measured for 3,030 readings without numba, 7.6 with it."""
+to 5 were measured for 3,030 readings."""
 
 LANES = 1.5
-"""Closing slopes of many postures by CasADi's machine over the same by numba. 4 to 6 were
-measured."""
+"""Closing slopes of many postures by CasADi's machine over the same by numba. 2.8 to
+6 were measured."""
 
 AT_ONCE = 100.0
-"""Calibrations of three offsets a second, all at once over one by one. 700 were measured."""
+"""Calibrations of three offsets a second, all at once over one by one. 440 to 700 were measured."""
 
 SHARE_AGAIN = 0.3
 """Of building and solving, for solving again. 0.13 to 0.15 were measured; building all of it again
