@@ -5,12 +5,14 @@ the three is. CasADi differentiates the whole; what orthocal finds without the c
 well stands beside it.
 """
 
+from pathlib import Path
+
 import casadi as ca
 import numpy as np
 
 import orthocal
 
-session = orthocal.load_session("examples/raw-cycles")
+session = orthocal.load_session(Path(__file__).parent / "raw-cycles")
 choice = orthocal.Choice("lengths")
 problem = orthocal.CalibrationProblem(session, choice.select(session.robot.parameters))
 program = orthocal.NonlinearProgram(problem)

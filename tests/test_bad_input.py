@@ -172,7 +172,7 @@ RANGE = "range_mm: [-5, 5]"
 SIGMA = "sigma_mm: 0.02"
 TITLE = "title: Experiment 2, after mechanical tuning, before calibration"
 FORMS = "coordinate_mm, from_root_mm, fraction"
-SESSION_KEYS = "robot, title, source, gauge, postures, controller, setups, cycles, readings"
+SESSION_KEYS = "robot, title, source, gauge, gauges, postures, controller, setups, cycles, readings"
 SETUPS = "xy, xz, yx, yz, zx, zy"
 POSTURES = "x_max, x_min, y_max, y_min, z_max, z_min"
 DRIVES = "x_slide, y_slide, z_slide"
@@ -636,8 +636,8 @@ OPTION_CASES = [
     option(
         "known-without-unit",
         "--known x_leg.length=1",
-        "--known: 'x_leg.length' carries no unit; expected one of the suffixes _mm, _um, _mrad, "
-        "_deg, _ppm",
+        "--known: 'x_leg.length' carries no unit; expected one of the suffixes _mm, _um, _m, _mrad, "
+        "_deg, _rad, _ppm",
     ),
     option(
         "known-half-a-tolerance",
@@ -899,7 +899,7 @@ ROWS = "x_parallelogram: {rows: [x, z]}"
 SUM = "[x_coupler.x, frame.x_rod_b_tip.x]"
 ZERO = "x_slide: {zero_mm: 310.25}"
 LEG = "x: {root: x_leg_root, tip: x_leg_tip}"
-SUFFIXES = "_mm, _um, _mrad, _deg, _ppm"
+SUFFIXES = "_mm, _um, _m, _mrad, _deg, _rad, _ppm"
 MOVING = ", ".join(
     f"{leg}_{joint}"
     for leg in "xyz"
@@ -1629,7 +1629,7 @@ SIMULATE_CASES = [
     simulate(
         "errors-file-key-unknown",
         " --errors {tmp}/errors.yaml",
-        "{tmp}/errors.yaml: offsets: unknown key; known keys: errors, zeros_mm",
+        "{tmp}/errors.yaml: offsets: unknown key; known keys: errors, zeros_mm, sensors",
         write("errors.yaml", "offsets: {x_slide.offset_mm: 1}\n"),
     ),
     simulate(
@@ -1752,7 +1752,7 @@ VIEW_CASES = [
             (
                 "setups.1.reads.leg",
                 "setups[1].reads.leg",
-                "'w' is not a leg of orthoglide; legs: x, y, z",
+                "'w' is not a leg of machine; legs: x, y, z",
             ),
             (
                 "setups.0.reads.direction",

@@ -188,7 +188,7 @@ def pack(self, **kwargs):
 nlp.NonlinearProgram.pack = pack
 signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
 try:
-    calibrate(session, model="full")
+    calibrate(session, "full")
 except KeyboardInterrupt:
     print("raised")
 """

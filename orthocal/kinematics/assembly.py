@@ -99,10 +99,13 @@ class _System:
     """Metres that one unit of each row amounts to, by which it was multiplied, shape (n_rows,)."""
     turns: NDArray[np.bool_]
     """Which rows are rotations, shape (n_rows,)."""
+    shortest: bool = False
+    """Whether steps are the shortest that close it: where motions may be free, what a solve makes
+    of a matrix that is singular but for its rounding is no step."""
 
     def step(self, residuals: Array, jacobians: Array) -> Array:
         """Newton steps, shape (K, n_x); least squares where rows depend on each other."""
-        if self.n_rows == self.n_x:
+        if self.n_rows == self.n_x and not self.shortest:
             try:
                 steps = np.asarray(np.linalg.solve(jacobians, -residuals[..., None])[..., 0])
             except np.linalg.LinAlgError:
@@ -208,7 +211,8 @@ class Assembly:
         *,
         allow_free: bool,
     ) -> Array:
-        passive = self._solve(self._closing, drives, machine, start, names, failures)
+        system = replace(self._closing, shortest=allow_free)
+        passive = self._solve(system, drives, machine, start, names, failures)
         if not allow_free:
             self._refuse_singular(drives, passive, machine, names, failures)
         return passive

@@ -107,11 +107,9 @@ class SessionKeys(_Keys):
     robot: str
     title: str = ""
     source: str = ""
-    gauge: GaugeKeys | None = None
+    gauge: GaugeKeys = None  # type: ignore[assignment] # absent; what is given has keys
     """Of a session with one gauge."""
-    gauges: Annotated[dict[Name, GaugeKeys], Field(min_length=1, max_length=MOST_GAUGES)] | None = (
-        None
-    )
+    gauges: Annotated[dict[Name, GaugeKeys], Field(min_length=1, max_length=MOST_GAUGES)] = None  # type: ignore[assignment] # likewise
     """Of a session with several; its setups name theirs."""
     postures: Annotated[dict[Name, PostureKeys], Field(min_length=1, max_length=MOST_POSTURES)]
     controller: ControllerKeys | None = None

@@ -20,6 +20,7 @@ from orthocal.study.accuracy import assess_tool, measure_uncertainty
 
 SIGMA = 5e-6
 OFFSETS = {"*.offset_mm": 2.0}
+IN_SI = {"*.offset": 2e-3}
 MACHINES = {"sweep": 100, "lines": 40}
 """What the sweep leaves open is a handful of directions: the error of 20 machines scatters by 13 %,
 that of 100 by 6 %. Of 200 machines it is 1.03 and 0.98 of what is predicted."""
@@ -34,7 +35,7 @@ class Machines:
 
     def __init__(self, root, name):
         self.plan = load_plan(root / f"examples/{name}/plan.yaml")
-        self.problem = build_problem(self.plan, model="full", tolerances=OFFSETS)
+        self.problem = build_problem(self.plan, model="full", tolerances=IN_SI)
         self.program = NonlinearProgram(self.problem)
         self.workspace = cube(self.plan.robot, points_a_side=5)
         assembly = Assembly(self.plan.robot)
@@ -96,7 +97,7 @@ def test_perfect_readings_give_the_tool_where_they_determine_it(machines):
     truth = m.draw(7)
     plan = m.plan.with_gauge(Gauge(None, None, None))  # nothing is rounded
     session = plan.with_values(problem.observations.rows(problem.predict(truth)))
-    fit = fit_problem(build_problem(session, model="full", tolerances=OFFSETS))
+    fit = fit_problem(build_problem(session, model="full", tolerances=IN_SI))
     accuracy = assess_tool(assemble_calibration(fit), m.workspace)
     error = m.tool(fit.solution.theta) - m.tool(truth)
     error -= m.workspace.weights @ error

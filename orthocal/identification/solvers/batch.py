@@ -72,8 +72,8 @@ class BatchProgram:
         """Solve for each set of readings.
 
         Args:
-            values: Readings as single ones, shape (n_sets, n_entries), or rows of the session,
-                shape (n_sets, n_rows), where these are differences, [m].
+            values: Readings as single ones, shape (n_sets, n_entries), [m of the first gauge], or
+                rows of the session, shape (n_sets, n_rows), where these are differences, [m].
             sigma: Standard deviation of one reading, [m].
 
         Raises:
@@ -102,7 +102,7 @@ class BatchProgram:
         if given.ndim == 2 and given.shape[1] == o.size:
             return given
         if given.ndim == 2 and given.shape[1] == o.plus.size:
-            return np.array([o.values(rows) for rows in given])
+            return np.array([o.values(rows) for rows in given]) / self.problem.noise
         raise ValueError(f"found the shape {given.shape}; expected (n_sets, {o.size})")
 
     def _few(self, start: Array) -> bool:

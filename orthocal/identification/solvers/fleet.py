@@ -32,7 +32,9 @@ class Fleet:
         self.theta = np.array(theta)
         self.passive = np.tile(problem.reference_passive, (len(theta), 1, 1))
         errors = compiled.errors
-        at = problem.assembly.errors() + self.theta @ problem.columns.T
+        n = problem.n_machine
+        at = problem.assembly.errors() + self.theta[:, :n] @ problem.columns.T
+        self._unknowns = self.theta[:, n:] * problem.theta_scale[n:]
         self._placements = errors.placements(at)
         self._offsets, self._gains = errors.offsets(at), errors.gains(at)
 
@@ -65,7 +67,7 @@ class Fleet:
         return done & np.isfinite(self.passive).all(axis=(1, 2))
 
     def predict(self) -> Array:
-        """Readings of all, gauge zeros at 0, shape (n_sets, n_entries), [m]."""
+        """Readings of all, gauge zeros at 0, shape (n_sets, n_entries), [m of the first gauge]."""
         problem, o = self._problem, self._problem.observations
         result = np.empty((self.size, o.size))
         zero = self._actuated(problem.session.zero_drives)
@@ -77,12 +79,12 @@ class Fleet:
                 actuated[:, at].reshape(self.size * n, -1),
                 self.passive[:, at].reshape(self.size * n, -1),
                 np.repeat(self._placements, n, axis=0),
-                np.repeat(zero, n, axis=0),
+                zero[:, group.setups].reshape(self.size * n, -1),
                 np.tile(group.constants, (self.size, 1)),
-                np.zeros((self.size * n, 0)),
+                self._unknowns[:, group.unknowns].reshape(self.size * n, -1),
             )
             result[:, group.entries] = h[:, 0].reshape(self.size, n)
-        return result
+        return np.asarray(result / problem.noise)
 
     def _actuated(self, commanded: Array) -> Array:
         """Where drives are: (n_sets, ..., n_drives) of (..., n_drives) commanded, [m, rad]."""

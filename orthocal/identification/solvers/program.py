@@ -66,7 +66,8 @@ class Program(Protocol):
 
         Args:
             sigma: Standard deviation of one reading, [m].
-            values: Readings as single ones, shape (n_entries,), [m]; the session's by default.
+            values: Readings as single ones, shape (n_entries,), [m of the first gauge]; the
+                session's by default.
             start: Free parameters to start from, shape (n_free,), [SI]; by default what the
                 controller already corrects.
             start_passive: Passive coordinates to start closing the loops from.
