@@ -636,8 +636,8 @@ OPTION_CASES = [
     option(
         "known-without-unit",
         "--known x_leg.length=1",
-        "--known: 'x_leg.length' carries no unit; expected one of the suffixes _mm, _um, _m, _mrad, "
-        "_deg, _rad, _ppm",
+        "--known: 'x_leg.length' carries no unit; expected one of the suffixes _mm, _um, _m, "
+        "_mrad, _deg, _rad, _ppm",
     ),
     option(
         "known-half-a-tolerance",
