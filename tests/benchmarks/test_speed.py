@@ -53,9 +53,8 @@ AT_ONCE = 100.0
 """Calibrations of three offsets a second, all at once over one by one. 440 to 700 were measured."""
 
 SHARE_AGAIN = 0.6
-"""Of building and solving, for solving again. 0.35 was measured by Ipopt, since functions are compiled
-once a robot (0.13 to 0.15 before, when building took longer); building all of it again would bring it
-to 1."""
+"""Of building and solving, for solving again. 0.35 was measured by Ipopt since functions are
+compiled once a robot, 0.13 to 0.15 before; building all of it again would bring it to 1."""
 
 GROWTH = 1.6
 """Seconds and bytes that one more posture takes, in the largest session over the smallest. 0.8 to
