@@ -223,7 +223,7 @@ def test_the_smallest_numbers_that_a_session_takes_are_read_again(root, tmp_path
 
 
 def test_a_result_that_makes_no_sense_is_refused_before_it_is_written(raw_cycles, monkeypatch):
-    module = sys.modules["orthocal.identification.calibrate"]
+    module = sys.modules["orthocal.identification.recording"]
     original = module._estimates
 
     def absurd(*args, **kwargs):
