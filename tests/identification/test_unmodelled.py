@@ -7,7 +7,7 @@ import pytest
 from fleets import Fleet
 
 from orthocal import calibrate, load_plan, simulate_session
-from orthocal.identification import calibrate as calibrate_module
+from orthocal.identification import recording
 from orthocal.identification.fit import fit_problem
 from orthocal.identification.problem import build_problem
 from orthocal.identification.solvers.ipopt import NonlinearProgram
@@ -113,7 +113,7 @@ def test_intervals_hold_what_they_say_with_all_errors_at_their_tolerances(
     """200 sessions: what scatter alone would promise is missed by far, all together is not."""
     fleet = Fleet(plan, model=model)
     # they hardly change from machine to machine, and take longest to find
-    monkeypatch.setattr(calibrate_module, "find_other_errors", lambda *_, **__: fleet.others)
+    monkeypatch.setattr(recording, "find_other_errors", lambda *_, **__: fleet.others)
     known = fleet.machine.free
     free = [known.index(n) if n in known else -1 for n in fleet.problem.free]
     hits, scatter_hits, count = 0, 0, 0
@@ -121,7 +121,7 @@ def test_intervals_hold_what_they_say_with_all_errors_at_their_tolerances(
         rng = np.random.default_rng(seed)
         errors = fleet.draw(rng)
         fit = fleet.fit(fleet.read(rng, errors))
-        result = calibrate_module.assemble_calibration(fit)
+        result = recording.assemble_calibration(fit)
         for p, (low, high), at in zip(result.free, result.intervals, free, strict=True):
             if at >= 0:
                 hits += low <= errors[at] <= high
