@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from orthocal import calibrate, draw_scene, load_session
-from orthocal.output.report.page import build_report
-from orthocal.output.view.browser import take_picture
+from orthocal.show.report.page import build_report
+from orthocal.viewer.browser import take_picture
 
 ROOT = Path(__file__).parents[1]
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 import orthocal
+from orthocal.assess.accuracy import assess_tool, find_remaining_errors
 from orthocal.kinematics.assembly import Assembly
 from orthocal.kinematics.workspace import cube
 from orthocal.measurement.synthetic import load_errors
-from orthocal.study.accuracy import assess_tool, find_remaining_errors
 
 EXAMPLES = Path(__file__).parent
 TOLERANCES = {"*.offset_mm": 2.0}  # the workshop's word for its offsets, one sigma

@@ -13,31 +13,31 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Calibration": "orthocal.identification.calibration",
-    "CalibrationProblem": "orthocal.identification.problem",
-    "Choice": "orthocal.identification.choice",
-    "LiveScene": "orthocal.output.view.live",
-    "Loss": "orthocal.identification.loss",
-    "NonlinearProgram": "orthocal.identification.solvers.ipopt",
+    "Calibration": "orthocal.calibration.calibration",
+    "CalibrationProblem": "orthocal.estimation.problem",
+    "Choice": "orthocal.estimation.choice",
+    "LiveScene": "orthocal.viewer.live",
+    "Loss": "orthocal.estimation.loss",
+    "NonlinearProgram": "orthocal.estimation.solvers.ipopt",
     "OrthocalError": "orthocal.errors",
     "Robot": "orthocal.robot.model",
-    "Scene": "orthocal.output.view.scene",
+    "Scene": "orthocal.viewer.scene",
     "Session": "orthocal.measurement.session",
-    "SolverOptions": "orthocal.identification.options",
-    "assess_tool": "orthocal.study.accuracy",
-    "calibrate": "orthocal.identification.calibrate",
-    "compare_models": "orthocal.study.comparison",
-    "decide": "orthocal.study.findings.calibration",
+    "SolverOptions": "orthocal.estimation.options",
+    "assess_tool": "orthocal.assess.accuracy",
+    "calibrate": "orthocal.calibration.calibrate",
+    "compare_models": "orthocal.assess.comparison",
+    "decide": "orthocal.assess.findings.calibration",
     "draw_errors": "orthocal.measurement.synthetic",
-    "draw_scene": "orthocal.output.view.drawing",
-    "load_calibration": "orthocal.identification.calibration_file",
+    "draw_scene": "orthocal.show.scene.drawing",
+    "load_calibration": "orthocal.calibration.file",
     "load_plan": "orthocal.measurement.session_file",
     "load_robot": "orthocal.robot.loading",
     "load_session": "orthocal.measurement.session_file",
     "simulate_session": "orthocal.measurement.synthetic",
-    "summarize": "orthocal.output.summary",
-    "validate_calibration": "orthocal.study.validation",
-    "write_report": "orthocal.output.report.page",
+    "summarize": "orthocal.show.summary",
+    "validate_calibration": "orthocal.assess.validation",
+    "write_report": "orthocal.show.report.page",
     "write_session": "orthocal.measurement.session_output",
 }
 
@@ -71,30 +71,30 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from orthocal.assess.accuracy import assess_tool
+    from orthocal.assess.comparison import compare_models
+    from orthocal.assess.findings.calibration import decide
+    from orthocal.assess.validation import validate_calibration
+    from orthocal.calibration.calibrate import calibrate
+    from orthocal.calibration.calibration import Calibration
+    from orthocal.calibration.file import load_calibration
     from orthocal.errors import OrthocalError
-    from orthocal.identification.calibrate import calibrate
-    from orthocal.identification.calibration import Calibration
-    from orthocal.identification.calibration_file import load_calibration
-    from orthocal.identification.choice import Choice
-    from orthocal.identification.loss import Loss
-    from orthocal.identification.options import SolverOptions
-    from orthocal.identification.problem import CalibrationProblem
-    from orthocal.identification.solvers.ipopt import NonlinearProgram
+    from orthocal.estimation.choice import Choice
+    from orthocal.estimation.loss import Loss
+    from orthocal.estimation.options import SolverOptions
+    from orthocal.estimation.problem import CalibrationProblem
+    from orthocal.estimation.solvers.ipopt import NonlinearProgram
     from orthocal.measurement.session import Session
     from orthocal.measurement.session_file import load_plan, load_session
     from orthocal.measurement.session_output import write_session
     from orthocal.measurement.synthetic import draw_errors, simulate_session
-    from orthocal.output.report.page import write_report
-    from orthocal.output.summary import summarize
-    from orthocal.output.view.drawing import draw_scene
-    from orthocal.output.view.live import LiveScene
-    from orthocal.output.view.scene import Scene
     from orthocal.robot.loading import load_robot
     from orthocal.robot.model import Robot
-    from orthocal.study.accuracy import assess_tool
-    from orthocal.study.comparison import compare_models
-    from orthocal.study.findings.calibration import decide
-    from orthocal.study.validation import validate_calibration
+    from orthocal.show.report.page import write_report
+    from orthocal.show.scene.drawing import draw_scene
+    from orthocal.show.summary import summarize
+    from orthocal.viewer.live import LiveScene
+    from orthocal.viewer.scene import Scene
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - any of the names above

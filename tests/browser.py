@@ -18,7 +18,7 @@ import pytest
 from PIL import Image
 
 from orthocal.errors import OrthocalError
-from orthocal.output.view.browser import chromium_flags, find_chromium
+from orthocal.viewer.browser import chromium_flags, find_chromium
 
 PATIENCE = 60.0
 """[s] Until something that must happen has happened."""

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from orthocal.identification.fit import fit_problem
-from orthocal.identification.problem import build_problem
-from orthocal.identification.unmodelled import find_other_errors, machine_errors
+from orthocal.diagnosis.unmodelled import find_other_errors, machine_errors
+from orthocal.estimation.fit import fit_problem
+from orthocal.estimation.problem import build_problem
 
 
 class Fleet:

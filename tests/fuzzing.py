@@ -294,15 +294,15 @@ def make_case(seed: int, index: int, good: dict[str, bytes]) -> tuple[str, bytes
 def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None:
     """Do with a file what the command line does; slow things with a probability of `thorough`."""
     from orthocal import calibrate, load_calibration, load_robot, load_session, summarize
+    from orthocal.assess.entering import find_entries
+    from orthocal.assess.rows import accuracy_rows, forward_rows, inverse_rows
     from orthocal.kinematics.assembly import nominal_assembly
     from orthocal.measurement.session_file import load_plan
     from orthocal.measurement.session_output import write_session
     from orthocal.measurement.synthetic import load_errors, simulate_session, truth_document
     from orthocal.measurement.table import read_joints, read_points
-    from orthocal.output.accuracy import format_points
-    from orthocal.output.view.drawing import draw_scene
-    from orthocal.study.entering import find_entries
-    from orthocal.study.rows import accuracy_rows, forward_rows, inverse_rows
+    from orthocal.show.accuracy import format_points
+    from orthocal.show.scene.drawing import draw_scene
 
     deep = rng.random() < thorough
     if kind in ("session", "readings"):

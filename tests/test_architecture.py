@@ -14,17 +14,9 @@ import orthocal
 STAGES = [
     *("characters", "arguments", "errors", "interrupts", "streams", "units"),
     *("files", "cache", "strict_yaml", "documents", "markup"),
-    *(
-        "robot",
-        "kinematics",
-        "sensors",
-        "measurement",
-        "identification",
-        "study",
-        "output",
-        "cli",
-        "__main__",
-    ),
+    *("robot", "kinematics", "sensors", "measurement"),
+    *("statistics", "estimation", "diagnosis", "calibration", "assess"),
+    *("viewer", "show", "cli", "__main__"),
 ]
 
 MODULES = sorted((ROOT / "orthocal").rglob("*.py"))

@@ -317,7 +317,7 @@ def test_simulate_draws_by_seed(orthocal, root, tmp_path):
 
 
 def test_a_solve_that_does_not_converge_exits_1(orthocal, experiment, monkeypatch, tmp_path):
-    from orthocal.identification.solvers import ipopt as nlp
+    from orthocal.estimation.solvers import ipopt as nlp
 
     monkeypatch.setattr(nlp, "CONVERGED", frozenset())
     code, out, err = orthocal("calibrate", experiment, "--out", tmp_path / "none")
@@ -328,7 +328,7 @@ def test_a_solve_that_does_not_converge_exits_1(orthocal, experiment, monkeypatc
 
 
 def test_a_bug_is_said_to_be_one(orthocal, experiment, monkeypatch):
-    from orthocal.identification import calibrate
+    from orthocal.calibration import calibrate
 
     def broken(*_, **__):
         raise RuntimeError("no such thing")

@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 
 from orthocal import Choice, calibrate, load_calibration, load_session
+from orthocal.assess.entering import find_entries
 from orthocal.documents import (
     MOST_CSV_ROWS,
     MOST_JSON_VALUES,
@@ -19,7 +20,6 @@ from orthocal.documents import (
 )
 from orthocal.errors import OrthocalError, SessionError, SolverError
 from orthocal.strict_yaml import LARGEST_YAML
-from orthocal.study.entering import find_entries
 
 PROMPT = 5.0
 """Processor time that no refusal may take, [s]."""
@@ -223,7 +223,7 @@ def test_the_smallest_numbers_that_a_session_takes_are_read_again(root, tmp_path
 
 
 def test_a_result_that_makes_no_sense_is_refused_before_it_is_written(raw_cycles, monkeypatch):
-    module = sys.modules["orthocal.identification.recording"]
+    module = sys.modules["orthocal.calibration.recording"]
     original = module._estimates
 
     def absurd(*args, **kwargs):

@@ -25,9 +25,9 @@ from orthocal import (
     validate_calibration,
     write_report,
 )
+from orthocal.assess.accuracy import Workspace
 from orthocal.errors import OrthocalError, ParameterError
 from orthocal.kinematics.assembly import Assembly
-from orthocal.study.accuracy import Workspace
 
 
 @pytest.fixture(scope="module")

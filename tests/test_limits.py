@@ -11,8 +11,8 @@ from orthocal import load_robot, load_session
 from orthocal.errors import OrthocalError, RobotError, SessionError
 from orthocal.measurement.schema import LARGEST_READING_MM, MOST_READINGS
 from orthocal.measurement.session_file import load_plan
-from orthocal.output.view.visuals import load_visuals
 from orthocal.robot.urdf import MOST_JOINTS, MOST_MOVING
+from orthocal.viewer.visuals import load_visuals
 
 PROMPT = 5.0
 """Processor time that no refusal may take, [s]."""

@@ -29,7 +29,7 @@ def test_the_wheel_holds_robots_and_types(wheel):
     assert "orthocal/py.typed" in names
     for name in ("view/web/scene.html", "view/web/scene.css", "view/web/scene.js"):
         assert f"orthocal/output/{name}" in names
-    assert "orthocal/output/report/report.css" in names
+    assert "orthocal/show/report/report.css" in names
     assert not [n for n in names if n.startswith(("tests", "examples"))]
 
 

@@ -179,7 +179,7 @@ RAISED = """
 import os, signal, sys
 from pathlib import Path
 from orthocal import calibrate, load_session
-import orthocal.identification.solvers.ipopt as nlp
+import orthocal.estimation.solvers.ipopt as nlp
 session = load_session(sys.argv[1])
 original = nlp.NonlinearProgram.pack
 def pack(self, **kwargs):

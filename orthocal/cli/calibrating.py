@@ -116,14 +116,14 @@ def calibrate(
     Exit code 3: what was identified is not to be entered, for the reason that is printed; all
     outputs are written all the same.
     """
+    from orthocal.assess.findings.calibration import decide
+    from orthocal.calibration.calibrate import calibrate as run
+    from orthocal.estimation.choice import Choice
+    from orthocal.estimation.selection import read_bounds, read_known, read_tolerances
     from orthocal.files import require_writable, write_files
-    from orthocal.identification.calibrate import calibrate as run
-    from orthocal.identification.choice import Choice
-    from orthocal.identification.selection import read_bounds, read_known, read_tolerances
     from orthocal.measurement.joining import join_sessions
-    from orthocal.output.printed_json import calibration_json
-    from orthocal.output.summary import print_summary
-    from orthocal.study.findings.calibration import decide
+    from orthocal.show.printed_json import calibration_json
+    from orthocal.show.summary import print_summary
 
     if out is not None:
         require_writable(out, ("calibration.json", "report.html"))
@@ -149,7 +149,7 @@ def calibrate(
     else:
         print_summary(result, details=details, all_rows=all_rows)
     if out is not None:
-        from orthocal.output.report.page import build_report
+        from orthocal.show.report.page import build_report
 
         files = {"calibration.json": result.to_json(), "report.html": build_report(result)}
         write_files(out, files)
@@ -178,10 +178,10 @@ def compare(
     Exit code 0: one is supported, and what it leaves is noise. 3: one is supported, but what it
     leaves is error of the model. 4: none is supported.
     """
-    from orthocal.identification.selection import read_tolerances
+    from orthocal.assess.comparison import compare_models
+    from orthocal.estimation.selection import read_tolerances
     from orthocal.measurement.session_file import load_session
-    from orthocal.output.summary import print_summary
-    from orthocal.study.comparison import compare_models
+    from orthocal.show.summary import print_summary
 
     loaded = load_session(session)
     result = compare_models(
@@ -213,12 +213,12 @@ def validate(
 
     Exit code 0: it is. 3: it is not, or a further fit would change something.
     """
-    from orthocal.identification.calibration_file import load_calibration
+    from orthocal.assess.findings.validation import decide_validation
+    from orthocal.assess.validation import validate_calibration
+    from orthocal.calibration.file import load_calibration
     from orthocal.measurement.session_file import load_session
-    from orthocal.output.printed_json import validation_json
-    from orthocal.output.summary import print_summary
-    from orthocal.study.findings.validation import decide_validation
-    from orthocal.study.validation import validate_calibration
+    from orthocal.show.printed_json import validation_json
+    from orthocal.show.summary import print_summary
 
     result = validate_calibration(load_calibration(calibration), load_session(session))
     if json:

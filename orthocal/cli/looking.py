@@ -14,7 +14,7 @@ from orthocal.cli.options import (
 from orthocal.cli.printing import put_note, put_out
 
 if TYPE_CHECKING:
-    from orthocal.output.view.scene import Scene
+    from orthocal.viewer.scene import Scene
 
 
 @app.command()
@@ -28,9 +28,9 @@ def report(
     ] = None,
 ) -> None:
     """Write a calibration as one page: what to enter, how far to believe it, and why."""
+    from orthocal.calibration.file import load_calibration
     from orthocal.files import is_folder, require_writable_file
-    from orthocal.identification.calibration_file import load_calibration
-    from orthocal.output.report.page import write_report
+    from orthocal.show.report.page import write_report
 
     result = load_calibration(calibration)
     folder = Path() if result.path is None else result.path.parent
@@ -84,9 +84,9 @@ def view(
     Without --html and --png on a server that only this machine reaches, until Ctrl-C.
     """
     from orthocal.files import require_writable_file
-    from orthocal.output.subject import load_subject
-    from orthocal.output.view.browser import find_chromium, parse_size, take_picture
-    from orthocal.output.view.drawing import draw_scene
+    from orthocal.show.scene.drawing import draw_scene
+    from orthocal.show.subject import load_subject
+    from orthocal.viewer.browser import find_chromium, parse_size, take_picture
 
     width, height = parse_size(size)
     for path, kinds in ((html, (".html", ".htm")), (png, (".png",))):
@@ -105,7 +105,7 @@ def view(
 
 def _serve(scene: Scene, port: int | None, browse: bool) -> None:
     """Show a scene until Ctrl-C."""
-    from orthocal.output.view.live import LiveScene
+    from orthocal.viewer.live import LiveScene
 
     with LiveScene(scene, port=port) as live:
         put_out(live.url)

@@ -12,7 +12,7 @@ from orthocal.characters import printable
 from orthocal.errors import SessionError
 
 if TYPE_CHECKING:
-    from orthocal.study.rows import Chunk
+    from orthocal.assess.rows import Chunk
 
 
 def put_out(text: str) -> None:

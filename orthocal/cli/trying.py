@@ -49,8 +49,8 @@ def simulate(
     ] = False,
 ) -> None:
     """Make a session of simulated readings of a machine whose errors are known."""
+    from orthocal.estimation.selection import read_tolerances
     from orthocal.files import exists, require_writable
-    from orthocal.identification.selection import read_tolerances
     from orthocal.measurement.session_file import load_plan
     from orthocal.measurement.session_output import write_session
     from orthocal.measurement.synthetic import (

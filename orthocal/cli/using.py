@@ -43,17 +43,17 @@ def accuracy(
     With points CSV on stdout: by how much the tool is off each, and one standard deviation of that.
     Exit code 3: some cannot be reached; they are named, and their cells are empty.
     """
-    from orthocal.identification.calibration_file import load_calibration
+    from orthocal.assess.accuracy import MOST_POINTS, assess_tool
+    from orthocal.assess.rows import accuracy_rows
+    from orthocal.calibration.file import load_calibration
     from orthocal.kinematics.workspace import Workspace, cube
     from orthocal.measurement.table import read_points
-    from orthocal.output.accuracy import (
+    from orthocal.show.accuracy import (
         POINT_COLUMNS,
         accuracy_json,
         format_points,
         print_accuracy,
     )
-    from orthocal.study.accuracy import MOST_POINTS, assess_tool
-    from orthocal.study.rows import accuracy_rows
 
     result = load_calibration(calibration)
     names, workspace = None, None
@@ -102,9 +102,9 @@ def forward(
 
     Exit code 3: some rows cannot be reached; they are named, and their cells are empty.
     """
-    from orthocal.identification.calibration_file import load_calibration
+    from orthocal.assess.rows import forward_rows
+    from orthocal.calibration.file import load_calibration
     from orthocal.measurement.table import TOOL_COLUMNS, format_rows, read_joints
-    from orthocal.study.rows import forward_rows
 
     result = load_calibration(calibration)
     names, values = read_joints(joints, result.robot)
@@ -126,9 +126,9 @@ def inverse(
 
     Exit code 3: some rows cannot be reached; they are named, and their cells are empty.
     """
-    from orthocal.identification.calibration_file import load_calibration
+    from orthocal.assess.rows import inverse_rows
+    from orthocal.calibration.file import load_calibration
     from orthocal.measurement.table import drive_columns, format_rows, read_points
-    from orthocal.study.rows import inverse_rows
 
     result = load_calibration(calibration)
     names, points = read_points(targets, result.robot)

@@ -19,13 +19,13 @@ from orthocal.documents import parse_number, read_csv_rows, read_yaml, validate
 from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.files import is_folder, read_file, require_plain_name
 from orthocal.kinematics.assembly import nominal_assembly
-from orthocal.measurement.gauge import locate_contacts
 from orthocal.measurement.schema import (
     LARGEST_READING_MM,
     MOST_READINGS,
     GaugeKeys,
     SessionKeys,
 )
+from orthocal.measurement.sensing import locate_contacts
 from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
 from orthocal.measurement.session_robot import build_offsets, require_given_zero
 from orthocal.robot.loading import load_robot

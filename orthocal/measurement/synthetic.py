@@ -16,7 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from orthocal.arguments import require_kind, require_names, require_numbers, require_seed
 from orthocal.documents import Number, parse_number, read_yaml, validate
 from orthocal.errors import ParameterError, SessionError
-from orthocal.measurement.gauge import build_observations, predict_entries, sensor_unknowns
+from orthocal.measurement.observations import build_observations
+from orthocal.measurement.sensing import predict_entries, sensor_unknowns
 from orthocal.measurement.session import Session
 from orthocal.robot.model import Robot
 from orthocal.units import to_mm

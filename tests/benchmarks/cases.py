@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal import load_plan, simulate_session
-from orthocal.identification.options import SolverKind, SolverOptions
-from orthocal.identification.problem import build_problem
-from orthocal.identification.solvers.choice import build_program
-from orthocal.identification.solvers.program import Program, Solution
+from orthocal.estimation.options import SolverKind, SolverOptions
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.choice import build_program
+from orthocal.estimation.solvers.program import Program, Solution
 from orthocal.measurement.session import Session
 from orthocal.measurement.synthetic import draw_errors
 

@@ -19,7 +19,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from orthocal.identification.options import SolverKind
+from orthocal.estimation.options import SolverKind
 
 SIZES = (SWEEP, 303, 1203)
 LARGE_SIZES = (3003, 10005)

@@ -15,14 +15,15 @@ from peer import PeerProblem
 from tolerances import KINEMATICS, SAME_OPTIMUM
 
 from orthocal import load_session
-from orthocal.identification.problem import build_problem
-from orthocal.identification.solvers.batch import BatchProgram
-from orthocal.identification.solvers.eliminated import EliminatedProgram
-from orthocal.identification.solvers.fleet import Fleet
-from orthocal.identification.solvers.ipopt import NonlinearProgram
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.eliminated import EliminatedProgram
+from orthocal.estimation.solvers.fleet import Fleet
+from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.kinematics import lanes
 from orthocal.kinematics.compiled import compiled_robot
-from orthocal.measurement.gauge import build_observations, predict_entries
+from orthocal.measurement.observations import build_observations
+from orthocal.measurement.sensing import predict_entries
 
 PEER_OFFSETS = 1e-8
 """[m] The peer's offsets. Its forward differences are wrong by about 1e-7 of themselves (steps of

@@ -9,9 +9,9 @@ import pytest
 
 from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
 from orthocal.errors import SessionError
-from orthocal.identification.problem import build_problem
-from orthocal.identification.solvers.eliminated import EliminatedProgram
-from orthocal.identification.solvers.ipopt import NonlinearProgram
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.eliminated import EliminatedProgram
+from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.measurement.joining import join_sessions
 from orthocal.measurement.session_file import load_session
 from orthocal.measurement.session_output import write_session
@@ -126,7 +126,7 @@ def test_both_solvers_weigh_gauges_alike(root):
     problem = build_problem(join_sessions(pair), model="lengths")
     problem = problem.with_noise(np.repeat([1.0, 0.25], problem.observations.size // 2))
     for loss in ("squares", "huber"):
-        from orthocal.identification.loss import Loss
+        from orthocal.estimation.loss import Loss
 
         options = SolverOptions(loss=Loss(loss))
         ours = EliminatedProgram(problem, options=options).solve(sigma=2e-5)

@@ -8,10 +8,10 @@ from linkages import joint, write_robot, write_wide_linkage
 from tolerances import KINEMATICS, TRUTH_BACK
 
 from orthocal import calibrate, load_plan, load_session, write_session
+from orthocal.assess.entering import find_entries
+from orthocal.assess.validation import validate_calibration
 from orthocal.errors import SessionError
 from orthocal.measurement.synthetic import simulate_session
-from orthocal.study.entering import find_entries
-from orthocal.study.validation import validate_calibration
 
 OFFSETS = {"motor_a.offset": 8e-3, "motor_b.offset": -5e-3}
 """[rad]"""

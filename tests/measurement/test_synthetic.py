@@ -10,7 +10,8 @@ from tolerances import KINEMATICS
 
 from orthocal import draw_errors, load_plan, load_session, simulate_session
 from orthocal.errors import ParameterError, SessionError
-from orthocal.measurement.gauge import build_observations, predict_entries
+from orthocal.measurement.observations import build_observations
+from orthocal.measurement.sensing import predict_entries
 from orthocal.measurement.synthetic import collect_errors, load_errors, truth_document
 
 ERRORS = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}

@@ -11,14 +11,15 @@ from tool_coordinate import ToolCoordinate
 
 from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
 from orthocal.cli import app
-from orthocal.identification.problem import build_problem
-from orthocal.identification.solvers.eliminated import EliminatedProgram
-from orthocal.identification.solvers.ipopt import NonlinearProgram
-from orthocal.measurement.gauge import build_observations, predict_entries
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.eliminated import EliminatedProgram
+from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.measurement.observations import build_observations
+from orthocal.measurement.sensing import predict_entries
 from orthocal.measurement.session_file import load_session
 from orthocal.measurement.session_output import write_session
-from orthocal.output.report.page import build_report
 from orthocal.sensors import registry
+from orthocal.show.report.page import build_report
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 

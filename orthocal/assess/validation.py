@@ -1,0 +1,307 @@
+"""Validation of a calibration by a new session, as the paper's third experiment.
+
+The new session is taken with the identified offsets active in the controller. If the calibration
+is right, the deviations it shows are those that the calibration expected, and a further fit would
+change nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from orthocal.arguments import require_kind
+from orthocal.assess.entering import ControllerEntry, find_entries
+from orthocal.assess.mistakes import EnteringMistake, find_mistake
+from orthocal.assess.repetition import Repetition, measure_repetition
+from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.recording import assemble_calibration
+from orthocal.calibration.repeating import repeat_fit
+from orthocal.diagnosis.rows import ResidualRow
+from orthocal.errors import SessionError
+from orthocal.estimation.fit import Fit
+from orthocal.measurement.session import Session
+from orthocal.robot.parameters import InUnit, Unit
+from orthocal.statistics.chance import BY_CHANCE, confidence_factor
+from orthocal.statistics.zeros import project_out_zeros
+
+Array = NDArray[np.float64]
+
+KNOWN_LEAVES = 2.0
+"""Times the expected deviations that a known mistake may leave at most, to be the reason."""
+
+LEAVES = 1.4
+"""The same where it is no known one, but any offset of one drive."""
+
+FEWEST = 5.0
+"""Degrees of freedom below which what does not repeat of two sessions is not known."""
+
+CHANGE_CHANCE = 0.05
+"""Probability that any parameter of a calibration that is right is said to change."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FurtherChange(InUnit):
+    """What a further fit would still change in one parameter."""
+
+    name: str
+    unit: Unit
+    change: float
+    """[unit]."""
+    std: float
+    """Standard deviation of the change: both sessions know the parameter only so well, [unit]."""
+    significant: bool
+    """Whether it is outside the interval around 0 that holds all changes together with 95 %."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Validation:
+    """A new session held against what a calibration expected."""
+
+    title: str
+    offsets_stated: bool
+    """Whether the session says which offsets were active; else the identified ones are taken."""
+    expected_rms: float
+    """Of the residuals of the calibration, [m]."""
+    expected_largest: float
+    achieved_rms: float
+    """Of the deviations in the new session, [m]."""
+    achieved_largest: float
+    refit_rms: float
+    """What a further fit would leave, [m]."""
+    refit_largest: float
+    excess_probability: float
+    """Probability that the achieved sum of squares would be as large by chance (F test); NaN if
+    the calibration had no readings to spare."""
+    changes: tuple[FurtherChange, ...]
+    mistake: EnteringMistake | None
+    """What seems to have gone wrong in entering; None where nothing did, or nothing explains it."""
+    enter: tuple[ControllerEntry, ...]
+    """What belongs into the controller: as it was, where a mistake explains the readings or nothing
+    is to change; else what the new readings say, with their session."""
+    repetition: Repetition
+    """Whether what both fits leave is the same."""
+    rows: tuple[ResidualRow, ...]
+    """Rows of the new session: nominal is the machine as the controller knows it."""
+
+    @property
+    def as_expected(self) -> bool | None:
+        """Whether the achieved deviations are no larger than expected, but for chance.
+
+        None if the calibration had no readings to spare: then it expected nothing.
+        """
+        if math.isnan(self.excess_probability):
+            return None
+        return self.excess_probability >= BY_CHANCE
+
+    @property
+    def confirmed(self) -> bool | None:
+        """Whether the calibration is confirmed; None if it expected nothing."""
+        if self.as_expected is None:
+            return None
+        return self.as_expected and self.nothing_to_change
+
+    @property
+    def nothing_to_change(self) -> bool:
+        """Whether no parameter would change beyond its standard error."""
+        return not any(c.significant for c in self.changes)
+
+    def to_json(self) -> str:
+        """As JSON, SI units."""
+
+        def number(value: float) -> float | None:
+            return value if math.isfinite(value) else None
+
+        document = {
+            "schema": "orthocal/validation/2",
+            "title": self.title,
+            "offsets_stated": self.offsets_stated,
+            "expected_rms": self.expected_rms,
+            "expected_largest": self.expected_largest,
+            "achieved_rms": self.achieved_rms,
+            "achieved_largest": self.achieved_largest,
+            "refit_rms": self.refit_rms,
+            "refit_largest": self.refit_largest,
+            "as_expected": self.as_expected,
+            "excess_probability": number(self.excess_probability),
+            "nothing_to_change": self.nothing_to_change,
+            "changes": [
+                {
+                    "name": c.name,
+                    "unit": c.unit,
+                    "change": c.change,
+                    "std": number(c.std),
+                    "significant": c.significant,
+                }
+                for c in self.changes
+            ],
+            "mistake": None
+            if self.mistake is None
+            else {
+                "kind": self.mistake.kind,
+                "drives": list(self.mistake.drives),
+                "active": self.mistake.active.tolist(),
+                "by": list(self.mistake.by),
+                "rms": self.mistake.rms,
+            },
+            "enter": [{"drive": e.drive, "unit": e.unit, "value": e.enter} for e in self.enter],
+            **self.repetition.to_document(),
+        }
+        return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def validate_calibration(calibration: Calibration, session: Session) -> Validation:
+    """Hold a new session against a calibration.
+
+    Args:
+        calibration: The calibration whose offsets were entered.
+        session: Taken afterwards, with its offsets active in the controller. Where the session
+            does not state its controller's offsets, they are taken to be the identified ones.
+
+    Raises:
+        SessionError: If the session is of another robot, or states offsets of another calibration.
+        NotIdentifiableError: If the session does not determine the parameters.
+        SolverError: If a further fit does not converge.
+    """
+    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    require_kind(session, Session, expected="a Session, such as load_session(...)")
+    where = None if session.path is None else str(session.path)
+    if session.robot.sha256 != calibration.robot_record.sha256:
+        raise SessionError(
+            f"is of robot '{session.robot.name}'; the calibration is of another, or of another "
+            f"version of '{calibration.robot_record.name}'",
+            where=where,
+        )
+    stated = session.controller_offsets is not None
+    entries = find_entries(calibration)
+    if stated:
+        _require_offsets(calibration, session)
+    elif entries:
+        by_drive = {e.drive: e.enter for e in entries}
+        offsets = np.array([by_drive.get(d.name, 0.0) for d in session.robot.drives])
+        session = session.with_controller(offsets)
+    fit = repeat_fit(calibration, session)
+    refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
+    repetition = measure_repetition(calibration, refit)
+    found = Validation(
+        title=session.title,
+        offsets_stated=stated,
+        expected_rms=calibration.rms_after,
+        expected_largest=calibration.largest_after,
+        achieved_rms=refit.rms_before,
+        achieved_largest=refit.largest_before,
+        refit_rms=refit.rms_after,
+        refit_largest=refit.largest_after,
+        excess_probability=_excess_probability(calibration, refit),
+        changes=_further_changes(calibration, refit, repetition),
+        mistake=None,
+        enter=entries,
+        repetition=repetition,
+        rows=refit.residuals,
+    )
+    if found.confirmed is not False:
+        return found
+    mistake = _find_mistake(calibration, fit, session)
+    if mistake is not None:  # what it leaves must be what was expected
+        times = LEAVES if mistake.kind == "one differs" else KNOWN_LEAVES
+        if mistake.rms > times * calibration.rms_after / calibration.row_factor:
+            mistake = None
+    slip = mistake is not None and mistake.kind != "one differs"
+    enter = entries if slip else find_entries(refit)
+    return replace(found, mistake=mistake, enter=enter)
+
+
+def _find_mistake(calibration: Calibration, fit: Fit, session: Session) -> EnteringMistake | None:
+    """The mistake in entering offsets that explains a session, if one does."""
+    drives, o, problem = session.robot.drives, fit.problem.observations, fit.problem
+    theta = np.array([p.value for p in calibration.free])
+    deviations = project_out_zeros(problem.values - problem.predict(theta), o)
+    slopes = np.zeros((o.size, len(drives)))
+    for i, drive in enumerate(drives):
+        name = f"{drive.name}.offset"
+        if name in problem.free:
+            k = problem.free.index(name)
+            slopes[:, i] = fit.jacobian[:, k] / problem.theta_scale[k]
+    entries = {e.drive: e for e in find_entries(calibration)}
+    identified, scatter = (
+        np.array([getattr(entries[d.name], key) if d.name in entries else 0.0 for d in drives])
+        for key in ("identified", "scatter")
+    )
+    zeros = project_out_zeros(slopes, o)
+    told = np.linalg.matrix_rank(zeros) / max(o.size, 1)
+    return find_mistake(
+        deviations,
+        zeros,
+        before=calibration.active_offsets,
+        identified=identified,
+        entered=session.active_offsets,
+        names=tuple(d.name for d in drives),
+        rounding=np.nan_to_num(scatter),
+        noise=calibration.rms_after / calibration.row_factor * math.sqrt(told),
+    )
+
+
+def _further_changes(
+    calibration: Calibration, refit: Calibration, repetition: Repetition
+) -> tuple[FurtherChange, ...]:
+    """New less old estimates, against the standard error of the difference of the two.
+
+    What repeats in both sessions, as errors of the model do, moves both estimates alike: where the
+    readings tell how much does not repeat, only that counts.
+    """
+    pairs = list(zip(calibration.free, refit.free, strict=True))
+    scale, dof = (1.0, 1.0), min(calibration.dof, refit.dof)
+    if not calibration.prior and repetition.scatter_dof >= FEWEST:
+        scatter = repetition.scatter
+        scale = (min(scatter / calibration.sigma, 1.0), min(scatter / refit.sigma, 1.0))
+        dof = repetition.scatter_dof
+    # so many chances to be wrong by chance: each gets its share
+    factor = confidence_factor(dof, 1.0 - CHANGE_CHANCE / len(pairs))
+    changes = []
+    for old, new in pairs:
+        change = new.value - old.value
+        std = math.hypot(old.std * scale[0], new.std * scale[1])
+        changes.append(FurtherChange(new.name, new.unit, change, std, abs(change) > factor * std))
+    return tuple(changes)
+
+
+def _require_offsets(calibration: Calibration, session: Session) -> None:
+    """The offsets that a session states must be those of the calibration, up to rounding."""
+    drives = [d.name for d in session.robot.drives]
+    others, where = [], ""
+    for entry in find_entries(calibration):
+        stated = float(session.active_offsets[drives.index(entry.drive)])
+        allowed = max(0.5 * entry.scatter, 0.02e-3)
+        if not math.isnan(allowed) and abs(stated - entry.enter) > allowed:
+            factor, unit = entry.edge_factor, entry.edge_unit
+            where = f"{session.path or 'session'}: controller.offsets_{unit}"
+            others.append(
+                f"{entry.drive} has {stated * factor:g} {unit} where the calibration says to enter "
+                f"{entry.enter * factor:.3f} {unit}"
+            )
+    if others:
+        raise SessionError(
+            f"{'; '.join(others)}. A validation needs a session that was measured with what the "
+            "calibration says to enter",
+            where=where,
+        )
+
+
+def _excess_probability(calibration: Calibration, refit: Calibration) -> float:
+    """Upper tail of the ratio of achieved to expected mean squares."""
+    expected = calibration.noise.residual_sigma
+    dof = calibration.noise.residual_dof
+    if not (expected > 0.0 and dof > 0.0):
+        return math.nan
+    rows = refit.residuals
+    zeros = len({r.setup for r in rows if r.minus is None})
+    achieved = sum(r.deviation**2 / (2.0 if r.minus else 1.0) for r in rows)
+    count = len(rows) - zeros
+    # what the calibration did not know of its parameters adds to what the new readings show
+    mean = expected**2 * (1.0 + (count - refit.noise.residual_dof) / count)
+    return float(special.fdtrc(count, dof, achieved / count / mean))

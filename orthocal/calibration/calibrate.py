@@ -1,0 +1,151 @@
+"""From a session to a calibration: the one call that most users need."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.arguments import require_kind, require_names
+from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.recording import assemble_calibration
+from orthocal.diagnosis.profile import profile_interval
+from orthocal.errors import NotIdentifiableError, ParameterError
+from orthocal.estimation.choice import Choice
+from orthocal.estimation.fit import Fit, first_sigma, fit_problem
+from orthocal.estimation.linear import linearise_at_reference
+from orthocal.estimation.loss import Loss, LossKind
+from orthocal.estimation.options import SolverKind, SolverOptions
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.kinematics.assembly import as_rows
+from orthocal.measurement.joining import join_sessions
+from orthocal.measurement.session import Session
+from orthocal.measurement.session_file import load_session
+from orthocal.statistics.identifiability import (
+    find_base_parameters,
+)
+from orthocal.statistics.noise import estimate_repeatability
+
+Array = NDArray[np.float64]
+
+
+MAX_BASE_ROUNDS = 8
+
+
+def calibrate(
+    session: Session | str | Path | Sequence[Session | str | Path],
+    choice: Choice | str | None = None,
+    *,
+    loss: Loss | LossKind | None = None,
+    solver: SolverOptions | SolverKind = "ipopt",
+    profile: Sequence[str] = (),
+    start: ArrayLike | None = None,
+) -> Calibration:
+    """Identify the errors of a machine from a session, exactly, with their uncertainty.
+
+    Args:
+        session: The session, or the path to one; or several, which are fitted together.
+        choice: Which errors are free, and what is known of them; or the name of a model. Offsets
+            by default.
+        loss: What a residual costs: `squares` (the default), `huber`, or one with its own width.
+        solver: `ipopt` on the whole program, the reference; `eliminated`, the same optimum sooner;
+            `linearised`, as the paper; or one with its own settings.
+        profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
+        start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
+            solution.
+
+    Raises:
+        NotIdentifiableError: If the readings leave a parameter open and there is no prior.
+        SolverError: If the solver does not converge.
+        ClosureError: If the machine cannot reach a posture.
+        ParameterError: If the model or a name is unknown.
+        TypeError: If an argument is of another kind.
+        ValueError: If there are not as many free parameters to start from as there are.
+    """
+    session = _gather(session)
+    require_names(profile, argument="profile")
+    require_kind(choice, (Choice, str, type(None)), expected="a Choice, or the name of a model")
+    chosen = choice if isinstance(choice, Choice) else Choice(choice)
+    options = _solver_options(solver, loss)
+    problem = CalibrationProblem(session, chosen.select(session.robot.parameters))
+    if start is not None:
+        start, _ = as_rows(start, problem.n_free, "free parameters to start from")
+        if start.shape != (1, problem.n_free) or not np.isfinite(start).all():
+            raise ValueError(f"expected {problem.n_free} finite numbers to start from")
+        start = start[0]
+    whole = None
+    if chosen.base:
+        whole = problem
+        fit = _fit_base(whole, options=options, start=start)
+    else:
+        fit = fit_problem(problem, options=options, start=start)
+    profiled = _match_profiled(fit.problem, profile)
+    intervals = {name: profile_interval(fit, name) for name in profiled}
+    return assemble_calibration(fit, whole=whole, intervals=intervals)
+
+
+def _solver_options(
+    solver: SolverOptions | SolverKind, loss: Loss | LossKind | None
+) -> SolverOptions:
+    require_kind(solver, (SolverOptions, str), expected="a solver's name, or SolverOptions(...)")
+    require_kind(loss, (Loss, str, type(None)), expected="a loss's name, or Loss(...)")
+    options = solver if isinstance(solver, SolverOptions) else SolverOptions(solver=solver)
+    if loss is None:
+        return options
+    return replace(options, loss=loss if isinstance(loss, Loss) else Loss(loss))
+
+
+def _gather(given: Session | str | Path | Sequence[Session | str | Path]) -> Session:
+    """What was given as one session."""
+    several: list[Session | str | Path]
+    several = list(given) if isinstance(given, (list, tuple)) else [given]  # type: ignore[list-item]
+    found = []
+    for one in several:
+        if not isinstance(one, Session):
+            require_kind(one, (str, Path), expected="a Session, or the path to one")
+            one = load_session(one)
+        found.append(one)
+    return join_sessions(found)
+
+
+def _fit_base(
+    problem: CalibrationProblem, *, options: SolverOptions | None, start: ArrayLike | None
+) -> Fit:
+    """Solve a problem in base parameters: what cannot be told apart is told as one.
+
+    How many there are depends on the noise, and that on what they leave: until both agree.
+    """
+    information = linearise_at_reference(problem).information
+    repeatability = estimate_repeatability(problem.values, problem.observations)
+    sigma = first_sigma(problem.session, repeatability)
+    leads: list[str] = []
+    for _ in range(MAX_BASE_ROUNDS):
+        factor = information.factor[:, : problem.n_machine]
+        machine = problem.machine_selection.parameters
+        found = find_base_parameters(factor, machine, threshold=sigma)
+        if not found:
+            raise NotIdentifiableError(
+                "the readings tell none of the free parameters", parameters=problem.free
+            )
+        chosen = [c.terms[0][0] for c in found]
+        if chosen == leads:
+            break
+        leads = chosen
+        reduced = CalibrationProblem(problem.session, problem.machine_selection.keep(leads))
+        fit = fit_problem(reduced, options=options, start=start)
+        sigma = max(fit.sigma, sigma)  # no more parameters than before
+    return fit
+
+
+def _match_profiled(problem: CalibrationProblem, patterns: Sequence[str]) -> list[str]:
+    if not patterns:
+        return []
+    found = [n for n in problem.robot.parameters.select(patterns) if n in problem.free]
+    if not found:
+        raise ParameterError(
+            f"{', '.join(patterns)}: no free parameter to find the interval of",
+        )
+    return found

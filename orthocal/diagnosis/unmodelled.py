@@ -1,0 +1,153 @@
+"""What a machine's other errors do to an estimate that leaves them out.
+
+Offsets that are fitted to a machine whose legs and axes are off as well take on some of those
+errors. To first order the estimate moves by L θᵤ for unmodelled errors θᵤ,
+
+    L = A⁻¹ Jᵀ Jᵤ/σ²,  A = Jᵀ J/σ² + P
+
+and with θᵤ within the tolerances this is known as a spread. It belongs into every honest ±.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.errors import ParameterError
+from orthocal.estimation.fit import Fit
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.selection import Selection
+from orthocal.estimation.weighting import SMALLEST_SIGMA
+from orthocal.kinematics.symbolic import hangs_on
+from orthocal.robot.model import Robot, read_only
+from orthocal.statistics.zeros import project_out_zeros
+
+Array = NDArray[np.float64]
+
+WHOLE_MODEL = "full"
+"""The robot's own model of its errors: what it leaves out of joint placements a machine has not."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unmodelled:
+    """Errors that an estimate leaves out, at their tolerances."""
+
+    names: tuple[str, ...]
+    tolerances: Array
+    """One standard deviation of each, shape (n_unmodelled,), [SI]."""
+    leakage: Array
+    """L: what the free parameters take on, shape (n_free, n_unmodelled), [SI per SI]."""
+    residual_rms: float
+    """What they alone would leave of the readings' rows after the fit, r.m.s., [m]."""
+
+    @property
+    def bias_covariance(self) -> Array:
+        """Covariance of what the free parameters take on, shape (n_free, n_free), [SI]."""
+        spread = self.leakage * self.tolerances
+        return np.asarray(spread @ spread.T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OtherErrors:
+    """Errors that a machine has and a fit left out, and how they move the readings."""
+
+    names: tuple[str, ...]
+    tolerances: Array
+    """One standard deviation of each, shape (n_others,), [SI]."""
+    slopes: Array
+    """∂h of one tolerance of each, gauge zeros eliminated, shape (n_entries, n_others), [m]."""
+
+
+def machine_errors(robot: Robot) -> tuple[str, ...]:
+    """Names of all errors that a machine is taken to have, in the robot's order.
+
+    Those of its model `full`; the scales of its drives; and where the parts of its loops end (the
+    far ends of rods and what they meet, the feet of legs). A frame that the tool hangs on is left
+    out: its error moves the tool alone, and says where on the platform that is. So are the ends of
+    legs' lines: they are drawn in the air.
+    """
+    parameters = robot.parameters
+    try:
+        whole = set(parameters.select_model(WHOLE_MODEL))
+    except ParameterError:
+        whole = set()
+    tool = set() if robot.tcp is None else _carriers(robot, robot.tcp.frame)
+    ends = {frame for closure in robot.closures for frame in (closure.frame_a, closure.frame_b)}
+    ends = {frame for frame in ends if robot.frame_id(frame) not in tool}
+    whole |= {
+        e.name
+        for e in parameters.elementary.values()
+        if e.kind == "scale" or (e.of_frame and e.owner in ends)
+    }
+    return tuple(name for name in parameters.names if name in whole)
+
+
+def _carriers(robot: Robot, frame: str) -> set[int]:
+    """A frame, and the frames of the same joint that it hangs on."""
+    found: set[int] = set()
+    current: int | None = robot.frame_id(frame)
+    while current is not None:
+        found.add(current)
+        current = hangs_on(robot.model, current)
+    return found
+
+
+def find_other_errors(fit: Fit, *, spoken_for: Collection[str] = ()) -> OtherErrors:
+    """The errors of the machine that a fit left out.
+
+    Args:
+        fit: The fit.
+        spoken_for: Names of parameters that its own stand for, too.
+    """
+    problem = fit.problem
+    parameters = problem.robot.parameters
+    # of a sum the first error is what it is told by: the others still differ from it
+    own = problem.machine_selection.names
+    taken = {parameters[n].terms[0][0] for n in (*own, *problem.fixed, *spoken_for)}
+    names = [
+        n
+        for n in machine_errors(problem.robot)
+        if n not in spoken_for and not taken & {term for term, _ in parameters[n].terms}
+    ]
+    o = problem.observations
+    if not names:
+        return OtherErrors((), read_only([]), read_only(np.zeros((o.size, 0))))
+    chosen = tuple(parameters[n] for n in names)
+    selection = Selection(
+        label="",
+        parameters=chosen,
+        prior=np.ones(len(names), dtype=bool),
+        mean=read_only(np.zeros(len(names))),
+        lower=read_only(np.full(len(names), -np.inf)),
+        upper=read_only(np.full(len(names), np.inf)),
+        fixed=problem.split_errors(fit.solution.theta),
+    )
+    others = CalibrationProblem(problem.session, selection, noise=problem.noise)
+    at = np.append(np.zeros(len(names)), fit.solution.theta[problem.n_machine :])
+    _, jacobian = others.linearise(at, fit.solution.passive)
+    slopes = project_out_zeros(jacobian[:, : len(names)], o)
+    return OtherErrors(tuple(names), read_only(selection.tolerances), read_only(slopes))
+
+
+def measure_unmodelled(fit: Fit, others: OtherErrors) -> Unmodelled:
+    """What errors of the machine that were not free do to an estimate."""
+    problem = fit.problem
+    if not others.names:
+        return Unmodelled((), read_only([]), read_only(np.zeros((problem.n_machine, 0))), 0.0)
+    o, sigma = problem.observations, max(fit.sigma, SMALLEST_SIGMA)
+    slopes = project_out_zeros(fit.jacobian, o)
+    inverse = fit.information.covariance(
+        sigma=sigma, precision=problem.prior_precision, held=fit.held
+    )
+    n = problem.n_machine
+    scaled = inverse @ (slopes.T @ others.slopes) / sigma**2
+    left = o.rows(others.slopes - slopes @ scaled)
+    return Unmodelled(
+        names=others.names,
+        tolerances=others.tolerances,
+        leakage=read_only((scaled * problem.theta_scale[:, None] / others.tolerances)[:n]),
+        residual_rms=float(np.sqrt((left**2).sum() / len(left))),
+    )

@@ -1,0 +1,102 @@
+"""What a calibration may change, as its user says it: numbers carry their unit in their name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from orthocal.arguments import require_kind, require_names, require_numbers
+from orthocal.errors import ParameterError
+from orthocal.estimation.selection import Known, Selection, select_parameters
+from orthocal.robot.parameters import ParameterSet
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Which errors of the machine are free, and what is known of them beforehand.
+
+    A number that has a unit stands under a name that ends with it, as on the command line:
+    {"x_leg.length_mm": 0.12}; the units are _mm, _um, _m, _mrad, _deg, _rad and _ppm.
+
+    Args:
+        model: A model of the robot's YAML: `offsets` (the default), `lengths`, `full` or one's own.
+        free: Names or globs that are free too, or instead where no model is named; '!' takes out.
+        prior: Whether tolerances act as a prior; by default not where only offsets are free.
+        known: Name with its unit to a known value, which is then held, or to a value and its
+            standard deviation, which then act as prior.
+        tolerances: Name or glob with its unit to another standard deviation than the robot's.
+        bounds: Name or glob with its unit to lowest and highest value, ±inf for open.
+        base: Identify base parameters instead, without any prior: of what the readings cannot
+            tell apart one parameter stays, and stands for the whole combination.
+
+    Raises:
+        TypeError: If an argument is of another kind.
+    """
+
+    model: str | None = None
+    free: Sequence[str] = ()
+    prior: bool | None = None
+    known: Mapping[str, Known] = field(default_factory=dict)
+    tolerances: Mapping[str, float] = field(default_factory=dict)
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    base: bool = False
+
+    def __post_init__(self) -> None:
+        require_kind(self.model, (str, type(None)), expected="the name of a model")
+        require_names(self.free, argument="free")
+        require_numbers(self.known, argument="known", counts=(1, 2))
+        require_numbers(self.tolerances, argument="tolerances")
+        require_numbers(self.bounds, argument="bounds", counts=(2,))
+        for value in (self.prior, self.base):
+            require_kind(value, (bool, type(None)), expected="True or False as prior or base")
+
+    def select(self, parameters: ParameterSet) -> Selection:
+        """The free parameters among those of a robot, in SI.
+
+        Raises:
+            ParameterError: If a name, unit, glob or model is unknown, or a number makes no sense.
+        """
+        own = [key for key, value in self.known.items() if isinstance(value, tuple)]
+        if self.base and (self.prior or own):
+            raise ParameterError(
+                "base parameters are identified without any prior"
+                + (f"; give {', '.join(own)} as known without ±" if own else "")
+            )
+        return select_parameters(
+            parameters,
+            model=self.model,
+            free=self.free,
+            prior=self.prior,
+            known=_known(self.known, parameters),
+            tolerances=parameters.read_tolerances(self.tolerances),
+            bounds=_bounds(self.bounds, parameters),
+        )
+
+
+def _known(known: Mapping[str, Known], parameters: ParameterSet) -> dict[str, Known]:
+    result: dict[str, Known] = {}
+    for key, value in known.items():
+        try:
+            name, factor = parameters.read_quantity(key, 1.0)
+        except ParameterError as e:
+            raise ParameterError(e.problem, where=e.where or "known") from None
+        if name in result:
+            raise ParameterError(f"'{name}' is given twice", where="known")
+        if isinstance(value, tuple):
+            result[name] = (value[0] * factor, value[1] * factor)
+        else:
+            result[name] = value * factor
+    return result
+
+
+def _bounds(
+    given: Mapping[str, tuple[float, float]], parameters: ParameterSet
+) -> dict[str, tuple[float, float]]:
+    result = {}
+    for key, (low, high) in given.items():
+        try:
+            glob, factor = parameters.read_glob(key)
+        except ParameterError as e:
+            raise ParameterError(e.problem, where=e.where or "bounds") from None
+        result[glob] = (low * factor, high * factor)
+    return result

@@ -1,0 +1,337 @@
+"""One problem solved: linearised start, noise, exact solution, and what the readings say there."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.errors import ClosureError, SolverError
+from orthocal.estimation.linear import Linearisation, linearise_at_reference
+from orthocal.estimation.loss import Loss
+from orthocal.estimation.options import SolverOptions
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.solvers.choice import build_program
+from orthocal.estimation.solvers.program import Program, Solution
+from orthocal.estimation.weighting import (
+    SMALLEST_SIGMA,
+    GaugeReadings,
+    first_noise,
+    leverages,
+    split_by_gauge,
+    stated_sigma,
+    weigh_gauges,
+)
+from orthocal.measurement.session import Session
+from orthocal.statistics.information import (
+    Information,
+    decompose,
+    marginalise,
+    require_identifiable,
+)
+from orthocal.statistics.noise import Noise, estimate_noise, estimate_repeatability
+from orthocal.statistics.zeros import project_out_zeros
+
+Array = NDArray[np.float64]
+
+SIGMA_SETTLED = 0.03
+"""Relative change of sigma below which it needs no further solution: beside a prior it moves no
+parameter by more than a twentieth of its standard deviation."""
+
+MAX_SIGMA_ROUNDS = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A solved problem."""
+
+    problem: CalibrationProblem
+    program: Program
+    seconds_build: float
+    """Building all functions and the program, once, [s]."""
+    seconds_solve: float
+    """All solutions until sigma had settled, [s]."""
+    iterations: int
+    """Of the solver, in all of them."""
+    linearisation: Linearisation
+    """About what the controller already corrects."""
+    linear: Array
+    """Linearised solution, shape (n_free,), [SI]."""
+    solution: Solution
+    noise: Noise
+    prediction: Array
+    """h at the solution, gauge zeros at 0, shape (n_entries,), [m]."""
+    jacobian: Array
+    """dh/dθ̂ at the solution, shape (n_entries, n_free), [m per tolerance]."""
+    information: Information
+    """Of that Jacobian."""
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of a reading by which the solution was weighted, [m].
+
+        With several gauges, that of the first.
+        """
+        if math.isfinite(self.noise.sigma):
+            return max(self.noise.sigma, SMALLEST_SIGMA)
+        return first_sigma(self.problem.session, (math.nan, 0))
+
+    @property
+    def loss(self) -> Loss:
+        """What a residual cost."""
+        return self.program.options.loss
+
+    @property
+    def residual(self) -> Array:
+        """Readings less predictions and gauge zeros, shape (n_entries,), [m]."""
+        return _residual(self.program, self.solution, self.prediction)
+
+    @property
+    def weights(self) -> Array:
+        """How much of a square each entry counted, shape (n_entries,): 1 without a robust loss."""
+        return self.loss.weight(self.residual / self.sigma)
+
+    @property
+    def machine_information(self) -> Information:
+        """What the readings say of the machine, sensors known to their tolerances."""
+        return marginalise(self.information, self.problem.n_machine, sigma=self.sigma)
+
+    @property
+    def independent_readings(self) -> int:
+        """Independent readings: repeated ones once, less gauge zeros."""
+        o = self.problem.observations
+        _, repeated = estimate_repeatability(self.problem.values, o)
+        return o.size - o.n_zeros - repeated
+
+    @property
+    def held(self) -> NDArray[np.bool_]:
+        """Parameters that a bound holds, shape (n_free,)."""
+        return np.asarray(self.solution.at_bound != 0)
+
+    def covariance(self) -> Array:
+        """Covariance of the free parameters, shape (n_free, n_free), [SI]; NaN if unknown."""
+        scale = np.outer(self.problem.theta_scale, self.problem.theta_scale)
+        if not math.isfinite(self.noise.sigma):
+            return np.full_like(scale, np.nan)
+        factors = (1.0, 1.0)
+        if self.loss.robust:
+            used = self.problem.observations.size - self.noise.residual_dof
+            gain = self.loss.gain(self.residual / self.sigma, used=used)
+            factors = (gain, self.loss.normal_square)
+        return scale * self.information.covariance(
+            sigma=self.sigma,  # some, also for readings without any scatter
+            precision=self.problem.prior_precision,
+            held=self.held,
+            loss=factors,
+        )
+
+
+def fit_problem(
+    problem: CalibrationProblem,
+    *,
+    options: SolverOptions | None = None,
+    start: ArrayLike | None = None,
+    program: Program | None = None,
+) -> Fit:
+    """Solve a problem exactly, with sigma from the readings where they tell it.
+
+    Args:
+        problem: The problem.
+        options: Which solver, and how it is run.
+        start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
+            solution.
+        program: Of the same problem with other readings, to be used again; `options` are its own.
+
+    Raises:
+        NotIdentifiableError: If neither readings nor a prior determine a parameter.
+        SolverError: If the solver does not converge.
+        ClosureError: If the machine cannot reach a posture.
+    """
+    began = time.perf_counter()
+    groups = split_by_gauge(problem.session, problem.observations)
+    if len(groups) > 1 and (problem.noise == 1.0).all():
+        problem = problem.with_noise(first_noise(problem.session, problem.observations))
+    linearisation = linearise_at_reference(problem)
+    require_determined(problem, linearisation.information)
+    repeatability = estimate_repeatability(problem.values, problem.observations)
+    if program is None:
+        program = build_program(problem, options)
+    else:
+        program = program.with_problem(problem)
+    built = time.perf_counter()
+    seconds, iterations = 0.0, 0
+    sigma = _linearised_sigma(program, linearisation, repeatability)
+    first = linearisation.solve(sigma=sigma) if start is None else np.asarray(start)
+    passive: Array | None = None
+    for _ in range(MAX_SIGMA_ROUNDS):
+        try:
+            solution = program.solve(sigma=sigma, start=first, start_passive=passive)
+        except ClosureError:
+            if start is not None or passive is not None:
+                raise
+            solution = program.solve(sigma=sigma)  # the linearised machine cannot be assembled
+        seconds, iterations = seconds + solution.seconds_solve, iterations + solution.iterations
+        prediction, jacobian = problem.linearise(solution.theta, solution.passive)
+        information = decompose(jacobian, problem.observations)
+        residual = _residual(program, solution, prediction)
+        held = solution.at_bound != 0
+        noise = _noise(program, residual, information, sigma, repeatability, held=held)
+        found = max(noise.sigma, SMALLEST_SIGMA)
+        weights = problem.noise
+        if len(groups) > 1:
+            weights = _weigh(problem, groups, residual, jacobian, information, sigma, held)
+        balanced = bool(np.abs(weights / problem.noise - 1.0).max() < SIGMA_SETTLED)
+        if balanced and (not _matters(program) or _settled(found, sigma)):
+            break
+        first, passive = solution.theta, solution.passive
+        if balanced:
+            sigma = found
+            continue
+        problem = problem.with_noise(weights)
+        program, linearisation = program.with_problem(problem), linearise_at_reference(problem)
+    require_assembly(problem, solution, robust=program.options.loss.robust)
+    weight = max(noise.sigma, SMALLEST_SIGMA) if math.isfinite(noise.sigma) else sigma
+    return Fit(
+        problem=problem,
+        program=program,
+        seconds_build=built - began,
+        seconds_solve=seconds,
+        iterations=iterations,
+        linearisation=linearisation,
+        linear=linearisation.solve(sigma=weight),
+        solution=solution,
+        noise=noise,
+        prediction=prediction,
+        jacobian=jacobian,
+        information=information,
+    )
+
+
+def _weigh(
+    problem: CalibrationProblem,
+    groups: Sequence[GaugeReadings],
+    residual: Array,
+    jacobian: Array,
+    information: Information,
+    sigma: float,
+    held: NDArray[np.bool_],
+) -> Array:
+    """Noise of each entry over the first gauge's, as the solution leaves it, (n_entries,)."""
+    covariance = information.covariance(sigma=sigma, precision=problem.prior_precision, held=held)
+    found = weigh_gauges(
+        groups,
+        problem.observations,
+        residual=residual * problem.noise,
+        leverage=leverages(jacobian, problem.observations, covariance, sigma),
+        values=problem.values * problem.noise,
+        sigma=sigma * problem.noise,
+    )
+    return np.asarray(found / found[groups[0].entries][0])
+
+
+def require_assembly(problem: CalibrationProblem, solution: Solution, *, robust: bool) -> None:
+    """Refuse a solution that is no machine: absurd readings can be met by absurd errors.
+
+    Args:
+        problem: The problem.
+        solution: Its solution.
+        robust: Whether the loss was a robust one already.
+
+    Raises:
+        SolverError: Naming the posture that the machine found cannot reach.
+    """
+    try:
+        problem.close(solution.theta, start=solution.passive)
+    except ClosureError as e:
+        hint = "" if robust else "; with the loss 'huber' it may be named"
+        raise SolverError(
+            f"the errors that fit these readings best make no machine: {e}. Look for a reading "
+            f"with a wrong sign or in a wrong row{hint}",
+            status=solution.status,
+            iterations=solution.iterations,
+        ) from None
+
+
+def _matters(program: Program) -> bool:
+    """Whether sigma matters to the estimate: beside a prior, or with a robust loss."""
+    return program.problem.prior or program.options.loss.robust
+
+
+def _settled(found: float, sigma: float) -> bool:
+    return not math.isfinite(found) or abs(found / sigma - 1.0) < SIGMA_SETTLED
+
+
+def _linearised_sigma(
+    program: Program, linearisation: Linearisation, repeatability: tuple[float, int]
+) -> float:
+    """Sigma as the linearised problem has it, [m]: mostly near enough for one exact solution."""
+    problem = program.problem
+    sigma = first_sigma(problem.session, repeatability)
+    for _ in range(MAX_SIGMA_ROUNDS if _matters(program) else 0):
+        change = (linearisation.solve(sigma=sigma) - problem.reference) / problem.theta_scale
+        residual = linearisation.residual - linearisation.slopes @ change
+        noise = _noise(program, residual, linearisation.information, sigma, repeatability)
+        found = max(noise.sigma, SMALLEST_SIGMA)
+        if _settled(found, sigma):
+            break
+        sigma = found
+    return sigma
+
+
+def first_sigma(session: Session, repeatability: tuple[float, int]) -> float:
+    """What a reading's standard deviation is taken to be before there is a solution, [m]."""
+    return stated_sigma(session.gauge, repeatability)
+
+
+def require_determined(problem: CalibrationProblem, information: Information) -> None:
+    """Refuse parameters that neither the readings nor a prior determine.
+
+    Raises:
+        NotIdentifiableError: Naming them.
+    """
+    session = problem.session
+    where = session.readings_path or session.path
+    require_identifiable(
+        information,
+        problem.free,
+        precision=problem.prior_precision,
+        where=None if where is None else str(where),
+    )
+
+
+def _residual(program: Program, solution: Solution, prediction: Array) -> Array:
+    """Residuals with the zeros that the loss gives: their mean for squares."""
+    problem, o = program.problem, program.problem.observations
+    left = problem.values - prediction
+    if program.options.loss.robust:
+        return np.asarray(left - solution.zeros[o.zero])
+    return project_out_zeros(left, o)
+
+
+def _noise(
+    program: Program,
+    residual: Array,
+    information: Information,
+    sigma: float,
+    repeatability: tuple[float, int],
+    *,
+    held: NDArray[np.bool_] | None = None,
+) -> Noise:
+    """Noise from residuals with zeros eliminated, shape (n_entries,), [m]."""
+    problem, loss = program.problem, program.options.loss
+    used = information.effective_parameters(
+        sigma=sigma, precision=problem.prior_precision, held=held
+    )
+    dof = problem.observations.size - problem.observations.n_zeros - used
+    return estimate_noise(
+        # cycles with a wrong reading among them would say that all scatter
+        repeatability=(math.nan, 0) if loss.robust and dof > 1.0 else repeatability,
+        residual_square=loss.robust_square(residual, dof=dof, start=sigma),
+        residual_dof=dof,
+        gauge_sigma=problem.session.gauge.sigma,
+        resolution=problem.session.gauge.resolution,
+    )

@@ -1,0 +1,222 @@
+"""Linear identification: the paper's equation (8), and the linearised solution of any problem."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.errors import NotIdentifiableError
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.kinematics.orthoglide import displacement_angle
+from orthocal.statistics.information import RANK_THRESHOLD, Information, decompose
+from orthocal.statistics.zeros import project_out_zeros
+
+Array = NDArray[np.float64]
+
+TWELVE_ROWS = (
+    "xy+",
+    "yx+",
+    "xy-",
+    "yx-",
+    "yz+",
+    "zy+",
+    "yz-",
+    "zy-",
+    "xz+",
+    "zx+",
+    "xz-",
+    "zx-",
+)
+"""Rows of equation (8): direction, leg, and + or − for maximum or minimum less zero posture.
+
+The last block is (Δx_z, Δz_x).
+"""
+
+SIX_ROWS = ("xy", "xz", "yx", "yz", "zx", "zy")
+"""Rows of the reduced system, maximum less minimum, in the order of the paper's Table 1."""
+
+
+def leg_parallelism_matrix(
+    *,
+    length: float,
+    displacement_max: float,
+    displacement_min: float,
+    rows: Literal[6, 12] = 12,
+    fraction_from_tcp: float = 0.5,
+) -> Array:
+    """Coefficients of equation (8), readings by offsets.
+
+        Δy_x = c Δρ_x + b Δρ_y,  b = sin α,  c = (1 − μ + sin α) tan α
+
+    With μ = 0.5 this is equation (7); a row of the reduced system is maximum less minimum.
+
+    Args:
+        length: Leg length L, [m].
+        displacement_max: Displacement of the tool in the maximum postures, [m].
+        displacement_min: Displacement in the minimum postures, negative, [m].
+        rows: 12 for differences from the zero posture (order TWELVE_ROWS), 6 for maximum less
+            minimum (order SIX_ROWS).
+        fraction_from_tcp: μ, where the gauge touches the leg in the zero posture: 0 at the tool.
+
+    Returns:
+        Shape (rows, 3), [m/m].
+
+    Raises:
+        UnreachableError: If a displacement is not below the leg length.
+    """
+    coefficients = {}
+    for sign, displacement in (("+", displacement_max), ("-", displacement_min)):
+        alpha = displacement_angle(displacement, length=length)
+        b = np.sin(alpha)
+        coefficients[sign] = (b, (1.0 - fraction_from_tcp + b) * np.tan(alpha))
+
+    def row(direction: str, leg: str, sign: str) -> Array:
+        b, c = coefficients[sign]
+        result = np.zeros(3)
+        result["xyz".index(leg)] = c
+        result["xyz".index(direction)] = b
+        return result
+
+    if rows == 12:
+        return np.array([row(name[0], name[1], name[2]) for name in TWELVE_ROWS])
+    return np.array([row(name[0], name[1], "+") - row(name[0], name[1], "-") for name in SIX_ROWS])
+
+
+def twelve_row_covariance() -> Array:
+    """Covariance of the twelve differences for readings of variance 1, shape (12, 12).
+
+    Maximum and minimum differences of one setup share the zero reading: [[2, 1], [1, 2]].
+    """
+    same_setup = np.array([[a[:2] == b[:2] for b in TWELVE_ROWS] for a in TWELVE_ROWS])
+    return same_setup.astype(np.float64) + np.eye(len(TWELVE_ROWS))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearFit:
+    """A least-squares solution of equation (8)."""
+
+    offsets: Array
+    """Δρ, shape (3,), [m]."""
+    residuals: Array
+    """y − A Δρ, shape (rows,), [m]."""
+    covariance: Array
+    """Covariance of the offsets for readings of the covariance given, shape (3, 3)."""
+    sigma: float
+    """√(Σ r²/(rows − 3)) of a row, or for generalised least squares of a reading, [m]."""
+    dof: int
+
+
+def solve_equation_8(
+    matrix: ArrayLike, differences: ArrayLike, *, covariance: ArrayLike | None = None
+) -> LinearFit:
+    """Least squares of equation (8): generalised with the covariance of the rows, else ordinary.
+
+    Args:
+        matrix: From `leg_parallelism_matrix`, shape (rows, 3).
+        differences: Measured differences, shape (rows,), [m].
+        covariance: Covariance of the rows up to a factor, shape (rows, rows).
+
+    Raises:
+        NotIdentifiableError: If the rows do not determine the three offsets.
+    """
+    a = np.asarray(matrix, dtype=np.float64)
+    y = np.asarray(differences, dtype=np.float64)
+    if np.linalg.matrix_rank(a, tol=RANK_THRESHOLD) < 3:
+        raise NotIdentifiableError(
+            "the rows do not determine the three offsets", parameters=("x", "y", "z")
+        )
+    whiten: Array = np.eye(len(y))
+    if covariance is not None:
+        factor = np.linalg.cholesky(np.asarray(covariance, dtype=np.float64))
+        whiten = np.asarray(np.linalg.inv(factor))
+    inverse = np.linalg.pinv(whiten @ a)
+    offsets = inverse @ (whiten @ y)
+    residuals = y - a @ offsets
+    dof = len(y) - 3
+    weighted = whiten @ residuals
+    return LinearFit(
+        offsets=offsets,
+        residuals=residuals,
+        covariance=inverse @ inverse.T,
+        sigma=float(np.sqrt(weighted @ weighted / dof)) if dof > 0 else float("nan"),
+        dof=dof,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearisation:
+    """A problem to first order about what the controller already corrects."""
+
+    problem: CalibrationProblem
+    residual: Array
+    """y − h there, less the mean of those with the same gauge zero, shape (n_entries,), [m]."""
+    slopes: Array
+    """dh/dθ̂ there, zeros eliminated likewise, shape (n_entries, n_free), [m per tolerance]."""
+    information: Information
+
+    def solve(self, *, sigma: float, use: NDArray[np.bool_] | None = None) -> Array:
+        """First-order solution: generalised least squares with the problem's prior and bounds.
+
+        Args:
+            sigma: Standard deviation of one reading, [m]; matters only beside a prior.
+            use: Which entries to use, shape (n_entries,): whole groups with a common zero.
+
+        Returns:
+            Free parameters, shape (n_free,), [SI].
+        """
+        problem = self.problem
+        chosen = slice(None) if use is None else use
+        slopes, residual = self.slopes[chosen], self.residual[chosen]
+        if len(slopes) > 2 * problem.n_free:  # the same normal equations from far fewer rows
+            stacked = np.asarray(np.linalg.qr(np.column_stack([slopes, residual]), mode="r"))
+            slopes, residual = stacked[:, :-1], stacked[:, -1]
+        reference = problem.reference / problem.theta_scale
+        weight = np.sqrt(problem.prior_precision)
+        if problem.prior:
+            expected = problem.prior_mean / problem.theta_scale
+            slopes = np.vstack([slopes / sigma, np.diag(weight)])
+            residual = np.concatenate([residual / sigma, weight * (expected - reference)])
+        selection = problem.selection
+        lower, upper = selection.lower, selection.upper
+        if np.isfinite(lower).any() or np.isfinite(upper).any():
+            from scipy.optimize import lsq_linear
+
+            limits = [b / problem.theta_scale - reference for b in (lower, upper)]
+            step = lsq_linear(slopes, residual, bounds=limits, method="bvls").x
+        else:
+            step = np.linalg.lstsq(slopes, residual, rcond=RANK_THRESHOLD)[0]
+        return np.asarray((reference + step) * problem.theta_scale)
+
+
+def linearise_at_reference(problem: CalibrationProblem) -> Linearisation:
+    """A problem to first order about what the controller already corrects.
+
+    Raises:
+        ClosureError: If the reference machine cannot reach a posture.
+    """
+    prediction, jacobian = problem.linearise(problem.reference)
+    return Linearisation(
+        problem,
+        project_out_zeros(problem.values - prediction, problem.observations),
+        project_out_zeros(jacobian, problem.observations),
+        decompose(jacobian, problem.observations),
+    )
+
+
+def solve_linearised(problem: CalibrationProblem, *, sigma: float) -> Array:
+    """First-order solution of a problem about what the controller already corrects.
+
+    Args:
+        problem: The problem.
+        sigma: Standard deviation of one reading, [m]; matters only beside a prior.
+
+    Returns:
+        Free parameters, shape (n_free,), [SI].
+
+    Raises:
+        ClosureError: If the reference machine cannot reach a posture.
+    """
+    return linearise_at_reference(problem).solve(sigma=sigma)

@@ -1,0 +1,23 @@
+"""The solver that is asked for."""
+
+from __future__ import annotations
+
+from orthocal.estimation.options import SolverOptions
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.solvers.program import Program
+
+
+def build_program(problem: CalibrationProblem, options: SolverOptions | None = None) -> Program:
+    """A problem made ready for the solver that is chosen; Ipopt by default."""
+    chosen = options or SolverOptions()
+    if chosen.solver == "eliminated":
+        from orthocal.estimation.solvers.eliminated import EliminatedProgram
+
+        return EliminatedProgram(problem, options=chosen)
+    if chosen.solver == "linearised":
+        from orthocal.estimation.solvers.linearised import LinearisedProgram
+
+        return LinearisedProgram(problem, options=chosen)
+    from orthocal.estimation.solvers.ipopt import NonlinearProgram
+
+    return NonlinearProgram(problem, options=chosen)

@@ -1,0 +1,243 @@
+"""A calibration problem in its free parameters alone: where it is, and its step to first order.
+
+The passive coordinates follow the parameters by the implicit function theorem, ∂q/∂θ = −g_q⁻¹ g_θ;
+a gauge's zero is where it leaves least. What remains is small and dense.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.estimation.expansion import Expansion
+from orthocal.estimation.loss import Loss
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.solvers.program import LEFT_OUT
+
+Array = NDArray[np.float64]
+
+SETTLED_WITHIN = 1e-11
+"""Last step towards the optimum of a subproblem with a robust loss, in tolerances."""
+
+MOST_STEPS_WITHIN = 100
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """The problem at some θ, or to first order near one."""
+
+    theta: Array
+    """θ̂, shape (n_free,)."""
+    passive: Array
+    """Passive coordinates of every posture where it is no approximation, [m, rad]."""
+    deviation: Array
+    """Readings less predictions, zeros still in them, shape (n_entries,), [σ]."""
+    zeros: Array
+    """Shape (n_zeros,), [σ]."""
+    objective: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """One set of readings, with their weights and the bounds of θ̂."""
+
+    problem: CalibrationProblem
+    loss: Loss
+    values: Array
+    weights: Array
+    sigma: float
+    low: Array
+    high: Array
+    """Bounds of θ̂, shape (n_free,)."""
+
+    @staticmethod
+    def of(
+        problem: CalibrationProblem,
+        loss: Loss,
+        *,
+        sigma: float,
+        values: ArrayLike | None,
+        left_out: ArrayLike | None,
+        held: Mapping[int, float] | None,
+    ) -> Task:
+        """What a solver is asked for; arguments as for `Program.solve`."""
+        lower, upper = problem.selection.lower.copy(), problem.selection.upper.copy()
+        for i, value in (held or {}).items():
+            lower[i] = upper[i] = value
+        weights = np.ones(problem.observations.size)
+        if left_out is not None:
+            weights[np.asarray(left_out, dtype=np.int64)] = LEFT_OUT
+        readings = problem.values if values is None else np.asarray(values, dtype=np.float64)
+        scale = problem.theta_scale
+        return Task(problem, loss, readings, weights, sigma, lower / scale, upper / scale)
+
+    def start(self, theta: ArrayLike | None) -> Array:
+        """θ̂ to start from, within the bounds, shape (n_free,)."""
+        problem = self.problem
+        given = np.array(problem.reference if theta is None else theta, dtype=np.float64)
+        return np.clip(given / problem.theta_scale, self.low, self.high)
+
+    def held_by_bounds(
+        self, state: State, jacobian: Array, held: Mapping[int, float] | None
+    ) -> NDArray[np.int8]:
+        """-1 where a lower bound holds a parameter, 1 where an upper one does, shape (n_free,)."""
+        pull = self.slope(state, jacobian)
+        result = np.zeros(state.theta.size, dtype=np.int8)
+        result[(state.theta <= self.low) & (pull > 0.0)] = -1
+        result[(state.theta >= self.high) & (pull < 0.0)] = 1
+        result[list(held or {})] = 0
+        return result
+
+    def at(self, theta: Array, passive: Array | None) -> State:
+        """The problem at some θ̂, shape (n_free,).
+
+        Raises:
+            ClosureError: If the machine cannot reach a posture there.
+        """
+        problem = self.problem
+        si = theta * problem.theta_scale
+        closed = problem.close(si, start=passive)
+        return self._state(theta, closed, (self.values - problem.predict(si, closed)) / self.sigma)
+
+    def begin(self, theta: ArrayLike | None, passive: Array | None) -> tuple[State, Expansion]:
+        """The problem where a solver begins; arguments as for `Program.solve`.
+
+        Raises:
+            ClosureError: If the machine cannot reach a posture there.
+        """
+        problem, at = self.problem, self.start(theta)
+        if passive is None:
+            passive = problem.reference_passive
+            if not np.array_equal(at * problem.theta_scale, problem.reference):
+                passive = problem.close(at * problem.theta_scale, start=passive)
+        else:
+            passive = problem.close(at * problem.theta_scale, start=passive)
+        expansion = self.expand(at, passive)
+        return self.near(at, passive, expansion), expansion
+
+    def expand(self, theta: Array, passive: Array) -> Expansion:
+        """Readings to first order about some θ̂ and passive coordinates near closed loops."""
+        return self.problem.expand(theta * self.problem.theta_scale, passive)
+
+    def near(self, theta: Array, passive: Array, expansion: Expansion) -> State:
+        """The problem at some θ̂, its loops closed to first order."""
+        predicted = expansion.reading + expansion.opening
+        return self._state(theta, passive, (self.values - predicted) / self.sigma)
+
+    def moved(self, state: State, jacobian: Array, change: Array) -> State:
+        """The problem to first order at another θ̂; arguments as for `step`."""
+        return self._state(state.theta + change, state.passive, state.deviation - jacobian @ change)
+
+    def step(self, state: State, jacobian: Array) -> Array:
+        """Change of θ̂ that solves the problem, its readings taken to first order, (n_free,).
+
+        Squares: one solve. A robust loss: Newton's method, whose weights are ρ''; where that does
+        not make it better, by the secant ρ'/r, which always does.
+
+        Args:
+            state: Where.
+            jacobian: dh/dθ̂ there, shape (n_entries, n_free), [σ per tolerance].
+        """
+        at = state
+        if not self.loss.robust:
+            return self._change(at, jacobian, self.weights)
+        for _ in range(MOST_STEPS_WITHIN):
+            residual = at.deviation - at.zeros[self.problem.observations.zero]
+            for weights in (self.loss.bend(residual), self.loss.weight(residual)):
+                change = self._change(at, jacobian, self.weights * weights)
+                found = self.moved(at, jacobian, change)
+                if found.objective <= at.objective:
+                    break
+            settled = float(np.abs(change).max(initial=0.0)) < SETTLED_WITHIN
+            if settled or found.objective > at.objective:
+                break
+            at = found
+        return np.asarray(at.theta - state.theta)
+
+    def _change(self, at: State, jacobian: Array, weights: Array) -> Array:
+        """Newton's step with given weights, within the bounds, shape (n_free,)."""
+        centred = self._centre(jacobian, weights)
+        if (weights != 1.0).any():
+            centred *= np.sqrt(weights)[:, None]
+        square = centred.T @ centred
+        square[np.diag_indices_from(square)] += self.problem.prior_precision
+        return self._solve(square, -self.slope(at, jacobian), at.theta)
+
+    def slope(self, state: State, jacobian: Array) -> Array:
+        """Derivative of the objective by θ̂, shape (n_free,)."""
+        residual = state.deviation - state.zeros[self.problem.observations.zero]
+        own = self.problem.prior_precision * self._off(state.theta)
+        return np.asarray(own - jacobian.T @ (self.weights * self.loss.influence(residual)))
+
+    def _state(self, theta: Array, passive: Array, deviation: Array) -> State:
+        o, off = self.problem.observations, self._off(theta)
+        zeros = self.loss.centres(deviation, o.zero, o.n_zeros, weights=self.weights)
+        own = 0.5 * float(off @ (self.problem.prior_precision * off))
+        cost = float(self.weights @ self.loss.value(deviation - zeros[o.zero]))
+        return State(theta, passive, deviation, zeros, cost + own)
+
+    def _solve(self, square: Array, pull: Array, theta: Array) -> Array:
+        """The s that minimises ½ sᵀ A s − bᵀ s within the bounds, shape (n_free,).
+
+        Parameters with a bound come last in the triangular factor, so that its last rows are a
+        problem in them alone; the others follow.
+        """
+        low, high = self.low - theta, self.high - theta
+        bounded = np.isfinite(low) | np.isfinite(high)
+        order = np.argsort(bounded, kind="stable")
+        n_open = int((~bounded).sum())
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
+        scaled = (square * np.outer(scale, scale))[np.ix_(order, order)]
+        target = (pull * scale)[order]
+        step = np.empty_like(theta)
+        from scipy import linalg
+
+        try:
+            factor = linalg.cholesky(scaled, lower=True).T
+        except linalg.LinAlgError:  # not told by anything: the least change
+            values, vectors = np.linalg.eigh(scaled)
+            kept = values > 1e-13 * values.max(initial=0.0)
+            step[order] = vectors[:, kept] @ ((vectors[:, kept].T @ target) / values[kept])
+            return np.asarray(np.clip(step * scale, low, high))
+        target = linalg.solve_triangular(factor, target, trans="T")
+        last = slice(n_open, None)
+        limits = ((side / scale)[order][last] for side in (low, high))
+        found = np.empty_like(target)
+        found[last] = _bounded(factor[last, last], target[last], *limits)
+        found[:n_open] = linalg.solve_triangular(
+            factor[:n_open, :n_open], target[:n_open] - factor[:n_open, last] @ found[last]
+        )
+        step[order] = found
+        return np.asarray(np.clip(step * scale, low, high))
+
+    def _off(self, theta: Array) -> Array:
+        """How far θ̂ is from its prior's mean, shape (n_free,)."""
+        return np.asarray(theta - self.problem.prior_mean / self.problem.theta_scale)
+
+    def _centre(self, values: Array, weights: Array) -> Array:
+        """Rows less the weighted mean of those that share their zero, shape as given."""
+        o = self.problem.observations
+        totals = o.sum_by_zero(values, weights)
+        sums = np.bincount(o.zero, weights, minlength=o.n_zeros)
+        return np.asarray(values - (totals / sums[:, None])[o.zero])
+
+
+def _bounded(factor: Array, target: Array, low: Array, high: Array) -> Array:
+    """The s that minimises ‖R s − t‖ within bounds, R upper triangular, shape (n,)."""
+    from scipy import linalg
+
+    free = linalg.solve_triangular(factor, target)
+    if ((free >= low) & (free <= high)).all():
+        return np.asarray(free)
+    from scipy.optimize import lsq_linear
+
+    movable = high > low
+    result = np.where(movable, 0.0, low)
+    left = target - factor @ result
+    limits = low[movable], high[movable]
+    found = lsq_linear(factor[:, movable], left, bounds=limits, method="bvls", tol=1e-15)
+    result[movable] = found.x
+    return np.asarray(result)

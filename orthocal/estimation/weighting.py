@@ -1,0 +1,134 @@
+"""How much the readings of several gauges count beside each other: by their noise.
+
+The noise of each gauge is found as that of a single one: from its repeated cycles, else from what
+is left of its own readings (Förstner, Ein Verfahren zur Schätzung von Varianz- und
+Kovarianzkomponenten, 1979: the squares left of a group, over its readings less what the parameters
+took of them), and never below what is stated of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.measurement.observations import Observations
+from orthocal.measurement.session import Gauge, Session
+from orthocal.statistics.noise import estimate_noise, estimate_repeatability, noise_floor
+from orthocal.statistics.zeros import project_out_zeros
+
+Array = NDArray[np.float64]
+
+SIGMA_WITHOUT_WORD = 10e-6
+"""Standard deviation of a reading assumed at first where nothing tells it, [m]."""
+
+SMALLEST_SIGMA = 1e-9
+"""Standard deviation of a reading below which readings count as perfect, [m]."""
+
+LEAST_DOF = 3.0
+"""Degrees of freedom below which what is left of a gauge's readings does not tell its noise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GaugeReadings:
+    """The entries that one gauge shows."""
+
+    name: str
+    gauge: Gauge
+    entries: NDArray[np.bool_]
+    """Shape (n_entries,)."""
+
+
+def split_by_gauge(session: Session, observations: Observations) -> tuple[GaugeReadings, ...]:
+    """Entries by the gauges that are read, the session's first gauge first."""
+    names = [s.gauge for s in session.setups.values()]
+    of_entry = np.array([list(session.gauges).index(n) for n in names])[observations.setup]
+    return tuple(
+        GaugeReadings(name, gauge, of_entry == i)
+        for i, (name, gauge) in enumerate(session.gauges.items())
+        if (of_entry == i).any()
+    )
+
+
+def stated_sigma(gauge: Gauge, repeatability: tuple[float, int]) -> float:
+    """What a reading's standard deviation is taken to be before there is a solution, [m]."""
+    cycles_sigma, cycles_dof = repeatability
+    floor = noise_floor(gauge.sigma, gauge.resolution)
+    if cycles_dof > 0:
+        return max(cycles_sigma, floor, SMALLEST_SIGMA)
+    return max(gauge.sigma or SIGMA_WITHOUT_WORD, floor)
+
+
+def first_noise(session: Session, observations: Observations) -> Array:
+    """Noise of each entry before there is a solution, over the first gauge's, (n_entries,)."""
+    groups = split_by_gauge(session, observations)
+    result = np.ones(observations.size)
+    if len(groups) < 2:
+        return result
+    values = observations.values(session.values)
+    for g in groups:
+        repeatability = _repeatability(values, observations, g)
+        result[g.entries] = stated_sigma(g.gauge, repeatability)
+    return np.asarray(result / result[groups[0].entries][0])
+
+
+def weigh_gauges(
+    groups: Sequence[GaugeReadings],
+    observations: Observations,
+    *,
+    residual: Array,
+    leverage: Array,
+    values: Array,
+    sigma: Array,
+) -> Array:
+    """Standard deviation of each entry's readings as its gauge's own readings tell it, [m].
+
+    Args:
+        groups: The gauges.
+        observations: Which setup, posture and zero each entry has.
+        residual: Zeros taken off, shape (n_entries,), [m].
+        leverage: What the parameters took of each entry, shape (n_entries,).
+        values: Readings as single ones, shape (n_entries,), [m].
+        sigma: By which they were weighted, shape (n_entries,), [m]: what holds where a gauge's
+            own readings are too few.
+    """
+    result = np.array(sigma)
+    for g in groups:
+        zeros = np.unique(observations.zero[g.entries]).size
+        dof = float(g.entries.sum() - zeros - leverage[g.entries].sum())
+        repeatability = _repeatability(values, observations, g)
+        if repeatability[1] < LEAST_DOF and dof < LEAST_DOF:
+            continue
+        noise = estimate_noise(
+            repeatability=repeatability,
+            residual_square=float(residual[g.entries] @ residual[g.entries]),
+            residual_dof=dof,
+            gauge_sigma=g.gauge.sigma,
+            resolution=g.gauge.resolution,
+        )
+        if math.isfinite(noise.sigma):
+            result[g.entries] = max(noise.sigma, SMALLEST_SIGMA)
+    return result
+
+
+def _repeatability(values: Array, o: Observations, group: GaugeReadings) -> tuple[float, int]:
+    chosen = group.entries
+    return estimate_repeatability(values[chosen], o.only(chosen))
+
+
+def leverages(
+    jacobian: Array, observations: Observations, covariance: Array, sigma: float
+) -> Array:
+    """What the parameters take of each entry, shape (n_entries,); their sum is how many they are.
+
+    Args:
+        jacobian: dh/dθ̂, shape (n_entries, n_free), [m per tolerance].
+        observations: Which zero each entry has.
+        covariance: Of θ̂, shape (n_free, n_free).
+        sigma: Standard deviation of a reading, [m].
+    """
+    centred = project_out_zeros(jacobian, observations)
+    return np.asarray(((centred @ covariance) * centred).sum(axis=1) / sigma**2)

@@ -1,0 +1,165 @@
+"""What sensors see: readings foretold, what is not known of the sensors, where they touch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.kinematics.assembly import Assembly, nominal_assembly
+from orthocal.kinematics.compiled import compiled_robot, zero_poses
+from orthocal.measurement.observations import Observations, drive_table
+from orthocal.measurement.session import Session
+from orthocal.robot.parameters import Parameter
+from orthocal.sensors.compiled import CompiledReading, compile_reading
+from orthocal.sensors.protocol import Contact
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorGroup:
+    """Entries whose sensors have one expression."""
+
+    reading: CompiledReading
+    entries: Indices
+    """Shape (n,)."""
+    setups: Indices
+    """Their setups, shape (n,)."""
+    constants: Array
+    """Of their setups, shape (n, n_constants)."""
+    unknowns: Indices
+    """Which of the session's unknowns are theirs, shape (n, n_unknowns)."""
+
+    def parts(self, size: int) -> Iterator[tuple[Indices, slice]]:
+        """Entries, and where they are in the group, not more than so many at a time."""
+        for first in range(0, self.entries.size, size):
+            part = slice(first, first + size)
+            yield self.entries[part], part
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorUnknowns:
+    """What of a session's sensors is not known exactly."""
+
+    parameters: tuple[Parameter, ...]
+    """Named after their setups, or after what several share; they add to no error of a machine."""
+    of_setup: tuple[tuple[int, ...], ...]
+    """Which of them each setup has, in the order of its sensor's."""
+
+
+def sensor_unknowns(session: Session) -> SensorUnknowns:
+    """The unknowns of all setups that are read."""
+    found: dict[str, Parameter] = {}
+    places = []
+    read = {r.setup for r in session.readings}
+    for setup in session.setups.values():
+        own = []
+        for unknown in setup.sensor.unknowns if setup.name in read else ():
+            owner = unknown.shared_by or f"setup.{setup.name}"
+            name = f"{owner}.{unknown.name}"
+            found.setdefault(name, Parameter(name, unknown.unit, unknown.tolerance, ()))
+            own.append(list(found).index(name))
+        places.append(tuple(own))
+    return SensorUnknowns(tuple(found.values()), tuple(places))
+
+
+def group_sensors(session: Session, observations: Observations) -> tuple[SensorGroup, ...]:
+    """Entries by the expression that they are readings of."""
+    robot = session.robot
+    setups = list(session.setups.values())
+    unknowns = sensor_unknowns(session).of_setup
+    found: dict[int, tuple[CompiledReading, list[int]]] = {}
+    for i in np.unique(observations.setup).tolist():
+        reading = compile_reading(robot, setups[i].sensor)
+        found.setdefault(id(reading), (reading, []))[1].append(i)
+    groups = []
+    for reading, members in found.values():
+        entries = np.flatnonzero(np.isin(observations.setup, members))
+        constants = {i: setups[i].sensor.constants(robot) for i in members}
+        of_entry = observations.setup[entries]
+        table = np.array([constants[i] for i in of_entry.tolist()])
+        own = np.array([unknowns[i] for i in of_entry.tolist()], dtype=np.int64)
+        own = own.reshape(entries.size, -1)
+        groups.append(SensorGroup(reading, entries, of_entry, table, own))
+    return tuple(groups)
+
+
+def predict_entries(
+    session: Session,
+    observations: Observations,
+    errors: Mapping[str, float] | None = None,
+    *,
+    passive: Array | None = None,
+    unknowns: Array | None = None,
+) -> Array:
+    """Readings that a machine with given errors shows, gauge zeros at 0, shape (n,), [m].
+
+    Args:
+        session: Postures, setups and robot.
+        observations: Which setup is read in which posture.
+        errors: Parameter name to value, [unit of the parameter].
+        passive: Passive coordinates of every posture, if they are known, [m, rad].
+        unknowns: Those of the sensors, in the order of `sensor_unknowns`, [SI]; 0 by default.
+
+    Raises:
+        ClosureError: If the machine cannot reach a posture.
+    """
+    robot = session.robot
+    drives = drive_table(session)
+    assembly = Assembly(robot, fixed=errors)
+    if passive is None:
+        passive = assembly.close(drives, names=list(session.postures))
+    machine = assembly.machine()
+    actuated, zero = machine.drives(drives), machine.drives(session.zero_drives)
+    if unknowns is None:
+        unknowns = np.zeros(len(sensor_unknowns(session).parameters))
+    result = np.empty(observations.size)
+    for group in group_sensors(session, observations):
+        at = observations.posture[group.entries]
+        (h,) = group.reading.value(
+            actuated[at],
+            passive[at],
+            machine.placements,
+            zero[group.setups],
+            group.constants,
+            unknowns[group.unknowns],
+        )
+        result[group.entries] = h[:, 0]
+    return result
+
+
+def locate_contacts(session: Session) -> dict[str, tuple[list[str], Contact]]:
+    """Where sensors touch the nominal machine.
+
+    Returns:
+        Setup to the postures that it is read in, and where it touches in them.
+    """
+    robot = session.robot
+    nominal = drive_table(session) + session.active_offsets
+    assembly = nominal_assembly(robot)
+    passive = assembly.close(nominal, names=list(session.postures))
+    machine, compiled = assembly.machine(), compiled_robot(robot)
+
+    def poses(frame: str, drives: Array, passive: Array) -> Array:
+        (found,) = compiled.pose(frame)(drives, passive, machine.placements)
+        return found
+
+    postures = {name: i for i, name in enumerate(session.postures)}
+    read: dict[str, set[str]] = {name: set() for name in session.setups}
+    for reading in session.readings:
+        read[reading.setup].update(p for p in (reading.posture, reading.minus) if p is not None)
+    result = {}
+    for setup in session.setups.values():
+        names = sorted(read[setup.name], key=postures.__getitem__)
+        rows, frames = [postures[n] for n in names], setup.sensor.frames(robot)
+        contact = setup.sensor.contact(
+            [poses(f, nominal[rows], passive[rows]) for f in frames.in_posture],
+            zero_poses(robot, frames.at_zero),
+            robot,
+        )
+        result[setup.name] = names, contact
+    return result

@@ -1,0 +1,80 @@
+"""Calibrations and validations as text that people read: tables, then what they mean."""
+
+from __future__ import annotations
+
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from orthocal.arguments import require_kind
+from orthocal.assess.comparison import Comparison
+from orthocal.assess.validation import Validation
+from orthocal.calibration.calibration import Calibration
+from orthocal.show.accuracy import render_tool
+from orthocal.show.answer import MORE, render_answer
+from orthocal.show.comparison import render_comparison
+from orthocal.show.entering import render_controller
+from orthocal.show.explanation import explain_fit
+from orthocal.show.heading import render_origin
+from orthocal.show.layout import bullets, print_rich, section, to_text
+from orthocal.show.report.rich_markup import to_markup
+from orthocal.show.sensors import render_parts
+from orthocal.show.tables import (
+    render_fit,
+    render_identifiability,
+    render_parameters,
+    render_residuals,
+)
+from orthocal.show.validation import render_validation
+
+Result = Calibration | Validation | Comparison
+
+
+def summarize(
+    result: Result, *, details: bool = False, all_rows: bool = False, html: bool = False
+) -> str:
+    """A calibration, validation or comparison as plain text.
+
+    Args:
+        result: What to summarise.
+        details: Of a calibration all that is known; else the short answer.
+        all_rows: List every reading and parameter, however many there are: details, too.
+        html: As HTML, as a notebook shows it.
+    """
+    content = _render(result, details, all_rows)
+    return to_markup(content) if html else to_text(content)
+
+
+def print_summary(result: Result, *, details: bool = False, all_rows: bool = False) -> None:
+    """Print a calibration, validation or comparison: in colour where there is a terminal."""
+    print_rich(_render(result, details, all_rows))
+
+
+def _render(result: Result, details: bool, all_rows: bool) -> RenderableType:
+    kinds = (Calibration, Comparison, Validation)
+    require_kind(result, kinds, expected="a Calibration, a Comparison or a Validation")
+    if isinstance(result, Calibration):
+        return render_calibration(result, details=details, all_rows=all_rows)
+    if isinstance(result, Comparison):
+        return render_comparison(result, all_rows=all_rows)
+    return render_validation(result, all_rows=all_rows)
+
+
+def render_calibration(
+    calibration: Calibration, *, details: bool = False, all_rows: bool = False
+) -> RenderableType:
+    """A calibration as rich renderables: the short answer, and on demand all the rest."""
+    answer = render_answer(calibration)
+    if not (details or all_rows):
+        return Group(answer, Text(MORE))
+    return Group(
+        answer,
+        section("How it was done", render_origin(calibration)),
+        section("What was identified", render_parameters(calibration, all_rows=all_rows)),
+        section("What the readings tell", render_identifiability(calibration, all_rows=all_rows)),
+        section("Readings before and after", render_residuals(calibration, all_rows=all_rows)),
+        section("How well it fits", render_fit(calibration)),
+        *(section("Gauges and sensors", part) for part in render_parts(calibration)),
+        section("At the tool", render_tool(calibration)),
+        section("What it means", bullets(explain_fit(calibration))),
+        section("What to enter into the controller", render_controller(calibration)),
+    )

@@ -1,0 +1,1 @@
+"""Of arrays: noise, chance, what readings say of parameters. Knows no fit."""

@@ -1,0 +1,34 @@
+"""What chance alone explains, and how wide an interval has to be."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import special
+
+BY_CHANCE = 0.01
+"""Probability below which residuals that are larger than noise are not put down to chance."""
+
+
+def chance_of_excess(chi_square: float, dof: float, *, cycles_dof: float = 0.0) -> float:
+    """Probability that noise alone leaves residuals as large, or larger.
+
+    Args:
+        chi_square: Σ r²/σ² of single readings, zeros eliminated.
+        dof: Degrees of freedom of the residuals.
+        cycles_dof: Those of σ, where it is from repeated cycles: an F test of what the residuals
+            have beside the cycles' own scatter. 0 for a σ that was given: a χ² test.
+    """
+    if cycles_dof == 0.0:
+        return float(special.chdtrc(dof, chi_square))
+    rest, rest_dof = chi_square - cycles_dof, dof - cycles_dof
+    if rest_dof <= 0.5 or rest <= 0.0:
+        return 1.0
+    return float(special.fdtrc(rest_dof, cycles_dof, rest / rest_dof))
+
+
+def confidence_factor(dof: float, level: float = 0.95) -> float:
+    """Standard deviations on either side of an estimate that hold it with a probability."""
+    tail = 0.5 + level / 2.0
+    if np.isinf(dof):
+        return float(special.ndtri(tail))
+    return float(special.stdtrit(dof, tail)) if dof > 0 else float("inf")

@@ -1,0 +1,222 @@
+"""Which parameters the readings tell, and which they cannot tell apart.
+
+All is read off the identification Jacobian with gauge zeros eliminated, each column scaled by its
+parameter's tolerance: an entry says how far one tolerance moves a reading. A direction counts as
+seen where one tolerance along it moves all readings together by more than the noise of one: then
+the readings say more of it than the workshop's tolerance did.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.robot.parameters import Parameter
+from orthocal.statistics.information import RANK_THRESHOLD, Information
+
+Array = NDArray[np.float64]
+
+NEGLIGIBLE = 1e-9
+"""Coefficients of a combination below this, in tolerances, are rounding."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Combination:
+    """A sum of parameters that the readings tell only as a whole."""
+
+    terms: tuple[tuple[str, float], ...]
+    """Parameter and coefficient, the first 1, [unit of the first per unit of the parameter]."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters."""
+        return tuple(name for name, _ in self.terms)
+
+    @property
+    def formula(self) -> str:
+        """As a sum: x_slide.offset + x_swivel.x − 0.31 x_slide.ry."""
+        return self.shorten(None)
+
+    def shorten(self, most: int | None) -> str:
+        """The sum with no more than so many terms, the largest coefficients first."""
+        rest = sorted(self.terms[1:], key=lambda t: -abs(t[1])) if most else self.terms[1:]
+        text = self.terms[0][0]
+        for name, coefficient in rest if most is None else rest[: most - 1]:
+            size = f"{abs(coefficient):.3g}"
+            factor = "" if size == "1" else f"{size} "
+            text += f" {'+' if coefficient > 0 else '−'} {factor}{name}"
+        left_out = 0 if most is None else len(self.terms) - most
+        if left_out <= 0:
+            return text
+        return f"{text} and {left_out} more, of at most {abs(rest[(most or 1) - 1][1]):.2g} each"
+
+    @property
+    def words(self) -> str:
+        """In words: a and b: only their sum."""
+        if len(self.terms) == 2 and f"{abs(self.terms[1][1]):.3g}" == "1":
+            kind = "sum" if self.terms[1][1] > 0 else "difference"
+            return f"{self.terms[0][0]} and {self.terms[1][0]}: only their {kind}"
+        if len(self.terms) == 1:
+            return f"{self.terms[0][0]}: by itself"
+        return f"{', '.join(self.names[:-1])} and {self.names[-1]}: only {self.formula}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identifiability:
+    """What the readings tell of the parameters, and what not."""
+
+    singular_values: Array
+    """Of the scaled identification Jacobian of the free parameters, descending, shape (n_free,),
+    [m per tolerance]; of base parameters it is the reduced one, of their columns."""
+    threshold: float
+    """Singular values above it count as seen, [m per tolerance]."""
+    rank: int
+    """Number of singular values above the threshold."""
+    structural_rank: int
+    """What perfect readings would tell: with base parameters, of all that they stand for."""
+    n_postures: int
+    n_readings: int
+    """Independent readings: repeated ones once, less gauge zeros."""
+    unseen: tuple[str, ...]
+    """Parameters that move no reading by more than the threshold."""
+    told: tuple[str, ...]
+    """Parameters that the readings alone tell better than their tolerances."""
+    alike: tuple[Combination, ...]
+    """Parameters that move the readings alike, two or more: only their sum is told."""
+    base: tuple[Combination, ...]
+    """Base parameters by QR decomposition with pivoting: what the readings tell, one each."""
+
+    @property
+    def condition(self) -> float:
+        """Largest over smallest singular value that counts; infinite if none does."""
+        seen = self.singular_values[: self.rank]
+        return float(seen[0] / seen[-1]) if self.rank else float("inf")
+
+    @property
+    def observability(self) -> dict[str, float]:
+        """Observability indices O1 to O5 over the singular values that count, [m per tolerance].
+
+        O1 = (∏ s)^(1/r)/√postures (Borm and Menq 1991), O2 = s_r/s_1 (Driels and Pathre 1990, [1]),
+        O3 = s_r and O4 = s_r²/s_1 (Nahvi and Hollerbach 1994, 1996), O5 = 1/Σ 1/s (Sun and
+        Hollerbach 2008). 0 where nothing counts. Plans that see different numbers r of directions
+        cannot be compared by any of them.
+        """
+        s = self.singular_values[: self.rank]
+        if not self.rank:
+            return dict.fromkeys(("O1", "O2", "O3", "O4", "O5"), 0.0)
+        return {
+            "O1": float(np.exp(np.log(s).mean()) / np.sqrt(self.n_postures)),
+            "O2": float(s[-1] / s[0]),
+            "O3": float(s[-1]),
+            "O4": float(s[-1] ** 2 / s[0]),
+            "O5": float(1.0 / (1.0 / s).sum()),
+        }
+
+
+def analyse_identifiability(
+    information: Information,
+    parameters: Sequence[Parameter],
+    *,
+    sigma: float,
+    n_postures: int,
+    n_readings: int,
+) -> Identifiability:
+    """Analyse an identification Jacobian.
+
+    Args:
+        information: The Jacobian, zeros eliminated.
+        parameters: The free parameters, in its order.
+        sigma: Standard deviation of a reading, which is the threshold, [m]; 0 or NaN for what
+            perfect readings would tell.
+        n_postures: Postures of the session.
+        n_readings: Independent readings of the session.
+    """
+    factor, s = information.factor, information.singular_values
+    smallest = RANK_THRESHOLD * float(s[0])
+    threshold = max(sigma, smallest) if sigma > 0.0 else smallest
+    sizes = np.linalg.norm(factor, axis=0)
+    names = [p.name for p in parameters]
+    told = information.determined(sigma=threshold if sigma > 0.0 else np.nan)
+    return Identifiability(
+        singular_values=s,
+        threshold=threshold,
+        rank=int((s > threshold).sum()),
+        structural_rank=information.rank,
+        n_postures=n_postures,
+        n_readings=n_readings,
+        unseen=tuple(n for n, size in zip(names, sizes, strict=True) if size <= threshold),
+        told=tuple(n for n, ok in zip(names, told, strict=True) if ok),
+        alike=_find_alike(factor, parameters, threshold),
+        base=find_base_parameters(factor, parameters, threshold=threshold),
+    )
+
+
+def find_base_parameters(
+    factor: Array, parameters: Sequence[Parameter], *, threshold: float
+) -> tuple[Combination, ...]:
+    """Base parameters by QR decomposition with column pivoting (Gautier 1991).
+
+    J P = Q [R₁ R₂], so that J θ̂ = Q R₁ (θ̂₁ + R₁⁻¹ R₂ θ̂₂): the readings tell as many sums as
+    columns count, each of one leading parameter and what cannot be told from it.
+
+    Args:
+        factor: The Jacobian, zeros eliminated, shape (n, n_free), [m per tolerance].
+        parameters: The free parameters, in its order.
+        threshold: A column counts if what it adds to those before moves the readings together
+            by more than this a tolerance, [m].
+    """
+    if not np.any(factor):
+        return ()
+    sizes = np.linalg.svd(factor, compute_uv=False)
+    if len(sizes) == factor.shape[1] and sizes[-1] > threshold * (1.0 + 1e-9):
+        return tuple(Combination(((p.name, 1.0),)) for p in parameters)  # each is told by itself
+    from scipy import linalg
+
+    r, order = linalg.qr(factor, mode="r", pivoting=True)
+    diagonal = np.abs(np.diag(r))
+    count = int((diagonal > threshold).sum())
+    if not count:
+        return ()
+    regroup = linalg.solve_triangular(r[:count, :count], r[:count, count:])
+    result = []
+    for i in range(count):
+        lead = parameters[order[i]]
+        terms = [(lead.name, 1.0)]
+        for j in np.flatnonzero(np.abs(regroup[i]) > NEGLIGIBLE):
+            other = parameters[order[count + j]]
+            coefficient = regroup[i, j] * lead.tolerance / other.tolerance
+            terms.append((other.name, float(coefficient)))
+        result.append(Combination(tuple(terms)))
+    place = {p.name: i for i, p in enumerate(parameters)}
+    return tuple(sorted(result, key=lambda c: place[c.terms[0][0]]))
+
+
+def _find_alike(
+    factor: Array, parameters: Sequence[Parameter], threshold: float
+) -> tuple[Combination, ...]:
+    """Columns that are multiples of one another within the threshold, gathered."""
+    sizes = np.linalg.norm(factor, axis=0)
+    products = factor.T @ factor
+    left = [int(i) for i in np.argsort(-sizes, kind="stable") if sizes[i] > threshold]
+    found = []
+    while left:
+        lead, *rest = left
+        slope = products[lead, rest] / sizes[lead] ** 2
+        square = sizes[rest] ** 2 - slope**2 * sizes[lead] ** 2
+        # a difference of squares loses half of the digits
+        floor = (1e-7 * sizes[rest]) ** 2
+        same = square <= np.maximum(threshold**2, floor)
+        members = sorted([lead, *(i for i, ok in zip(rest, same, strict=True) if ok)])
+        if len(members) > 1:
+            first = members[0]
+            terms = []
+            for i in members:
+                scaled = products[lead, i] / products[lead, first]
+                ratio = scaled * parameters[first].tolerance / parameters[i].tolerance
+                terms.append((parameters[i].name, float(ratio)))
+            found.append((first, Combination(tuple(terms))))
+        left = [i for i, ok in zip(rest, same, strict=True) if not ok]
+    return tuple(c for _, c in sorted(found, key=lambda f: f[0]))

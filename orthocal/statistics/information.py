@@ -1,0 +1,241 @@
+"""What the readings say of the parameters, and how well: rank, covariance, what nothing determines.
+
+Everything is in scaled parameters θ̂ = θ/tolerance, with gauge zeros eliminated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.errors import NotIdentifiableError
+from orthocal.measurement.observations import Observations
+from orthocal.statistics.zeros import project_out_zeros
+
+Array = NDArray[np.float64]
+
+RANK_THRESHOLD = 1e-10
+"""Singular values below this part of the largest count as zero."""
+
+MOST_NAMED = 6
+"""Parameters that a message names one by one."""
+
+MOST_LOST = 2
+"""Ways to change parameters unseen that a message names."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Information:
+    """What the readings say of the parameters: the identification Jacobian, zeros eliminated."""
+
+    factor: Array
+    """A matrix with the same product FᵀF as the Jacobian, shape (n, n_free), [m per tolerance]."""
+    singular_values: Array
+    """Descending, shape (n_free,), padded with zeros, [m per tolerance]."""
+    directions: Array
+    """Right singular vectors as rows, shape (n_free, n_free)."""
+
+    @property
+    def rank(self) -> int:
+        """Number of singular values above RANK_THRESHOLD of the largest."""
+        largest = self.singular_values[0]
+        return int((self.singular_values > RANK_THRESHOLD * largest).sum()) if largest > 0 else 0
+
+    @property
+    def identifiable(self) -> NDArray[np.bool_]:
+        """Whether the readings alone determine a parameter, shape (n_free,)."""
+        null = self.directions[self.rank :]
+        return np.asarray(np.sqrt((null**2).sum(axis=0)) < 1e-6)
+
+    def determined(self, *, sigma: float) -> NDArray[np.bool_]:
+        """Whether the readings alone tell a parameter better than its tolerance, shape (n_free,).
+
+        Args:
+            sigma: Standard deviation of one reading, [m]; if not known, what is structurally
+                identifiable counts as told.
+        """
+        if not sigma > 0.0:
+            return self.identifiable
+        told = self.singular_values > RANK_THRESHOLD * self.singular_values[0]
+        variance = np.zeros_like(self.singular_values)
+        variance[told] = (sigma / self.singular_values[told]) ** 2
+        return np.asarray(((self.directions**2).T @ variance < 1.0) & self.identifiable)
+
+    def effective_parameters(
+        self, *, sigma: float, precision: Array, held: NDArray[np.bool_] | None = None
+    ) -> float:
+        """Parameters that the readings determine, n − tr(P cov): the rank without a prior.
+
+        Args:
+            sigma: Standard deviation of one reading, [m].
+            precision: Diagonal of P, what the prior knows: 1 or 0, shape (n_free,).
+            held: Parameters that are held where they are, by a bound.
+        """
+        count = 0 if held is None else int(held.sum())
+        if not precision.any():
+            return float(self.rank - count)
+        covariance = self.covariance(sigma=sigma, precision=precision, held=held)
+        return float(len(precision) - count - precision @ np.diag(covariance))
+
+    def covariance(
+        self,
+        *,
+        sigma: float,
+        precision: Array,
+        held: NDArray[np.bool_] | None = None,
+        loss: tuple[float, float] = (1.0, 1.0),
+    ) -> Array:
+        """Covariance of θ̂, (Jᵀ J/σ² + P)⁻¹, shape (n_free, n_free).
+
+        With a robust loss it is A⁻¹ B A⁻¹, A = a Jᵀ J/σ² + P and B = b Jᵀ J/σ² + P (Huber, Robust
+        Statistics, 1981, section 7.6, with a prior).
+
+        Args:
+            sigma: Standard deviation of one reading, [m].
+            precision: Diagonal of P: 1 or 0, shape (n_free,).
+            held: Parameters that are held where they are, by a bound: no covariance.
+            loss: a, mean of ρ'', and b, mean square of ρ', of the residuals; 1 for squares.
+        """
+        free = np.ones(len(precision), dtype=bool) if held is None else ~held
+        rows = self.factor[:, free] / sigma
+        gain, noise = loss
+        prior = np.diag(np.sqrt(precision[free]))
+        stacked = np.vstack([np.sqrt(gain) * rows, prior])
+        inverse = _inverse_square(stacked)
+        if loss != (1.0, 1.0):
+            spread = np.hstack([np.sqrt(noise) * inverse @ rows.T, inverse @ prior])
+            inverse = spread @ spread.T
+        result = np.zeros((len(free), len(free)))
+        result[np.ix_(free, free)] = 0.5 * (inverse + inverse.T)
+        return result
+
+
+def _inverse_square(matrix: Array) -> Array:
+    """(MᵀM)⁻¹ without forming MᵀM; infinite where M has not full rank."""
+    r = np.linalg.qr(matrix, mode="r")
+    diagonal = np.abs(np.diag(r))
+    if not diagonal.size:
+        return np.zeros((0, 0))
+    if diagonal.min() <= np.finfo(np.float64).eps * diagonal.max():
+        return np.full((len(r), len(r)), np.inf)
+    half = np.linalg.solve(r, np.eye(len(r)))
+    return np.asarray(half @ half.T)
+
+
+def marginalise(information: Information, kept: int, *, sigma: float) -> Information:
+    """What readings say of the first parameters, the others known to their tolerances at most.
+
+    Args:
+        information: Of all parameters.
+        kept: How many are kept.
+        sigma: Standard deviation of a reading, [m].
+    """
+    count = information.factor.shape[1] - kept
+    if not count:
+        return information
+    rows = np.vstack([information.factor / sigma, np.zeros((count, kept + count))])
+    rows[-count:, kept:] = np.eye(count)
+    taken, _ = np.linalg.qr(rows[:, kept:])
+    left = rows[:, :kept] - taken @ (taken.T @ rows[:, :kept])
+    return _information(sigma * left)
+
+
+def decompose(jacobian: Array, observations: Observations) -> Information:
+    """Decompose an identification Jacobian.
+
+    Args:
+        jacobian: dh/dθ̂, shape (n_entries, n_free), [m per tolerance].
+        observations: Which zero each entry has.
+    """
+    return _information(project_out_zeros(jacobian, observations))
+
+
+def _information(factor: Array) -> Information:
+    if len(factor) > 2 * factor.shape[1]:  # same singular values, far fewer rows
+        factor = np.asarray(np.linalg.qr(factor, mode="r"))
+    _, values, directions = np.linalg.svd(factor, full_matrices=True)
+    padded = np.zeros(factor.shape[1])
+    padded[: len(values)] = values
+    return Information(factor, padded, directions)
+
+
+def require_identifiable(
+    information: Information,
+    names: tuple[str, ...],
+    *,
+    precision: Array,
+    where: str | None = None,
+) -> None:
+    """Refuse parameters that neither readings nor a prior determine.
+
+    Args:
+        information: Of the readings.
+        names: Of the free parameters.
+        precision: What the prior knows of each: 1 or 0, shape (n_free,).
+        where: File, for messages.
+
+    Raises:
+        NotIdentifiableError: Naming the parameters.
+    """
+    if precision.all():
+        return
+    largest = max(float(information.singular_values[0]), 1e-300)
+    stacked = np.vstack([information.factor / largest, np.diag(precision)])
+    _, values, directions = np.linalg.svd(stacked, full_matrices=False)
+    null = directions[values <= RANK_THRESHOLD * values[0]]
+    lost = tuple(n for n, size in zip(names, (null**2).sum(axis=0), strict=True) if size > 1e-12)
+    if lost:
+        named = ", ".join(lost[:MOST_NAMED])
+        more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
+        raise NotIdentifiableError(
+            f"the readings do not determine {named}{more}: {information.rank} of {len(names)} free "
+            f"parameters can be told from them. {_advise_lost(information, names, null)} Or use "
+            "tolerances as a prior (--prior), or identify base parameters (--base)",
+            parameters=lost,
+            where=where,
+        )
+
+
+def _advise_lost(information: Information, names: tuple[str, ...], null: Array) -> str:
+    """Which directions no reading sees, and what would help."""
+    sizes = np.linalg.norm(information.factor, axis=0)
+    unread = sizes <= RANK_THRESHOLD * max(float(sizes.max(initial=0.0)), 1e-300)
+    words = []
+    if unread.any():
+        listed = [n for n, out in zip(names, unread, strict=True) if out]
+        rest = f" and {len(listed) - MOST_NAMED} more" if len(listed) > MOST_NAMED else ""
+        words.append(
+            f"No reading depends on {', '.join(listed[:MOST_NAMED])}{rest}: read the legs that are "
+            "missing, in postures along their own axes."
+        )
+    # each row of the reduced echelon form is one way to change the others that nothing sees
+    rest_null = _reduce(null[:, ~unread])
+    seen = [n for n, out in zip(names, unread, strict=True) if not out]
+    for row in rest_null[:MOST_LOST]:
+        order = np.argsort(-np.round(np.abs(row), 9), kind="stable")
+        terms = [i for i in order if abs(row[i]) > 1e-6]
+        ways = ", ".join(
+            f"{seen[i]} {'up' if row[i] * row[terms[0]] > 0 else 'down'}"
+            for i in terms[:MOST_NAMED]
+        )
+        others = f" and {len(terms) - MOST_NAMED} more" if len(terms) > MOST_NAMED else ""
+        words.append(f"No reading sees a change of these together: {ways}{others}.")
+    return " ".join(words)
+
+
+def _reduce(rows: Array) -> Array:
+    """Reduced echelon form of what rows span: the same for any rows that span it.
+
+    The pivots are the largest columns; of those that are alike, the first.
+    """
+    _, values, basis = np.linalg.svd(rows, full_matrices=False)
+    basis = basis[values > 1e-6]
+    left, pivots = np.array(basis), []
+    for _ in range(len(basis)):
+        sizes = np.linalg.norm(left, axis=0)
+        pivots.append(int(np.argmax(sizes >= (1.0 - 1e-6) * sizes.max())))
+        along = left[:, pivots[-1]] / sizes[pivots[-1]]
+        left -= np.outer(along, along @ left)
+    return np.asarray(np.linalg.solve(basis[:, pivots], basis))

@@ -1,1 +1,0 @@
-"""What if: comparisons and checks made with calibrations."""

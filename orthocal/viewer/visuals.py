@@ -1,0 +1,215 @@
+"""What is to be seen of a robot: the visuals of its URDF, or sticks where it has none."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import coal
+import meshcat.geometry as g
+import numpy as np
+import pinocchio as pin
+from lxml import etree
+from numpy.typing import NDArray
+
+from orthocal.errors import RobotError
+from orthocal.files import exists, read_file, require_file
+from orthocal.robot.model import Robot
+from orthocal.robot.urdf import LARGEST_PLACE, captured_stderr, parse_urdf
+from orthocal.viewer.shapes import Colour, cylinder, pose_along
+
+Array = NDArray[np.float64]
+
+MESH_FORMATS = (".stl", ".obj", ".dae", ".ply")
+
+LARGEST_REPETITION = 10 * 2**20
+"""What a mesh file amounts to where it is drawn again and again, [bytes]."""
+
+LONGEST_LINE = 4_000
+"""Characters of a line of an OBJ: a face of some hundred corners."""
+
+MOST_TRIANGLES = 300_000
+"""Of a mesh; a page holds each as text."""
+
+_STICK: Colour = (0.55, 0.58, 0.62)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visual:
+    """One visible part of a link."""
+
+    link: str
+    placement: Array
+    """In the link's frame, shape (4, 4), [m]."""
+    geometry: g.Geometry
+    colour: Colour
+    opacity: float
+    corners: Array
+    """Of its bounding box in the link's frame, shape (8, 3), [m]."""
+
+
+def load_visuals(robot: Robot) -> tuple[Visual, ...]:
+    """Visible parts of a robot's links, or sticks between its joints where the URDF has none.
+
+    Raises:
+        RobotError: If a mesh file is missing, outside of the robot's folder or not readable.
+    """
+    text = _with_absolute_meshes(robot)
+    try:
+        with captured_stderr():
+            geometry = pin.buildGeomFromUrdfString(robot.model, text, pin.GeometryType.VISUAL)
+    except (ValueError, RuntimeError) as e:
+        # without the place in its source, and a hint at a folder that was right
+        reason = " ".join(str(e).split("message:")[-1].split("Hint:")[0].split())
+        raise RobotError(f"its visuals cannot be loaded: {reason}", where=str(robot.urdf)) from None
+    visuals = tuple(_visual(robot, part) for part in geometry.geometryObjects)
+    return visuals or tuple(_sticks(robot))
+
+
+def _with_absolute_meshes(robot: Robot) -> str:
+    """Text of the URDF with the paths of its meshes resolved within the robot's folder."""
+    root = parse_urdf(robot.urdf)
+    folder = robot.folder.resolve()
+    uses: Counter[Path] = Counter()
+    for mesh in root.iter("mesh"):
+        name = mesh.get("filename") or ""
+        where = f"{robot.urdf}:{mesh.sourceline}"
+        path = (folder / _relative(name)).resolve()
+        if not path.is_relative_to(folder):
+            raise RobotError(f"the mesh '{name}' lies outside of the robot's folder", where=where)
+        if path.suffix.lower() not in MESH_FORMATS:
+            raise RobotError(f"the mesh '{name}' is none of {', '.join(MESH_FORMATS)}", where=where)
+        if not exists(path):
+            raise RobotError(f"there is no mesh file {path}", where=where)
+        require_file(path, error=RobotError)
+        if path.suffix.lower() == ".obj":
+            _require_short_lines(path, where)
+        again = path.stat().st_size * uses[path]
+        uses[path] += 1
+        if again > LARGEST_REPETITION:
+            raise RobotError(
+                f"the mesh '{name}' is drawn {uses[path]} times, {again / 2**20:.0f} MiB again; "
+                f"expected at most {LARGEST_REPETITION / 2**20:g} MiB",
+                where=where,
+            )
+        mesh.set("filename", str(path))
+    return str(etree.tostring(root, encoding="unicode"))
+
+
+def _require_short_lines(path: Path, where: str) -> None:
+    """Refuse an OBJ with a face of thousands of corners: cutting it up takes their square."""
+    lines = read_file(path, error=RobotError).split(b"\n")
+    longest = max(len(line) for line in lines)
+    if longest > LONGEST_LINE:
+        raise RobotError(
+            f"the mesh {path} has a line of {longest} characters; expected at most {LONGEST_LINE}",
+            where=where,
+        )
+
+
+def _relative(name: str) -> Path:
+    """Path of a mesh in the robot's folder: a package's name, or file://, is taken off."""
+    if name.startswith("package://"):
+        return Path(*Path(name.removeprefix("package://")).parts[1:])
+    return Path(name.removeprefix("file://"))
+
+
+def _visual(robot: Robot, part: pin.GeometryObject) -> Visual:
+    geometry = _geometry(robot, part)
+    frame = robot.model.frames[part.parentFrame]
+    placement = frame.placement.inverse() * part.placement
+    shape = part.geometry
+    shape.computeLocalAABB()
+    box = shape.aabb_local
+    low, high = np.asarray(box.min_).reshape(3), np.asarray(box.max_).reshape(3)
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    inside = low + corners * (high - low)
+    colour = np.asarray(part.meshColor, dtype=np.float64).reshape(4)
+    return Visual(
+        link=frame.name,
+        placement=np.asarray(placement.homogeneous),
+        geometry=geometry,
+        colour=(float(colour[0]), float(colour[1]), float(colour[2])),
+        opacity=float(colour[3]),
+        corners=inside @ placement.rotation.T + placement.translation,
+    )
+
+
+def _geometry(robot: Robot, part: pin.GeometryObject) -> g.Geometry:
+    shape = part.geometry
+    if isinstance(shape, coal.Box):
+        return g.Box([float(v) for v in 2.0 * np.asarray(shape.halfSide).reshape(3)])
+    if isinstance(shape, coal.Sphere):
+        return g.Sphere(float(shape.radius))
+    if isinstance(shape, coal.Cylinder):
+        half = float(shape.halfLength)
+        return cylinder(2.0 * half, float(shape.radius), start=-half)
+    if isinstance(shape, coal.BVHModelBase):
+        _check_mesh(robot, part)
+        faces = [shape.tri_indices(i) for i in range(shape.num_tris)]
+        triangles = np.array([[f[0], f[1], f[2]] for f in faces], dtype=np.uint32)
+        return g.TriangularMeshGeometry(np.asarray(shape.vertices()), triangles)
+    raise RobotError(
+        f"the visual '{part.name}' is a {type(shape).__name__}; expected a box, a cylinder, a "
+        "sphere or a mesh",
+        where=str(robot.urdf),
+    )
+
+
+def _check_mesh(robot: Robot, part: pin.GeometryObject) -> None:
+    """Refuse a mesh that no picture can hold."""
+    vertices = np.asarray(part.geometry.vertices())
+    problem = None
+    if part.geometry.num_tris > MOST_TRIANGLES:
+        problem = f"has {part.geometry.num_tris} triangles; expected at most {MOST_TRIANGLES}"
+    elif not (np.isfinite(vertices).all() and np.abs(vertices).max(initial=0.0) <= LARGEST_PLACE):
+        problem = f"reaches beyond ±{LARGEST_PLACE:g} m"
+    if problem:
+        raise RobotError(f"the mesh '{part.meshPath}' {problem}", where=str(robot.urdf))
+
+
+def _sticks(robot: Robot) -> Iterator[Visual]:
+    """A ball at every link, and a stick from it to all that hangs on it."""
+    model = robot.model
+    radius = 0.012 * robot.characteristic_length
+    for i, frame in enumerate(model.frames):
+        if frame.type != pin.FrameType.BODY:
+            continue
+        yield _stick(frame.name, np.zeros(3), radius)
+        for k in range(1, model.njoints):
+            if model.parents[k] == frame.parentJoint and i == _body_of(model, frame.parentJoint):
+                end = frame.placement.inverse() * model.jointPlacements[k]
+                yield _stick(frame.name, np.asarray(end.translation), radius)
+        for other in model.frames:
+            fixed = other.type == pin.FrameType.BODY and other.name != frame.name
+            if fixed and other.parentJoint == frame.parentJoint and _hangs_on(model, other, i):
+                end = frame.placement.inverse() * other.placement
+                yield _stick(frame.name, np.asarray(end.translation), radius)
+
+
+def _body_of(model: pin.Model, joint: int) -> int:
+    """Index of the first link that a joint carries."""
+    bodies = (
+        i
+        for i, f in enumerate(model.frames)
+        if f.type == pin.FrameType.BODY and f.parentJoint == joint
+    )
+    return next(bodies, -1)
+
+
+def _hangs_on(model: pin.Model, frame: pin.Frame, body: int) -> bool:
+    """Whether a link is mounted on another by one fixed joint."""
+    mount = model.frames[frame.parentFrame]
+    return mount.type == pin.FrameType.FIXED_JOINT and int(mount.parentFrame) == body
+
+
+def _stick(link: str, end: Array, radius: float) -> Visual:
+    length = float(np.linalg.norm(end))
+    if length < 1e-9:
+        geometry, placement = g.Sphere(1.6 * radius), np.eye(4)
+    else:
+        geometry, placement = cylinder(length, radius), pose_along(np.zeros(3), end / length)
+    corners = np.array([np.full(3, -radius), np.full(3, radius)] * 4) + np.outer([0, 1] * 4, end)
+    return Visual(link, placement, geometry, _STICK, 1.0, corners)

@@ -1,0 +1,131 @@
+"""What unmodelled errors do to an estimate: the formula against machines that have them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fleets import Fleet
+
+from orthocal import calibrate, load_plan, simulate_session
+from orthocal.calibration import recording
+from orthocal.diagnosis.unmodelled import (
+    find_other_errors,
+    machine_errors,
+    measure_unmodelled,
+)
+from orthocal.estimation.fit import fit_problem
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.statistics.zeros import project_out_zeros
+
+
+@pytest.fixture(scope="module")
+def plan(root):
+    return load_plan(root / "examples/raw-cycles/plan.yaml")
+
+
+@pytest.mark.parametrize("name", ["x_slide.rz", "x_swivel.x", "y_coupler.x", "z_bar_b.z"])
+@pytest.mark.parametrize("model", ["offsets", "lengths"])
+def test_an_unmodelled_error_moves_the_estimate_by_its_leakage(plan, name, model):
+    """Perfect readings of a machine with one small error, calibrated without it."""
+    probe = simulate_session(plan, {}, exact=True).session
+    fit = fit_problem(build_problem(probe, model=model))
+    found = measure_unmodelled(fit, find_other_errors(fit))
+    if name not in found.names:
+        assert (model, name) == ("lengths", "y_coupler.x")  # the length of the leg has it
+        return
+    column = found.leakage[:, found.names.index(name)]
+    size = 1e-6
+    problem = build_problem(simulate_session(plan, {name: size}, exact=True).session, model=model)
+    sigma = fit_problem(build_problem(probe, model=model)).sigma
+    moved = NonlinearProgram(problem).solve(sigma=sigma).theta / size
+    assert moved == pytest.approx(column, abs=2e-3 * max(1.0, np.abs(column).max()))
+
+
+@pytest.fixture(scope="module")
+def machines(plan):
+    """Offsets and residuals found on 200 machines with all other errors, perfect readings."""
+    offsets = build_problem(plan)
+    errors = [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
+    others = build_problem(plan, free=errors)
+    program, rng = NonlinearProgram(offsets), np.random.default_rng(0)
+    found, left = [], []
+    for _ in range(200):
+        values = others.predict(rng.normal(size=others.n_free) * others.theta_scale)
+        solution = program.solve(sigma=1e-5, values=values)
+        residual = values - offsets.predict(solution.theta, solution.passive)
+        found.append(solution.theta)
+        left.append(project_out_zeros(residual, offsets.observations))
+    return np.array(found), np.array(left)
+
+
+def test_residuals_of_machines_with_all_errors_are_as_large_as_foretold(plan, machines):
+    result = calibrate(simulate_session(plan, {}, exact=True).session)
+    rms = np.sqrt(np.mean(machines[1] ** 2))
+    assert rms == pytest.approx(result.unmodelled.residual_rms, rel=0.06)
+
+
+def test_the_offsets_of_machines_with_all_errors_scatter_as_foretold(plan, machines):
+    """Whitened by the covariance foretold they are standard normal."""
+    result = calibrate(simulate_session(plan, {}, exact=True).session)
+    root = np.linalg.cholesky(result.unmodelled.bias_covariance)
+    white = np.linalg.solve(root, machines[0].T)
+    spread = np.linalg.eigvalsh(white @ white.T / white.shape[1])
+    edge = np.sqrt(3 / white.shape[1])
+    assert (1 - edge) ** 2 - 0.1 < spread.min()
+    assert spread.max() < (1 + edge) ** 2 + 0.1
+
+
+def test_a_machine_has_all_errors_of_its_parts(orthoglide, biglide):
+    """21 placements and offsets, three scales, both ends of what its loops join (DESIGN: 177)."""
+    names = machine_errors(orthoglide)
+    assert len(names) == 126 + 3 + 8 * 6
+    assert {n for n in names if n.endswith(".scale")} == {f"{k}_slide.scale" for k in "xyz"}
+    owners = {n.rsplit(".", 1)[0] for n in names if n.startswith("frame.")}
+    rods = {f"frame.{k}_{end}" for k in "xyz" for end in ("crossbar_end", "rod_b_tip")}
+    assert owners == rods | {"frame.y_foot_end", "frame.z_foot_end"}
+    # where the tool hangs on a closure's frame, that frame says where the tool is
+    assert not any(n.startswith("frame.x_tip") for n in machine_errors(biglide))
+
+
+def test_the_full_model_leaves_out_what_is_at_the_ends_of_rods_and_in_the_drives(plan):
+    session = simulate_session(plan, {"x_slide.offset": 1e-3}, seed=1).session
+    found = calibrate(session, "full").unmodelled
+    assert set(found.names) == set(machine_errors(plan.robot)) - set(
+        plan.robot.parameters.select_model("full")
+    )
+    assert found.leakage.shape == (126, 51)
+
+
+def test_with_a_sum_free_its_parts_may_still_differ(plan):
+    """A leg's length is told by its coupler; the second rod may be longer than the first."""
+    session = simulate_session(plan, {"x_slide.offset": 1e-3}, seed=1).session
+    found = calibrate(session, "lengths").unmodelled
+    assert "x_coupler.x" not in found.names
+    assert "frame.x_rod_b_tip.x" in found.names
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "least"), [("offsets", 0.93), ("lengths", 0.93)])
+def test_intervals_hold_what_they_say_with_all_errors_at_their_tolerances(
+    plan, model, least, monkeypatch
+):
+    """200 sessions: what scatter alone would promise is missed by far, all together is not."""
+    fleet = Fleet(plan, model=model)
+    # they hardly change from machine to machine, and take longest to find
+    monkeypatch.setattr(recording, "find_other_errors", lambda *_, **__: fleet.others)
+    known = fleet.machine.free
+    free = [known.index(n) if n in known else -1 for n in fleet.problem.free]
+    hits, scatter_hits, count = 0, 0, 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        errors = fleet.draw(rng)
+        fit = fleet.fit(fleet.read(rng, errors))
+        result = recording.assemble_calibration(fit)
+        for p, (low, high), at in zip(result.free, result.intervals, free, strict=True):
+            if at >= 0:
+                hits += low <= errors[at] <= high
+                scatter_hits += abs(p.value - errors[at]) < result.confidence_factor * p.std
+                count += 1
+    assert least < hits / count < 0.99
+    assert scatter_hits / count < 0.6

@@ -1,0 +1,211 @@
+"""The nonlinear program: derivatives, perfect data, and agreement of solvers."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from derivatives import central_differences
+from scipy.optimize import least_squares
+from tolerances import DERIVATIVE, SAME_OPTIMUM, TRUTH_BACK
+
+from orthocal import load_plan, load_session, simulate_session
+from orthocal.errors import SolverError
+from orthocal.estimation.linear import solve_linearised
+from orthocal.estimation.loss import SQUARES, Loss
+from orthocal.estimation.options import SolverOptions
+from orthocal.estimation.problem import LENGTH_SCALE, build_problem
+from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.statistics.zeros import project_out_zeros
+
+HUBER = Loss("huber")
+LOSSES = [SQUARES, HUBER]
+TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
+
+
+@pytest.fixture(scope="module")
+def plan(root):
+    return load_plan(root / "examples/raw-cycles/plan.yaml")
+
+
+@pytest.fixture(scope="module")
+def perfect(plan):
+    return simulate_session(plan, TRUTH, exact=True).session
+
+
+def point(program, problem, size, seed=0):
+    """A point of the program near closed loops, with every variable moved."""
+    rng = np.random.default_rng(seed)
+    functions = program.functions()
+    n = functions["nlp"].size1_in(0)
+    x = size * rng.normal(size=n)
+    passive = np.tile(problem.robot.zero[problem.robot.passive_index], problem.n_postures)
+    scale = np.tile(problem.passive_scale, problem.n_postures)
+    x[n - passive.size :] += passive / scale + 5.0 * rng.normal(size=passive.size)
+    return x, program.pack(sigma=2e-4, left_out=[1, 4])
+
+
+@pytest.mark.parametrize("size", [0.0, 1.5])
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("model", ["offsets", "lengths", "full"])
+def test_gradient_and_jacobian_are_exact(perfect, model, loss, size):
+    problem = build_problem(perfect, model=model, prior=True)
+    program = NonlinearProgram(problem, options=SolverOptions(loss=loss))
+    f = program.functions()
+    x, p = point(program, problem, size)
+    gradient = np.asarray(f["grad_f"](x, p)[1]).ravel()
+    jacobian = np.asarray(f["jac_g"](x, p)[1].full())
+    along = np.random.default_rng(1).normal(size=(x.size, 12))
+    along /= np.linalg.norm(along, axis=0)
+
+    def both(t):
+        objective, closure = f["nlp"](x + along @ t, p)
+        return np.r_[float(objective), np.asarray(closure).ravel()]
+
+    numeric = central_differences(both, np.zeros(12), step=1e-4)
+    exact = np.vstack([gradient @ along, jacobian @ along])
+    scale = np.maximum(1.0, np.abs(numeric).max(axis=1, keepdims=True))
+    assert (np.abs(exact - numeric) / scale).max() < DERIVATIVE
+
+
+@pytest.mark.parametrize("size", [0.0, 1.5])
+@pytest.mark.parametrize(("model", "loss"), [("offsets", HUBER), ("full", SQUARES)])
+def test_the_exact_hessian_is_that_of_the_lagrangian(perfect, model, loss, size):
+    problem = build_problem(perfect, model=model, prior=True)
+    program = NonlinearProgram(problem, options=SolverOptions(hessian="exact", loss=loss))
+    f = program.functions()
+    x, p = point(program, problem, size)
+    lam_g = np.random.default_rng(2).normal(size=f["nlp"].size1_out(1))
+    upper = np.asarray(f["hess_lag"](x, p, 0.7, lam_g).full())
+    hessian = upper + np.triu(upper, 1).T
+    assert np.array_equal(np.tril(upper, -1), np.zeros_like(upper))
+    along = np.random.default_rng(3).normal(size=(x.size, 8))
+    along /= np.linalg.norm(along, axis=0)
+
+    def slope(t):
+        gradient = np.asarray(f["grad_f"](x + along @ t, p)[1]).ravel()
+        jacobian = f["jac_g"](x + along @ t, p)[1]
+        return 0.7 * gradient + np.asarray(ca.mtimes(jacobian.T, lam_g)).ravel()
+
+    numeric = central_differences(slope, np.zeros(8), step=1e-4)
+    scale = max(1.0, np.abs(numeric).max())
+    assert np.abs(hessian @ along - numeric).max() / scale < DERIVATIVE
+
+
+def test_the_gauss_newton_hessian_is_the_exact_one_without_curvature(perfect):
+    """At zero residuals and zero multipliers they are the same."""
+    problem = build_problem(perfect, prior=True)
+    theta = np.array(list(TRUTH.values()))
+    passive = problem.close(theta)
+    left = problem.values - problem.predict(theta, passive)
+    zeros = [left[problem.observations.zero == i].mean() / LENGTH_SCALE for i in range(6)]
+    x = np.r_[theta / problem.theta_scale, zeros, (passive / problem.passive_scale).ravel()]
+    matrices = []
+    for hessian in ("exact", "gauss-newton"):
+        program = NonlinearProgram(problem, options=SolverOptions(hessian=hessian))
+        f, p = program.functions(), program.pack(sigma=1e-5)
+        lam = np.zeros(f["nlp"].size1_out(1))
+        matrices.append(np.asarray(f["hess_lag"](x, p, 1.0, lam).full()))
+    scale = np.abs(matrices[0]).max()
+    assert np.abs(matrices[0] - matrices[1]).max() / scale < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
+def test_perfect_data_give_the_truth_back_from_any_start(perfect, seed, hessian):
+    rng = np.random.default_rng(seed)
+    start = rng.uniform(-0.02, 0.02, 3)
+    if seed == 0:
+        start = np.array([0.02, -0.02, 0.02])
+    problem = build_problem(perfect)
+    program = NonlinearProgram(problem, options=SolverOptions(hessian=hessian))
+    solution = program.solve(sigma=1e-5, start=start)
+    assert np.abs(solution.theta - list(TRUTH.values())).max() < TRUTH_BACK
+    assert solution.closure < 1e-11
+
+
+@pytest.mark.parametrize(
+    ("model", "loss"),
+    [("offsets", SQUARES), ("offsets", HUBER), ("lengths", HUBER), ("full", SQUARES)],
+)
+def test_both_hessians_reach_the_same_optimum(plan, model, loss):
+    session = simulate_session(plan, TRUTH, seed=3).session
+    problem = build_problem(session, model=model)
+    start = solve_linearised(problem, sigma=1e-5)  # whence fits start by themselves
+    found = [
+        NonlinearProgram(problem, options=SolverOptions(hessian=h, loss=loss)).solve(
+            sigma=1e-5, start=start
+        )
+        for h in ("gauss-newton", "exact")
+    ]
+    gap = np.abs(found[0].theta - found[1].theta)
+    assert (gap / np.maximum(problem.theta_scale, 1e-3)).max() < 1e-6
+    assert abs(found[0].objective / found[1].objective - 1.0) < 1e-9
+
+
+@pytest.mark.parametrize("model", ["offsets", "lengths"])
+def test_another_solver_finds_the_same(plan, model):
+    """SciPy's least squares on the reduced problem, loops closed by Newton at every step."""
+    session = simulate_session(plan, TRUTH, seed=4).session
+    problem = build_problem(session, model=model)
+    solution = NonlinearProgram(problem).solve(sigma=1e-5)
+
+    def residuals(theta_hat):
+        left = problem.values - problem.predict(theta_hat * problem.theta_scale)
+        whitened = project_out_zeros(left, problem.observations) / 1e-5
+        return np.r_[whitened, theta_hat * problem.prior]
+
+    other = least_squares(
+        residuals, np.zeros(problem.n_free), jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12
+    )
+    assert np.abs(other.x * problem.theta_scale - solution.theta).max() < SAME_OPTIMUM
+    assert other.cost == pytest.approx(solution.objective, rel=1e-9)
+
+
+def test_new_readings_do_not_rebuild(plan):
+    first, second = (simulate_session(plan, TRUTH, seed=s).session for s in (5, 6))
+    program = NonlinearProgram(build_problem(first))
+    again = program.solve(sigma=1e-5, values=build_problem(second).values)
+    fresh = NonlinearProgram(build_problem(second)).solve(sigma=1e-5)
+    assert np.abs(again.theta - fresh.theta).max() < SAME_OPTIMUM
+
+
+@pytest.mark.parametrize("experiment", ["1-printed", "1-corrected"])
+def test_where_gauss_newton_does_not_converge_the_exact_hessian_does(root, experiment):
+    """Six readings on the straight part of Huber's loss: where it ends its slope is 0."""
+    problem = build_problem(
+        load_session(root / f"examples/table1/experiment-{experiment}"), model="full"
+    )
+    program, sigma = NonlinearProgram(problem, options=SolverOptions(loss=HUBER)), 2e-5
+    solution = program.solve(sigma=sigma, start=solve_linearised(problem, sigma=sigma))
+    assert solution.hessian == "exact"
+    prediction, jacobian = problem.linearise(solution.theta, solution.passive)
+    residual = problem.values - prediction - solution.zeros[problem.observations.zero]
+    pulls = -jacobian * HUBER.influence(residual / sigma)[:, None] / sigma
+    slope = pulls.sum(axis=0) + problem.prior * solution.theta / problem.theta_scale
+    assert np.abs(slope).max() < DERIVATIVE * np.abs(pulls).sum(axis=0).max()
+
+
+def test_not_converged_is_an_error_and_never_a_result(plan):
+    session = simulate_session(plan, TRUTH, seed=7).session
+    program = NonlinearProgram(build_problem(session), options=SolverOptions(max_iterations=1))
+    with pytest.raises(SolverError, match="Ipopt did not converge: Maximum_Iterations") as caught:
+        program.solve(sigma=1e-5)
+    assert caught.value.iterations == 1
+    assert caught.value.exit_code == 1
+
+
+def test_another_robot_is_calibrated_the_same_way(biglide, tmp_path, root):
+    (tmp_path / "plan.yaml").write_text(
+        f"robot: {root}/tests/robots/biglide\n"
+        "postures:\n  zero: {tcp_mm: [0, 0]}\n  x_max: {tcp_mm: [40, 0]}\n"
+        "  x_min: {tcp_mm: [-60, 0]}\n  y_max: {tcp_mm: [0, 40]}\n  y_min: {tcp_mm: [0, -60]}\n"
+        "setups:\n"
+        "  yx: {leg: x, direction: y, section: {fraction: 0.5}, postures: [zero, x_max, x_min]}\n"
+        "  xy: {leg: y, direction: x, section: {fraction: 0.5}, postures: [zero, y_max, y_min]}\n"
+    )
+    plan = load_plan(tmp_path / "plan.yaml")
+    truth = {"x_slide.offset": 0.7e-3, "y_slide.offset": -1.1e-3}
+    session = simulate_session(plan, truth, exact=True).session
+    solution = NonlinearProgram(build_problem(session)).solve(sigma=1e-5)
+    assert np.abs(solution.theta - list(truth.values())).max() < TRUTH_BACK

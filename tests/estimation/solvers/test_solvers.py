@@ -1,0 +1,188 @@
+"""Solvers side by side: each checks the others."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from orthocal import calibrate, load_calibration, load_session
+from orthocal.errors import OrthocalError, SolverError
+from orthocal.estimation.linear import (
+    SIX_ROWS,
+    leg_parallelism_matrix,
+    linearise_at_reference,
+    solve_equation_8,
+)
+from orthocal.estimation.loss import Loss
+from orthocal.estimation.options import SolverOptions
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.eliminated import EliminatedProgram
+from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.estimation.solvers.linearised import LinearisedProgram
+
+AGREED = 1e-6
+"""Largest difference of two solvers' parameters, [tolerances]."""
+
+EXAMPLES = (
+    "table1/experiment-1-printed",
+    "table1/experiment-2",
+    "table1/experiment-3",
+    "raw-cycles",
+    "sweep",
+)
+CHOICES = {
+    "plain": {},
+    "bounds": {"bounds": {"x_slide.offset": (-0.1e-3, 0.1e-3), "y_slide.offset": (0.6e-3, np.inf)}},
+    "known": {"known": {"x_slide.offset": 0.3e-3, "y_slide.offset": (0.1e-3, 0.05e-3)}},
+}
+
+
+def both(problem, *, loss, sigma, **given):
+    options = SolverOptions(loss=Loss(loss))
+    programs = (
+        EliminatedProgram(problem, options=options),
+        NonlinearProgram(problem, options=options),
+    )
+    return [program.solve(sigma=sigma, **given) for program in programs]
+
+
+@pytest.mark.parametrize("example", EXAMPLES)
+@pytest.mark.parametrize("model", ["offsets", "lengths", "full"])
+@pytest.mark.parametrize("loss", ["squares", "huber"])
+@pytest.mark.parametrize("choice", CHOICES)
+def test_two_solvers_find_one_optimum(root, example, model, loss, choice):
+    session = load_session(root / "examples" / example)
+    problem = build_problem(session, model=model, **CHOICES[choice])
+    ours, ipopts = both(problem, loss=loss, sigma=20e-6)
+    difference = np.abs(ours.theta - ipopts.theta) / problem.theta_scale
+    assert difference.max() < AGREED
+    assert np.abs(ours.zeros - ipopts.zeros).max() < 1e-9
+    assert np.abs(ours.passive - ipopts.passive).max() < 1e-8
+    assert ours.objective == pytest.approx(ipopts.objective, rel=1e-6)
+    assert (ours.at_bound == ipopts.at_bound).all()
+    if choice == "bounds":
+        assert ours.at_bound.any()
+
+
+@pytest.mark.parametrize("example", EXAMPLES)
+@pytest.mark.parametrize("model", ["lengths", "full"])
+@pytest.mark.parametrize("choice", CHOICES)
+def test_the_linearised_solver_is_least_squares_about_what_the_controller_corrects(
+    root, example, model, choice
+):
+    """As SciPy's bounded least squares on stacked rows has it."""
+    session = load_session(root / "examples" / example)
+    problem = build_problem(session, model=model, **CHOICES[choice])
+    found = LinearisedProgram(problem).solve(sigma=20e-6)
+    expected = linearise_at_reference(problem).solve(sigma=20e-6)
+    assert np.abs(found.theta - expected).max() < 1e-9 * problem.theta_scale.max()
+    assert np.abs(problem.close(found.theta) - found.passive).max() < 1e-12
+
+
+def test_linearised_offsets_of_the_paper_are_equation_8s(root):
+    """Residuals and offsets of Experiment 2 by the paper's own matrix."""
+    session = load_session(root / "examples/table1/experiment-2")
+    problem = build_problem(session)
+    matrix = leg_parallelism_matrix(
+        length=0.31025, displacement_max=0.06, displacement_min=-0.1, rows=6
+    )
+    rows = {(r.setup, r.posture): r.value for r in session.readings}
+    assert len(rows) == 6
+    differences = [rows[name, f"{name[1]}_max"] for name in SIX_ROWS]
+    offsets = solve_equation_8(matrix, differences).offsets
+    assert LinearisedProgram(problem).solve(sigma=1e-5).theta == pytest.approx(offsets, abs=1e-8)
+
+
+def test_the_linearised_solver_takes_a_robust_loss(root):
+    """What it finds has no slope, by central differences of the linear problem's own cost."""
+    problem = build_problem(load_session(root / "examples/raw-cycles"), model="lengths")
+    sigma, loss = 5e-6, Loss("huber")
+    options = SolverOptions(solver="linearised", loss=loss)
+    found = LinearisedProgram(problem, options=options).solve(sigma=sigma)
+    squares = LinearisedProgram(problem).solve(sigma=sigma)
+    prediction, jacobian = problem.linearise(problem.reference)
+    o, scale = problem.observations, problem.theta_scale
+
+    def cost(theta, zeros):
+        left = problem.values - prediction - jacobian @ ((theta - problem.reference) / scale)
+        off = problem.prior_precision * (theta - problem.prior_mean) / scale
+        return loss.value((left - zeros[o.zero]) / sigma).sum() + 0.5 * off @ off
+
+    assert np.abs(found.theta - squares.theta).max() > 1e-7
+    least = cost(found.theta, found.zeros)
+    for i in range(problem.n_free):
+        for step in (-1e-4, 1e-4):
+            moved = np.array(found.theta)
+            moved[i] += step * scale[i]
+            assert cost(moved, found.zeros) > least
+    for i in range(o.n_zeros):
+        for step in (-1e-8, 1e-8):
+            moved = np.array(found.zeros)
+            moved[i] += step
+            assert cost(found.theta, moved) > least
+
+
+def test_a_calibration_says_by_which_solver_it_was_found(root, tmp_path):
+    session = load_session(root / "examples/table1/experiment-2")
+    found = {
+        kind: calibrate(session, solver=SolverOptions(solver=kind))
+        for kind in ("ipopt", "eliminated", "linearised")
+    }
+    for kind, result in found.items():
+        assert result.solver.name == kind
+        path = tmp_path / "calibration.json"
+        path.write_text(result.to_json())
+        assert load_calibration(path).solver.name == kind
+    exact, other, first = found.values()
+    assert other.covariance == pytest.approx(exact.covariance, rel=1e-6)
+    for p, q, r in zip(exact.free, other.free, first.free, strict=True):
+        assert q.value == pytest.approx(p.value, abs=1e-11)
+        assert r.value != p.value
+        assert r.value == pytest.approx(r.linear, abs=1e-12)
+        assert r.value == pytest.approx(p.linear, abs=1e-12)
+
+
+def test_only_known_solvers_are_taken():
+    with pytest.raises(OrthocalError, match="the solver is 'newton'; expected one of ipopt"):
+        SolverOptions(solver="newton")
+
+
+def test_readings_left_out_and_parameters_held(root):
+    problem = build_problem(load_session(root / "examples/raw-cycles"), model="lengths")
+    given = {"left_out": [3, 11], "held": {0: 0.4e-3}}
+    ours, ipopts = both(problem, loss="squares", sigma=10e-6, **given)
+    assert np.abs((ours.theta - ipopts.theta) / problem.theta_scale).max() < AGREED
+    assert ours.theta[0] == pytest.approx(0.4e-3, abs=1e-15)
+    assert not ours.at_bound.any()
+    free, _ = both(problem, loss="squares", sigma=10e-6)
+    assert np.abs(free.theta - ours.theta).max() > 1e-5
+
+
+def test_the_gradient_vanishes_by_central_differences(root):
+    """No derivative of the solver's own is asked."""
+    session = load_session(root / "examples/table1/experiment-1-printed")
+    problem = build_problem(session, model="lengths")
+    solution = EliminatedProgram(problem).solve(sigma=20e-6)
+    o = problem.observations
+
+    def objective(theta):
+        deviation = problem.values - problem.predict(theta)
+        counts = np.bincount(o.zero, minlength=o.n_zeros)
+        residual = deviation - (np.bincount(o.zero, deviation) / counts)[o.zero]
+        off = problem.prior_precision * (theta - problem.prior_mean) / problem.theta_scale
+        return 0.5 * (residual @ residual) / 20e-6**2 + 0.5 * (off @ off)
+
+    assert objective(solution.theta) == pytest.approx(solution.objective, rel=1e-9)
+    for i, scale in enumerate(problem.theta_scale):
+        step = np.zeros(problem.n_free)
+        step[i] = 1e-3 * scale
+        up, down = objective(solution.theta + step), objective(solution.theta - step)
+        curvature = up + down - 2.0 * objective(solution.theta)
+        # where the parabola through the three points has its lowest, in steps
+        assert abs(0.5 * (down - up) / curvature) < 1e-4
+
+
+def test_it_says_when_it_does_not_converge(root):
+    problem = build_problem(load_session(root / "examples/sweep"), model="full")
+    with pytest.raises(SolverError, match=r"the step is still .* after 1 iterations"):
+        EliminatedProgram(problem, options=SolverOptions(max_iterations=1)).solve(sigma=5e-6)

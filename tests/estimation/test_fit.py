@@ -1,0 +1,166 @@
+"""Bounds, known values and robust fits of real problems against other ways to the same numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+from tolerances import SAME_OPTIMUM
+
+from orthocal import Choice, SolverOptions, calibrate, load_plan, simulate_session
+from orthocal.estimation.fit import fit_problem
+from orthocal.estimation.linear import linearise_at_reference
+from orthocal.estimation.loss import Loss
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.show.explanation import explain_fit
+from orthocal.statistics.information import decompose
+from orthocal.statistics.zeros import project_out_zeros
+
+TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
+
+LINEAR = 0.02e-3
+"""[m] Exact against linearised offsets, at offsets of a millimetre."""
+
+
+@pytest.fixture(scope="module")
+def plan(root):
+    return load_plan(root / "examples/raw-cycles/plan.yaml")
+
+
+@pytest.fixture(scope="module")
+def session(plan):
+    return simulate_session(plan, TRUTH, seed=11).session
+
+
+def test_a_bound_holds_a_parameter_and_the_others_make_up_for_it(session):
+    """As the linear problem with the same bounds, to what linearising costs."""
+    bounds = {"x_slide.offset": (-1e-3, 0.9e-3)}
+    fit = fit_problem(build_problem(session, bounds=bounds))
+    assert list(fit.solution.at_bound) == [1, 0, 0]
+    assert fit.solution.theta[0] == pytest.approx(0.9e-3, abs=1e-8)
+    linear = linearise_at_reference(build_problem(session))
+    low = np.array([-1e-3, -np.inf, -np.inf]) / 5e-3
+    high = np.array([0.9e-3, np.inf, np.inf]) / 5e-3
+    bounds = (low, high)
+    expected = lsq_linear(linear.slopes, linear.residual, bounds=bounds, tol=1e-15).x * 5e-3
+    assert np.abs(fit.solution.theta - expected).max() < LINEAR
+    assert fit.linear == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_parameter_at_its_bound_has_no_deviation_and_others_hold_with_it_there(session):
+    bounded = calibrate(session, Choice(bounds={"x_slide.offset_m": (-1e-3, 0.9e-3)}))
+    known = calibrate(session, Choice(known={"x_slide.offset_m": 0.9e-3}))
+    p = bounded["x_slide.offset"]
+    assert p.at_bound == "upper"
+    assert p.std == 0.0
+    assert bounded.noise.residual_dof == known.noise.residual_dof  # two parameters are fitted
+    for name in ("y_slide.offset", "z_slide.offset"):
+        assert bounded[name].value == pytest.approx(known[name].value, abs=1e-8)
+        assert bounded[name].std == pytest.approx(known[name].std, rel=1e-3)
+
+
+def test_bounds_that_do_not_bind_change_nothing(session):
+    free = calibrate(session)
+    bounded = calibrate(session, Choice(bounds={"*.offset_m": (-5e-3, 5e-3)}))
+    for a, b in zip(free.free, bounded.free, strict=True):
+        assert a.value == pytest.approx(b.value, abs=SAME_OPTIMUM)
+        assert a.std == pytest.approx(b.std, rel=1e-6)
+        assert b.at_bound is None
+
+
+def test_a_parameter_beside_its_bound_is_not_held_by_it(experiment_2):
+    """y is best at −0.0948 mm while x and z are held: 5 µm from a bound that does not hold it."""
+    narrow = calibrate(experiment_2, Choice(bounds={"*.offset_m": (-1e-4, 1e-4)}))
+    others = {f"{k}_slide.offset_m": (-1e-4, 1e-4) for k in "xz"}
+    free = calibrate(experiment_2, Choice(bounds=others))
+    assert [p.at_bound for p in narrow.free] == ["lower", None, "lower"]
+    found, expected = narrow["y_slide.offset"], free["y_slide.offset"]
+    assert found.value == pytest.approx(expected.value, abs=1e-8)
+    assert found.std == pytest.approx(expected.std, rel=1e-4)
+    assert 0.0 < found.value + 1e-4 < 1e-5
+
+
+def test_a_known_value_with_its_tolerance_is_weighed_with_the_readings(session):
+    """Precisions add: the hand-made mean of what the readings and the drawing say."""
+    alone = fit_problem(build_problem(session, free=["*.offset"]))
+    sigma = alone.sigma
+    i, value, spread = 0, 1.0e-3, 3e-6
+    own = alone.covariance()
+    gain = own[:, i] / (own[i, i] + spread**2)
+    expected = alone.solution.theta + gain * (value - alone.solution.theta[i])
+    problem = build_problem(session, known={"x_slide.offset": (value, spread)})
+    found = NonlinearProgram(problem).solve(sigma=sigma)
+    assert np.abs(found.theta - expected).max() < 0.05 * spread
+    fit = fit_problem(problem)
+    scale = (fit.sigma / sigma) ** 2
+    precision = 1.0 / (own[i, i] * scale) + 1.0 / spread**2
+    assert fit.covariance()[i, i] == pytest.approx(1.0 / precision, rel=1e-3)
+
+
+def test_the_robust_covariance_is_that_of_many_simulated_calibrations(plan):
+    """Huber's loss on normal noise: whitened errors are standard normal."""
+    sigma = 20e-6
+    problem = build_problem(plan)
+    program = NonlinearProgram(problem, options=SolverOptions(loss=Loss("huber")))
+    entries = problem.predict(np.array(list(TRUTH.values())))
+    rng, white, loss = np.random.default_rng(0), [], Loss("huber")
+    truth, o = np.array(list(TRUTH.values())), problem.observations
+    _, jacobian = problem.linearise(truth)
+    information = decompose(jacobian, o)
+    for _ in range(300):
+        values = entries + sigma * rng.normal(size=entries.size)
+        solution = program.solve(sigma=sigma, values=values, start=truth)
+        left = values - problem.predict(solution.theta, solution.passive)
+        residual = project_out_zeros(left, o) / sigma
+        covariance = information.covariance(
+            sigma=sigma,
+            precision=problem.prior_precision,
+            loss=(loss.gain(residual, used=3 + o.n_zeros), loss.normal_square),
+        )
+        error = (solution.theta - truth) / problem.theta_scale
+        white.append(np.linalg.solve(np.linalg.cholesky(covariance), error))
+    # 900 squares have a standard error of 5 %; the formula is one for many readings
+    assert np.mean(np.square(white)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_nothing_moved_is_explained(plan):
+    still = calibrate(simulate_session(plan, {}, exact=True).session)
+    assert any("Nothing moved: the readings show no deviation" in s for s in explain_fit(still))
+    assert not any("Nothing moved" in s for s in explain_fit(calibrate(plan_with_truth(plan))))
+
+
+def plan_with_truth(plan):
+    return simulate_session(plan, TRUTH, seed=0).session
+
+
+def test_nothing_to_move_is_explained(plan):
+    """The platform's own placement is seen by no reading of leg x alone."""
+    result = calibrate(plan_with_truth(plan), Choice(free=["frame.tcp.*"]))
+    assert any("no reading depends on any free parameter" in s for s in explain_fit(result))
+    assert set(result.identifiability.unseen) == {p.name for p in result.free}
+
+
+def test_iterations_and_times_are_told(session):
+    result = calibrate(session, "full")
+    assert result.solver.status == "Solve_Succeeded"
+    assert result.solver.iterations >= 1
+    assert result.solver.seconds_build > 0.0
+    assert result.solver.seconds_solve > 0.0
+
+
+def test_correlations_are_those_of_the_covariance(session):
+    result = calibrate(session)
+    expected = result.covariance / np.outer(
+        np.sqrt(np.diag(result.covariance)), np.sqrt(np.diag(result.covariance))
+    )
+    assert result.correlation == pytest.approx(expected)
+    assert result.correlated(above=0.2)[0][2] == pytest.approx(-0.25, abs=0.02)
+    assert result.correlated(above=0.5) == ()
+
+
+def test_how_much_the_readings_said_of_each_parameter(session):
+    result = calibrate(session, "lengths")
+    p = result["x_leg.length"]
+    assert p.data_share == pytest.approx(1.0 - (p.std / p.tolerance) ** 2)
+    assert np.isnan(calibrate(session)["x_slide.offset"].data_share)

@@ -1,0 +1,124 @@
+"""Equation (8): coefficients, singular values, standard errors, and first-order agreement."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tolerances import KINEMATICS, PRINTED
+
+from orthocal.errors import NotIdentifiableError
+from orthocal.estimation.linear import (
+    SIX_ROWS,
+    TWELVE_ROWS,
+    leg_parallelism_matrix,
+    solve_equation_8,
+    solve_linearised,
+    twelve_row_covariance,
+)
+from orthocal.estimation.problem import build_problem
+
+GEOMETRY = {"length": 0.31025, "displacement_max": 0.06, "displacement_min": -0.10}
+
+
+def test_coefficients_are_those_of_equation_7():
+    matrix = leg_parallelism_matrix(**GEOMETRY)
+    assert matrix.shape == (12, 3)
+    assert np.abs(matrix[TWELVE_ROWS.index("yx+")] - [0.13668, 0.19339, 0]).max() < PRINTED
+    assert np.abs(matrix[TWELVE_ROWS.index("yx-")] - [-0.06050, -0.32232, 0]).max() < PRINTED
+    # the last block of (8) is (Δx_z, Δz_x)
+    assert np.abs(matrix[TWELVE_ROWS.index("xz+")] - [0.19339, 0, 0.13668]).max() < PRINTED
+
+
+def test_the_reduced_rows_are_maximum_less_minimum():
+    twelve, six = (leg_parallelism_matrix(**GEOMETRY, rows=n) for n in (12, 6))
+    for i, name in enumerate(SIX_ROWS):
+        a, b = (twelve[TWELVE_ROWS.index(name + sign)] for sign in "+-")
+        assert np.abs(six[i] - (a - b)).max() < KINEMATICS
+
+
+def test_singular_values_of_the_six_equations():
+    values = np.linalg.svd(leg_parallelism_matrix(**GEOMETRY, rows=6), compute_uv=False)
+    assert np.abs(values - [1.00818, 0.63742, 0.63742]).max() < PRINTED
+
+
+@pytest.mark.parametrize(
+    ("fraction_from_tcp", "expected"), [(0.5, 1.4031), (0.2, 1.3448), (0.65, 1.3914)]
+)
+def test_standard_errors_of_the_six_equations(fraction_from_tcp, expected):
+    matrix = leg_parallelism_matrix(**GEOMETRY, rows=6, fraction_from_tcp=fraction_from_tcp)
+    fit = solve_equation_8(matrix, np.zeros(6))
+    assert np.abs(np.sqrt(np.diag(fit.covariance)) - expected).max() < 0.00006
+    if fraction_from_tcp == 0.5:
+        correlation = fit.covariance[0, 1] / fit.covariance[0, 0]
+        assert abs(correlation + 0.25) < 0.005
+
+
+def test_standard_errors_per_reading_of_the_three_ways():
+    six, twelve = (leg_parallelism_matrix(**GEOMETRY, rows=n) for n in (6, 12))
+    covariance = twelve_row_covariance()
+    assert np.array_equal(covariance[:3, :3], [[2, 0, 1], [0, 2, 0], [1, 0, 2]])
+
+    def per_reading(matrix, rows_covariance, weighting):
+        fit = solve_equation_8(matrix, np.zeros(len(matrix)), covariance=weighting)
+        whiten = np.eye(len(matrix))
+        if weighting is not None:
+            whiten = np.linalg.inv(np.linalg.cholesky(weighting))
+        estimator = np.linalg.pinv(whiten @ matrix) @ whiten
+        spread = estimator @ rows_covariance @ estimator.T
+        if weighting is not None:
+            assert np.abs(spread - fit.covariance).max() < KINEMATICS
+        return np.sqrt(spread[0, 0])
+
+    assert abs(per_reading(six, 2 * np.eye(6), None) - 1.984) < 0.0006
+    assert abs(per_reading(twelve, covariance, None) - 2.066) < 0.0006
+    assert abs(per_reading(twelve, covariance, covariance) - 1.942) < 0.0006
+
+
+def test_perfect_differences_give_the_offsets_back():
+    matrix = leg_parallelism_matrix(**GEOMETRY)
+    offsets = np.array([1e-3, -2e-3, 0.5e-3])
+    for weighting in (None, twelve_row_covariance()):
+        fit = solve_equation_8(matrix, matrix @ offsets, covariance=weighting)
+        assert np.abs(fit.offsets - offsets).max() < KINEMATICS
+        assert fit.sigma < KINEMATICS
+        assert fit.dof == 9
+
+
+def test_rows_of_one_leg_do_not_determine_three_offsets():
+    with pytest.raises(NotIdentifiableError):
+        solve_equation_8(leg_parallelism_matrix(**GEOMETRY, rows=6)[[2, 3]], np.zeros(2))
+
+
+def test_the_closed_loop_model_agrees_to_first_order_with_equation_8(experiment_2):
+    """Six differences of the URDF's model against the reduced system, rows and solution."""
+    problem = build_problem(experiment_2)
+    _, jacobian = problem.linearise(problem.reference)
+    slopes = problem.observations.rows(jacobian) / problem.theta_scale
+    matrix = leg_parallelism_matrix(**GEOMETRY, rows=6)
+    assert np.abs(slopes - matrix).max() < 1e-11
+    theta = solve_linearised(problem, sigma=1e-5)
+    expected = solve_equation_8(matrix, experiment_2.values).offsets
+    assert np.abs(theta - expected).max() < 1e-13
+
+
+def test_twelve_generalised_rows_are_raw_readings_with_their_zeros(root):
+    """Raw readings of zero, max and min, zeros eliminated, are equation (8) with its covariance."""
+    from orthocal import load_plan
+
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    rng = np.random.default_rng(0)
+    session = plan.with_values(1e-3 * rng.normal(size=len(plan.readings)))
+    problem = build_problem(session)
+    theta = solve_linearised(problem, sigma=1e-5)
+    means = {}
+    for r in session.readings:
+        means.setdefault((r.setup, r.posture), []).append(r.value)
+    means = {k: np.mean(v) for k, v in means.items()}
+    differences = [
+        means[name[:2], f"{name[1]}_{'max' if name[2] == '+' else 'min'}"] - means[name[:2], "zero"]
+        for name in TWELVE_ROWS
+    ]
+    fit = solve_equation_8(
+        leg_parallelism_matrix(**GEOMETRY), differences, covariance=twelve_row_covariance()
+    )
+    assert np.abs(theta - fit.offsets).max() < 1e-12

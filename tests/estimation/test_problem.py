@@ -1,0 +1,107 @@
+"""The identification Jacobian, by central differences of machines that are closed anew."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from derivatives import assert_derivative
+from tolerances import KINEMATICS
+
+from orthocal import load_plan
+from orthocal.errors import ParameterError, RobotError
+from orthocal.estimation.problem import build_problem
+from orthocal.measurement.observations import build_observations
+from orthocal.measurement.sensing import predict_entries
+
+
+@pytest.fixture(scope="module")
+def plan(root):
+    return load_plan(root / "examples/raw-cycles/plan.yaml")
+
+
+@pytest.mark.parametrize("size", [0.0, 3.0])
+@pytest.mark.parametrize("model", ["offsets", "lengths", "full"])
+def test_the_implicit_jacobian_is_the_derivative(plan, model, size):
+    problem = build_problem(plan, model=model)
+    at = size * np.random.default_rng(1).normal(size=problem.n_free)
+    _, jacobian = problem.linearise(at * problem.theta_scale)
+    assert_derivative(
+        jacobian * 1e3,
+        lambda t: problem.predict(t * problem.theta_scale) * 1e3,
+        at,
+        step=1e-3,
+        tolerance=1e-6,  # steps of a thousandth of a tolerance, third order
+    )
+
+
+def test_frames_and_scales_can_be_freed_too(plan):
+    names = plan.robot.parameters.select(["*.offset", "*.scale", "frame.*"])
+    problem = build_problem(plan, free=names)
+    at = np.random.default_rng(2).normal(size=len(names))
+    _, jacobian = problem.linearise(at * problem.theta_scale)
+    assert_derivative(
+        jacobian * 1e3,
+        lambda t: problem.predict(t * problem.theta_scale) * 1e3,
+        at,
+        step=1e-3,
+        tolerance=1e-6,
+    )
+
+
+def test_predictions_are_those_of_the_observation_model(plan):
+    problem = build_problem(plan, model="full")
+    theta = 2.0 * np.random.default_rng(3).normal(size=problem.n_free) * problem.theta_scale
+    entries = predict_entries(plan, build_observations(plan), problem.split_errors(theta))
+    assert np.abs(problem.predict(theta) - entries).max() < KINEMATICS * 10
+
+
+def test_known_values_are_held(plan):
+    fixed = {"x_leg.length": 0.3e-3, "x_slide.offset": 1e-3}
+    problem = build_problem(plan, model="lengths", known=fixed)
+    assert "x_slide.offset" not in problem.free
+    entries = predict_entries(plan, build_observations(plan), fixed)
+    assert np.abs(problem.predict(np.zeros(problem.n_free)) - entries).max() < KINEMATICS * 10
+
+
+def test_what_the_controller_corrects_is_the_reference(root):
+    from dataclasses import replace
+
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    active = replace(plan, controller_offsets=np.array([1e-3, 2e-3, 3e-3]))
+    assert np.array_equal(build_problem(active).reference, [1e-3, 2e-3, 3e-3])
+
+
+def test_readings_depend_on_few_variables(plan):
+    """A reading knows its own leg only: this is what makes large problems fast."""
+    problem = build_problem(plan, model="full")
+    setups = list(plan.setups.values())
+    for piece in problem.reading_pieces:
+        (leg,) = {setups[i].sensor.leg for i in problem.observations.setup[piece.entries]}
+        assert piece.passive_index.size == 3
+        assert piece.theta_index.size == 24
+        names = {problem.free[i].split("_")[0] for i in piece.theta_index}
+        assert names == {leg}
+
+
+def test_nothing_free_is_refused(plan):
+    with pytest.raises(ParameterError, match="nothing to identify"):
+        build_problem(plan, free=["!*"])
+
+
+def test_an_unknown_model_is_named_with_what_there_is(plan):
+    with pytest.raises(ParameterError, match="'all' is not a model of this robot; models: offsets"):
+        build_problem(plan, model="all")
+
+
+def test_closure_rows_that_depend_on_others_are_named(root, tmp_path):
+    folder = tmp_path / "biglide"
+    folder.mkdir()
+    for name in ("biglide.urdf", "biglide.yaml"):
+        text = (root / "tests/robots/biglide" / name).read_text()
+        (folder / name).write_text(text.replace("{rows: [x, y]}", "{}"))
+    (tmp_path / "plan.yaml").write_text(
+        "robot: biglide\npostures: {zero: {tcp_mm: [0, 0]}}\n"
+        "setups:\n  yx: {leg: x, direction: y, section: {fraction: 0.5}}\n"
+    )
+    with pytest.raises(RobotError, match=r"closure rows depend on others: z of apex; leave them"):
+        build_problem(load_plan(tmp_path / "plan.yaml"))

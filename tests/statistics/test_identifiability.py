@@ -1,0 +1,231 @@
+"""What readings tell and what they cannot tell apart: hand-made Jacobians, then real plans."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from orthocal import Choice, calibrate, load_plan, load_session, simulate_session
+from orthocal.errors import ParameterError
+from orthocal.estimation.problem import build_problem
+from orthocal.robot.parameters import Parameter
+from orthocal.statistics.identifiability import (
+    Combination,
+    analyse_identifiability,
+    find_base_parameters,
+)
+from orthocal.statistics.information import Information, decompose
+
+
+def information(jacobian):
+    _, values, directions = np.linalg.svd(jacobian)
+    padded = np.zeros(jacobian.shape[1])
+    padded[: len(values)] = values
+    return Information(jacobian, padded, directions)
+
+
+def parameters(*names, tolerances=None):
+    tolerances = tolerances or [1.0] * len(names)
+    return [Parameter(n, "m", t, ((n, 1.0),)) for n, t in zip(names, tolerances, strict=True)]
+
+
+A = np.array([3.0, 0.0, 0.0, 0.0])
+B = np.array([0.0, 2.0, 0.0, 0.0])
+C = np.array([0.0, 0.0, 0.5, 0.0])
+
+
+def analyse(columns, names, *, sigma=0.1, tolerances=None):
+    return analyse_identifiability(
+        information(np.column_stack(columns)),
+        parameters(*names, tolerances=tolerances),
+        sigma=sigma,
+        n_postures=4,
+        n_readings=4,
+    )
+
+
+def test_two_that_act_alike_are_told_as_a_sum():
+    found = analyse([A, B, A], ["x_leg.length", "y.z", "x_slide.offset"])
+    assert [c.words for c in found.alike] == ["x_leg.length and x_slide.offset: only their sum"]
+    assert found.told == ("y.z",)
+    assert found.rank == 2
+
+
+def test_two_that_act_oppositely_are_told_as_a_difference():
+    found = analyse([A, -A], ["a", "b"])
+    assert found.alike[0].words == "a and b: only their difference"
+
+
+def test_coefficients_count_in_units_not_in_tolerances():
+    """One tolerance of b, 0.5, moves as far as one of a, 2: in units b moves four times as far."""
+    found = analyse([A, A, B], ["a", "b", "c"], tolerances=[2.0, 0.5, 1.0])
+    assert found.alike[0].terms == (("a", 1.0), ("b", pytest.approx(4.0)))
+    assert found.alike[0].words == "a and b: only a + 4 b"
+
+
+def test_what_moves_nothing_by_more_than_the_noise_is_not_seen():
+    found = analyse([A, 0.01 * B, C], ["a", "b", "c"])
+    assert found.unseen == ("b",)
+    assert found.rank == 2
+    assert found.structural_rank == 3
+    perfect = analyse([A, 0.01 * B, C], ["a", "b", "c"], sigma=0.0)
+    assert perfect.unseen == ()
+    assert perfect.rank == 3
+
+
+def test_base_parameters_regroup_what_depends_on_others():
+    """The third column is the first plus half of the second."""
+    found = find_base_parameters(
+        np.column_stack([A, B, A + 0.5 * B]), parameters("a", "b", "c"), threshold=0.1
+    )
+    sums = {c.terms[0][0]: dict(c.terms) for c in found}
+    assert len(sums) == 2
+    # what the base parameters predict is what all parameters predict
+    theta = {"a": 0.3, "b": -1.2, "c": 0.7}
+    columns = {"a": A, "b": B, "c": A + 0.5 * B}
+    whole = sum(columns[n] * v for n, v in theta.items())
+    base = sum(
+        columns[lead] * sum(k * theta[n] for n, k in terms.items()) for lead, terms in sums.items()
+    )
+    assert base == pytest.approx(whole, abs=1e-12)
+
+
+def test_observability_indices_solved_by_hand():
+    """Singular values 3, 2 and 0.5 in four postures."""
+    o = analyse([A, B, C], ["a", "b", "c"]).observability
+    assert o["O1"] == pytest.approx(3.0 ** (1 / 3) / 2.0)
+    assert o["O2"] == pytest.approx(0.5 / 3.0)
+    assert o["O3"] == pytest.approx(0.5)
+    assert o["O4"] == pytest.approx(0.25 / 3.0)
+    assert o["O5"] == pytest.approx(1.0 / (1 / 3 + 1 / 2 + 2))
+    assert analyse([A, B, C], ["a", "b", "c"]).condition == pytest.approx(6.0)
+
+
+def test_nothing_seen_has_no_indices():
+    found = analyse([0.01 * A], ["a"])
+    assert found.rank == 0
+    assert set(found.observability.values()) == {0.0}
+    assert found.base == ()
+    assert np.isinf(found.condition)
+
+
+def test_words_for_three():
+    c = Combination((("a", 1.0), ("b", -1.0), ("c", 0.31)))
+    assert c.words == "a, b and c: only a − b + 0.31 c"
+    assert Combination((("a", 1.0),)).words == "a: by itself"
+
+
+@pytest.fixture(scope="module")
+def jacobians(root):
+    """Identification Jacobians of the full model at nominal, of sweep and lines."""
+    found = {}
+    for name in ("sweep", "lines"):
+        problem = build_problem(load_plan(root / f"examples/{name}/plan.yaml"), model="full")
+        _, jacobian = problem.linearise(np.zeros(problem.n_free))
+        found[name] = problem, jacobian
+    return found
+
+
+@pytest.mark.parametrize(("plan", "rank"), [("sweep", 30), ("lines", 42)])
+def test_the_base_parameters_of_a_plan_predict_every_reading(jacobians, plan, rank):
+    """The base parameters are as many as the rank, and say all that the readings say."""
+    problem, jacobian = jacobians[plan]
+    found = decompose(jacobian, problem.observations)
+    assert found.rank == rank
+    smallest = 0.5 * found.singular_values[rank - 1]
+    base = find_base_parameters(found.factor, problem.parameters, threshold=1e-3 * smallest)
+    assert len(base) == rank
+    index = {n: i for i, n in enumerate(problem.free)}
+    theta = np.random.default_rng(0).normal(size=problem.n_free) * problem.theta_scale
+    reduced = np.zeros(problem.n_free)
+    for combination in base:
+        lead = combination.terms[0][0]
+        reduced[index[lead]] = sum(k * theta[index[n]] for n, k in combination.terms)
+    seen, kept = (found.factor @ (t / problem.theta_scale) for t in (theta, reduced))
+    # coefficients below a thousandth of a tolerance are left out of the sums
+    assert np.abs(kept - seen).max() < 2e-3 * np.abs(found.factor).max()
+
+
+def test_what_the_sweep_takes_for_one_the_lines_tell_apart(jacobians):
+    """The length of a leg's bars against the tilt of the axis that carries it, and more."""
+    alike = {}
+    for name, (problem, jacobian) in jacobians.items():
+        found = analyse_identifiability(
+            decompose(jacobian, problem.observations),
+            problem.parameters,
+            sigma=5e-6,
+            n_postures=problem.n_postures,
+            n_readings=jacobian.shape[0],
+        )
+        alike[name] = found
+    assert alike["lines"].rank > 1.5 * alike["sweep"].rank
+    groups = {c.names for c in alike["sweep"].alike}
+    assert ("x_slide.offset", "x_swivel.x", "x_wrist.x", "x_fork.x") in groups
+    # on displaced lines the wrist's place is no longer the same as an offset
+    assert ("x_slide.offset", "x_swivel.x", "x_fork.x") in {c.names for c in alike["lines"].alike}
+
+
+def test_a_leg_length_that_only_the_zero_posture_would_show_is_one_with_the_offset(root):
+    """Known in words from a session: the swivel's place along the slide is an offset."""
+    session = load_session(root / "examples/raw-cycles")
+    result = calibrate(session, Choice(free=["*.offset", "x_swivel.x"], prior=True))
+    words = [c.words for c in result.identifiability.alike]
+    assert words == ["x_slide.offset and x_swivel.x: only their difference"]
+
+
+def test_base_parameters_without_prior_are_the_sums_of_the_truth(root):
+    """Perfect readings: each base parameter is its whole combination, to first order."""
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    truth = {"x_slide.offset": 0.4e-3, "y_slide.offset": -0.3e-3, "x_swivel.x": 0.1e-3}
+    session = simulate_session(plan, truth, exact=True).session
+    result = calibrate(session, Choice(free=["*.offset", "x_swivel.x"], base=True))
+    assert result.base
+    assert not result.prior
+    assert len(result.free) == 3
+    leads = [p.name for p in result.free]
+    lead = next(n for n in leads if n.startswith("x_"))
+    combination = next(c for c in result.identifiability.base if c.terms[0][0] == lead)
+    expected = sum(k * truth[n] for n, k in combination.terms)
+    assert result[lead].value == pytest.approx(expected, abs=1e-8)
+    assert result["y_slide.offset"].value == pytest.approx(-0.3e-3, abs=1e-8)
+
+
+def test_base_and_prior_based_solutions_predict_the_same(root):
+    """Where the prior is weak beside the readings, both describe the readings alike."""
+    session = load_session(root / "examples/sweep")
+    base = calibrate(session, Choice(model="full", base=True))
+    prior = calibrate(session, Choice(model="full", tolerances={"*.offset_m": 2e-3}))
+    gap = [a.predicted - b.predicted for a, b in zip(base.residuals, prior.residuals, strict=True)]
+    assert np.sqrt(np.mean(np.square(gap))) < 0.4 * prior.sigma
+    assert len(base.free) < 30
+    assert base.noise.reading_sigma == pytest.approx(5e-6, rel=0.15)
+
+
+def test_base_parameters_have_no_prior(root):
+    session = load_session(root / "examples/raw-cycles")
+    with pytest.raises(ParameterError, match="without any prior"):
+        calibrate(session, Choice(model="full", base=True, prior=True))
+    with pytest.raises(ParameterError, match=r"give x_leg\.length_m as known without ±"):
+        calibrate(session, Choice(known={"x_leg.length_m": (1e-4, 1e-5)}, base=True))
+
+
+def test_readings_that_tell_nothing_leave_no_base(raw_cycles):
+    rows = tuple(r for r in raw_cycles.readings if r.posture == "zero")
+    from orthocal.errors import NotIdentifiableError
+
+    with pytest.raises(NotIdentifiableError, match="tell none of the free parameters"):
+        calibrate(replace(raw_cycles, readings=rows), Choice(base=True))
+
+
+def test_the_base_parameters_of_table_1_are_the_three_offsets(experiment_2):
+    """What six readings with that scatter tell of 126 errors is what the paper identifies."""
+    base = calibrate(experiment_2, Choice(model="full", base=True))
+    offsets = calibrate(experiment_2)
+    assert [p.name for p in base.free] == [p.name for p in offsets.free]
+    for a, b in zip(base.free, offsets.free, strict=True):
+        assert a.value == pytest.approx(b.value, abs=1e-9)
+        assert a.std == pytest.approx(b.std, rel=1e-6)
+    assert base.spare_readings == 3
+    assert calibrate(experiment_2, "full").spare_readings == 0

@@ -1,0 +1,181 @@
+"""Noise and covariance: hand-solved cases first, then sampling."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from tolerances import KINEMATICS
+
+from orthocal import calibrate, load_plan
+from orthocal.errors import NotIdentifiableError
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.measurement.observations import Observations, build_observations
+from orthocal.measurement.sensing import predict_entries
+from orthocal.statistics.chance import chance_of_excess, confidence_factor
+from orthocal.statistics.information import Information, decompose
+from orthocal.statistics.noise import estimate_noise, estimate_repeatability
+
+TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
+
+
+def observations(setup, posture, zero):
+    s, p, z = (np.array(v, dtype=np.int64) for v in (setup, posture, zero))
+    n = int(z.max()) + 1
+    rows = np.arange(len(s))
+    return Observations(s, p, z, n, ("s",) * n, (True,) * n, rows, np.full(len(s), -1))
+
+
+def test_covariance_of_a_line_solved_by_hand():
+    """y = a u + zero at u = −1, 0, 2: the slope has variance σ²/Σ(u − ū)² = σ²/(14/3)."""
+    o = observations([0, 0, 0], [0, 1, 2], [0, 0, 0])
+    information = decompose(np.array([[-1.0], [0.0], [2.0]]), o)
+    assert information.covariance(sigma=0.3, precision=np.zeros(1))[0, 0] == pytest.approx(
+        0.3**2 / (14 / 3), rel=KINEMATICS
+    )
+    # with a prior of one: precisions add
+    assert information.covariance(sigma=0.3, precision=np.ones(1))[0, 0] == pytest.approx(
+        1.0 / (1.0 + (14 / 3) / 0.3**2), rel=KINEMATICS
+    )
+    assert information.effective_parameters(sigma=0.3, precision=np.ones(1)) == pytest.approx(
+        (14 / 3) / (14 / 3 + 0.3**2), rel=KINEMATICS
+    )
+
+
+def test_a_direction_without_readings_is_seen():
+    o = observations([0] * 3, [0, 1, 2], [0] * 3)
+    u = np.array([-1.0, 0.0, 1.0])
+    information = decompose(np.column_stack([u, 2 * u, u**2]), o)
+    assert information.rank == 2
+    assert list(information.identifiable) == [False, False, True]
+
+
+def test_repeatability_by_hand():
+    """Two postures twice: ±1 and ±2 around their means, 4 readings less 2 means."""
+    o = observations([0] * 4, [0, 1, 0, 1], [0] * 4)
+    sigma, dof = estimate_repeatability(np.array([1.0, 7.0, -1.0, 3.0]), o)
+    assert dof == 2
+    assert sigma == pytest.approx(np.sqrt((1 + 1 + 4 + 4) / 2))
+
+
+def test_repeatability_of_differences_is_that_of_one_reading(root):
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    rows = [replace(r, minus="zero") for r in plan.readings if r.posture != "zero"]
+    plan = replace(plan, readings=tuple(rows))
+    o = build_observations(plan)
+    entries = predict_entries(plan, o, TRUTH)
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(60):
+        rows = o.rows(entries + 0.01e-3 * rng.normal(size=o.size))
+        sigma, dof = estimate_repeatability(o.values(rows), o)
+        found.append(sigma**2)
+    assert dof == 6 * 2 * 2  # six setups, two differences, three cycles less one
+    assert np.mean(found) / (0.01e-3) ** 2 == pytest.approx(1.0, abs=4 * np.sqrt(2 / dof / 60))
+
+
+def test_no_repetition_no_repeatability():
+    sigma, dof = estimate_repeatability(np.array([1.0, 2.0]), observations([0, 0], [0, 1], [0, 0]))
+    assert dof == 0
+    assert np.isnan(sigma)
+
+
+@pytest.mark.parametrize(
+    ("repeatability", "square", "dof", "gauge", "source", "sigma"),
+    [
+        ((np.nan, 0), 12.0, 3.0, 0.1, "residuals", 2.0),
+        ((np.nan, 0), 0.0, 0.0, 0.1, "gauge", 0.1),
+        ((np.nan, 0), 0.0, 0.0, None, "unknown", np.nan),
+        ((1.0, 10), 13.0, 13.0, 0.1, "cycles", 1.0),
+        # 10 of the cycles, and 3 more with a mean square of 100: an F of 100
+        ((1.0, 10), 310.0, 13.0, 0.1, "residuals", np.sqrt(310 / 13)),
+    ],
+)
+def test_where_sigma_is_from(repeatability, square, dof, gauge, source, sigma):
+    noise = estimate_noise(
+        repeatability=repeatability, residual_square=square, residual_dof=dof, gauge_sigma=gauge
+    )
+    assert noise.source == source
+    assert noise.sigma == pytest.approx(sigma, nan_ok=True)
+    assert noise.misfit == (source == "residuals" and repeatability[1] > 0)
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_noise_leaves_large_residuals_as_often_as_chance_has_it(given):
+    """Twelve residuals, five of them the scatter of cycles: the chances of many are uniform."""
+    rng = np.random.default_rng(1)
+    rest, cycles = rng.chisquare(7, 4000), rng.chisquare(5, 4000)
+    if given:
+        chances = [chance_of_excess(r + c, 12) for r, c in zip(rest, cycles, strict=True)]
+    else:  # sigma² is what the cycles say it is
+        chances = [
+            chance_of_excess((r + c) / (c / 5), 12, cycles_dof=5)
+            for r, c in zip(rest, cycles, strict=True)
+        ]
+    assert stats.kstest(chances, "uniform").pvalue > 0.001
+    assert chance_of_excess(3.0, 5, cycles_dof=5) == 1.0  # nothing beside the cycles
+
+
+def test_confidence_factors_are_students():
+    assert confidence_factor(3.0) == pytest.approx(3.182446, abs=1e-6)
+    assert confidence_factor(np.inf) == pytest.approx(1.959964, abs=1e-6)
+    assert confidence_factor(0.0) == np.inf
+
+
+def test_readings_of_one_leg_leave_an_offset_open(raw_cycles):
+    rows = tuple(r for r in raw_cycles.readings if r.setup == "yx")
+    with pytest.raises(NotIdentifiableError, match=r"do not determine z_slide\.offset") as caught:
+        calibrate(replace(raw_cycles, readings=rows))
+    assert caught.value.parameters == ("z_slide.offset",)
+
+
+def test_six_equations_have_the_closed_form_covariance(experiment_2):
+    problem = build_problem(experiment_2)
+    _, jacobian = problem.linearise(problem.reference)
+    information = decompose(jacobian, problem.observations)
+    scale = np.outer(problem.theta_scale, problem.theta_scale)
+    precision = problem.prior_precision
+    covariance = information.covariance(sigma=1.0 / np.sqrt(2.0), precision=precision) * scale
+    assert np.abs(np.sqrt(np.diag(covariance)) - 1.4031).max() < 0.00006
+    assert abs(covariance[0, 1] / covariance[0, 0] + 0.25) < 0.005
+
+
+@pytest.mark.parametrize("model", ["offsets", "lengths"])
+def test_predicted_covariance_is_that_of_many_simulated_calibrations(root, model):
+    """Eigenvalues and directions: the whitened estimates are standard normal."""
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    sigma = 20e-6
+    problem = build_problem(plan, model=model)
+    program = NonlinearProgram(problem)
+    rng = np.random.default_rng(0)
+    whitened = []
+    for _ in range(300):
+        truth = rng.normal(size=problem.n_free)  # as the prior says, where there is one
+        entries = problem.predict(truth * problem.theta_scale)
+        values = entries + sigma * rng.normal(size=entries.size)
+        solution = program.solve(sigma=sigma, values=values)
+        _, jacobian = problem.linearise(solution.theta, solution.passive)
+        covariance = decompose(jacobian, problem.observations).covariance(
+            sigma=sigma, precision=problem.prior_precision
+        )
+        error = solution.theta / problem.theta_scale - truth
+        whitened.append(np.linalg.solve(np.linalg.cholesky(covariance), error))
+    z = np.array(whitened)
+    n = len(z)
+    assert np.abs(z.mean(axis=0)).max() < 4.0 / np.sqrt(n)
+    spread = np.linalg.eigvalsh(z.T @ z / n)
+    # Marchenko-Pastur edges of a sample covariance of white noise, with a tenth to spare
+    edge = np.sqrt(z.shape[1] / n)
+    assert (1 - edge) ** 2 - 0.1 < spread.min()
+    assert spread.max() < (1 + edge) ** 2 + 0.1
+    inside = np.mean(np.abs(z) < confidence_factor(np.inf))
+    assert 0.93 < inside < 0.97
+
+
+def test_an_information_without_readings_has_no_rank():
+    information = Information(np.zeros((0, 2)), np.zeros(2), np.eye(2))
+    assert information.rank == 0
+    assert not information.identifiable.any()

@@ -1,0 +1,117 @@
+"""Every robot that loads is shown: with motions left free, rows to spare, no legs and no tool."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from linkages import (
+    joint,
+    write_ball_platform,
+    write_crooked_loop,
+    write_robot,
+    write_wide_linkage,
+)
+from orthocal.output.view import drawing
+from tolerances import CLOSED, KINEMATICS
+
+from orthocal import draw_scene, load_robot
+from orthocal.cli import main
+from orthocal.kinematics.assembly import nominal_assembly
+from orthocal.robot.zero import count_free_motions
+from orthocal.viewer.visuals import load_visuals
+
+
+def write_loose_loop(folder):
+    """Two rods between a crank and a post, and a hinge along the last one."""
+    joints = joint("motor", "base", (0, 0, 0), "z") + joint("rod", "motor", (0.1, 0, 0), "z")
+    joints += joint("arm", "rod", (0.1, 0, 0), "z") + joint("spin", "arm", (0.1, 0, 0), "x")
+    joints += joint("end", "spin", (0, 0, 0), "") + joint("post", "base", (0.1, 0.15, 0), "")
+    extra = "orthocal: {passive_start: {rod_deg: 60, arm_deg: 40}}\n"
+    return write_robot(
+        folder, joints, f"closed_loop: [[end, post]]\ntype: [3d]\nname_mot: [motor]\n{extra}"
+    )
+
+
+def write_open_arm(folder):
+    """No loop at all, and a drive whose limits are as good as none."""
+    far = '<limit lower="-1e6" upper="1e6" effort="1" velocity="1"/>'
+    joints = joint("slide", "base", (0, 0, 0), "x", kind="prismatic", limit=far)
+    joints += joint("hand", "slide", (0.2, 0, 0), "")
+    return write_robot(folder, joints, "closed_loop: []\ntype: []\nname_mot: [slide]\n")
+
+
+ROBOTS = {
+    "crooked": write_crooked_loop,
+    "wide": write_wide_linkage,
+    "balls": write_ball_platform,
+    "universal": lambda folder: write_ball_platform(folder, "UJOINT_YX"),
+    "loose": write_loose_loop,
+    "open": write_open_arm,
+}
+
+
+@pytest.fixture(params=ROBOTS)
+def robot(request, tmp_path):
+    return load_robot(ROBOTS[request.param](tmp_path / request.param))
+
+
+def test_it_is_drawn_where_pinocchio_has_it(robot):
+    scene = draw_scene(robot)
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.configuration(robot.zero))
+    drawn = {p.split("/")[1] for p in scene.nodes if p.startswith(f"{drawing.MACHINE}/")}
+    assert drawn == {f.name for f in robot.model.frames if f.type == pin.FrameType.BODY}
+    for link in drawn:
+        expected = data.oMf[robot.frame_id(link)].homogeneous
+        assert np.abs(scene.pose(f"{drawing.MACHINE}/{link}") - expected).max() < KINEMATICS
+    assert any(fact.startswith("Mechanical zero: ") for fact in scene.facts)
+
+
+def test_its_drives_are_moved_and_no_further_than_the_machine_is_large(robot):
+    stops = drawing._tour(robot)
+    assert len(stops) > 1
+    drives = np.array([s.drives for s in stops])
+    assert np.abs(drives - robot.drive_zero).max() <= 0.4 * max(1.0, robot.characteristic_length)
+    passive = nominal_assembly(robot).close(drives, allow_free=True)
+    for d, p in zip(drives, passive, strict=True):
+        residual, _ = robot.evaluate_constraints(d, p)
+        assert np.abs(residual).max(initial=0.0) < CLOSED
+
+
+def test_what_is_found_and_what_is_free_is_said(robot):
+    facts = " ".join(draw_scene(robot).facts)
+    found = [d.name for d in robot.drives if d.zero_found]
+    assert ("Found when the loops were closed, not given" in facts) == bool(found)
+    assert all(name in facts for name in found)
+    free = count_free_motions(robot)
+    assert (f"The loops leave {free} passive motion" in facts) == bool(free)
+
+
+def test_only_the_wide_linkage_has_a_zero_that_was_found(tmp_path):
+    found = {n: load_robot(w(tmp_path / n)).drives[0].zero_found for n, w in ROBOTS.items()}
+    assert [name for name, moved in found.items() if moved] == ["wide"]
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_view_writes_its_page(name, tmp_path, monkeypatch, capsys):
+    folder, page = ROBOTS[name](tmp_path / name), tmp_path / "page.html"
+    monkeypatch.setattr(sys, "argv", ["orthocal", "view", str(folder), "--html", str(page)])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert (stopped.value.code or 0) == 0, capsys.readouterr().err
+    assert "Mechanical zero" in page.read_text(encoding="utf-8")
+
+
+def test_visuals_behind_a_ball_joint_are_drawn_on_their_links(tmp_path):
+    folder = write_ball_platform(tmp_path / "balls")
+    urdf = folder / "balls.urdf"
+    box = '<visual><origin xyz="0 0 0.01"/><geometry><box size="0.1 0.2 0.3"/></geometry></visual>'
+    urdf.write_text(
+        urdf.read_text().replace('<link name="ball_a"/>', f'<link name="ball_a">{box}</link>')
+    )
+    (visual,) = load_visuals(load_robot(folder))
+    assert visual.link == "ball_a"
+    assert np.abs(visual.placement[:3, 3] - [0, 0, 0.01]).max() < KINEMATICS

@@ -1,0 +1,319 @@
+"""Every page in a real browser without a network: it draws, moves, says what it must, and no more.
+
+How many requests: one, for the file itself. What the console says: nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from browser import SIZES, open_browser, require_browser, visit
+from PIL import Image
+
+from orthocal import LiveScene, calibrate, draw_scene, load_robot, load_session, write_report
+from orthocal.measurement.session_file import load_plan
+from orthocal.viewer.browser import take_picture
+
+EXPECTED = ("zx −1.140 → −0.130 mm", "x_max − x_min", "Before: measured − nominal", "leg z")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with open_browser() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def calibration(experiment_2):
+    return calibrate(experiment_2)
+
+
+@pytest.fixture(scope="module")
+def page(calibration, tmp_path_factory):
+    return draw_scene(calibration).save(tmp_path_factory.mktemp("page") / "scene.html")
+
+
+@pytest.fixture(scope="module")
+def report(calibration, tmp_path_factory):
+    return write_report(calibration, tmp_path_factory.mktemp("report") / "report.html")
+
+
+def is_drawn(picture):
+    """Whether there is more than a background: many colours, and large parts that are no grey."""
+    colours = np.unique(picture[..., :3].reshape(-1, 3), axis=0)
+    spread = picture[..., :3].astype(int).max(axis=-1) - picture[..., :3].astype(int).min(axis=-1)
+    return len(colours) > 500 and (spread > 60).mean() > 0.005
+
+
+def boxes(page):
+    """Rectangles of the labels that are to be seen, and of the panels."""
+    return page.evaluate(
+        """() => [...document.querySelectorAll('.label, #panel, #bar, .dg.main')]
+             .filter((e) => e.offsetWidth > 0 && e.offsetHeight > 0)
+             .map((e) => { const r = e.getBoundingClientRect();
+                           return [r.left, r.top, r.right, r.bottom, e.textContent]; })"""
+    )
+
+
+def seek(found, time):
+    """Go to a time of the animation by meshcat's own controls, and wait until that is drawn."""
+    found.page.evaluate(
+        """(time) => {
+             const animator = viewer.animator;
+             animator.reset();
+             animator.play();
+             animator.pause();
+             animator.time_scrubber.setValue(time);
+           }""",
+        time,
+    )
+    seen = found.page.evaluate("Number(document.documentElement.dataset.rendered)")
+    found.page.evaluate("viewer.set_dirty()")
+    found.wait_until_drawn(times=seen)
+
+
+@pytest.mark.parametrize("name", ["constructor", "__proto__", "<object>"])
+def test_a_setup_with_any_name_is_drawn(name, browser, raw_cycles, tmp_path):
+    """The viewer keeps nodes in plain objects, which hold some names from the beginning."""
+    setups = {n.replace("yx", name): s for n, s in raw_cycles.setups.items()}
+    session = replace(
+        raw_cycles,
+        setups={n: replace(s, name=n) for n, s in setups.items()},
+        readings=tuple(replace(r, setup=r.setup.replace("yx", name)) for r in raw_cycles.readings),
+    )
+    path = draw_scene(session).save(tmp_path / "scene.html")
+    with visit(browser, path.as_uri(), size=SIZES[0]) as found:
+        found.wait_until_drawn()
+        assert found.messages == []
+        assert is_drawn(found.picture())
+
+
+@pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")
+def test_scene_draws_and_asks_for_nothing(browser, page, size):
+    with visit(browser, page.as_uri(), size=size) as found:
+        found.wait_until_drawn()
+        assert found.messages == []
+        assert found.requests == [page.as_uri()]
+        assert is_drawn(found.canvas())
+        text = found.page.inner_text("body")
+        for expected in EXPECTED:
+            assert expected in text
+        assert "Leg x is furthest from parallel: −1.140 mm" in text
+        assert "deviation × 12" in text
+
+
+@pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")
+@pytest.mark.parametrize("name", ["table1/experiment-2", "sweep", "lines"])
+def test_no_label_covers_another_or_a_panel(browser, root, tmp_path, name, size):
+    page = draw_scene(load_session(root / "examples" / name)).save(tmp_path / "page.html")
+    with visit(browser, page.as_uri(), size=size) as found:
+        found.wait_until_drawn()
+        rectangles = boxes(found.page)
+    assert sum("mm" in r[4] for r in rectangles) >= 6
+    for i, (left, top, right, bottom, text) in enumerate(rectangles):
+        for l2, t2, r2, b2, other in rectangles[i + 1 :]:
+            apart = right <= l2 or r2 <= left or bottom <= t2 or b2 <= top
+            assert apart, f"{text!r} and {other!r} overlap"
+        assert left >= 0
+        assert top >= 0
+        assert right <= size[0] + 1
+        assert bottom <= size[1] + 1
+
+
+@pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")
+def test_all_that_the_panel_says_is_in_the_picture(browser, calibration, tmp_path, size):
+    page = draw_scene(calibration, show="all").save(tmp_path / "page.html")
+    with visit(browser, f"{page.as_uri()}#picture", size=size) as found:
+        found.wait_until_drawn()
+        text, room = found.page.evaluate(
+            "(({ scrollHeight, clientHeight }) => [scrollHeight, clientHeight])"
+            "(document.getElementById('panel'))"
+        )
+    assert text <= room
+
+
+@pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")
+def test_labels_cover_no_dial_of_all_eighteen(browser, root, tmp_path, size):
+    """Six of them have a label, the worst of each leg and direction."""
+    page = draw_scene(load_session(root / "examples/sweep")).save(tmp_path / "page.html")
+    with visit(browser, page.as_uri(), size=size) as found:
+        found.wait_until_drawn()
+        dials = found.page.evaluate(
+            """() => JSON.parse(document.getElementById('scene-data').textContent).labels
+                 .filter((label) => label.node.startsWith('Gauges/'))
+                 .map(({ at: [[x, y, z]] }) => new MeshCat.THREE.Vector3(x, z, -y)
+                   .project(viewer.camera))
+                 .map((p) => [((p.x + 1) / 2) * window.innerWidth,
+                              ((1 - p.y) / 2) * window.innerHeight])"""
+        )
+        labels = [r for r in boxes(found.page) if " mm" in r[4] and len(r[4]) < 80]
+    assert len(dials) == 18
+    assert len(labels) == 6
+    for left, top, right, bottom, text in labels:
+        covered = [d for d in dials if left <= d[0] <= right and top <= d[1] <= bottom]
+        assert not covered, f"{text!r} covers {covered}"
+
+
+def test_whole_machine_is_in_view_beside_the_panels(browser, page):
+    for size in SIZES:
+        with visit(browser, page.as_uri(), size=size) as found:
+            found.wait_until_drawn()
+            left, right, top, bottom = found.page.evaluate(
+                """() => {
+                     const data = JSON.parse(document.getElementById('scene-data').textContent);
+                     const at = data.camera.points.map(([x, y, z]) =>
+                       new MeshCat.THREE.Vector3(x, z, -y).project(viewer.camera));
+                     const x = at.map((p) => ((p.x + 1) / 2) * window.innerWidth);
+                     const y = at.map((p) => ((1 - p.y) / 2) * window.innerHeight);
+                     return [Math.min(...x), Math.max(...x), Math.min(...y), Math.max(...y)];
+                   }"""
+            )
+            panel = found.page.evaluate(
+                "document.getElementById('panel').getBoundingClientRect().right"
+            )
+        assert left > panel
+        assert right < size[0]
+        assert top > 0
+        assert bottom < size[1]
+        assert (right - left) * (bottom - top) > 0.2 * size[0] * size[1]
+
+
+def test_measurement_plays(browser, page):
+    """By the scrubber of meshcat's controls, and by the button; labels follow the posture."""
+    with visit(browser, page.as_uri()) as found:
+        found.wait_until_drawn()
+        steps = found.page.evaluate(
+            "JSON.parse(document.getElementById('scene-data').textContent).steps"
+        )
+        pictures, captions = [], []
+        for name in ("overview", "x_max", "y_min"):
+            step = next(s for s in steps if s["name"] == name)
+            seek(found, (step["start"] + step["end"]) / 2)
+            pictures.append(found.canvas())
+            captions.append(found.page.inner_text("#bar span"))
+            labels = [r[4] for r in boxes(found.page) if " mm" in r[4]]
+            if name == "x_max":
+                assert any(text.startswith("zx −1.140") for text in labels)
+                assert not any(text.startswith("zy") for text in labels)
+        for one, two in ((0, 1), (1, 2), (0, 2)):
+            changed = np.abs(pictures[one].astype(int) - pictures[two].astype(int)).max(axis=-1)
+            assert (changed > 40).mean() > 0.005
+        assert captions[1].startswith("x_max, leg x: ")
+        assert captions[2].startswith("y_min, leg y: taken off what is read at y_max")
+        found.page.evaluate("viewer.animator.reset()")
+        found.page.click("#bar button")
+        found.wait_for("viewer.animator.time > 2.5")
+        moving = found.canvas()
+        assert (np.abs(moving.astype(int) - pictures[0].astype(int)).max(axis=-1) > 40).any()
+        assert found.page.inner_text("#bar button") == "❚❚ Pause"
+        assert found.messages == []
+
+
+def test_boxes_of_the_legend_show_and_hide(browser, page):
+    with visit(browser, page.as_uri()) as found:
+        found.wait_until_drawn()
+        before = found.canvas()
+        found.page.click("#legend label:has-text('Machine where it really is')")
+        found.wait_for("!viewer.scene_tree.find(['Machine, calibrated']).object.visible")
+        assert (found.canvas() != before).any()
+        assert any("zx" in r[4] and "→" in r[4] for r in boxes(found.page)[2:])
+        found.page.click("#legend label:has-text('Gauges')")
+        found.wait_for("!document.getElementById('labels').innerText.includes('→')")
+        # what meshcat's own tree hides is off in the legend, too
+        found.page.evaluate(
+            "viewer.set_property(['Leg lines'], 'visible', false); viewer.set_dirty()"
+        )
+        found.wait_for(
+            """![...document.querySelectorAll('#legend label')]
+                 .find((e) => e.textContent.startsWith('Leg,')).querySelector('input').checked"""
+        )
+
+
+def test_other_scenes_draw_too(browser, root, tmp_path, raw_cycles):
+    scenes = {
+        "robot": draw_scene(load_robot("orthoglide")),
+        "fivebar": draw_scene(load_robot(root / "tests/robots/fivebar")),
+        "plan": draw_scene(load_plan(root / "examples/lines/plan.yaml")),
+        "session": draw_scene(raw_cycles),
+        "tool": draw_scene(calibrate(raw_cycles), show="all"),
+        "true": draw_scene(calibrate(raw_cycles), posture="x_max", exaggeration=1.0),
+    }
+    for name, scene in scenes.items():
+        path = scene.save(tmp_path / f"{name}.html")
+        with visit(browser, path.as_uri(), size=SIZES[1]) as found:
+            found.wait_until_drawn()
+            assert found.messages == [], name
+            assert found.requests == [path.as_uri()], name
+            canvas = found.canvas()
+            assert len(np.unique(canvas.reshape(-1, 4), axis=0)) > 300, name
+
+
+def test_live_page_draws_what_the_server_sends(browser, calibration):
+    scene = draw_scene(calibration)
+    with LiveScene(scene) as live, visit(browser, live.url, online=True) as found:
+        found.wait_for(f"viewer.num_messages_received >= {len(scene.commands)}")
+        found.wait_until_drawn()
+        found.page.wait_for_timeout(500)
+        assert is_drawn(found.canvas())
+        assert found.messages == []
+        assert {u.split("/")[2] for u in found.requests} == {f"127.0.0.1:{live.port}"}
+        scene.set_property("Machine, calibrated", "visible", False)
+        found.wait_for("!viewer.scene_tree.find(['Machine, calibrated']).object.visible")
+
+
+# ---- the report
+
+
+def test_report_opens_and_asks_for_nothing(browser, report):
+    with visit(browser, report.as_uri(), size=(1000, 900)) as found:
+        assert found.page.title().startswith("Calibration of orthoglide")
+        text = found.page.inner_text("body")
+        for expected in ("x_slide", "-0.527", "What it means", "SHA-256"):
+            assert expected in text
+        found.page.locator("iframe").scroll_into_view_if_needed()
+        frame = found.page.frame_locator("iframe")
+        frame.locator("#headline").wait_for(timeout=60_000)
+        handle = found.page.query_selector("iframe").content_frame()
+        found.wait_until_drawn(frame=handle)
+        assert is_drawn(found.picture())
+        assert found.messages == []
+        outside = [u for u in found.requests if not u.startswith(("about:", "data:"))]
+        assert outside == [report.as_uri()]
+
+
+def test_report_is_as_wide_as_its_window(browser, report):
+    """Nothing sticks out at either size."""
+    for size in SIZES:
+        with visit(browser, report.as_uri(), size=size) as found:
+            width = found.page.evaluate("document.documentElement.scrollWidth")
+            assert width <= size[0]
+            for figure in found.page.query_selector_all("figure svg"):
+                box = figure.bounding_box()
+                assert box["x"] >= 0
+                assert box["x"] + box["width"] <= size[0] + 1
+
+
+def test_report_prints(browser, report, tmp_path):
+    """On paper: several pages, the list of readings open, and the scene as a picture."""
+    with visit(browser, report.as_uri()) as found:
+        found.page.locator("iframe").scroll_into_view_if_needed()
+        handle = found.page.query_selector("iframe").content_frame()
+        found.wait_until_drawn(frame=handle)
+        data = found.page.pdf(path=str(tmp_path / "report.pdf"), format="A4", print_background=True)
+    assert data.startswith(b"%PDF")
+    assert data.count(b"/Type /Page\n") + data.count(b"/Type /Page ") >= 3
+
+
+# ---- pictures
+
+
+def test_picture_is_of_the_size_asked_for(page, tmp_path):
+    require_browser()
+    width, height = SIZES[1]
+    text = page.read_text(encoding="utf-8")
+    path = take_picture(text, tmp_path / "a.png", width=width, height=height)
+    with Image.open(path) as image:
+        assert image.size == (width, height)
+        assert is_drawn(np.asarray(image.convert("RGB")))

@@ -1,0 +1,605 @@
+"""What scenes hold, without a browser: poses against Pinocchio, arrows against residuals."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from orthocal.output.view import drawing, readings, stage, tool_errors
+from tolerances import KINEMATICS
+
+from orthocal import calibrate, draw_scene, load_robot, load_session
+from orthocal.assess.accuracy import assess_tool, find_excess, measure_uncertainty
+from orthocal.assess.entering import find_entries
+from orthocal.assess.tool import error_covariance
+from orthocal.calibration.file import load_calibration
+from orthocal.errors import ParameterError
+from orthocal.measurement.session_file import load_plan
+from orthocal.measurement.synthetic import simulate_session
+from orthocal.sensors.leg_indicator import DIRECTIONS
+from orthocal.show.scene.deviations import measure_deviations
+from orthocal.viewer.motion import FRAMES_A_SECOND
+from orthocal.viewer.scene import round_scale
+from orthocal.viewer.shapes import arrow_parts, head_length
+
+
+@pytest.fixture(scope="module")
+def calibration(experiment_2):
+    return calibrate(experiment_2)
+
+
+@pytest.fixture(scope="module")
+def scene(calibration):
+    return draw_scene(calibration)
+
+
+@pytest.fixture(scope="module")
+def full(root):
+    return calibrate(load_session(root / "examples/sweep"), "full")
+
+
+def world(scene, path):
+    """Pose of a node in the world."""
+    names = path.split("/")
+    pose = np.eye(4)
+    for i in range(len(names)):
+        pose = pose @ scene.pose("/".join(names[: i + 1]))
+    return pose
+
+
+def placed(robot, drives, passive):
+    """Every link's pose by Pinocchio alone."""
+    data = robot.model.createData()
+    q = robot.configuration(robot.joint_coordinates(drives, passive))
+    pin.framesForwardKinematics(robot.model, data, q)
+    return {
+        f.name: data.oMf[i].homogeneous
+        for i, f in enumerate(robot.model.frames)
+        if f.type == pin.FrameType.BODY
+    }
+
+
+def links(scene, machine):
+    return {path.split("/")[1] for path in scene.nodes if path.startswith(f"{machine}/")}
+
+
+def arrow_length(scene, path):
+    """From the foot of an arrow to the tip of its head, along it."""
+    shaft, head = scene.pose(f"{path}/shaft"), scene.pose(f"{path}/head")
+    width = readings.arrow_width(dial(scene))
+    assert np.isclose(shaft[2, 2], head[2, 3], atol=1e-8)
+    return head[2, 3] + head[2, 2] * head_length(width)
+
+
+def dial(scene):
+    """Radius of the dials, from the shape itself."""
+    shape = next(
+        c["object"]["geometries"][0]
+        for c in scene.commands
+        if c["type"] == "set_object" and c["path"].endswith("/case")
+    )
+    return shape["radiusTop"]
+
+
+def animation(scene):
+    """Node to its tracks: property to times [s] and values."""
+    command = next(c for c in scene.commands if c["type"] == "set_animation")
+    found = {}
+    for part in command["animations"]:
+        found[part["path"].strip("/")] = {
+            t["name"].strip("."): (
+                np.array([k["time"] for k in t["keys"]]) / part["clip"]["fps"],
+                np.array([k["value"] for k in t["keys"]]),
+            )
+            for t in part["clip"]["tracks"]
+        }
+    return found
+
+
+# ---- the machine
+
+
+def test_nominal_machine_stands_where_pinocchio_puts_it(orthoglide):
+    scene = draw_scene(orthoglide)
+    zero = placed(orthoglide, orthoglide.drive_zero, orthoglide.zero[orthoglide.passive_index])
+    drawn = links(scene, drawing.MACHINE)
+    assert {"base", "x_slider", "y_rod_a", "z_rod_b", "platform"} <= drawn
+    for link in drawn:
+        pose = world(scene, f"{drawing.MACHINE}/{link}")
+        assert np.abs(pose - zero[link]).max() < KINEMATICS
+
+
+def test_true_scale_is_the_calibrated_machine_of_pinocchio(full):
+    """All 126 errors in placements, loops closed by Pinocchio; in a posture, and the ghost."""
+    posture = next(p for p in full.postures if p.name == "y_+60")
+    scene = draw_scene(full, posture="y_+60", exaggeration=1.0)
+    machine = full.robot.with_errors(full.errors)
+    passive = machine.close_with_pinocchio(posture.drives, np.array(posture.passive))
+    real = placed(machine, posture.drives, passive)
+    for link in links(scene, drawing.SOLID):
+        pose = world(scene, f"{drawing.SOLID}/{link}")
+        assert np.abs(pose - real[link]).max() < KINEMATICS
+    robot = full.robot
+    start = robot.close_with_pinocchio(posture.drives, np.array(posture.passive))
+    nominal = placed(robot, posture.drives, start)
+    ghosts = links(scene, drawing.GHOST)
+    assert "base" not in ghosts
+    assert "x_rod_a" in ghosts
+    for link in ghosts:
+        pose = world(scene, f"{drawing.GHOST}/{link}")
+        assert np.abs(pose - nominal[link]).max() < KINEMATICS
+
+
+def test_deviation_is_drawn_larger_by_the_factor_that_is_stated(full):
+    true = draw_scene(full, posture="x_+60", exaggeration=1.0)
+    large = draw_scene(full, posture="x_+60", exaggeration=25.0)
+    assert large.exaggeration == 25.0
+    assert any("× 25" in fact for fact in large.facts)
+    assert any("true scale" in fact for fact in true.facts)
+    moved = []
+    for link in links(true, drawing.GHOST):
+        ghost = world(true, f"{drawing.GHOST}/{link}")
+        small = world(true, f"{drawing.SOLID}/{link}")
+        big = world(large, f"{drawing.SOLID}/{link}")
+        assert np.abs(world(large, f"{drawing.GHOST}/{link}") - ghost).max() < KINEMATICS
+        shift = small[:3, 3] - ghost[:3, 3]
+        moved.append(np.linalg.norm(shift))
+        assert big[:3, 3] - ghost[:3, 3] == pytest.approx(25.0 * shift, abs=KINEMATICS)
+        turn = pin.log3(ghost[:3, :3].T @ small[:3, :3])
+        assert pin.log3(ghost[:3, :3].T @ big[:3, :3]) == pytest.approx(25.0 * turn, abs=1e-9)
+    assert max(moved) > 1e-3
+
+
+@pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles", "lines"])
+def test_default_factor_makes_the_largest_deviation_a_twentieth_of_the_machine(root, name):
+    found = calibrate(load_session(root / "examples" / name))
+    scene = draw_scene(found)
+    size = np.ptp(scene.camera.points, axis=0).max()
+    true = draw_scene(found, exaggeration=1.0)
+    fact = next(f for f in true.facts if "largest" in f)
+    largest = float(fact.split("largest ")[1].split(" mm")[0]) * 1e-3
+    assert 0.03 * size < scene.exaggeration * largest <= 0.0501 * size
+
+
+def test_machine_without_deviation_needs_no_ghost(root):
+    """The true machine is the nominal one, and so is what comes out."""
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    session = simulate_session(plan, {}, exact=True).session
+    scene = draw_scene(calibrate(session))
+    assert not links(scene, drawing.GHOST)
+    assert scene.exaggeration == 1.0
+    assert "where the controller takes it to be" in " ".join(scene.facts)
+    assert "No gauge has seen any deviation" in scene.headline
+
+
+def test_offsets_that_are_active_are_in_the_ghost(root):
+    """The controller sends the drives elsewhere because it knows: the ghost is at the target."""
+    session = load_session(root / "examples/raw-cycles")
+    offsets = np.array([1e-3, -2e-3, 0.5e-3])
+    postures = {n: replace(p, drives=p.drives - offsets) for n, p in session.postures.items()}
+    active = replace(session, controller_offsets=offsets, postures=postures)
+    scene = draw_scene(calibrate(active), posture="x_max")
+    robot = session.robot
+    drives = session.postures["x_max"].drives
+    passive = robot.close_with_pinocchio(drives, robot.zero[robot.passive_index])
+    target = placed(robot, drives, passive)["platform"]
+    ghost = world(scene, f"{drawing.GHOST}/platform")
+    assert np.abs(ghost - target).max() < 1e-11
+
+
+def test_leg_lines_go_from_root_to_tip(scene, calibration):
+    """Through what is drawn: both ends belong to links that are."""
+    root = world(scene, f"{drawing.SOLID}/x_yoke")[:3, 3]
+    line = scene.pose(f"{stage.LINES}/leg x")
+    assert line[:3, 3] == pytest.approx(root, abs=KINEMATICS)
+    assert np.linalg.norm(line[:3, 2]) == pytest.approx(
+        calibration.robot.legs["x"].length, abs=1e-3
+    )
+
+
+# ---- gauges and arrows
+
+
+def test_arrows_are_as_long_as_the_residuals(scene, calibration):
+    assert set(readings.BEFORE + "/" + r.setup for r in calibration.residuals) == {
+        p.rsplit("/", 1)[0] for p in scene.nodes if p.startswith(readings.BEFORE)
+    }
+    for row in calibration.residuals:
+        for node, value in ((readings.BEFORE, row.deviation), (readings.AFTER, row.residual)):
+            path = f"{node}/{row.setup}"
+            assert arrow_length(scene, path) == pytest.approx(value * scene.arrow_scale, abs=1e-9)
+            setup = next(s for s in calibration.setups if s.name == row.setup)
+            along = scene.pose(path)[:3, 2]
+            assert along == pytest.approx(np.array(DIRECTIONS[setup.sensor.direction]))
+    arrows = [e.text for e in scene.legend if e.nodes[0] in (readings.BEFORE, readings.AFTER)]
+    assert len(arrows) == 2
+    assert all(text.endswith(f"(× {scene.arrow_scale:g})") for text in arrows)
+
+
+def test_arrow_that_is_shorter_than_its_head_is_a_smaller_head():
+    width = 0.01
+    for length in (0.2, 0.03, 0.001, -0.001, -0.2):
+        parts = arrow_parts(length, width)
+        assert parts.foot + parts.head[2] * head_length(width) == pytest.approx(length)
+        assert abs(parts.head[2]) <= 1.0
+        assert np.sign(parts.head[2]) == np.sign(length)
+    assert arrow_parts(0.0, width).head[0] < 1e-5
+
+
+def test_gauges_touch_the_leg_at_their_section(scene, calibration):
+    for setup in calibration.setups:
+        tip = scene.pose(f"{readings.GAUGES}/{setup.name}")[:3, 3]
+        line = scene.pose(f"{stage.LINES}/leg {setup.sensor.leg}")
+        along = line[:3, 2] / np.linalg.norm(line[:3, 2])
+        off = tip - line[:3, 3]
+        assert np.linalg.norm(off - (off @ along) * along) < KINEMATICS
+        leg = calibration.robot.legs[setup.sensor.leg]
+        plane = leg.axis @ leg.zero_root + setup.sensor.section.value * leg.length
+        assert leg.axis @ tip == pytest.approx(plane, abs=KINEMATICS)
+        stem = scene.pose(f"{readings.GAUGES}/{setup.name}")[:3, 2]
+        assert stem == pytest.approx(np.array(DIRECTIONS[setup.sensor.direction]))
+
+
+def test_labels_say_setup_millimetres_and_postures(scene, calibration):
+    texts = [label.texts[0] for label in scene.labels if label.rank >= 0.0]
+    assert len(texts) == 6
+    row = next(r for r in calibration.residuals if r.setup == "zx")
+    assert f"zx −1.140 → −{abs(row.residual) * 1e3:.3f} mm\nx_max − x_min" in texts
+    assert scene.headline.startswith("Leg x is furthest from parallel: −1.140 mm at gauge zx")
+
+
+def test_scene_says_which_offsets_were_found(scene, calibration):
+    """The leg that leans most, x, is not the one whose drive is most off, z."""
+    fact = next(f for f in scene.facts if f.startswith("Offsets to enter"))
+    for entry in find_entries(calibration):
+        assert f"{entry.drive} {entry.enter * 1e3:+.3f}".replace("-", "−") + " mm" in fact
+
+
+def test_of_many_gauges_the_overview_names_the_worst(full):
+    scene = draw_scene(full)
+    named = [
+        label.texts[0].split()[0] for label in scene.labels if label.texts[0] and label.rank > 0
+    ]
+    assert len(named) == 6
+    worst = max(full.residuals, key=lambda r: abs(r.deviation))
+    assert worst.setup in named
+    assert len({p.split("/")[1] for p in scene.nodes if p.startswith(readings.GAUGES)}) == 18
+
+
+@pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles", "lines", "sweep"])
+def test_deviations_of_a_session_are_those_of_its_calibration(root, name):
+    """Two ways to the same numbers: without any solution, and as the solved problem reports."""
+    session = load_session(root / "examples" / name)
+    rows = calibrate(session).residuals
+    mean = {}
+    for row in rows:
+        mean.setdefault((row.setup, row.posture, row.minus), []).append(row.deviation)
+    found = {(d.setup, d.posture, d.minus): d.before for d in measure_deviations(session)}
+    assert found.keys() == mean.keys()
+    for key, values in mean.items():
+        assert found[key] == pytest.approx(np.mean(values), abs=1e-10)
+
+
+def test_session_alone_shows_the_nominal_machine_and_what_was_seen(raw_cycles):
+    scene = draw_scene(raw_cycles)
+    assert links(scene, drawing.MACHINE)
+    assert not links(scene, drawing.SOLID)
+    assert not [p for p in scene.nodes if p.startswith(readings.AFTER)]
+    worst = max(measure_deviations(raw_cycles), key=lambda d: abs(d.before))
+    assert f"{abs(worst.before) * 1e3:.3f} mm" in scene.headline
+
+
+def test_plan_shows_where_gauges_will_stand(root):
+    scene = draw_scene(load_plan(root / "examples/lines/plan.yaml"))
+    assert scene.headline == "A plan: 270 readings in 135 postures, none taken yet."
+    assert not [p for p in scene.nodes if p.startswith(readings.BEFORE)]
+    assert {label.texts[0] for label in scene.labels if label.rank >= 0.0} == {
+        *("yx", "zx", "xy", "zy", "xz", "yz")
+    }
+
+
+# ---- animation
+
+
+def test_measurement_goes_from_zero_through_every_leg(raw_cycles):
+    scene = draw_scene(calibrate(raw_cycles))
+    names = [s.name for s in scene.steps]
+    legs = [["zero", f"{leg}_max", f"{leg}_min"] for leg in "xyz"]
+    assert names == ["overview", *legs[0], *legs[1], *legs[2], "overview"]
+    ends = [(s.start, s.end) for s in scene.steps]
+    assert all(a < b for a, b in ends)
+    assert all(a[1] < b[0] for a, b in pairwise(ends))
+
+
+def test_animation_is_at_every_posture_when_its_step_says_so(full):
+    scene = draw_scene(full, exaggeration=1.0)
+    tracks = animation(scene)
+    machine = full.robot.with_errors(full.errors)
+    postures = {p.name: p for p in full.postures}
+    for step in scene.steps[1:-1:7]:
+        if step.name not in postures:
+            continue
+        posture = postures[step.name]
+        passive = machine.close_with_pinocchio(posture.drives, np.array(posture.passive))
+        real = placed(machine, posture.drives, passive)
+        for link in ("x_slider", "y_rod_b", "platform"):
+            track = tracks[f"{drawing.SOLID}/{link}"]
+            times, values = track["position"]
+            for time in (step.start, step.end):
+                at = values[np.flatnonzero(np.isclose(times, time))[0]]
+                assert at == pytest.approx(real[link][:3, 3], abs=KINEMATICS)
+            if "quaternion" in track:
+                times, values = track["quaternion"]
+                x, y, z, w = values[np.flatnonzero(np.isclose(times, step.start))[0]]
+                turn = pin.Quaternion(w, x, y, z).toRotationMatrix()
+                assert turn == pytest.approx(real[link][:3, :3], abs=1e-11)
+
+
+def test_arrows_follow_the_readings_of_every_posture(raw_cycles):
+    found = calibrate(raw_cycles)
+    scene = draw_scene(found)
+    tracks, head = animation(scene), head_length(readings.arrow_width(dial(scene)))
+    step = next(s for s in scene.steps if s.name == "y_min")
+    for setup in ("xy", "zy", "yx"):
+        rows = [r for r in found.residuals if r.setup == setup and r.posture == "y_min"]
+        for node, kind in ((readings.BEFORE, "deviation"), (readings.AFTER, "residual")):
+            mean = np.mean([getattr(r, kind) for r in rows]) if rows else 0.0
+            track = tracks[f"{node}/{setup}/head"]
+            k = np.flatnonzero(np.isclose(track["position"][0], step.start))[0]
+            length = track["position"][1][k][2] + track["scale"][1][k][2] * head
+            assert length == pytest.approx(mean * scene.arrow_scale, abs=1e-6)
+            assert ("yx" == setup) == (not rows)
+    assert "leg y: xy" in step.caption
+
+
+def test_every_animated_node_is_one_that_is_drawn(scene):
+    for path in animation(scene):
+        assert any(n == path or n.startswith(f"{path}/") for n in scene.nodes), path
+
+
+def test_many_postures_are_thinned_out_for_the_animation(root, monkeypatch):
+    monkeypatch.setattr("orthocal.show.scene.deviations.MOST_STOPS", 20)
+    scene = draw_scene(load_session(root / "examples/sweep"))
+    assert len(scene.steps) == 22
+    assert any("stops at 20 of 30 postures" in fact for fact in scene.facts)
+
+
+def test_no_joint_leaps_between_two_frames(scene):
+    """Links move a little at a time: no branch of assembly is left."""
+    times, values = animation(scene)[f"{drawing.SOLID}/platform"]["position"]
+    assert np.abs(np.diff(values, axis=0)).max() < 0.03
+    assert np.diff(times).max() < 2.0
+    assert times[-1] * FRAMES_A_SECOND > 100
+
+
+# ---- errors of the tool
+
+
+def test_errors_of_the_tool_are_those_of_the_calibration(full):
+    scene = draw_scene(full, show="tool")
+    whole = assess_tool(full)  # what is taken out is taken out of the whole region
+    middles = np.isin(np.round(whole.workspace.points, 9), [-0.06, 0.0, 0.06]).all(axis=1)
+    corners = np.flatnonzero(middles)
+    targets = whole.targets[corners]
+    for node, deviation in (
+        (tool_errors.TOOL_NOW, whole.align(whole.deviation)[corners]),
+        (tool_errors.TOOL_LEFT, whole.align(whole.error_after_offsets)[corners]),
+    ):
+        for i in (0, 13, 26):
+            pose = scene.pose(f"{node}/point {i + 1}")
+            assert pose[:3, 3] == pytest.approx(targets[i], abs=KINEMATICS)
+            size = np.linalg.norm(deviation[i])
+            assert pose[:3, 2] == pytest.approx(deviation[i] / size, abs=1e-9)
+            head = scene.pose(f"{node}/point {i + 1}/head")
+            width = head_length(0.006 * np.ptp(scene.camera.points, axis=0).max())
+            length = head[2, 3] + head[2, 2] * width
+            assert length == pytest.approx(size * scene.tool_scale, rel=1e-3)
+    told = [e.text for e in scene.legend if e.nodes[0].startswith("Tool error")]
+    assert len(told) == 3
+    assert all(text.endswith(f"(× {scene.tool_scale:g})") for text in told)
+    assert scene.steps[0].caption == "Overview at the zero"  # no gauge is there
+    ball = scene.pose(f"{tool_errors.TOOL_UNKNOWN}/point 5")[:3, :3]
+    assert ball @ ball.T == pytest.approx(
+        scene.tool_scale**2 * whole.after.aligned_covariance[corners[4]], rel=1e-6, abs=1e-16
+    )
+
+
+def test_what_is_shown_at_first_can_be_chosen(calibration):
+    def hidden(scene):
+        return {
+            c["path"].strip("/")
+            for c in scene.commands
+            if c["type"] == "set_property" and c["property"] == "visible" and not c["value"]
+        }
+
+    assert hidden(draw_scene(calibration)) == {tool_errors.TOOL_NOW, tool_errors.TOOL_UNKNOWN}
+    assert hidden(draw_scene(calibration, show="tool")) == {
+        *(readings.GAUGES, readings.BEFORE, readings.AFTER)
+    }
+    assert hidden(draw_scene(calibration, show="all")) == set()
+    with pytest.raises(ParameterError, match="'everything' is none of readings, tool, all"):
+        draw_scene(calibration, show="everything")
+
+
+def test_pose_of_a_node_that_is_not_there_is_an_error(scene):
+    assert (scene.pose("/Leg lines/leg x") == scene.pose("Leg lines/leg x")).all()
+    with pytest.raises(KeyError, match="Leg lines/leg w"):
+        scene.pose("Leg lines/leg w")
+
+
+def test_legend_names_nodes_that_are_there(scene):
+    for entry in scene.legend:
+        for node in entry.nodes:
+            assert any(p.startswith(f"{node}/") for p in scene.nodes), node
+
+
+# ---- any robot
+
+
+@pytest.mark.parametrize("name", ["fivebar", "biglide"])
+def test_robots_without_visuals_are_drawn_as_sticks(root, name):
+    robot = load_robot(root / "tests/robots" / name)
+    scene = draw_scene(robot)
+    zero = placed(robot, robot.drive_zero, robot.zero[robot.passive_index])
+    drawn = links(scene, drawing.MACHINE)
+    assert drawn == {*zero}
+    for link in drawn:
+        pose = world(scene, f"{drawing.MACHINE}/{link}")
+        assert np.abs(pose - zero[link]).max() < KINEMATICS
+    assert len(scene.steps) > 3
+
+
+def test_posture_must_be_one_of_the_session(calibration, orthoglide):
+    with pytest.raises(ParameterError, match=r"'x_mx' is not a posture; postures: x_max, x_min"):
+        draw_scene(calibration, posture="x_mx")
+    with pytest.raises(ParameterError, match="a robot alone has no postures"):
+        draw_scene(orthoglide, posture="zero")
+
+
+def test_only_a_calibrated_machine_deviates(experiment_2, orthoglide):
+    for subject in (experiment_2, orthoglide):
+        with pytest.raises(ParameterError, match="only a calibration has a machine that deviates"):
+            draw_scene(subject, exaggeration=2.0)
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, float("nan"), float("inf")])
+def test_exaggeration_must_be_positive(calibration, factor):
+    with pytest.raises(ParameterError, match="expected a positive number"):
+        draw_scene(calibration, exaggeration=factor)
+
+
+def test_arrows_at_one_place_stand_beside_each_other(scene):
+    """Both gauges of a leg touch it at the same point."""
+    for one, two in (("yx", "zx"), ("xy", "zy"), ("xz", "yz")):
+        for node in (readings.BEFORE, readings.AFTER):
+            feet = [scene.pose(f"{node}/{name}")[:3, 3] for name in (one, two)]
+            assert np.linalg.norm(feet[0] - feet[1]) > 0.01
+
+
+@pytest.mark.parametrize("posture", [None, "x_max", "x_min"])
+def test_arrows_do_not_reach_through_the_ground(calibration, posture):
+    scene = draw_scene(calibration, posture=posture)
+    ground = scene.pose(stage.GROUND)[2, 3]
+    for row in calibration.residuals:
+        pose = scene.pose(f"{readings.BEFORE}/{row.setup}")
+        shown = posture is None or row.posture == posture
+        length = row.deviation * scene.arrow_scale if shown else 0.0
+        assert (pose[:3, 3] + length * pose[:3, 2])[2] > ground
+
+
+def test_a_scene_of_the_tool_says_how_far_it_is_off(calibration):
+    scene = draw_scene(calibration, show="tool")
+    found = assess_tool(calibration)
+    largest = np.linalg.norm(found.align(found.deviation), axis=1).max() * 1e6
+    assert scene.headline.startswith(f"The tool is up to {largest:.0f} µm off where it is sent")
+    # with errors as far beyond their tolerances as what remains of the readings says
+    covariance = error_covariance(calibration, excess=find_excess(calibration))
+    known = measure_uncertainty(found.jacobian, covariance, found.workspace, found.targets)
+    known = known.sizes.aligned.largest
+    assert known > 1.2 * found.after.sizes.aligned.largest
+    assert f"known to {known * 1e6:.0f} µm or better" in scene.headline
+    (told,) = (e.text for e in scene.legend if e.nodes == (tool_errors.TOOL_UNKNOWN,))
+    assert "errors 2.1 × tolerances" in told
+
+
+def test_only_machines_sessions_and_calibrations_are_drawn():
+    with pytest.raises(TypeError, match="found a str; expected a Calibration"):
+        draw_scene("out/experiment-2")
+
+
+# ---- the page
+
+
+def test_same_calibration_makes_the_same_page(calibration):
+    assert draw_scene(calibration).to_html() == draw_scene(calibration).to_html()
+
+
+def test_the_page_is_what_meshcats_own_interface_gives(scene):
+    assert scene.visualizer.static_html() == scene.to_html()
+
+
+def test_loaded_calibration_makes_the_same_scene(calibration, tmp_path):
+    path = calibration.save(tmp_path / "calibration.json")
+    assert draw_scene(load_calibration(path)).to_html() == draw_scene(calibration).to_html()
+
+
+def rename_setups(session, names):
+    """The session with other names of its setups."""
+    return replace(
+        session,
+        setups={
+            names.get(n, n): replace(s, name=names.get(n, n)) for n, s in session.setups.items()
+        },
+        readings=tuple(replace(r, setup=names.get(r.setup, r.setup)) for r in session.readings),
+    )
+
+
+TAKEN = ("constructor", "__proto__", "toString", "hasOwnProperty", "<object>")
+
+
+@pytest.mark.parametrize("name", TAKEN)
+def test_names_that_the_viewer_takes_for_itself_are_not_those_of_nodes(name, raw_cycles):
+    """Its tables are plain objects of JavaScript, which hold some names from the beginning."""
+    session = rename_setups(raw_cycles, {"yx": name})
+    scene = draw_scene(session)
+    parts = {part for path in scene.nodes for part in path.split("/")}
+    assert f"{name} (name)" in parts
+    assert not parts & set(TAKEN)
+    assert len(scene.nodes) == len(draw_scene(raw_cycles).nodes)
+
+
+def test_links_with_any_name_move(root, tmp_path):
+    """A link's name is a node's, drawn and moved under the same one."""
+    folder = tmp_path / "biglide"
+    shutil.copytree(root / "tests/robots/biglide", folder)
+    path = folder / "biglide.urdf"
+    text = path.read_text()
+    link = re.findall(r'<child link="([^"]+)"', text)[0]
+    path.write_text(text.replace(f'"{link}"', '"constructor"'))
+    scene = draw_scene(load_robot(folder))
+    paths = [*animation(scene), *scene.nodes]
+    assert any("/constructor (name)" in path for path in animation(scene))
+    assert not [path for path in paths if "constructor" in path.split("/")]
+
+
+def test_names_of_strangers_cannot_leave_the_data(raw_cycles):
+    """Titles, setups and postures come from files: none may end a script or begin an element."""
+    evil = "</script><img src=x onerror=alert(1)>"
+    names = {r.setup for r in raw_cycles.readings}
+    session = replace(
+        raw_cycles,
+        title=evil,
+        source=evil,
+        setups={
+            f"{n}/{evil}": replace(s, name=f"{n}/{evil}") for n, s in raw_cycles.setups.items()
+        },
+        readings=tuple(replace(r, setup=f"{r.setup}/{evil}") for r in raw_cycles.readings),
+    )
+    scene = draw_scene(session)
+    page = scene.to_html()
+    assert page.lower().count("</script>") == draw_scene(raw_cycles).to_html().count("</script>")
+    assert "<img" not in page
+    gauges = {p.split("/")[1] for p in scene.nodes if p.startswith(readings.GAUGES)}
+    assert len(gauges) == len(names)
+    assert "<img" not in scene._repr_html_()
+
+
+@pytest.mark.parametrize(
+    ("value", "rounded"),
+    [
+        (0.3, 1.0),
+        (1.0, 1.0),
+        (1.19, 1.0),
+        (13.0, 12.0),
+        (99.0, 80.0),
+        (250.0, 250.0),
+        (np.inf, 1.0),
+    ],
+)
+def test_scales_are_round_and_never_too_large(value, rounded):
+    assert round_scale(value) == rounded
