@@ -18,7 +18,7 @@ from orthocal.assess.tool import CalibratedTool, error_covariance, find_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.robot.model import read_only
-from orthocal.robot.parameters import InUnit, Unit
+from orthocal.units import InUnit, Unit
 
 Array = NDArray[np.float64]
 

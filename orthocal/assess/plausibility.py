@@ -11,6 +11,7 @@ from scipy import special
 from orthocal.assess.findings.finding import Finding, Place, place_of
 from orthocal.calibration.calibration import Calibration
 from orthocal.diagnosis.rows import ResidualRow, root_mean_square, rows_by_setup
+from orthocal.units import DRIVE_UNITS, MM, UM
 
 Array = NDArray[np.float64]
 
@@ -77,10 +78,10 @@ def _postures(calibration: Calibration) -> Finding | None:
         "wrong size",
         "stops",
         f"In these postures the robot with {lengths} would have shown the gauge "
-        f"{deviation * 1e3:.1f} mm (r.m.s.) that it did not see: the postures are those of a "
+        f"{deviation / MM:.1f} mm (r.m.s.) that it did not see: the postures are those of a "
         "machine of another size, or the robot is.",
         "Check `robot` and the joint coordinates.",
-        numbers={"foretold_rms_mm": deviation * 1e3, "measured_rms_mm": measured * 1e3},
+        numbers={"foretold_rms_mm": deviation / MM, "measured_rms_mm": measured / MM},
     )
 
 
@@ -102,10 +103,10 @@ def _finer(calibration: Calibration) -> Finding | None:
         "finer than the dial",
         "warns",
         f"{len(finer)} of {len(calibration.residuals)} readings are finer than the gauge's "
-        f"resolution of {step * 1e3:g} mm, the first in {calibration.where(first)} "
-        f"({first.measured * 1e3:.6g} mm).",
+        f"resolution of {step / MM:g} mm, the first in {calibration.where(first)} "
+        f"({first.measured / MM:.6g} mm).",
         "Make sure that they are in mm, not in inches, and that the resolution is right.",
-        numbers={"finer": float(len(finer)), "resolution_mm": step * 1e3},
+        numbers={"finer": float(len(finer)), "resolution_mm": step / MM},
         places=tuple(place_of(calibration, r) for r in finer[:MOST_PLACES]),
     )
 
@@ -129,14 +130,14 @@ def _smooth(calibration: Calibration) -> Finding | None:
     return Finding(
         "too little left",
         "warns",
-        f"What remains, {noise.residual_sigma * 1e6:.2g} µm, is less than rounding to the gauge's "
-        f"resolution of {step * 1e3:g} mm leaves ({least * 1e6:.2g} µm): the readings are in "
+        f"What remains, {noise.residual_sigma / UM:.2g} µm, is less than rounding to the gauge's "
+        f"resolution of {step / MM:g} mm leaves ({least / UM:.2g} µm): the readings are in "
         "another unit than mm, were computed, or the dial did not move.",
         "Make sure that the readings are what the dial showed, in mm.",
         numbers={
-            "left_um": noise.residual_sigma * 1e6,
-            "rounding_um": least * 1e6,
-            "resolution_mm": step * 1e3,
+            "left_um": noise.residual_sigma / UM,
+            "rounding_um": least / UM,
+            "resolution_mm": step / MM,
         },
     )
 
@@ -151,10 +152,10 @@ def _coarse(calibration: Calibration) -> Finding | None:
     return Finding(
         "sigma too coarse",
         "warns",
-        f"The σ given for the gauge, {given * 1e3:g} mm, is {given / scatter:.0f} times what its "
-        f"readings scatter by ({scatter * 1e3:.2g} mm).",
+        f"The σ given for the gauge, {given / MM:g} mm, is {given / scatter:.0f} times what its "
+        f"readings scatter by ({scatter / MM:.2g} mm).",
         "Make sure that gauge.sigma_mm is in mm.",
-        numbers={"given_mm": given * 1e3, "scatter_mm": scatter * 1e3, "times": given / scatter},
+        numbers={"given_mm": given / MM, "scatter_mm": scatter / MM, "times": given / scatter},
     )
 
 
@@ -174,10 +175,10 @@ def _tiny(calibration: Calibration) -> Finding | None:
     return Finding(
         "posture too near",
         "warns",
-        f"Posture '{name}' is {gaps[worst] * 1e3:.2g} mm from another one, where postures "
-        f"are up to {largest * 1e3:.0f} mm apart.",
+        f"Posture '{name}' is {gaps[worst] / MM:.2g} mm from another one, where postures "
+        f"are up to {largest / MM:.0f} mm apart.",
         "Make sure that it is in mm, not in metres.",
-        numbers={"gap_mm": float(gaps[worst]) * 1e3, "largest_mm": largest * 1e3},
+        numbers={"gap_mm": float(gaps[worst]) / MM, "largest_mm": largest / MM},
         places=(Place(posture=name),),
     )
 
@@ -208,7 +209,7 @@ def _legs(calibration: Calibration) -> Finding | None:
         "warns",
         f"The machine's legs are not of one length ({_leg_words(legs)}).",
         "Make sure that its size was changed in every place of the URDF.",
-        numbers={f"{name}_mm": length * 1e3 for name, length in legs},
+        numbers={f"{name}_mm": length / MM for name, length in legs},
     )
 
 
@@ -221,7 +222,7 @@ def _length_tolerance(calibration: Calibration) -> float:
 
 
 def _leg_words(legs: tuple[tuple[str, float], ...]) -> str:
-    shown = {name: f"{length * 1e3:g}" for name, length in legs}
+    shown = {name: f"{length / MM:g}" for name, length in legs}
     if len(set(shown.values())) == 1:
         return f"legs of {next(iter(shown.values()))} mm"
     return f"legs of {', '.join(f'{n} {v}' for n, v in shown.items())} mm"
@@ -231,9 +232,9 @@ def describe_machine(calibration: Calibration) -> str:
     """The machine's size: legs and travel, in words."""
     travel = {}
     for name, unit, *ends in calibration.robot_record.travel:
-        factor, word = (1e3, "mm") if unit == "m" else (180.0 / math.pi, "°")
-        low, high = ("∞" if v is None else f"{v * factor:g}" for v in ends)
-        travel[name] = f"{low} … {high} {word}".replace("∞ …", "−∞ …")
+        word, size = DRIVE_UNITS[unit]
+        low, high = ("∞" if v is None else f"{v / size:g}" for v in ends)
+        travel[name] = f"{low} … {high} {word.replace('deg', '°')}".replace("∞ …", "−∞ …")
     words = []
     if calibration.robot_record.legs:
         words.append(_leg_words(calibration.robot_record.legs))

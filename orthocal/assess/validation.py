@@ -26,9 +26,9 @@ from orthocal.diagnosis.rows import ResidualRow
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import Fit
 from orthocal.measurement.session import Session
-from orthocal.robot.parameters import InUnit, Unit
 from orthocal.statistics.chance import BY_CHANCE, confidence_factor
 from orthocal.statistics.zeros import project_out_zeros
+from orthocal.units import InUnit, Unit
 
 Array = NDArray[np.float64]
 

@@ -18,6 +18,7 @@ from orthocal.assess.repetition import Repetition
 from orthocal.assess.scores import ModelResult, Undetermined
 from orthocal.measurement.session import Session
 from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
+from orthocal.units import MM, UM
 
 Standing = Literal[
     "supported", "no check", "tells no more", "no better", "does not carry over", "not determined"
@@ -162,7 +163,7 @@ def judge_models(
         gain = best.exact.aicc - result.exact.aicc
         old, new = best.exact.unseen_rms, result.exact.unseen_rms
         predicts = not new >= old  # unknown counts for the model
-        words = f"unseen setups are predicted to {new * 1e3:.4f} mm instead of {old * 1e3:.4f} mm"
+        words = f"unseen setups are predicted to {new / MM:.4f} mm instead of {old / MM:.4f} mm"
         if gain > WORTHWHILE and predicts:
             judge(
                 result,
@@ -215,7 +216,7 @@ def _explain_remainder(
     factor = calibration.row_factor
     row = "a difference" if calibration.rows_are_differences else "a reading"
     where = {"cycles": "repeated cycles scatter", "gauge": "the gauge's own σ"}[noise.source]
-    sizes = f"σ {found * factor * 1e3:.3g} mm of {row} against {noise.sigma * factor * 1e3:.2g} mm"
+    sizes = f"σ {found * factor / MM:.3g} mm of {row} against {noise.sigma * factor / MM:.2g} mm"
     if chance >= BY_CHANCE:
         return False, 1.0, [f"What {best.model} leaves is noise: {sizes} ({where})."]
     words = [
@@ -227,7 +228,7 @@ def _explain_remainder(
         rms = calibration.rms_after
         words.append(
             f"Errors that {best.model} leaves out, at their tolerances, would leave "
-            f"{tolerated * 1e3:.3f} mm r.m.s.; found are {rms * 1e3:.3f} mm"
+            f"{tolerated / MM:.3f} mm r.m.s.; found are {rms / MM:.3f} mm"
             + (
                 f": this machine is worse than its tolerances, by about {scale:.1f} times."
                 if scale > 1.0
@@ -259,18 +260,18 @@ def _explain_tool(best: ModelResult, excess: float) -> list[str]:
         return []
     after, cost = best.tool.after.sizes.headline, best.linearisation_cost
     words = [
-        f"At the tool {best.model} is good for {after.rms * 1e6:.0f} µm r.m.s. over "
+        f"At the tool {best.model} is good for {after.rms / UM:.0f} µm r.m.s. over "
         f"{best.tool.workspace.words}, shift and rotation taken out, if the tolerances hold."
     ]
     if excess > 1.0:
         size = assess_excess(best.calibration, best.tool, excess).sizes.headline
         words[0] = (
-            f"At the tool {best.model} is good for about {size.rms * 1e6:.0f} µm r.m.s. over "
+            f"At the tool {best.model} is good for about {size.rms / UM:.0f} µm r.m.s. over "
             f"{best.tool.workspace.words}, shift and rotation taken out, with errors "
             f"{excess:.1f} times their tolerances."
         )
     if cost is not None:
-        words.append(f"Linearising it costs {cost.rms * 1e6:.1f} µm r.m.s. there.")
+        words.append(f"Linearising it costs {cost.rms / UM:.1f} µm r.m.s. there.")
     return words
 
 

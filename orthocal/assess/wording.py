@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from orthocal.units import MM, UM
+
 
 def mm(value: float) -> str:
     """A length in mm, three decimals."""
-    return plain(value * 1e3)
+    return plain(value / MM)
 
 
 def plain(value: float, decimals: int = 3) -> str:
@@ -23,7 +25,7 @@ def signed(value: float, decimals: int = 3) -> str:
 
 def um(value: float) -> str:
     """A length in µm, as many decimals as say something."""
-    size = value * 1e6
+    size = value / UM
     return f"{size:.0f}" if abs(size) >= 20.0 else f"{size:.1f}"
 
 

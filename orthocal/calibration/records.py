@@ -8,10 +8,10 @@ from typing import Literal
 
 from orthocal.estimation.loss import LossKind
 from orthocal.estimation.options import SolverKind
-from orthocal.robot.parameters import InUnit, Unit
 from orthocal.sensors.protocol import Sensor
 from orthocal.statistics.chance import chance_of_excess
 from orthocal.statistics.noise import NoiseSource
+from orthocal.units import InUnit, Unit
 
 
 @dataclass(frozen=True, slots=True, eq=False)

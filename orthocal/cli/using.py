@@ -15,6 +15,7 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.printing import print_rows, put_out
 from orthocal.errors import ClosureError, SessionError
+from orthocal.units import MM
 
 if TYPE_CHECKING:
     pass
@@ -70,14 +71,14 @@ def accuracy(
             )
         workspace = Workspace.even(given)
     elif half_side_mm is not None:
-        workspace = cube(result.robot, half_side=half_side_mm * 1e-3)
+        workspace = cube(result.robot, half_side=half_side_mm * MM)
     try:
         found = assess_tool(result, workspace, names=names)
     except ClosureError as e:
         if half_side_mm is None:
             raise SessionError(e.reason, where=e.posture) from None
         largest = assess_tool(result).workspace.half_side
-        known = "" if largest is None else f"; without this it is ±{largest * 1e3:.3g} mm"
+        known = "" if largest is None else f"; without this it is ±{largest / MM:.3g} mm"
         raise SessionError(
             f"the machine does not reach a cube of ±{half_side_mm:g} mm{known} ({e.reason})",
             where="--half-side-mm",

@@ -14,7 +14,8 @@ from orthocal.characters import composed
 from orthocal.documents import parse_number
 from orthocal.errors import ParameterError
 from orthocal.robot.model import read_only
-from orthocal.robot.parameters import Parameter, ParameterSet, Unit
+from orthocal.robot.parameters import Parameter, ParameterSet
+from orthocal.units import Unit
 
 Array = NDArray[np.float64]
 Known = float | tuple[float, float]

@@ -27,6 +27,7 @@ from orthocal.robot.model import (
     coordinate_limits,
     coordinate_units,
 )
+from orthocal.units import DRIVE_UNITS
 
 Array = NDArray[np.float64]
 Failures = dict[int, ClosureError]
@@ -455,11 +456,11 @@ class Assembly:
         for i in np.flatnonzero(~system.within_limits(x) & ~lost_for_good).tolist():
             over = np.maximum(x[i] - system.upper, system.lower - x[i])
             j = int(over.argmax())
-            unit, factor = ("mm", 1e3) if system.units[j] == 1.0 else ("deg", 180.0 / np.pi)
+            unit, size = DRIVE_UNITS["m" if system.units[j] == 1.0 else "rad"]
             reason = (
                 f"cannot be reached: joint '{system.names[j]}' would be at "
-                f"{x[i][j] * factor:.4g} {unit}, outside its limits "
-                f"{system.lower[j] * factor:g} ... {system.upper[j] * factor:g} {unit}"
+                f"{x[i][j] / size:.4g} {unit}, outside its limits "
+                f"{system.lower[j] / size:g} ... {system.upper[j] / size:g} {unit}"
             )
             refuse(i, reason, 0.0)
         x[lost_for_good] = np.nan

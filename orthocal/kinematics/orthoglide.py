@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import UnreachableError
+from orthocal.units import MM
 
 Array = NDArray[np.float64]
 
@@ -70,8 +71,8 @@ def inverse(
         bad = np.argwhere(~np.atleast_2d(under >= 0.0))[0]
         point = np.atleast_2d(p.reshape(-1, 3))[int(bad[0]) if p.ndim == 2 else 0]
         raise UnreachableError(
-            f"point {np.round(point * 1e3, 3).tolist()} mm is out of reach of leg "
-            f"{'xyz'[bad[-1]]} (length {length * 1e3:g} mm)"
+            f"point {np.round(point / MM, 3).tolist()} mm is out of reach of leg "
+            f"{'xyz'[bad[-1]]} (length {length / MM:g} mm)"
         )
     return np.asarray(p + signs * np.sqrt(under) - np.asarray(offsets, dtype=np.float64))
 
@@ -119,8 +120,8 @@ def direct(
     if not np.all(reachable):
         worst = np.atleast_2d(slides)[int(np.flatnonzero(~np.atleast_1d(reachable).ravel())[0])]
         raise UnreachableError(
-            f"the legs do not meet with the sliders at {np.round(worst * 1e3, 3).tolist()} mm "
-            f"(length {length * 1e3:g} mm)"
+            f"the legs do not meet with the sliders at {np.round(worst / MM, 3).tolist()} mm "
+            f"(length {length / MM:g} mm)"
         )
     t = (-product + root * np.sqrt(discriminant)) / (2.0 * a)
     return np.asarray(slides / 2.0 + t[..., None] / slides)
@@ -181,8 +182,8 @@ def displacement_angle(displacement: float, *, length: float) -> float:
     """
     if not abs(displacement) < length:
         raise UnreachableError(
-            f"a displacement of {displacement * 1e3:g} mm is out of reach of legs of "
-            f"{length * 1e3:g} mm"
+            f"a displacement of {displacement / MM:g} mm is out of reach of legs of "
+            f"{length / MM:g} mm"
         )
     return float(np.arcsin(displacement / length))
 

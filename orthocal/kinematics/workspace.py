@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.errors import ClosureError
 from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.robot.model import Robot, read_only
+from orthocal.units import MM
 
 Array = NDArray[np.float64]
 
@@ -57,7 +58,7 @@ class Workspace:
         if self.half_side is None:
             return f"{len(self.points)} points"
         shape = {1: "line", 2: "square"}.get(self.points.shape[1], "cube")
-        return f"a {shape} of ±{self.half_side * 1e3:.3g} mm around the zero"
+        return f"a {shape} of ±{self.half_side / MM:.3g} mm around the zero"
 
     def remove_shift(self, field: Array) -> Array:
         """A field of position errors less its mean, shape (K, 3, ...)."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from orthocal.documents import Name, Number, PositiveNumber
-from orthocal.robot.parameters import Unit
+from orthocal.units import DEG, MM, MRAD, Unit
 
 Vector = Annotated[list[Number], Field(min_length=1, max_length=12)]
 
@@ -36,9 +35,9 @@ GaugeEnd = Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM
 
 
 OFFSET_KEYS: dict[str, tuple[Unit, float]] = {
-    "offsets_mm": ("m", 1e-3),
-    "offsets_deg": ("rad", math.pi / 180.0),
-    "offsets_mrad": ("rad", 1e-3),
+    "offsets_mm": ("m", MM),
+    "offsets_deg": ("rad", DEG),
+    "offsets_mrad": ("rad", MRAD),
 }
 """Keys of `controller` to the unit of the drives they are of, and the factor to it."""
 

@@ -18,6 +18,7 @@ from orthocal.arguments import require_array
 from orthocal.markup import paragraph, table
 from orthocal.robot.model import Robot, read_only
 from orthocal.sensors.protocol import Sensor
+from orthocal.units import MM
 
 Array = NDArray[np.float64]
 
@@ -153,7 +154,7 @@ class Session:
         """In a notebook: the setups and what was read in each."""
         rows = []
         for setup in self.setups.values():
-            values = [r.value * 1e3 for r in self.readings if r.setup == setup.name]
+            values = [r.value / MM for r in self.readings if r.setup == setup.name]
             span = (f"{min(values):+.3f}", f"{max(values):+.3f}") if values else ("", "")
             rows.append((setup.name, setup.sensor.describe(), str(len(values)), *span))
         kind = "differences" if self.only_differences else "readings"

@@ -32,6 +32,7 @@ from orthocal.robot.loading import load_robot
 from orthocal.robot.model import Robot, read_only
 from orthocal.sensors.protocol import Sensor, SetupKeys
 from orthocal.sensors.registry import read_setup
+from orthocal.units import DRIVE_UNITS, MM
 
 Array = NDArray[np.float64]
 
@@ -182,9 +183,9 @@ def _build_gauges(keys: SessionKeys) -> dict[str, Gauge]:
     given = keys.gauges or {"": keys.gauge or GaugeKeys()}
     return {
         name: Gauge(
-            None if g.sigma_mm is None else g.sigma_mm * 1e-3,
-            None if g.resolution_mm is None else g.resolution_mm * 1e-3,
-            None if g.range_mm is None else (g.range_mm[0] * 1e-3, g.range_mm[1] * 1e-3),
+            None if g.sigma_mm is None else g.sigma_mm * MM,
+            None if g.resolution_mm is None else g.resolution_mm * MM,
+            None if g.range_mm is None else (g.range_mm[0] * MM, g.range_mm[1] * MM),
         )
         for name, g in given.items()
     }
@@ -254,7 +255,7 @@ def _build_postures(
                     f"has {len(posture.tcp_mm)} coordinates; expected {len(robot.drives)}",
                     where=f"{where}.tcp_mm",
                 )
-            given[name] = ("tcp_mm", np.array(posture.tcp_mm) * 1e-3)
+            given[name] = ("tcp_mm", np.array(posture.tcp_mm) * MM)
             targets[name] = given[name][1]
             continue
         form = "joints_mm" if posture.joints_mm is not None else "joints_deg"
@@ -267,7 +268,7 @@ def _build_postures(
                     f"drive {drive.name} is in {'mm' if drive.unit == 'm' else 'deg'}",
                     where=f"{where}.{form}",
                 )
-        si = np.array(values) * 1e-3 if unit == "m" else np.deg2rad(values)
+        si = np.array(values) * MM if unit == "m" else np.deg2rad(values)
         given[name] = (form, si)
         nominal[name] = si
     if targets:
@@ -296,11 +297,11 @@ def _check_travel(robot: Robot, drives: Array, *, where: str, joiner: str = ": "
     """Refuse drive coordinates beyond a drive's travel."""
     for drive, value in zip(robot.drives, drives, strict=True):
         if not drive.lower - 1e-9 <= value <= drive.upper + 1e-9:
-            factor, unit = (1e3, "mm") if drive.unit == "m" else (180 / np.pi, "deg")
+            unit, size = DRIVE_UNITS[drive.unit]
             file, _, key = where.partition(": ")
             problem = (
-                f"{key}{joiner}{drive.name} would be at {value * factor:.2f} {unit}; it reaches "
-                f"from {drive.lower * factor:g} to {drive.upper * factor:g} {unit}"
+                f"{key}{joiner}{drive.name} would be at {value / size:.2f} {unit}; it reaches "
+                f"from {drive.lower / size:g} to {drive.upper / size:g} {unit}"
             )
             raise SessionError(problem, where=file)
 
@@ -333,7 +334,7 @@ def _read_readings(path: Path, content: bytes, plan: Session) -> tuple[Reading, 
             raise SessionError(f"takes posture '{posture}' off itself", where=where)
         cycle = _parse_cycle(row.get("cycle", ""), where)
         value = parse_number(row["reading_mm"], where=where, name="reading_mm", error=SessionError)
-        reading = Reading(setup, posture, minus or None, cycle, value * 1e-3, line)
+        reading = Reading(setup, posture, minus or None, cycle, value * MM, line)
         key = (setup, posture, minus, cycle)
         if key in seen:
             raise SessionError(
@@ -369,7 +370,7 @@ def _check_range(value_mm: float, gauge: Gauge, difference: bool, where: str) ->
         )
     if gauge.range is None:
         return
-    lowest, highest = (v * 1e3 for v in gauge.range)
+    lowest, highest = (v / MM for v in gauge.range)
     if difference:
         lowest, highest = lowest - highest, highest - lowest
     if not lowest - 1e-9 <= value_mm <= highest + 1e-9:

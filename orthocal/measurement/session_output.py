@@ -15,7 +15,7 @@ from orthocal.files import write_files
 from orthocal.measurement.session import Gauge, Session
 from orthocal.robot.loading import packaged_robots
 from orthocal.sensors.registry import write_sensor
-from orthocal.units import tidy, to_mm
+from orthocal.units import MM, tidy, to_mm
 
 COLUMNS = ("setup", "posture", "minus", "cycle", "reading_mm")
 """Columns of a readings.csv; `minus` and `cycle` may be absent."""
@@ -63,7 +63,7 @@ def _offsets_document(session: Session) -> dict[str, list[float]]:
     document: dict[str, list[float]] = {}
     for drive, offset in zip(session.robot.drives, session.active_offsets, strict=True):
         key = "offsets_mm" if drive.unit == "m" else "offsets_mrad"
-        document.setdefault(key, []).append(tidy(float(offset) * 1e3))
+        document.setdefault(key, []).append(tidy(float(offset) / MM))
     return document
 
 
@@ -109,7 +109,7 @@ def write_session(
             "posture": r.posture,
             "minus": r.minus or "",
             "cycle": str(r.cycle),
-            "reading_mm": _trim(f"{r.value * 1e3:.{decimals}f}"),
+            "reading_mm": _trim(f"{r.value / MM:.{decimals}f}"),
         }
         table.write(",".join(fields[c] for c in columns) + "\n")
     files = {"session.yaml": text, "readings.csv": table.getvalue(), **(extra or {})}

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from orthocal.errors import SessionError
 from orthocal.measurement.schema import OFFSET_KEYS, ControllerKeys
 from orthocal.robot.model import Robot, read_only
+from orthocal.units import DRIVE_UNITS
 
 Array = NDArray[np.float64]
 
@@ -23,9 +24,9 @@ def require_given_zero(robot: Robot, where: str) -> None:
         SessionError: With the zeros that were found, which may be adopted.
     """
     found = [
-        f"{d.name}.{'zero_mm' if d.unit == 'm' else 'zero_deg'} ({d.zero * factor:.6g} was found)"
+        f"{d.name}.zero_{unit} ({d.zero / size:.6g} was found)"
         for d in robot.drives
-        for factor in [1e3 if d.unit == "m" else 180.0 / np.pi]
+        for unit, size in [DRIVE_UNITS[d.unit]]
         if d.zero_found
     ]
     if found:

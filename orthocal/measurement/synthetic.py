@@ -20,7 +20,7 @@ from orthocal.measurement.observations import build_observations
 from orthocal.measurement.sensing import predict_entries, sensor_unknowns
 from orthocal.measurement.session import Session
 from orthocal.robot.model import Robot
-from orthocal.units import to_mm
+from orthocal.units import MM, to_mm
 
 Array = NDArray[np.float64]
 
@@ -138,8 +138,8 @@ def simulate_session(
             )
             if not lowest <= value <= highest:
                 raise SessionError(
-                    f"the simulated reading {reading.label} is {value * 1e3:.3f} mm; the gauge's "
-                    f"range ends at {(lowest if value < lowest else highest) * 1e3:g} mm",
+                    f"the simulated reading {reading.label} is {value / MM:.3f} mm; the gauge's "
+                    f"range ends at {(lowest if value < lowest else highest) / MM:g} mm",
                     where=_where(plan, gauge_name, "range_mm") if plan.path is not None else None,
                 )
     session = replace(

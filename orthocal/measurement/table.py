@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -11,21 +10,17 @@ from numpy.typing import NDArray
 from orthocal.documents import parse_number, read_csv_rows
 from orthocal.errors import SessionError
 from orthocal.robot.model import Robot
+from orthocal.units import DRIVE_UNITS, MM
 
 Array = NDArray[np.float64]
 
-TOOL_COLUMNS = {"x_mm": 1e-3, "y_mm": 1e-3, "z_mm": 1e-3}
+TOOL_COLUMNS = {"x_mm": MM, "y_mm": MM, "z_mm": MM}
 """Columns of tool points, and their factors to SI."""
 
 
 def drive_columns(robot: Robot) -> dict[str, float]:
     """Columns of drive coordinates, and their factors to SI."""
-    return {
-        (f"{d.name}_mm" if d.unit == "m" else f"{d.name}_deg"): (
-            1e-3 if d.unit == "m" else math.pi / 180.0
-        )
-        for d in robot.drives
-    }
+    return {f"{d.name}_{unit}": size for d in robot.drives for unit, size in [DRIVE_UNITS[d.unit]]}
 
 
 def read_joints(path: Path, robot: Robot) -> tuple[list[str], Array]:

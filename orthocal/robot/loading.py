@@ -31,12 +31,12 @@ from orthocal.robot.parameters import (
     ElementaryError,
     Kind,
     ParameterSet,
-    Unit,
     build_parameters,
     split_unit,
 )
 from orthocal.robot.urdf import load_urdf
 from orthocal.robot.zero import stand_at_zero
+from orthocal.units import DEG, DRIVE_UNITS, MM, MRAD, PPM, Unit
 
 Array = NDArray[np.float64]
 
@@ -163,15 +163,15 @@ def _build_drives(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Drive,
                     f"the drive is {kind}; expected {right}",
                     where=f"{where}: orthocal.drives.{motor}.{wrong}",
                 )
-            zero = (entry.zero_mm or 0.0) * 1e-3 if prismatic else np.deg2rad(entry.zero_deg or 0.0)
+            zero = (entry.zero_mm or 0.0) * MM if prismatic else (entry.zero_deg or 0.0) * DEG
         bounded = joint.nq == 1
         lower = float(model.lowerPositionLimit[joint.idx_q]) if bounded else -np.inf
         upper = float(model.upperPositionLimit[joint.idx_q]) if bounded else np.inf
         if _is_zero_given(keys, motor) and not lower <= zero <= upper:
-            factor, unit = (1e3, "mm") if prismatic else (180.0 / np.pi, "deg")
+            unit, size = DRIVE_UNITS["m" if prismatic else "rad"]
             raise RobotError(
-                f"the zero, {zero * factor:g} {unit}, is outside the joint's limits "
-                f"{lower * factor:g} ... {upper * factor:g} {unit}",
+                f"the zero, {zero / size:g} {unit}, is outside the joint's limits "
+                f"{lower / size:g} ... {upper / size:g} {unit}",
                 where=f"{where}: orthocal.drives.{motor}",
             )
         drives.append(Drive(motor, "m" if prismatic else "rad", float(zero), lower, upper))
@@ -263,11 +263,11 @@ def _build_parameter_set(
         elementary,
         sums=extra.parameters,
         tolerances={
-            "offset:m": t.offset_mm * 1e-3,
-            "offset:rad": t.offset_mrad * 1e-3,
-            "translation": t.translation_mm * 1e-3,
-            "rotation": t.rotation_mrad * 1e-3,
-            "scale": t.scale_ppm * 1e-6,
+            "offset:m": t.offset_mm * MM,
+            "offset:rad": t.offset_mrad * MRAD,
+            "translation": t.translation_mm * MM,
+            "rotation": t.rotation_mrad * MRAD,
+            "scale": t.scale_ppm * PPM,
         },
         overrides=t.overrides,
         models=models,

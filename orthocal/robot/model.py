@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.errors import ClosureError, RobotError
 from orthocal.robot.closing import close_loops, describe_opening
 from orthocal.robot.parameters import (
-    InUnit,
     ParameterSet,
-    Unit,
 )
+from orthocal.units import InUnit, Unit
 
 Array = NDArray[np.float64]
 

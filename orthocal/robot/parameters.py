@@ -23,30 +23,12 @@ from typing import Literal
 from orthocal.arguments import require_numbers
 from orthocal.characters import composed
 from orthocal.errors import ParameterError
+from orthocal.units import UNIT_SUFFIXES, InUnit, Unit
 
 Kind = Literal["offset", "scale", "translation", "rotation"]
-Unit = Literal["m", "rad", "1"]
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Components of a twist, translation first."""
-
-UNIT_SUFFIXES: dict[str, tuple[Unit, float]] = {
-    "_mm": ("m", 1e-3),
-    "_um": ("m", 1e-6),
-    "_m": ("m", 1.0),
-    "_mrad": ("rad", 1e-3),
-    "_deg": ("rad", 0.017453292519943295),
-    "_rad": ("rad", 1.0),
-    "_ppm": ("1", 1e-6),
-}
-"""Suffix of a name in a file to unit and factor to SI."""
-
-EDGE_UNITS: dict[Unit, tuple[str, float]] = {
-    "m": ("mm", 1e3),
-    "rad": ("mrad", 1e3),
-    "1": ("ppm", 1e6),
-}
-"""Unit to the unit people read, and the factor to it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,23 +44,6 @@ class ElementaryError:
     axis: int
     """Component of the twist, 0 to 5; -1 for offset and scale."""
     unit: Unit
-
-
-class InUnit:
-    """Something with a `unit` that people read in another one."""
-
-    __slots__ = ()
-    unit: Unit
-
-    @property
-    def edge_unit(self) -> str:
-        """Unit in which people read it: mm, mrad or ppm."""
-        return EDGE_UNITS[self.unit][0]
-
-    @property
-    def edge_factor(self) -> float:
-        """Factor from SI to the unit in which people read it."""
-        return EDGE_UNITS[self.unit][1]
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from orthocal.documents import Name, Number
 from orthocal.errors import SessionError
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.protocol import Contact, Frames, SetupKeys, Unknown, View
-from orthocal.units import to_mm
+from orthocal.units import MM, to_mm
 
 Array = NDArray[np.float64]
 
@@ -86,9 +86,9 @@ class Section:
     def from_keys(keys: SectionKeys) -> Section:
         """As in a session.yaml."""
         if keys.coordinate_mm is not None:
-            return Section("coordinate_mm", keys.coordinate_mm * 1e-3)
+            return Section("coordinate_mm", keys.coordinate_mm * MM)
         if keys.from_root_mm is not None:
-            return Section("from_root_mm", keys.from_root_mm * 1e-3)
+            return Section("from_root_mm", keys.from_root_mm * MM)
         return Section("fraction", keys.fraction or 0.0)
 
     def to_keys(self) -> dict[str, float]:
@@ -185,7 +185,7 @@ class LegIndicator:
         """Leg, direction and section."""
         form, place = self.section.form, self.section.value
         words = form.removesuffix("_mm").replace("_", " ")
-        where = f"{words} {place:g}" if form == "fraction" else f"{words} {place * 1e3:g} mm"
+        where = f"{words} {place:g}" if form == "fraction" else f"{words} {place / MM:g} mm"
         return f"leg {self.leg}, {self.direction}, {where}"
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
@@ -196,7 +196,7 @@ class LegIndicator:
             plane += float(leg.axis @ at_zero[0][:3, 3])
         root, tip = (pose[:, :3, 3] for pose in frames)
         fraction = (plane - root @ leg.axis) / ((tip - root) @ leg.axis)
-        length = leg.length * 1e3
+        length = leg.length / MM
         return Contact(
             points=root + fraction[:, None] * (tip - root),
             direction=np.array(DIRECTIONS[self.direction]),

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from orthocal.documents import Name
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
-from orthocal.robot.parameters import Unit
+from orthocal.units import Unit
 
 Array = NDArray[np.float64]
 

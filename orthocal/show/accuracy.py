@@ -24,6 +24,7 @@ from orthocal.assess.findings.tool import promise
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
 from orthocal.show.layout import add_row, print_rich, table_of, um
+from orthocal.units import MM, UM
 
 THREE_WAYS = (
     "With shift and rotation taken out, as a workpiece sees it that is aligned on the machine; "
@@ -116,8 +117,8 @@ def format_points(rows: Array) -> str:
     """
     lines = []
     for row in rows:
-        numbers = [f"{round(v * 1e3, 6) + 0.0:.9g}" for v in row[:3]]
-        numbers += [f"{v * 1e6:.3f}" for v in row[3:]]
+        numbers = [f"{round(v / MM, 6) + 0.0:.9g}" for v in row[:3]]
+        numbers += [f"{v / UM:.3f}" for v in row[3:]]
         lines.append(",".join("" if n == "nan" else n for n in numbers) + "\n")
     return "".join(lines)
 

@@ -21,6 +21,7 @@ from orthocal.show.layout import (
     table_of,
     um,
 )
+from orthocal.units import MM
 
 
 def render_comparison(comparison: Comparison, *, all_rows: bool = False) -> RenderableType:
@@ -55,12 +56,12 @@ def _scores(comparison: Comparison) -> RenderableType:
             first = score.method == "linearised"
             # what can take up every reading is not judged by what it leaves of them
             fits = (
-                plain(score.rms * 1e3, 4),
+                plain(score.rms / MM, 4),
                 _short(score.chi_square),
                 f"{score.dof:.1f}",
                 _short(score.aicc if score.dof >= FEWEST_LEFT else math.inf),
                 _short(score.bic),
-                plain(score.unseen_rms * 1e3, 4),
+                plain(score.unseen_rms / MM, 4),
             )
             add_row(
                 table,
@@ -130,7 +131,7 @@ def _residuals(comparison: Comparison, all_rows: bool) -> RenderableType:
         order = sorted(order, key=lambda i: -largest[i])[:WORST_ROWS]
         note = f"The {WORST_ROWS} largest of {len(comparison.labels)}; --all lists every reading."
     for i in order:
-        add_row(table, comparison.labels[i], *(signed(r.exact.residuals[i] * 1e3) for r in results))
+        add_row(table, comparison.labels[i], *(signed(r.exact.residuals[i] / MM) for r in results))
     return Group(table, Text(note)) if note else table
 
 

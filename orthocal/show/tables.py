@@ -12,6 +12,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.diagnosis.rows import ResidualRow
 from orthocal.show.layout import add_row, choose_rows, counted, mm, plain, signed, table_of
+from orthocal.units import MM, UM
 
 MANY_PARAMETERS = 12
 """Parameters above which only those that the readings tell are listed."""
@@ -141,7 +142,7 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
     count = found.singular_values.size
     taken = found.n_readings - calibration.spare_readings
     o = found.observability
-    sight = f"singular values above the noise, {found.threshold * 1e6:.3g} µm a tolerance"
+    sight = f"singular values above the noise, {found.threshold / UM:.3g} µm a tolerance"
     if calibration.base:
         lines = [
             f"{count} base parameters: sums of errors, each of which the readings tell apart from "
@@ -158,9 +159,9 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
     )
     if found.rank:
         lines.append(
-            f"Condition number {found.condition:.3g}; observability O1 {o['O1'] * 1e3:.3g} mm, "
-            f"O2 {o['O2']:.3g}, O3 {o['O3'] * 1e3:.3g} mm, O4 {o['O4'] * 1e3:.3g} mm, "
-            f"O5 {o['O5'] * 1e3:.3g} mm a tolerance: of {counted(found.rank, 'direction')}, and "
+            f"Condition number {found.condition:.3g}; observability O1 {o['O1'] / MM:.3g} mm, "
+            f"O2 {o['O2']:.3g}, O3 {o['O3'] / MM:.3g} mm, O4 {o['O4'] / MM:.3g} mm, "
+            f"O5 {o['O5'] / MM:.3g} mm a tolerance: of {counted(found.rank, 'direction')}, and "
             "to be compared only with plans that see as many."
         )
     hidden = find_hidden(calibration)
@@ -210,9 +211,9 @@ def render_residuals(
             r.setup,
             r.postures,
             *([str(r.cycle)] if cycles else []),
-            signed(r.measured * 1e3),
-            signed(r.deviation * 1e3),
-            signed(r.residual * 1e3),
+            signed(r.measured / MM),
+            signed(r.deviation / MM),
+            signed(r.residual / MM),
             f"{r.residual / spread(r):+.1f}" if spread(r) > 0.0 else "",
             f"{r.studentised:+.1f}" if math.isfinite(r.studentised) else "",
             f"{r.influence:.1f}",

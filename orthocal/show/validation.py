@@ -17,6 +17,7 @@ from orthocal.show.layout import (
     signed,
     table_of,
 )
+from orthocal.units import MM
 
 MANY_CHANGES = 12
 """Parameters above which only those that change most are listed."""
@@ -86,8 +87,8 @@ def _validation_rows(validation: Validation, all_rows: bool) -> RenderableType:
             r.setup,
             r.postures,
             *([str(r.cycle)] if cycles else []),
-            signed(r.deviation * 1e3),
-            signed(r.residual * 1e3),
+            signed(r.deviation / MM),
+            signed(r.residual / MM),
         )
     return Group(table, Text(note)) if note else table
 

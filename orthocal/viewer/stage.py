@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.robot.model import Robot
+from orthocal.units import MM
 from orthocal.viewer.motion import Film, place_frames
 from orthocal.viewer.scene import Camera, Label, Scene, node_name
 from orthocal.viewer.shapes import (
@@ -81,7 +82,7 @@ class Stage:
         scene.set_property("Background", "top_color", [1.0, 1.0, 1.0])
         scene.set_property("Background", "bottom_color", [0.80, 0.85, 0.90])
         draw_ground(scene, GROUND, side=2.0 * size, pitch=self.pitch)
-        scene.facts.append(f"Squares on the ground: {self.pitch * 1e3:g} mm.")
+        scene.facts.append(f"Squares on the ground: {self.pitch / MM:g} mm.")
         draw_axes(scene, AXES, length=0.15 * size)
         self.lowest = float(self.low[2])
         """Of all that is drawn and does not lie on the ground, [m]."""

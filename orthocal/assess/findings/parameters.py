@@ -10,6 +10,7 @@ from orthocal.assess.findings.finding import Finding, places_of
 from orthocal.assess.wording import joined, mm, plain
 from orthocal.calibration.calibration import Calibration
 from orthocal.statistics.chance import confidence_factor
+from orthocal.units import MM
 
 STANDSTILL = 1e-6
 """Part of a tolerance by which a parameter must move to have moved."""
@@ -26,7 +27,7 @@ def find_standstill(calibration: Calibration) -> list[Finding]:
     """Whether nothing moved, and why."""
     if any(abs(p.value - p.start) > STANDSTILL * p.tolerance for p in calibration.free):
         return []
-    numbers = {"before_rms_mm": calibration.rms_before * 1e3}
+    numbers = {"before_rms_mm": calibration.rms_before / MM}
     if len(calibration.identifiability.unseen) == len(calibration.free):
         return [
             Finding(

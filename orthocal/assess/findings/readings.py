@@ -9,6 +9,7 @@ from orthocal.assess.wording import joined, mm, signed
 from orthocal.calibration.calibration import Calibration
 from orthocal.diagnosis.rows import ResidualRow
 from orthocal.statistics.chance import BY_CHANCE
+from orthocal.units import MM
 
 MANY_SUSPICIOUS = 0.2
 """Part of the readings above which it is not the readings that are wrong."""
@@ -41,8 +42,8 @@ def find_turned(calibration: Calibration) -> list[Finding]:
             "See which way the gauge stood and whether a minus was forgotten; then turn the signs, "
             "or `direction`, and calibrate again.",
             numbers={
-                "as_read_rms_mm": turned.as_read * 1e3,
-                "turned_rms_mm": turned.turned * 1e3,
+                "as_read_rms_mm": turned.as_read / MM,
+                "turned_rms_mm": turned.turned / MM,
                 "log_likelihood_ratio": turned.evidence,
             },
             places=tuple(Place(setup=name) for name in names),
@@ -89,13 +90,13 @@ def _suspicion(calibration: Calibration, row: ResidualRow) -> Finding:
     return Finding(
         "suspicious reading",
         "warns",
-        f"{calibration.where(row)}: {row.label}{cycle}, reads {signed(row.measured * 1e3)} mm, "
+        f"{calibration.where(row)}: {row.label}{cycle}, reads {signed(row.measured / MM)} mm, "
         f"{row.studentised:+.1f} of its σ from what all others say; without it {row.influenced} "
         f"would change by {row.influence:.1f} of its σ.",
         "Look at what stands out, read it again if it is wrong, and calibrate again.",
         numbers={
-            "measured_mm": row.measured * 1e3,
-            "expected_mm": row.predicted * 1e3,
+            "measured_mm": row.measured / MM,
+            "expected_mm": row.predicted / MM,
             "cycle": float(row.cycle),
             "studentised": row.studentised,
             "influence": row.influence,
@@ -110,7 +111,7 @@ def find_scattered(calibration: Calibration) -> list[Finding]:
     if not worst or gauge is None:
         return []
     scatter = calibration.noise.cycles_sigma
-    shown = ", ".join(f"{signed(r.measured * 1e3)} in cycle {r.cycle}" for r in worst[:6])
+    shown = ", ".join(f"{signed(r.measured / MM)} in cycle {r.cycle}" for r in worst[:6])
     odd = _odd_one_out(worst)
     first = [r for r in worst if r is odd]
     where = (
@@ -125,7 +126,7 @@ def find_scattered(calibration: Calibration) -> list[Finding]:
             f"Repeated readings scatter by {mm(scatter)} mm, more than the gauge's {mm(gauge)} mm "
             f"explain. They differ most at {worst[0].label}: {shown} mm; {where}.",
             "Check these for a wrong sign or row before anything is entered, and read them again.",
-            numbers={"scatter_mm": scatter * 1e3, "gauge_mm": gauge * 1e3},
+            numbers={"scatter_mm": scatter / MM, "gauge_mm": gauge / MM},
             places=tuple(
                 place_of(calibration, r) for r in [*first, *(r for r in worst if r is not odd)]
             ),

@@ -11,6 +11,7 @@ from orthocal.assess.wording import mm, times
 from orthocal.calibration.calibration import Calibration
 from orthocal.diagnosis.rows import root_mean_square, rows_by_setup
 from orthocal.statistics.chance import BY_CHANCE
+from orthocal.units import MM
 
 FAR_BEYOND = 4.0
 """Times the tolerances beyond which it is readings or description that are wrong."""
@@ -24,8 +25,8 @@ def find_tolerances(calibration: Calibration) -> list[Finding]:
     text = f"What remains is {excess:.1f} times what a machine within its tolerances would leave"
     numbers = {
         "times_tolerances": excess,
-        "left_rms_mm": calibration.rms_after * 1e3,
-        "tolerated_rms_mm": calibration.unmodelled.residual_rms * 1e3,
+        "left_rms_mm": calibration.rms_after / MM,
+        "tolerated_rms_mm": calibration.unmodelled.residual_rms / MM,
     }
     if calibration.turned is not None or excess <= FAR_BEYOND:
         if calibration.turned is not None:
@@ -48,7 +49,7 @@ def find_tolerances(calibration: Calibration) -> list[Finding]:
             f"Look at setup {name} first: it differs by {mm(size)} mm (r.m.s.) from what all "
             "others say."
         )
-        numbers["worst_setup_rms_mm"] = size * 1e3
+        numbers["worst_setup_rms_mm"] = size / MM
     setups = (Place(setup=name),) if name else places
     return [Finding("tolerances exceeded", "stops", text, action, numbers, setups)]
 
@@ -121,13 +122,13 @@ def find_remainder(calibration: Calibration) -> list[Finding]:
             "Only what remains says how large the noise is, so error of the model, or of a whole "
             "setup, would look like noise.",
             "Repeat readings in cycles, or give gauge.sigma_mm.",
-            {"sigma_mm": calibration.sigma * 1e3},
+            {"sigma_mm": calibration.sigma / MM},
         )
     ]
 
 
 def _rests_on_gauge(calibration: Calibration) -> Finding:
-    numbers = {"sigma_mm": calibration.noise.reading_sigma * 1e3}
+    numbers = {"sigma_mm": calibration.noise.reading_sigma / MM}
     if calibration.spare_readings > 0:
         return Finding(
             "fits",
@@ -146,7 +147,7 @@ def _within_cycles(calibration: Calibration) -> list[Finding]:
     if scatter is not None and noise.chance_in_cycles(scatter) < BY_CHANCE:
         return []
     text = "What remains is what repeated cycles scatter by: the model fits."
-    return [Finding("fits", "informs", text, numbers={"scatter_mm": noise.cycles_sigma * 1e3})]
+    return [Finding("fits", "informs", text, numbers={"scatter_mm": noise.cycles_sigma / MM})]
 
 
 def _beyond_cycles(calibration: Calibration) -> Finding:
@@ -160,8 +161,8 @@ def _beyond_cycles(calibration: Calibration) -> Finding:
         "not noise.",
         _larger_model(calibration),
         {
-            "sigma_mm": noise.residual_sigma * 1e3,
-            "scatter_mm": noise.cycles_sigma * 1e3,
+            "sigma_mm": noise.residual_sigma / MM,
+            "scatter_mm": noise.cycles_sigma / MM,
             "times": ratio,
         },
     )
@@ -173,8 +174,8 @@ def _against_gauge(calibration: Calibration, gauge: float) -> Finding:
     ratio = noise.residual_sigma / gauge
     row = "a difference" if calibration.rows_are_differences else "a reading"
     numbers = {
-        "sigma_mm": noise.residual_sigma * 1e3,
-        "gauge_sigma_mm": gauge * 1e3,
+        "sigma_mm": noise.residual_sigma / MM,
+        "gauge_sigma_mm": gauge / MM,
         "times": ratio,
     }
     if calibration.has_model_error:

@@ -15,6 +15,7 @@ from orthocal.assess.findings.finding import Finding
 from orthocal.assess.wording import um
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
+from orthocal.units import UM
 
 
 def find_at_tool(calibration: Calibration) -> list[Finding]:
@@ -52,11 +53,11 @@ def promise(calibration: Calibration, accuracy: ToolAccuracy) -> list[Finding]:
             "informs",
             f"{text}.",
             numbers={
-                "expected_um": expected * 1e6,
-                "expected_as_it_is_um": math.hypot(off, known) * 1e6,
-                "known_to_be_off_um": off * 1e6,
-                "all_errors_known_um": known * 1e6,
-                "expected_absolute_um": math.hypot(left, remaining.sizes.absolute.rms) * 1e6,
+                "expected_um": expected / UM,
+                "expected_as_it_is_um": math.hypot(off, known) / UM,
+                "known_to_be_off_um": off / UM,
+                "all_errors_known_um": known / UM,
+                "expected_absolute_um": math.hypot(left, remaining.sizes.absolute.rms) / UM,
                 "times_tolerances": excess,
             },
         )

@@ -7,6 +7,7 @@ from orthocal.assess.findings.finding import Finding, Kind, Place, places_of
 from orthocal.assess.mistakes import EnteringMistake, Mistake
 from orthocal.assess.validation import FurtherChange, Validation
 from orthocal.assess.wording import joined, mm, signed
+from orthocal.units import MM
 
 REMOVED = 0.7
 """Part of the deviations below which a further fit is said to remove them."""
@@ -59,9 +60,9 @@ def _standing(validation: Validation) -> Finding:
     """Whether the deviations are those that were expected."""
     achieved, expected = validation.achieved_rms, validation.expected_rms
     numbers = {
-        "expected_rms_mm": expected * 1e3,
-        "achieved_rms_mm": achieved * 1e3,
-        "refit_rms_mm": validation.refit_rms * 1e3,
+        "expected_rms_mm": expected / MM,
+        "achieved_rms_mm": achieved / MM,
+        "refit_rms_mm": validation.refit_rms / MM,
         "chance": validation.excess_probability,
     }
     places = _worst_row(validation)
@@ -166,7 +167,7 @@ def _one_differs(validation: Validation, mistake: EnteringMistake) -> Finding:
 def _mistake_numbers(validation: Validation, mistake: EnteringMistake) -> dict[str, float]:
     """What is in the controller less what was to be entered, drive by drive, and what is left."""
     units = {e.drive: (e.edge_factor, e.edge_unit.replace("°", "deg")) for e in validation.enter}
-    found = {"left_rms_mm": mistake.rms * 1e3}
+    found = {"left_rms_mm": mistake.rms / MM}
     for drive, by in zip(mistake.drives, mistake.by, strict=True):
         factor, unit = units.get(drive, (1.0, "si"))
         found[f"{drive}_by_{unit}"] = by * factor
@@ -186,7 +187,7 @@ def _changed(validation: Validation) -> Finding:
         f"elsewhere than the session says.{told} Most would change, in their σ: "
         f"{', '.join(names)}.",
         AGAIN,
-        {"refit_rms_mm": validation.refit_rms * 1e3},
+        {"refit_rms_mm": validation.refit_rms / MM},
         places_of(*names),
     )
 

@@ -43,6 +43,7 @@ from orthocal.show.tables import (
     render_parameters,
     render_residuals,
 )
+from orthocal.units import MM
 from orthocal.viewer.scene import frame_of
 
 FEW_ROWS = 40
@@ -272,7 +273,7 @@ def _provenance(calibration: Calibration) -> str:
                 ("its files, SHA-256", part.sha256 or "none"),
             )
         ),
-        ("Gauge", "σ not stated" if sigma is None else f"σ {plain(sigma * 1e3)} mm a reading"),
+        ("Gauge", "σ not stated" if sigma is None else f"σ {plain(sigma / MM)} mm a reading"),
         ("Offsets active while measuring", active),
         (
             "Model",

@@ -29,6 +29,7 @@ from orthocal.show.report.figure import (
     scale_log,
     shade,
 )
+from orthocal.units import MM
 
 Array = NDArray[np.float64]
 
@@ -220,12 +221,12 @@ def _mark_signs(
 def _draw_singular_values(calibration: Calibration) -> Figure:
     found = calibration.identifiability
     count = found.singular_values.size
-    values = found.singular_values[: found.structural_rank] * 1e3
+    values = found.singular_values[: found.structural_rank] / MM
     title = f"What the readings tell: {found.rank} of {count} combinations rise above the noise"
     figure = open_figure(2.9, title)
     axes = figure.subplots()
     index = np.arange(1, values.size + 1)
-    above = values > found.threshold * 1e3
+    above = values > found.threshold / MM
     for chosen, face, label in (
         (above, AFTER, "told better than its tolerance"),
         (~above, "white", "lost in the noise"),
@@ -235,9 +236,9 @@ def _draw_singular_values(calibration: Calibration) -> Figure:
             axes.plot(index[chosen], values[chosen], label=label, **look)
     noise = calibration.noise.reading_sigma
     kind = "σ of a reading" if noise >= found.threshold else "rounding: the noise is unknown"
-    label = f"{kind}: {found.threshold * 1e3:.2g} mm"
-    axes.axhline(found.threshold * 1e3, color="black", linestyle="--", label=label)
-    scale_log(axes, "y", np.r_[values, found.threshold * 1e3])
+    label = f"{kind}: {found.threshold / MM:.2g} mm"
+    axes.axhline(found.threshold / MM, color="black", linestyle="--", label=label)
+    scale_log(axes, "y", np.r_[values, found.threshold / MM])
     axes.grid(True, axis="y")
     axes.set_xlim(0.5, values.size + 0.5)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))

@@ -27,6 +27,7 @@ from orthocal.show.report.figure import (
     scale_log,
     shade,
 )
+from orthocal.units import MM
 
 Array = NDArray[np.float64]
 
@@ -77,8 +78,8 @@ def _draw_residuals(calibration: Calibration, most: int) -> Figure:
         title = f"Readings before and after calibration: the {len(rows)} worst of {len(found)}"
     figure, axes = open_list(title, _row_names(calibration, rows))
     y = np.arange(len(rows))
-    before, after = (np.array([f(r) for r in rows]) * 1e3 for f in (_deviation, _residual))
-    sigma = np.array([_row_sigma(calibration, r) for r in rows]) * 1e3
+    before, after = (np.array([f(r) for r in rows]) / MM for f in (_deviation, _residual))
+    sigma = np.array([_row_sigma(calibration, r) for r in rows]) / MM
     if np.isfinite(sigma).all():
         kind = "row" if np.ptp(sigma) > 0.0 else _row_word(calibration)
         shade(axes, y, -2.0 * sigma, 2.0 * sigma, f"±2 σ of a {kind}")
@@ -108,11 +109,11 @@ def _draw_setups(calibration: Calibration, most: int) -> Figure:
         sizes = np.array([root_mean_square(map(get, groups[n])) for n in names])
         known = np.isfinite(sizes)
         if known.any():
-            sizes = np.maximum(sizes[known], SMALLEST_LENGTH) * 1e3
+            sizes = np.maximum(sizes[known], SMALLEST_LENGTH) / MM
             axes.plot(sizes, y[known] + shift, label=label, **look)
             shown.append(sizes)
     if math.isfinite(calibration.sigma) and calibration.sigma > SMALLEST_LENGTH:
-        sigma = calibration.sigma * 1e3
+        sigma = calibration.sigma / MM
         axes.axvline(sigma, color="black", linestyle=":", label=f"σ of a {_row_word(calibration)}")
         shown.append(np.array([sigma]))
     scale_log(axes, "x", np.concatenate(shown))
@@ -125,7 +126,7 @@ def _draw_spread(calibration: Calibration) -> Figure:
     found = calibration.residuals
     word = _row_word(calibration)
     single = np.array([_residual(r) / _noise_factor(r) for r in found])
-    values = np.sort(single) * calibration.row_factor * 1e3
+    values = np.sort(single) * calibration.row_factor / MM
     quantiles = special.ndtri((np.arange(values.size) + 0.5) / values.size)
     chosen = _thin(values.size)
     figure = open_figure(3.8, "Do the residuals scatter as the noise explains?")
@@ -143,8 +144,8 @@ def _draw_spread(calibration: Calibration) -> Figure:
         (given, "σ given for the gauge", "--"),
     ):
         if math.isfinite(sigma):
-            label = f"{name}: {sigma * 1e3:.2g} mm"
-            axes.plot(reach, reach * part * sigma * 1e3, color="black", linestyle=line, label=label)
+            label = f"{name}: {sigma / MM:.2g} mm"
+            axes.plot(reach, reach * part * sigma / MM, color="black", linestyle=line, label=label)
     axes.grid(True)
     axes.set_xlabel(
         "normal quantile: what pure noise would give at the same place in the order [σ]\n"

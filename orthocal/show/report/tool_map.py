@@ -19,6 +19,7 @@ from orthocal.assess.accuracy import ToolAccuracy, assess_remaining, find_excess
 from orthocal.assess.entering import find_entries
 from orthocal.calibration.calibration import Calibration
 from orthocal.show.report.figure import open_figure, render_figure
+from orthocal.units import MM, UM
 
 Array = NDArray[np.float64]
 
@@ -92,12 +93,12 @@ def _error_parts(calibration: Calibration, accuracy: ToolAccuracy, which: Field)
     Shift and rotation of the whole region are no errors of a workpiece that is aligned there.
     """
     if which == "now":
-        return accuracy.align(accuracy.deviation) * 1e6
+        return accuracy.align(accuracy.deviation) / UM
     remaining, _ = assess_remaining(calibration, accuracy)
     if which == "left" or remaining is None:
-        return accuracy.align(accuracy.error_after_offsets) * 1e6
+        return accuracy.align(accuracy.error_after_offsets) / UM
     variance = np.trace(remaining.aligned_covariance, axis1=1, axis2=2)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0))[:, None] * 1e6)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0))[:, None] / UM)
 
 
 def _draw_tool_map(
@@ -120,7 +121,7 @@ def _draw_tool_map(
         axes.set_ylabel(f"{'xyz'[world[plane[1]]]} [mm]", labelpad=0.0)
         taken = np.zeros((0, 2))
         if which != "unknown":
-            at_x, at_y = (lines[k] * 1e3 for k in plane)
+            at_x, at_y = (lines[k] / MM for k in plane)
             taken = _draw_arrows(axes, at_x, at_y, cut, [world[k] for k in plane], levels)
         _draw_size(axes, x, y, size, levels, taken)
     label = "size of the error [µm]; arrows: its part in the plane"
@@ -159,13 +160,13 @@ def _refine(lines: list[Array], parts: Array) -> tuple[Array, Array, Array]:
     degree = {"kx": min(3, lines[0].size - 1), "ky": min(3, lines[1].size - 1)}
     splines = [RectBivariateSpline(*lines, p, **degree) for p in np.moveaxis(parts, -1, 0)]
     size = np.linalg.norm([spline(x, y) for spline in splines], axis=0)
-    return x * 1e3, y * 1e3, size.T
+    return x / MM, y / MM, size.T
 
 
 def _describe_cut(lines: list[Array], plane: tuple[int, ...], world: tuple[int, ...]) -> str:
     """Where the plane lies: z = 0 mm."""
     return ", ".join(
-        f"{'xyz'[world[k]]} = {line[line.size // 2] * 1e3 + 0.0:g} mm"
+        f"{'xyz'[world[k]]} = {line[line.size // 2] / MM + 0.0:g} mm"
         for k, line in enumerate(lines)
         if k not in plane
     )

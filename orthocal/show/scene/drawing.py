@@ -32,6 +32,7 @@ from orthocal.show.scene.deviations import (
 )
 from orthocal.show.scene.readings import draw_readings, write_headline, write_steps
 from orthocal.show.scene.tool_errors import draw_tool_errors
+from orthocal.units import MM
 from orthocal.viewer.motion import (
     Film,
     Timeline,
@@ -296,7 +297,7 @@ def _place_machines(
         exaggeration = round_scale(wanted)
     if exaggeration * largest > FURTHEST * stage.size:
         raise ParameterError(
-            f"is {exaggeration:g}; the largest deviation of {largest * 1e3:.3g} mm would be drawn "
+            f"is {exaggeration:g}; the largest deviation of {largest / MM:.3g} mm would be drawn "
             f"larger than the machine: expected at most {stage.size / largest:.0f}",
             where="exaggeration",
         )
@@ -329,7 +330,7 @@ def _explain_machines(scene: Scene, machines: _Machines) -> None:
     if machines.largest <= NOTHING:
         scene.facts.insert(0, "The machine is where the controller takes it to be.")
         return
-    size = f"largest {machines.largest * 1e3:.3f} mm, at {machines.where}"
+    size = f"largest {machines.largest / MM:.3f} mm, at {machines.where}"
     if machines.exaggeration == 1.0:
         scene.facts.insert(0, f"Machine: true scale ({size}).")
     else:

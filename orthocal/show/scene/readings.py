@@ -20,6 +20,7 @@ from orthocal.show.scene.deviations import (
     Stop,
     worst_of_setups,
 )
+from orthocal.units import MM
 from orthocal.viewer.motion import Film, Timeline
 from orthocal.viewer.scene import Label, LegendEntry, Scene, Step, node_name, round_scale
 from orthocal.viewer.shapes import (
@@ -287,7 +288,7 @@ def write_headline(measured: Measurement) -> str:
         return text
     return (
         f"{text} Calibrated: {_mm(worst.after)} mm there; no reading is off by more than "
-        f"{measured.largest_after * 1e3:.3f} mm."
+        f"{measured.largest_after / MM:.3f} mm."
     )
 
 
@@ -300,4 +301,4 @@ def write_steps(
 
 
 def _mm(value: float) -> str:
-    return typeset(value * 1e3)
+    return typeset(value / MM)
