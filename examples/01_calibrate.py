@@ -11,7 +11,7 @@ calibration = orthocal.calibrate(session, "offsets")
 print(orthocal.summarize(calibration))
 
 # Where the tool really is when the encoders show the mechanical zero, in mm.
-print("Tool at the mechanical zero:", calibration.forward([0.31025] * 3) * 1e3)
+print("Tool at the mechanical zero:", calibration.machine.forward([0.31025] * 3) * 1e3)
 
 # The paper's third experiment: the offsets were entered, and the legs measured again.
 afterwards = orthocal.load_session(TABLE_1 / "experiment-3")

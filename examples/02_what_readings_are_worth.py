@@ -45,7 +45,7 @@ for name, session in sessions.items():
     for model in ("offsets", "full"):
         result = orthocal.calibrate(session, orthocal.Choice(model=model, tolerances=TOLERANCES))
         promised = 1e6 * assess_tool(result, space).after.sizes.aligned.rms
-        achieved = error_at_tool(result.forward(drives))
+        achieved = error_at_tool(result.machine.forward(drives))
         label = f"{name}, {model}"
         print(f"{label:26}{len(session.readings):>10}{promised:10.1f}{achieved:10.1f}")
         results[name, model] = result

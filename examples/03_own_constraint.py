@@ -27,7 +27,7 @@ solver = ca.nlpsol(
     {"x": nlp.variables, "p": nlp.parameters, "f": nlp.objective, "g": constraints},
     {"ipopt": {"print_level": 0, "sb": "yes"}, "print_time": False},
 )
-sigma = orthocal.calibrate(session, choice).noise.reading_sigma
+sigma = orthocal.calibrate(session, choice).noise.sigma
 found = solver(x0=program.begin(sigma=sigma), p=program.pack(sigma=sigma), lbg=0.0, ubg=0.0)
 own = found["x"].full()[: problem.n_free, 0] * problem.theta_scale
 

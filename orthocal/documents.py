@@ -7,15 +7,17 @@ every message names the file and what was found in it.
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args, get_origin
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
-from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, TypeAdapter, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
 from orthocal.characters import composed, shorten, text_problem
@@ -23,7 +25,7 @@ from orthocal.errors import OrthocalError
 from orthocal.files import read_file
 from orthocal.strict_yaml import DEEPEST, LARGEST_YAML, LONGEST_NUMBER, StrictLoader
 
-Model = TypeVar("Model", bound=BaseModel)
+Record = TypeVar("Record")
 
 
 def _refuse_truth_values(value: object) -> object:
@@ -310,14 +312,14 @@ def parse_number(text: str, *, where: str, name: str, error: type[OrthocalError]
 
 
 def validate(
-    schema: type[Model],
+    schema: type[Record],
     data: Any,  # noqa: ANN401 - any document
     *,
     where: str,
     error: type[OrthocalError],
     under: str = "",
-) -> Model:
-    """Data as an instance of a pydantic schema.
+) -> Record:
+    """Data as an instance of a pydantic model, or of a dataclass.
 
     Args:
         schema: What is expected.
@@ -335,20 +337,39 @@ def validate(
         at = f"{where}: {under}" if under else where
         raise error(f"holds {found}; expected keys and values", where=at)
     try:
-        return schema.model_validate(data)
+        record: Record = _adapter(schema).validate_python(data)
+        return record
     except ValidationError as e:
         key, problem = explain_validation_error(e, schema)
         key = ".".join(part for part in (under, key) if part)
         raise error(problem, where=f"{where}: {key}" if key else where) from None
 
 
-def explain_validation_error(
-    exception: ValidationError, schema: type[BaseModel]
-) -> tuple[str, str]:
+def write_plain(record: object, schema: type[Any]) -> dict[str, Any]:
+    """A dataclass as plain data, as `validate` reads it."""
+    plain: dict[str, Any] = _adapter(schema).dump_python(record, mode="json", by_alias=True)
+    return plain
+
+
+_ADAPTERS: dict[type[Any], TypeAdapter[Any]] = {}
+
+
+def _adapter(schema: type[Any]) -> TypeAdapter[Any]:
+    """Built once a schema: that takes time."""
+    if schema not in _ADAPTERS:
+        _ADAPTERS[schema] = TypeAdapter(schema)
+    return _ADAPTERS[schema]
+
+
+UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
+"""What pydantic calls a key that is not known, of a model and of a dataclass."""
+
+
+def explain_validation_error(exception: ValidationError, schema: type[Any]) -> tuple[str, str]:
     """Key and plain words for the first finding of a pydantic ValidationError."""
     # an unknown key explains a missing one: name it first
     findings = sorted(
-        exception.errors(include_url=False), key=lambda f: f["type"] != "extra_forbidden"
+        exception.errors(include_url=False), key=lambda f: f["type"] not in UNKNOWN_KEY
     )
     first = findings[0]
     path = [part for part in first["loc"] if not _is_pydantic_tag(part)]
@@ -356,7 +377,7 @@ def explain_validation_error(
     if "[key]" in first["loc"] and not isinstance(found, str):
         return _join(path[:-1]), f"found the key {_show(found)}; expected text: put it in quotes"
     key = _join(path)
-    if kind == "extra_forbidden":
+    if kind in UNKNOWN_KEY:
         known = _keys_at(schema, path[:-1])
         hint = f"; known keys: {', '.join(known)}" if known else ""
         return key, f"unknown key{hint}"
@@ -366,7 +387,7 @@ def explain_validation_error(
     if kind in ("value_error", "assertion_error"):
         # a validator over several keys begins its message with the one that it is about
         inner, separator, rest = words.partition("|")
-        return (_join([*path, inner]), rest) if separator else (key, words)
+        return (_join([*path, inner] if inner else path), rest) if separator else (key, words)
     shown = "nothing" if found is None else f"'{_show(found)}'"
     return key, f"found {shown}; expected {_expectation(kind, words, first.get('ctx') or {})}"
 
@@ -380,7 +401,7 @@ def _show(value: object) -> str:
 
 def _expectation(kind: str, words: str, context: Mapping[str, Any]) -> str:
     """What pydantic expected, in words of this program."""
-    if kind in ("dict_type", "model_type", "model_attributes_type", "mapping_type"):
+    if kind in ("dict_type", "model_type", "dataclass_type", "mapping_type"):
         return "keys and values"
     if kind == "string_pattern_mismatch":
         return "a name without blanks, commas, semicolons or quotes"
@@ -410,7 +431,25 @@ def _keys_at(annotation: Any, path: list[Any]) -> list[str]:  # noqa: ANN401 - t
         if not path:
             return list(fields)
         return _keys_at(fields[path[0]], path[1:]) if path[0] in fields else []
+    if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
+        hints = get_type_hints(annotation, include_extras=True)
+        named = {
+            _alias(hints[f.name]) or f.name: hints[f.name] for f in dataclasses.fields(annotation)
+        }
+        if not path:
+            return list(named)
+        return _keys_at(named[path[0]], path[1:]) if path[0] in named else []
+    if get_origin(annotation) is Annotated:
+        return _keys_at(get_args(annotation)[0], path)
     arguments = get_args(annotation)
+    if get_origin(annotation) is tuple:
+        return _keys_at(arguments[0], path[1:])
     if get_origin(annotation) in (dict, list):
         return _keys_at(arguments[-1], path[1:])
     return next((found for a in arguments if (found := _keys_at(a, path))), [])
+
+
+def _alias(hint: Any) -> str | None:  # noqa: ANN401 - typing objects
+    """The key of a dataclass's field, where it is not its name."""
+    found = [m.alias for m in get_args(hint)[1:] if isinstance(m, FieldInfo) and m.alias]
+    return found[0] if found else None

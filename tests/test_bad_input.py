@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 
 from orthocal import calibrate, load_session
+from orthocal.calibration.file import calibration_json
 from orthocal.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -1359,12 +1360,12 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "schema-other",
-        f"{CALIBRATION}: schema is 'orthocal/calibration/9'; expected 'orthocal/calibration/3'",
-        swap(FILE, "orthocal/calibration/3", "orthocal/calibration/9"),
+        f"{CALIBRATION}: schema is 'orthocal/calibration/9'; expected 'orthocal/calibration/4'",
+        swap(FILE, "orthocal/calibration/4", "orthocal/calibration/9"),
     ),
     calibration(
         "schema-missing",
-        f"{CALIBRATION}: schema: is missing; expected 'orthocal/calibration/3'",
+        f"{CALIBRATION}: schema: is missing; expected 'orthocal/calibration/4'",
         write(FILE, "{}"),
     ),
     calibration(
@@ -1952,7 +1953,7 @@ def calibrated() -> str:
     """Text of a good calibration.json; the folder that it names is no longer there."""
     with tempfile.TemporaryDirectory() as name:
         lay_out(Path(name), "machine")
-        return calibrate(load_session(name)).to_json()
+        return calibration_json(calibrate(load_session(name)))
 
 
 @pytest.fixture

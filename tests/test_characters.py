@@ -15,6 +15,7 @@ from orthocal import (
     load_session,
     summarize,
 )
+from orthocal.calibration.file import write_calibration
 from orthocal.characters import printable
 from orthocal.errors import ClosureError, OrthocalError
 from orthocal.markup import paragraph, table
@@ -76,7 +77,7 @@ def test_names_of_files_are_escaped_in_messages(file, old, new, session):
 
 
 def test_strings_in_lists_of_a_json_are_looked_at_too(session):
-    path = calibrate(load_session(session)).save(session / "calibration.json")
+    path = write_calibration(calibrate(load_session(session)), session / "calibration.json")
     text = path.read_text(encoding="utf-8")
     assert '"told": [\n   "x_slide.offset"' in text
     path.write_text(text.replace('"told": [\n   "x_', '"told": [\n   "\\u001b[31mx_'))

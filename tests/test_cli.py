@@ -187,7 +187,7 @@ def test_forward_and_inverse_undo_each_other(orthocal, experiment, tmp_path):
     rows = list(csv.DictReader(io.StringIO(out)))
     assert list(rows[0]) == ["x_mm", "y_mm", "z_mm"]
     first = np.array([float(v) for v in rows[0].values()]) * 1e-3
-    expected = load_calibration(tmp_path).forward([0.31025] * 3)
+    expected = load_calibration(tmp_path).machine.forward([0.31025] * 3)
     assert np.abs(first - expected).max() < 1e-9
     points = tmp_path / "points.csv"
     points.write_text(out)

@@ -11,6 +11,7 @@ import pytest
 
 from orthocal import Choice, calibrate, load_calibration, load_session
 from orthocal.assess.entering import find_entries
+from orthocal.calibration.file import calibration_document, write_calibration
 from orthocal.documents import (
     MOST_CSV_ROWS,
     MOST_JSON_VALUES,
@@ -133,7 +134,7 @@ def test_texts_of_a_json_are_texts_wherever_they_stand(where, text, refused):
 
 @pytest.fixture(scope="module")
 def document(experiment_2):
-    return calibrate(experiment_2).to_document()
+    return calibration_document(calibrate(experiment_2))
 
 
 def change(document, keys, value):
@@ -203,8 +204,8 @@ def test_a_calibration_of_nothing(document, tmp_path):
 def test_every_calibration_that_is_written_is_read_as_the_same(model, name, root, tmp_path):
     """18 readings beside 126 errors leave a hundredth of a degree of freedom, for example."""
     calibration = calibrate(root / "examples" / name, model)
-    found = load_calibration(calibration.save(tmp_path / "calibration.json"))
-    assert found.to_document() == calibration.to_document()
+    found = load_calibration(write_calibration(calibration, tmp_path / "calibration.json"))
+    assert calibration_document(found) == calibration_document(calibration)
 
 
 def test_the_smallest_numbers_that_a_session_takes_are_read_again(root, tmp_path):
@@ -218,8 +219,8 @@ def test_the_smallest_numbers_that_a_session_takes_are_read_again(root, tmp_path
     calibration = calibrate(
         load_session(tmp_path), Choice(tolerances={"*.offset_m": 1e-9}, model="offsets", prior=True)
     )
-    found = load_calibration(calibration.save(tmp_path / "calibration.json"))
-    assert found.to_document() == calibration.to_document()
+    found = load_calibration(write_calibration(calibration, tmp_path / "calibration.json"))
+    assert calibration_document(found) == calibration_document(calibration)
 
 
 def test_a_result_that_makes_no_sense_is_refused_before_it_is_written(raw_cycles, monkeypatch):

@@ -16,6 +16,7 @@ import pytest
 from fuzzing import KINDS, lay_out, make_case, run
 
 from orthocal import calibrate, load_calibration, load_robot
+from orthocal.calibration.file import calibration_document
 from orthocal.errors import CalibrationFileError
 from orthocal.kinematics.assembly import nominal_assembly
 
@@ -79,7 +80,7 @@ def test_what_must_not_be_is_seen(spoil, seen, good, tmp_path, monkeypatch):
 
 def test_a_noise_whose_square_is_no_number(experiment_2, tmp_path):
     """Quotients by a σ of 1e-308 overflow when they are squared: seed 10, case 27478."""
-    document = calibrate(experiment_2).to_document()
+    document = calibration_document(calibrate(experiment_2))
     document["session"]["gauge_sigma"] = 1e-308
     (tmp_path / "calibration.json").write_text(json.dumps(document))
     with pytest.raises(CalibrationFileError, match=r"session.gauge_sigma: found '1e-308'"):

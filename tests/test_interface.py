@@ -26,6 +26,7 @@ from orthocal import (
     write_report,
 )
 from orthocal.assess.accuracy import Workspace
+from orthocal.calibration.file import write_calibration
 from orthocal.errors import OrthocalError, ParameterError
 from orthocal.kinematics.assembly import Assembly
 
@@ -150,14 +151,14 @@ def test_coordinates_of_other_shapes(value, calibration, orthoglide):
 
 
 def test_nothing_is_nothing(calibration):
-    assert calibration.forward(np.zeros((0, 3))).shape == (0, 3)
-    assert calibration.inverse(np.zeros((0, 3))).shape == (0, 3)
+    assert calibration.machine.forward(np.zeros((0, 3))).shape == (0, 3)
+    assert calibration.machine.inverse(np.zeros((0, 3))).shape == (0, 3)
 
 
 def test_names_theta_and_start_of_other_lengths(calibration, orthoglide):
     zero = orthoglide.drive_zero
     with pytest.raises(ValueError, match="found 1 names for 2 rows"):
-        calibration.forward([zero, zero], names=["a"])
+        calibration.machine.forward([zero, zero], names=["a"])
     with pytest.raises(ValueError, match="expected 1 values of the free parameters a row"):
         Assembly(orthoglide, free=["x_slide.offset"]).close(zero, theta=[1.0, 2.0])
     with pytest.raises(ValueError, match="expected 18 start values a row"):
@@ -170,7 +171,7 @@ def test_names_theta_and_start_of_other_lengths(calibration, orthoglide):
 
 def test_points_far_beyond_all_numbers(calibration):
     with pytest.raises(OrthocalError, match="cannot be reached"):
-        calibration.inverse([1e308, 0.0, 0.0])
+        calibration.machine.inverse([1e308, 0.0, 0.0])
 
 
 def test_other_things_than_calibrations_and_sessions(calibration, experiment_2, tmp_path):
@@ -201,4 +202,4 @@ def test_other_things_than_calibrations_and_sessions(calibration, experiment_2, 
         with pytest.raises(ValueError, match=re.escape(message)):
             act()
     with pytest.raises(OrthocalError, match="no name of a file"):
-        calibration.save(tmp_path / "a\0b")
+        write_calibration(calibration, tmp_path / "a\0b")

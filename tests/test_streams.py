@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from orthocal import calibrate, load_session
+from orthocal.calibration.file import write_calibration
 from orthocal.errors import OrthocalError
 
 COMMAND = [sys.executable, "-m", "orthocal"]
@@ -25,7 +26,7 @@ def folder(root, tmp_path_factory):
     folder = tmp_path_factory.mktemp("calibrated")
     for name in ("session.yaml", "readings.csv"):
         shutil.copy(root / "examples/table1/experiment-2" / name, folder)
-    calibrate(load_session(folder)).save(folder / "calibration.json")
+    write_calibration(calibrate(load_session(folder)), folder / "calibration.json")
     rows = "310,310,310\n" * 3000
     (folder / "joints.csv").write_text(f"x_slide_mm,y_slide_mm,z_slide_mm\n{rows}")
     return folder

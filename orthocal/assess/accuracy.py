@@ -21,8 +21,8 @@ from orthocal.assess.entering import entered_offsets
 from orthocal.assess.tool import CalibratedTool, error_covariance, find_tool, place_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
+from orthocal.fields import read_only
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
-from orthocal.robot.model import read_only
 
 Array = NDArray[np.float64]
 
@@ -257,7 +257,7 @@ def find_excess(calibration: Calibration) -> float:
     noise, gauge = calibration.noise, calibration.session.gauge_sigma
     known = noise.cycles_sigma if noise.cycles_dof > 0 else gauge
     foretold = calibration.unmodelled.residual_rms
-    if known is None or foretold < ROUNDING or not calibration.has_model_error:
+    if known is None or foretold < ROUNDING or not noise.leaves_more(gauge):
         return 1.0
     # residuals keep the noise that parameters and gauge zeros have not taken up
     kept = noise.residual_dof / len(calibration.residuals)

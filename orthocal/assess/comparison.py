@@ -12,13 +12,13 @@ from orthocal.arguments import require_kind, require_names
 from orthocal.assess.accuracy import ErrorSize
 from orthocal.assess.repetition import Repetition, measure_repetition
 from orthocal.assess.scores import ModelResult, Score, Undetermined, score_model
-from orthocal.assess.verdict import KnownNoise, Verdict, give_verdict, judge_models
+from orthocal.assess.verdict import Verdict, give_verdict, judge_models
 from orthocal.calibration.repeating import repeat_calibration
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.measurement.session import Session
-from orthocal.statistics.noise import estimate_repeatability
+from orthocal.statistics.noise import KnownNoise, estimate_repeatability
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from orthocal.assess.tool import CalibratedTool, error_covariance, find_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
-from orthocal.robot.model import read_only
+from orthocal.fields import read_only
 from orthocal.units import InUnit, Unit
 
 Array = NDArray[np.float64]

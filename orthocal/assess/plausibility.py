@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from orthocal.assess.findings.finding import Finding, Place, place_of
 from orthocal.calibration.calibration import Calibration
@@ -114,7 +113,7 @@ def _finer(calibration: Calibration) -> Finding | None:
 def _smooth(calibration: Calibration) -> Finding | None:
     """Residuals that are smaller than rounding to the gauge's steps leaves."""
     step, noise = calibration.session.gauge_resolution, calibration.noise
-    if not step or not noise.residual_dof > 0.5:
+    if not step:
         return None
     total = len(calibration.residuals)
     zeros = len({r.setup for r in calibration.residuals if r.minus is None})
@@ -122,10 +121,7 @@ def _smooth(calibration: Calibration) -> Finding | None:
     # repeated readings may have been rounded alike: each counts once
     dof = calibration.identifiability.n_readings - used
     least = step / math.sqrt(12.0)
-    if dof < 1.0 or not math.isfinite(noise.residual_sigma):
-        return None
-    chance = float(special.chdtr(dof, dof * (noise.residual_sigma / least) ** 2))
-    if chance > BY_CHANCE:
+    if not noise.is_finer_than(least, dof=dof):
         return None
     return Finding(
         "too little left",

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.assess.tool import error_covariance
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
+from orthocal.fields import read_only
 from orthocal.kinematics.assembly import (
     Assembly,
     Failures,
@@ -22,7 +23,6 @@ from orthocal.kinematics.assembly import (
     nominal_assembly,
 )
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.robot.model import read_only
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
+from orthocal.fields import read_only
 from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, largest_cube
-from orthocal.robot.model import Robot, read_only
+from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,6 @@ extra parameters buy (AICc; Hurvich and Tsai, 1989), and predict setups that it 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -17,7 +16,7 @@ from orthocal.assess.accuracy import assess_excess, find_excess
 from orthocal.assess.repetition import Repetition
 from orthocal.assess.scores import ModelResult, Undetermined
 from orthocal.measurement.session import Session
-from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
+from orthocal.statistics.noise import KnownNoise
 from orthocal.units import MM, UM
 
 Standing = Literal[
@@ -28,23 +27,11 @@ NOT_ALONE = (
     " The readings alone do not determine it: what they leave open is held by the tolerances."
 )
 
-NoiseKind = Literal["cycles", "gauge", "unknown"]
-
 TELLING = 0.5
 """Effective parameters by which a larger model must exceed a smaller one to say anything new."""
 
 WORTHWHILE = 2.0
 """Least drop of AICc for which a larger model is preferred (Burnham and Anderson, 2002, 2.6)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class KnownNoise:
-    """Noise of a reading that no model has a part in."""
-
-    sigma: float
-    """[m]; NaN if nothing tells it."""
-    source: NoiseKind
-    dof: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,19 +192,18 @@ def _explain_remainder(
     calibration = best.calibration
     dof, chi_square = best.exact.dof, best.exact.chi_square
     found = calibration.noise.residual_sigma
-    if not math.isfinite(noise.sigma) or dof < 0.5:
+    exceeded = noise.is_exceeded(chi_square, dof)
+    if exceeded is None:
         words = [
             "Whether what remains is noise cannot be told: nothing says what the noise is. Repeat "
             "readings in cycles, or give gauge.sigma_mm."
         ]
         return None, 1.0, words
-    cycles_dof = 0.0 if math.isinf(noise.dof) else noise.dof
-    chance = chance_of_excess(chi_square, dof, cycles_dof=cycles_dof)
     factor = calibration.row_factor
     row = "a difference" if calibration.rows_are_differences else "a reading"
     where = {"cycles": "repeated cycles scatter", "gauge": "the gauge's own σ"}[noise.source]
     sizes = f"σ {found * factor / MM:.3g} mm of {row} against {noise.sigma * factor / MM:.2g} mm"
-    if chance >= BY_CHANCE:
+    if not exceeded:
         return False, 1.0, [f"What {best.model} leaves is noise: {sizes} ({where})."]
     words = [
         f"What {best.model} leaves is error of the model rather than noise: {sizes} ({where}), "

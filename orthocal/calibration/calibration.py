@@ -1,91 +1,40 @@
-"""The result of a calibration, in memory and as calibration.json.
+"""The result of a calibration: its record, and what follows from that.
 
 It holds all that a report, a scene or an export needs: none of them asks for the session again.
 """
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from orthocal.calibration.machine import Machine
 from orthocal.calibration.recorded_robot import (
     load_recorded_robot,
     require_offsets,
     require_parameters,
     require_rows,
 )
-from orthocal.calibration.records import (
-    GaugeRecord,
-    NoiseRecord,
-    ParameterEstimate,
-    PostureRecord,
-    RobotRecord,
-    SessionRecord,
-    SetupRecord,
-    SolverRecord,
-)
+from orthocal.calibration.records import CalibrationRecord, ParameterEstimate
 from orthocal.diagnosis.rows import ResidualRow, root_mean_square
-from orthocal.diagnosis.turned import TurnedSetup
-from orthocal.diagnosis.unmodelled import Unmodelled
-from orthocal.files import write_file
-from orthocal.kinematics.assembly import Assembly, as_rows, find_beyond_travel
 from orthocal.robot.model import Robot
-from orthocal.sensors.registry import write_sensor
-from orthocal.statistics.chance import BY_CHANCE, chance_of_excess, confidence_factor
-from orthocal.statistics.identifiability import Combination, Identifiability
+from orthocal.statistics.chance import confidence_factor
 
 Array = NDArray[np.float64]
 
 Found = TypeVar("Found")
 
-SCHEMA = "orthocal/calibration/3"
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Calibration:
-    """Identified error parameters of a robot, with their uncertainty and provenance."""
+class Calibration(CalibrationRecord):
+    """A calibration, and what follows from it."""
 
-    robot_record: RobotRecord
-    session: SessionRecord
-    model: str
-    prior: bool
-    """Whether tolerances acted as a prior."""
-    solver: SolverRecord
-    parameters: tuple[ParameterEstimate, ...]
-    """Free parameters, then those held at a known value."""
-    sensors: tuple[ParameterEstimate, ...]
-    """What was not known of the sensors, estimated with them."""
-    covariance: Array
-    """Of the free parameters, shape (n_free, n_free), [SI]."""
-    unmodelled: Unmodelled
-    """What errors that were not free do to the estimate."""
-    identifiability: Identifiability
-    """What the readings tell, and what they cannot tell apart."""
-    base: bool
-    """Whether free parameters are base parameters: each the value of a whole combination."""
-    noise: NoiseRecord
-    sigma: float
-    """Standard deviation of one row of the readings, [m]: of a difference where all are."""
-    dof: float
-    """Degrees of freedom of sigma."""
-    rows_are_differences: bool
-    residuals: tuple[ResidualRow, ...]
-    turned: TurnedSetup | None
-    """The setup that seems to have been read with the wrong sign."""
-    critical: float
-    """Studentised residuals beyond this are suspicious; infinite if nothing tells the noise."""
-    postures: tuple[PostureRecord, ...]
-    setups: tuple[SetupRecord, ...]
-    gauges: tuple[GaugeRecord, ...]
-    version: str
-    """Of orthocal."""
     path: Path | None = None
     """Where it was loaded from."""
     _kept: dict[str, Any] = field(init=False, default_factory=dict)
@@ -136,24 +85,6 @@ class Calibration:
         return found.n_readings - (len(self.free) if self.base else found.structural_rank)
 
     @property
-    def chance_within_tolerances(self) -> float | None:
-        """Probability that a machine within its tolerances shows such readings, or odder ones.
-
-        Beside a prior what is left of the readings and what the parameters took of their tolerances
-        add up to χ² of the readings as the prior foretells them. None where the noise is not known
-        but from the residuals.
-        """
-        known = self.noise.source in ("cycles", "gauge") and self.sigma > 0.0
-        if not known or not self.prior or any(p.at_bound for p in self.free):
-            return None
-        left = sum((r.residual / self.sigma) ** 2 for r in self.residuals)
-        taken = sum(((p.value - p.mean) / p.tolerance) ** 2 for p in self.free if p.prior)
-        zeros = len({r.setup for r in self.residuals if r.minus is None})
-        flat = sum(not p.prior for p in self.free)
-        dof = len(self.residuals) - zeros - flat
-        return chance_of_excess(left + taken, dof) if dof > 0 else None
-
-    @property
     def suspicious(self) -> tuple[ResidualRow, ...]:
         """Rows that all the others contradict, the worst first."""
         rows = [r for r in self.residuals if abs(r.studentised) > self.critical]
@@ -187,17 +118,14 @@ class Calibration:
         return max(abs(r.residual) for r in self.residuals)
 
     @property
-    def has_model_error(self) -> bool:
-        """Whether more remains than the noise of repeated cycles, or of the gauge, explains.
+    def sigma(self) -> float:
+        """Standard deviation of one row of the readings, [m]: of a difference where all are."""
+        return self.noise.sigma * self.row_factor
 
-        False where nothing tells that noise.
-        """
-        noise, gauge = self.noise, self.session.gauge_sigma
-        if noise.source != "residuals":
-            return False
-        if noise.cycles_dof > 0:
-            return True  # else sigma would be theirs
-        return gauge is not None and noise.chance_in_residuals(gauge) < BY_CHANCE
+    @property
+    def dof(self) -> float:
+        """Degrees of freedom of sigma."""
+        return self.noise.dof
 
     @property
     def row_factor(self) -> float:
@@ -275,95 +203,14 @@ class Calibration:
         offsets = {f"{d.name}.offset" for d in self.robot.drives}
         return all(p.name in offsets for p in self.parameters if p.free or p.value != 0.0)
 
-    def forward(self, joints: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
-        """Tool centre point of the calibrated machine.
-
-        Args:
-            joints: Drive coordinates as the encoders give them, without any offset of the
-                controller, shape (K, n_drives) or (n_drives,), [m, rad].
-            names: What to call the rows in messages.
-
-        Returns:
-            Shape (K, 3) or (3,), [m].
+    @property
+    def machine(self) -> Machine:
+        """The machine as it was identified: it moves.
 
         Raises:
-            ClosureError: If the machine cannot be at such coordinates.
+            RobotError, CalibrationFileError: As `robot`.
         """
-        robot = self.robot
-        rows, single = as_rows(joints, len(robot.drives), "drive coordinates")
-        labels = names or [f"posture {i + 1}" for i in range(len(rows))]
-        for error in find_beyond_travel(robot, rows, labels).values():
-            raise error
-        points = Assembly(robot, fixed=self.errors).forward(rows, names=labels)
-        return points[0] if single else points
-
-    def inverse(self, points: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
-        """Drive coordinates that bring the calibrated machine's tool to given points.
-
-        Args:
-            points: Shape (K, n_drives) or (n_drives,), [m].
-            names: What to call the rows in messages.
-
-        Returns:
-            Drive coordinates as the encoders give them, shape (K, n_drives) or (n_drives,).
-
-        Raises:
-            ClosureError: If a point cannot be reached.
-        """
-        return Assembly(self.robot, fixed=self.errors).inverse(points, names=names)
-
-    def to_document(self) -> dict[str, Any]:
-        """As plain data: the content of calibration.json."""
-        return {
-            "schema": SCHEMA,
-            "orthocal": self.version,
-            "robot": _plain(self.robot_record),
-            "session": _session_document(self.session),
-            "model": self.model,
-            "prior": self.prior,
-            "solver": _plain(self.solver),
-            "parameters": [_plain(p) for p in self.parameters],
-            "sensors": [_plain(p) for p in self.sensors],
-            "covariance": [[_number(v) for v in row] for row in self.covariance.tolist()],
-            "sigma": _number(self.sigma),
-            "dof": _number(self.dof),
-            "unmodelled": {
-                "names": list(self.unmodelled.names),
-                "tolerances": self.unmodelled.tolerances.tolist(),
-                "leakage": self.unmodelled.leakage.tolist(),
-                "residual_rms": self.unmodelled.residual_rms,
-            },
-            "identifiability": _identifiability_document(self.identifiability),
-            "base": self.base,
-            "noise": _plain(self.noise),
-            "rows_are_differences": self.rows_are_differences,
-            "rms_before": self.rms_before,
-            "rms_after": self.rms_after,
-            "largest_before": self.largest_before,
-            "largest_after": self.largest_after,
-            "critical": _number(self.critical),
-            "residuals": [{**_plain(r), "residual": r.residual} for r in self.residuals],
-            "turned": None if self.turned is None else _plain(self.turned),
-            "postures": [_plain(p) for p in self.postures],
-            "setups": [
-                {"name": s.name, "reads": write_sensor(s.sensor), "zero": s.zero}
-                for s in self.setups
-            ],
-            "gauges": [_plain(g) for g in self.gauges],
-        }
-
-    def to_json(self) -> str:
-        """As the text of calibration.json."""
-        return json.dumps(self.to_document(), indent=1, allow_nan=False) + "\n"
-
-    def save(self, path: str | Path) -> Path:
-        """Write calibration.json.
-
-        Raises:
-            OrthocalError: If it cannot be written.
-        """
-        write_file(Path(path), self.to_json())
-        return Path(path)
+        return self.remember("machine", lambda: Machine(self.robot, self.errors))
 
     def _repr_html_(self) -> str:
         """In a notebook: the short answer."""
@@ -378,44 +225,3 @@ class Calibration:
         require_rows(robot, self.setups, self.postures, self.residuals, prefix=prefix)
         require_offsets(robot, self.session.controller_offsets, prefix=prefix)
         return robot
-
-
-def _session_document(record: SessionRecord) -> dict[str, Any]:
-    parts = [{k: v for k, v in _plain(p).items() if k != "parts"} for p in record.parts]
-    return {**_plain(record), "parts": parts}
-
-
-def _identifiability_document(found: Identifiability) -> dict[str, Any]:
-    def combination(c: Combination) -> list[list[Any]]:
-        return [[name, coefficient] for name, coefficient in c.terms]
-
-    return {
-        "singular_values": found.singular_values.tolist(),
-        "threshold": found.threshold,
-        "rank": found.rank,
-        "structural_rank": found.structural_rank,
-        "condition": _number(found.condition),
-        "observability": found.observability,
-        "n_postures": found.n_postures,
-        "n_readings": found.n_readings,
-        "unseen": list(found.unseen),
-        "told": list(found.told),
-        "alike": [combination(c) for c in found.alike],
-        "base": [combination(c) for c in found.base],
-    }
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _plain(record: Any) -> dict[str, Any]:  # noqa: ANN401 - any of the records above
-    result = {}
-    for name in record.__slots__:
-        value = getattr(record, name)
-        if isinstance(value, float):
-            value = _number(value)
-        elif isinstance(value, tuple):
-            value = list(value)
-        result[name] = value
-    return result

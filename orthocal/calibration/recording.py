@@ -15,7 +15,6 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.file import require_loadable
 from orthocal.calibration.records import (
     GaugeRecord,
-    NoiseRecord,
     ParameterEstimate,
     PostureRecord,
     RobotRecord,
@@ -37,9 +36,9 @@ from orthocal.estimation.fit import Fit
 from orthocal.estimation.linear import Linearisation, linearise_at_reference
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.weighting import split_by_gauge
+from orthocal.fields import read_only
 from orthocal.measurement.session import Session
 from orthocal.robot.loading import packaged_robots
-from orthocal.robot.model import read_only
 from orthocal.robot.parameters import Parameter
 from orthocal.statistics.chance import confidence_factor
 from orthocal.statistics.identifiability import (
@@ -82,7 +81,6 @@ def assemble_calibration(
     estimates = _estimates(fit, covariance, _widen(fit, unmodelled, intervals or {}))
     diagnostics = diagnose_readings(fit)
     residuals = _residual_rows(fit, diagnostics, nominal)
-    factor = np.sqrt(2.0) if session.only_differences else 1.0
     calibration = Calibration(
         robot_record=_robot_record(session),
         session=_session_record(session),
@@ -104,16 +102,7 @@ def assemble_calibration(
         unmodelled=unmodelled,
         identifiability=_identifiability(fit, whole),
         base=whole is not None,
-        noise=NoiseRecord(
-            reading_sigma=noise.sigma,
-            source=noise.source,
-            cycles_sigma=noise.cycles_sigma,
-            cycles_dof=noise.cycles_dof,
-            residual_sigma=noise.residual_sigma,
-            residual_dof=noise.residual_dof,
-        ),
-        sigma=noise.sigma * float(factor),
-        dof=noise.dof,
+        noise=noise,
         rows_are_differences=session.only_differences,
         residuals=residuals,
         turned=find_turned_setup(fit, others, residuals),
@@ -311,6 +300,7 @@ def _gauge_records(fit: Fit) -> tuple[GaugeRecord, ...]:
             name=g.name,
             sigma=g.gauge.sigma,
             resolution=g.gauge.resolution,
+            range=g.gauge.range,
             noise=fit.noise.sigma * float(problem.noise[g.entries][0]),
             readings=int(g.entries.sum()),
         )
@@ -328,6 +318,12 @@ def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
         if real
     }
     return tuple(
-        SetupRecord(s.name, s.sensor, zeros.get(s.name))
+        SetupRecord(
+            s.name,
+            s.sensor,
+            gauge=s.gauge,
+            active=None if s.active is None else tuple(s.active.tolist()),
+            zero=zeros.get(s.name),
+        )
         for s in fit.problem.session.setups.values()
     )

@@ -1,22 +1,32 @@
-"""The parts of a calibration's result: plain data, as they stand in calibration.json."""
+"""What a calibration is as plain data: these records are the schema of calibration.json."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
+from pydantic import Field
+
+from orthocal.diagnosis.rows import ResidualRow
+from orthocal.diagnosis.turned import TurnedSetup
+from orthocal.diagnosis.unmodelled import Unmodelled
+from orthocal.documents import Count, Number, PositiveInSI
 from orthocal.estimation.loss import LossKind
 from orthocal.estimation.options import SolverKind
+from orthocal.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN
 from orthocal.sensors.protocol import Sensor
-from orthocal.statistics.chance import chance_of_excess
-from orthocal.statistics.noise import NoiseSource
+from orthocal.sensors.registry import RECORDED
+from orthocal.statistics.identifiability import Identifiability
+from orthocal.statistics.noise import Noise
 from orthocal.units import InUnit, Unit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotRecord:
     """The robot that was calibrated."""
+
+    __pydantic_config__ = CLOSED
 
     name: str
     reference: str
@@ -25,9 +35,9 @@ class RobotRecord:
     """Folder of a robot that does not come with orthocal."""
     sha256: str
     """Of its URDF and YAML."""
-    legs: tuple[tuple[str, float], ...]
+    legs: Many[tuple[str, PositiveInSI]]
     """Legs and their nominal lengths, [m]."""
-    travel: tuple[tuple[str, Unit, float | None, float | None], ...]
+    travel: Many[tuple[str, Unit, Number | None, Number | None]]
     """Drives, their units, and the ends of their travel, [unit]; None where there is none."""
 
 
@@ -35,18 +45,20 @@ class RobotRecord:
 class SessionRecord:
     """The session that it was calibrated from."""
 
+    __pydantic_config__ = CLOSED
+
     path: str | None
     readings_path: str | None
     title: str
     source: str
     sha256: str
-    gauge_sigma: float | None
+    gauge_sigma: PositiveInSI | None
     """[m]."""
-    gauge_resolution: float | None
+    gauge_resolution: PositiveInSI | None
     """[m]."""
-    controller_offsets: tuple[float, ...] | None
+    controller_offsets: Many[Number] | None
     """Offsets active in the controller, [m, rad]; None where not stated."""
-    parts: tuple[SessionRecord, ...] = ()
+    parts: Many[SessionRecord] = ()
     """The sessions that were joined into this one."""
 
 
@@ -54,18 +66,20 @@ class SessionRecord:
 class SolverRecord:
     """How the solution was found."""
 
+    __pydantic_config__ = CLOSED
+
     name: SolverKind
     status: str
-    iterations: int
+    iterations: Count
     """In all solutions until sigma had settled."""
-    seconds_build: float
+    seconds_build: Number
     """Building all functions and the program, once, [s]."""
-    seconds_solve: float
+    seconds_solve: Number
     """All solutions until sigma had settled, [s]."""
     hessian: str
     loss: LossKind
     """What residuals cost: their squares, or Huber's smooth loss."""
-    loss_width: float
+    loss_width: PositiveInSI
     """Where that turns from square to linear, [standard deviations]."""
 
     @property
@@ -81,32 +95,34 @@ class SolverRecord:
 class ParameterEstimate(InUnit):
     """One error parameter."""
 
+    __pydantic_config__ = CLOSED
+
     name: str
     unit: Unit
-    value: float
+    value: Number
     """Exact estimate, [unit]."""
-    linear: float
+    linear: Number
     """Linearised estimate, [unit]."""
-    std: float
+    std: SizeOrNaN
     """Standard deviation, [unit]; NaN if nothing tells."""
-    tolerance: float
+    tolerance: PositiveInSI
     """One standard deviation before the calibration, [unit]."""
     free: bool
     identifiable: bool
     """Whether the readings alone tell it better than its tolerance."""
-    start: float
+    start: Number
     """What the controller already corrects: the point of linearisation, [unit]."""
     prior: bool
     """Whether its tolerance acted as a prior."""
-    mean: float
+    mean: Number
     """Mean of that prior, [unit]."""
-    lower: float | None
+    lower: Number | None
     """Lower bound, [unit]."""
-    upper: float | None
+    upper: Number | None
     """Upper bound, [unit]."""
     at_bound: Literal["lower", "upper"] | None
     """Which bound holds it: it has no standard deviation then, and others hold with it there."""
-    interval: tuple[float, float] | None
+    interval: tuple[Number, Number] | None
     """Profile-likelihood interval of 95 %, [unit], where it was asked for; widened by errors of the
     machine that were not free, at their tolerances."""
 
@@ -119,36 +135,15 @@ class ParameterEstimate(InUnit):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NoiseRecord:
-    """Standard deviation of one reading of the indicator; see `uncertainty.Noise`."""
-
-    reading_sigma: float
-    """[m]; a difference of two readings has √2 of it."""
-    source: NoiseSource
-    cycles_sigma: float
-    cycles_dof: int
-    residual_sigma: float
-    residual_dof: float
-
-    def chance_in_residuals(self, sigma: float) -> float:
-        """Probability that readings of a standard deviation [m] leave residuals as large."""
-        return chance_of_excess(
-            (self.residual_sigma / sigma) ** 2 * self.residual_dof, self.residual_dof
-        )
-
-    def chance_in_cycles(self, sigma: float) -> float:
-        """Probability that readings of a standard deviation [m] scatter as much when repeated."""
-        return chance_of_excess((self.cycles_sigma / sigma) ** 2 * self.cycles_dof, self.cycles_dof)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class PostureRecord:
     """A posture of the session."""
 
+    __pydantic_config__ = CLOSED
+
     name: str
-    drives: tuple[float, ...]
+    drives: Many[Number]
     """Commanded drive coordinates, controller offsets taken off, [m, rad]."""
-    passive: tuple[float, ...]
+    passive: Many[Number]
     """Passive coordinates of the calibrated machine, [m, rad]."""
 
 
@@ -156,15 +151,19 @@ class PostureRecord:
 class GaugeRecord:
     """A gauge that was read."""
 
+    __pydantic_config__ = CLOSED
+
     name: str
     """"" for an only one."""
-    sigma: float | None
+    sigma: PositiveInSI | None
     """Standard deviation of a reading as stated, [m]."""
-    resolution: float | None
+    resolution: PositiveInSI | None
     """[m]."""
-    noise: float
+    range: tuple[Number, Number] | None
+    """Lowest and highest reading, [m]."""
+    noise: SizeOrNaN
     """Standard deviation of a reading as found, [m]; NaN if nothing tells."""
-    readings: int
+    readings: Count
     """Of it, differences taken apart."""
 
 
@@ -172,8 +171,57 @@ class GaugeRecord:
 class SetupRecord:
     """A setup of the session."""
 
+    __pydantic_config__ = CLOSED
+
     name: str
-    sensor: Sensor
+    sensor: Annotated[Sensor, RECORDED, Field(alias="reads")]
     """What stood there."""
-    zero: float | None
+    gauge: str
+    """Name of what showed its readings."""
+    active: Many[Number] | None
+    """Offsets active in the controller, [m, rad], where they were not those of the session."""
+    zero: Number | None
     """Estimated zero of the gauge, [m]; None where only differences were given."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationRecord:
+    """Identified error parameters of a robot, with their uncertainty and provenance: plain data.
+
+    What a calibration was made from is among it, so that it can be made again: readings, postures,
+    sensors, gauges, and what was free, held, bounded and known beforehand.
+    """
+
+    __pydantic_config__ = CLOSED
+
+    version: Annotated[str, Field(alias="orthocal")]
+    """Of orthocal."""
+    robot_record: Annotated[RobotRecord, Field(alias="robot")]
+    session: SessionRecord
+    model: str
+    prior: bool
+    """Whether tolerances acted as a prior."""
+    solver: SolverRecord
+    parameters: Annotated[Many[ParameterEstimate], Field(min_length=1)]
+    """Free parameters, then those held at a known value."""
+    sensors: Many[ParameterEstimate]
+    """What was not known of the sensors, estimated with them."""
+    covariance: Matrix
+    """Of the free parameters, shape (n_free, n_free), [SI]."""
+    unmodelled: Unmodelled
+    """What errors that were not free do to the estimate."""
+    identifiability: Identifiability
+    """What the readings tell, and what they cannot tell apart."""
+    base: bool
+    """Whether free parameters are base parameters: each the value of a whole combination."""
+    noise: Noise
+    """Of one reading of the (first) gauge."""
+    rows_are_differences: bool
+    critical: SizeOrInf
+    """Studentised residuals beyond this are suspicious; infinite if nothing tells the noise."""
+    residuals: Annotated[Many[ResidualRow], Field(min_length=1)]
+    turned: TurnedSetup | None
+    """The setup that seems to have been read with the wrong sign."""
+    postures: Many[PostureRecord]
+    setups: Many[SetupRecord]
+    gauges: Many[GaugeRecord]

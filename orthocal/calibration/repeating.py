@@ -1,8 +1,10 @@
-"""The same parameters, identified from another session."""
+"""The same calibration made again: from another session, or from what its file keeps."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -13,8 +15,9 @@ from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
-from orthocal.measurement.session import Session
-from orthocal.robot.model import read_only
+from orthocal.fields import read_only
+from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
+from orthocal.robot.model import Robot
 
 
 def repeat_calibration(calibration: Calibration, session: Session) -> Calibration:
@@ -45,3 +48,52 @@ def repeat_fit(calibration: Calibration, session: Session) -> Fit:
     solver = calibration.solver
     options = SolverOptions(solver=solver.name, loss=Loss(solver.loss, solver.loss_width))
     return fit_problem(CalibrationProblem(session, selection), options=options)
+
+
+def restore_session(calibration: Calibration) -> Session:
+    """The session that a calibration was made from, as its file keeps it.
+
+    `repeat_calibration(calibration, restore_session(calibration))` identifies the same again.
+
+    Raises:
+        RobotError, CalibrationFileError: If the robot cannot be loaded, or has changed.
+    """
+    record, robot = calibration.session, calibration.robot
+    offsets = record.controller_offsets
+    return Session(
+        robot=robot,
+        robot_reference=calibration.robot_record.reference,
+        title=record.title,
+        source=record.source,
+        gauges={g.name: Gauge(g.sigma, g.resolution, g.range) for g in calibration.gauges},
+        postures={
+            p.name: Posture(p.name, _form(robot), np.array(p.drives), np.array(p.drives))
+            for p in calibration.postures
+        },
+        setups={
+            s.name: Setup(
+                s.name, s.sensor, s.gauge, None if s.active is None else np.array(s.active)
+            )
+            for s in calibration.setups
+        },
+        readings=tuple(
+            Reading(
+                r.setup,
+                r.posture,
+                r.minus,
+                r.cycle,
+                r.measured,
+                r.line,
+                None if r.file is None else Path(r.file),
+            )
+            for r in calibration.residuals
+        ),
+        controller_offsets=None if offsets is None else read_only(offsets),
+        path=None if record.path is None else Path(record.path),
+        readings_path=None if record.readings_path is None else Path(record.readings_path),
+        sha256=record.sha256,
+    )
+
+
+def _form(robot: Robot) -> Literal["joints_mm", "joints_deg"]:
+    return "joints_mm" if all(d.unit == "m" for d in robot.drives) else "joints_deg"

@@ -122,7 +122,7 @@ def calibrate(
     from orthocal.estimation.selection import read_bounds, read_known, read_tolerances
     from orthocal.files import require_writable, write_files
     from orthocal.measurement.joining import join_sessions
-    from orthocal.show.printed_json import calibration_json
+    from orthocal.show.printed_json import printed_calibration
     from orthocal.show.summary import print_summary
 
     if out is not None:
@@ -145,13 +145,14 @@ def calibrate(
         profile=split_globs(profile),
     )
     if json:
-        put_out(calibration_json(result).rstrip("\n"))
+        put_out(printed_calibration(result).rstrip("\n"))
     else:
         print_summary(result, details=details, all_rows=all_rows)
     if out is not None:
+        from orthocal.calibration.file import calibration_json
         from orthocal.show.report.page import build_report
 
-        files = {"calibration.json": result.to_json(), "report.html": build_report(result)}
+        files = {"calibration.json": calibration_json(result), "report.html": build_report(result)}
         write_files(out, files)
         put_note(f"Wrote {out / 'calibration.json'} and {out / 'report.html'}")
     if code := decide(result).exit_code:
@@ -217,12 +218,12 @@ def validate(
     from orthocal.assess.validation import validate_calibration
     from orthocal.calibration.file import load_calibration
     from orthocal.measurement.session_file import load_session
-    from orthocal.show.printed_json import validation_json
+    from orthocal.show.printed_json import printed_validation
     from orthocal.show.summary import print_summary
 
     result = validate_calibration(load_calibration(calibration), load_session(session))
     if json:
-        put_out(validation_json(result).rstrip("\n"))
+        put_out(printed_validation(result).rstrip("\n"))
     else:
         print_summary(result, all_rows=all_rows)
     if code := decide_validation(result).exit_code:

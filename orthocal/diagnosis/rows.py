@@ -5,35 +5,43 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
+
+from orthocal.documents import Count, Number
+from orthocal.fields import CLOSED, NumberOrNaN
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualRow:
     """One row of the session's readings; measured = nominal + deviation = predicted + residual."""
 
+    __pydantic_config__ = CLOSED
+
     setup: str
     posture: str
-    minus: str | None
-    cycle: int
-    measured: float
+    minus: Annotated[str, Field(min_length=1)] | None
+    cycle: Count
+    measured: Number
     """[m]."""
-    nominal: float
+    nominal: Number
     """What the machine would show as the controller knows it, with the best gauge zero, [m]."""
-    linear: float
+    linear: NumberOrNaN
     """The same for the linearised estimate, [m]."""
-    predicted: float
+    predicted: Number
     """The same for the calibrated machine, [m]."""
-    line: int | None
+    line: Count | None
     """Line in the CSV."""
     file: str | None
     """The CSV, where it is not that of the session."""
-    studentised: float
+    studentised: NumberOrNaN
     """Error of the row as all others see it, in its standard deviations; NaN if they do not."""
-    influence: float
+    influence: Number
     """Largest change of a parameter without this row, in its standard deviations."""
     influenced: str
     """Which parameter that is."""
-    unseen: float
+    unseen: NumberOrNaN
     """Error of predicting it from all other setups, [m]; NaN if they do not determine the model."""
 
     @property

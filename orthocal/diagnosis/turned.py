@@ -23,9 +23,11 @@ from scipy import special
 
 from orthocal.diagnosis.rows import ResidualRow, root_mean_square
 from orthocal.diagnosis.unmodelled import OtherErrors
+from orthocal.documents import Number
 from orthocal.errors import ClosureError, SolverError
 from orthocal.estimation.fit import Fit, first_sigma
 from orthocal.estimation.problem import CalibrationProblem
+from orthocal.fields import CLOSED, NumberOrNaN
 from orthocal.statistics.information import RANK_THRESHOLD
 from orthocal.statistics.noise import estimate_repeatability
 from orthocal.statistics.zeros import project_out_zeros
@@ -51,12 +53,14 @@ LEAST_READINGS = 2
 class TurnedSetup:
     """A setup whose readings agree with all others once their sign is turned."""
 
+    __pydantic_config__ = CLOSED
+
     name: str
-    as_read: float
+    as_read: NumberOrNaN
     """Root mean square of what they differ by from what all others say, [m]; NaN if not known."""
-    turned: float
+    turned: NumberOrNaN
     """The same with the sign turned, [m]."""
-    evidence: float
+    evidence: Number
     """Logarithm of the factor by which the turned sign makes all readings more likely."""
     also: tuple[str, ...] = ()
     """Setups of which it is nearly as likely that they are the one."""

@@ -16,13 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.documents import Number
 from orthocal.errors import ParameterError
 from orthocal.estimation.fit import Fit
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.weighting import SMALLEST_SIGMA
+from orthocal.fields import CLOSED, Many, Matrix, Sizes, read_only
 from orthocal.kinematics.symbolic import hangs_on
-from orthocal.robot.model import Robot, read_only
+from orthocal.robot.model import Robot
 from orthocal.statistics.zeros import project_out_zeros
 
 Array = NDArray[np.float64]
@@ -35,12 +37,14 @@ WHOLE_MODEL = "full"
 class Unmodelled:
     """Errors that an estimate leaves out, at their tolerances."""
 
-    names: tuple[str, ...]
-    tolerances: Array
+    __pydantic_config__ = CLOSED
+
+    names: Many[str]
+    tolerances: Sizes
     """One standard deviation of each, shape (n_unmodelled,), [SI]."""
-    leakage: Array
+    leakage: Matrix
     """L: what the free parameters take on, shape (n_free, n_unmodelled), [SI per SI]."""
-    residual_rms: float
+    residual_rms: Number
     """What they alone would leave of the readings' rows after the fit, r.m.s., [m]."""
 
     @property

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthocal.characters import composed
 from orthocal.documents import parse_number
 from orthocal.errors import ParameterError
-from orthocal.robot.model import read_only
+from orthocal.fields import read_only
 from orthocal.robot.parameters import Parameter, ParameterSet
 from orthocal.units import Unit
 

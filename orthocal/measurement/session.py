@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.arguments import require_array
+from orthocal.fields import read_only
 from orthocal.markup import paragraph, table
-from orthocal.robot.model import Robot, read_only
+from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Sensor
 from orthocal.units import MM
 

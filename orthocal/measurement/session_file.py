@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from orthocal.characters import shorten
 from orthocal.documents import parse_number, read_csv_rows, read_yaml, validate
 from orthocal.errors import ClosureError, RobotError, SessionError
+from orthocal.fields import read_only
 from orthocal.files import is_folder, read_file, require_plain_name
 from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.measurement.schema import (
@@ -29,7 +30,7 @@ from orthocal.measurement.sensing import locate_contacts
 from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
 from orthocal.measurement.session_robot import build_offsets, require_given_zero
 from orthocal.robot.loading import load_robot
-from orthocal.robot.model import Robot, read_only
+from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Sensor, SetupKeys
 from orthocal.sensors.registry import read_setup
 from orthocal.units import DRIVE_UNITS, MM

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import SessionError
+from orthocal.fields import read_only
 from orthocal.measurement.schema import OFFSET_KEYS, ControllerKeys
-from orthocal.robot.model import Robot, read_only
+from orthocal.robot.model import Robot
 from orthocal.units import DRIVE_UNITS
 
 Array = NDArray[np.float64]

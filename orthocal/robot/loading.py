@@ -13,6 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from orthocal.errors import ParameterError, RobotError
+from orthocal.fields import read_only
 from orthocal.files import is_folder, read_file, require_plain_name
 from orthocal.robot.description import RobotKeys, load_description
 from orthocal.robot.model import (
@@ -24,7 +25,6 @@ from orthocal.robot.model import (
     build_constraints,
     find_frame,
     joint_axis,
-    read_only,
 )
 from orthocal.robot.parameters import (
     AXES,

@@ -11,6 +11,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError, RobotError
+from orthocal.fields import read_only
 from orthocal.robot.closing import close_loops, describe_opening
 from orthocal.robot.parameters import (
     ParameterSet,
@@ -18,13 +19,6 @@ from orthocal.robot.parameters import (
 from orthocal.units import InUnit, Unit
 
 Array = NDArray[np.float64]
-
-
-def read_only(values: ArrayLike) -> Array:
-    """A float64 copy that cannot be written to."""
-    array = np.array(values, dtype=np.float64)
-    array.setflags(write=False)
-    return array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

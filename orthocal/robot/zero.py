@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import RobotError
+from orthocal.fields import read_only
 from orthocal.robot.closing import MAX_STEPS, NOTHING, Closing, close_loops, describe_opening
 from orthocal.robot.model import (
     Robot,
@@ -22,7 +23,6 @@ from orthocal.robot.model import (
     coordinate_limits,
     coordinate_units,
     joint_turns,
-    read_only,
 )
 
 Array = NDArray[np.float64]

@@ -7,6 +7,7 @@ from typing import Any
 
 from orthocal.documents import validate
 from orthocal.errors import OrthocalError
+from orthocal.fields import As
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Sensor, SetupKeys
 
@@ -54,3 +55,16 @@ def write_sensor(sensor: Sensor) -> dict[str, Any]:
     """A sensor as a document describes it."""
     kind = {} if sensor.kind == DEFAULT else {"sensor": sensor.kind}
     return {**kind, **sensor.to_keys()}
+
+
+def _read_recorded(data: object) -> Sensor:
+    if not isinstance(data, Mapping):
+        raise ValueError("expected keys and values")
+    try:
+        return read_setup(data, where="", under="", error=OrthocalError)[1]
+    except OrthocalError as e:
+        raise ValueError(f"{(e.where or '').strip(' :.')}|{e.problem}") from None
+
+
+RECORDED = As(_read_recorded, write_sensor)
+"""A sensor in a record: as a document describes it."""

@@ -8,18 +8,19 @@ from orthocal.assess.findings.calibration import decide
 from orthocal.assess.findings.validation import decide_validation
 from orthocal.assess.validation import Validation
 from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.file import calibration_document
 
 
-def calibration_json(calibration: Calibration) -> str:
+def printed_calibration(calibration: Calibration) -> str:
     """A calibration as in calibration.json, with `decision` and `findings`, which follow from it.
 
     It loads as a calibration, too; what follows is then found anew.
     """
-    document = {**calibration.to_document(), **decide(calibration).to_document()}
+    document = {**calibration_document(calibration), **decide(calibration).to_document()}
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
-def validation_json(validation: Validation) -> str:
+def printed_validation(validation: Validation) -> str:
     """A validation with its `decision` and `findings`."""
     document = {**json.loads(validation.to_json()), **decide_validation(validation).to_document()}
     return json.dumps(document, indent=1, allow_nan=False) + "\n"

@@ -190,7 +190,7 @@ def render_residuals(
     calibration: Calibration, *, all_rows: bool = False, worst_first: bool = False
 ) -> RenderableType:
     """Readings before and after, the worst of many or all, in their order or the worst first."""
-    noise = calibration.noise.reading_sigma
+    noise = calibration.noise.sigma
 
     def spread(row: ResidualRow) -> float:
         return noise * (math.sqrt(2.0) if row.minus else 1.0)
@@ -245,8 +245,8 @@ def render_fit(calibration: Calibration) -> RenderableType:
     row = "a difference" if c.rows_are_differences else "a reading"
     dof = "" if math.isinf(c.dof) else f", {c.dof:.3g} degrees of freedom"
     text = f"σ of {row}: {mm(c.sigma)} mm, {_SOURCES[noise.source]}{dof}"
-    if c.rows_are_differences and math.isfinite(noise.reading_sigma):
-        text += f" (of one reading {mm(noise.reading_sigma)} mm)"
+    if c.rows_are_differences and math.isfinite(noise.sigma):
+        text += f" (of one reading {mm(noise.sigma)} mm)"
     lines: list[RenderableType] = [table, Text(text)]
     if noise.cycles_dof > 0 and noise.source != "cycles":
         lines.append(

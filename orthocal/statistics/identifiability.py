@@ -10,10 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, PlainSerializer
 
+from orthocal.documents import Count, Number
+from orthocal.fields import CLOSED, Many, Vector
 from orthocal.robot.parameters import Parameter
 from orthocal.statistics.information import RANK_THRESHOLD, Information
 
@@ -27,7 +31,7 @@ NEGLIGIBLE = 1e-9
 class Combination:
     """A sum of parameters that the readings tell only as a whole."""
 
-    terms: tuple[tuple[str, float], ...]
+    terms: Annotated[tuple[tuple[str, Number], ...], Field(min_length=1)]
     """Parameter and coefficient, the first 1, [unit of the first per unit of the parameter]."""
 
     @property
@@ -64,29 +68,39 @@ class Combination:
         return f"{', '.join(self.names[:-1])} and {self.names[-1]}: only {self.formula}"
 
 
+Recorded = Annotated[
+    Combination,
+    BeforeValidator(lambda terms: {"terms": terms}),
+    PlainSerializer(lambda combination: combination.terms),
+]
+"""A combination as pairs of parameter and coefficient."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Identifiability:
     """What the readings tell of the parameters, and what not."""
 
-    singular_values: Array
+    __pydantic_config__ = CLOSED
+
+    singular_values: Vector
     """Of the scaled identification Jacobian of the free parameters, descending, shape (n_free,),
     [m per tolerance]; of base parameters it is the reduced one, of their columns."""
-    threshold: float
+    threshold: Number
     """Singular values above it count as seen, [m per tolerance]."""
-    rank: int
+    rank: Count
     """Number of singular values above the threshold."""
-    structural_rank: int
+    structural_rank: Count
     """What perfect readings would tell: with base parameters, of all that they stand for."""
-    n_postures: int
-    n_readings: int
+    n_postures: Annotated[Count, Field(ge=1)]
+    n_readings: Count
     """Independent readings: repeated ones once, less gauge zeros."""
-    unseen: tuple[str, ...]
+    unseen: Many[str]
     """Parameters that move no reading by more than the threshold."""
-    told: tuple[str, ...]
+    told: Many[str]
     """Parameters that the readings alone tell better than their tolerances."""
-    alike: tuple[Combination, ...]
+    alike: Many[Recorded]
     """Parameters that move the readings alike, two or more: only their sum is told."""
-    base: tuple[Combination, ...]
+    base: Many[Recorded]
     """Base parameters by QR decomposition with pivoting: what the readings tell, one each."""
 
     @property

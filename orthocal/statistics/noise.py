@@ -1,4 +1,7 @@
-"""How much readings scatter, and where that is known from."""
+"""How much readings scatter, where that is known from, and what it explains.
+
+Whether noise explains something is answered by yes, no, or None where nothing tells.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.documents import Count
+from orthocal.fields import CLOSED, Size, SizeOrInf, SizeOrNaN
 from orthocal.measurement.observations import Observations
 from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
 
 Array = NDArray[np.float64]
+
+LEAST_DOF = 0.5
+"""Degrees of freedom below which residuals say nothing of the noise."""
 
 NoiseSource = Literal["cycles", "residuals", "gauge", "unknown"]
 
@@ -21,22 +29,97 @@ NoiseSource = Literal["cycles", "residuals", "gauge", "unknown"]
 class Noise:
     """Standard deviation of one reading of the indicator, and where it is from."""
 
-    sigma: float
-    """[m]; NaN if nothing tells."""
-    dof: float
+    __pydantic_config__ = CLOSED
+
+    sigma: SizeOrNaN
+    """[m]; NaN if nothing tells; a difference of two readings has √2 of it."""
+    dof: SizeOrInf
     """Degrees of freedom; infinite for a sigma that was given."""
     source: NoiseSource
-    cycles_sigma: float
+    cycles_sigma: SizeOrNaN
     """From repeated cycles, [m]; NaN without."""
-    cycles_dof: int
-    residual_sigma: float
+    cycles_dof: Count
+    residual_sigma: SizeOrNaN
     """√(Σ r²/(m − n)), [m]; NaN without degrees of freedom."""
-    residual_dof: float
+    residual_dof: Size
 
-    @property
-    def misfit(self) -> bool:
-        """Whether residuals are larger than repeated cycles explain: the model is in error."""
-        return self.source == "residuals" and self.cycles_dof > 0
+    def leaves_more(self, gauge: float | None) -> bool | None:
+        """Whether residuals are larger than noise explains, so that the model is in error.
+
+        Args:
+            gauge: Standard deviation of a reading as stated, [m]; None where it is not.
+
+        Returns:
+            None where nothing but the residuals tells the noise.
+        """
+        if self.source in ("cycles", "gauge"):
+            return False
+        if self.source == "residuals" and self.cycles_dof > 0:
+            return True  # else sigma would be theirs
+        if self.source == "unknown" or gauge is None:
+            return None
+        return self._chance_in_residuals(gauge) < BY_CHANCE
+
+    def leaves_less(self, gauge: float | None) -> bool | None:
+        """Whether residuals are smaller than a gauge of a standard deviation [m] would leave.
+
+        Returns:
+            None where that is not stated, or no residuals are free to tell it.
+        """
+        if gauge is None or not self.residual_dof > 0.0 or math.isnan(self.residual_sigma):
+            return None
+        return self._chance_in_residuals(gauge) > 1.0 - BY_CHANCE
+
+    def cycles_scatter_more(self, gauge: float | None) -> bool | None:
+        """Whether repeated readings differ by more than a standard deviation [m] explains.
+
+        Returns:
+            None where that is not stated, or nothing was repeated.
+        """
+        if gauge is None or self.cycles_dof == 0:
+            return None
+        chi_square = (self.cycles_sigma / gauge) ** 2 * self.cycles_dof
+        return chance_of_excess(chi_square, self.cycles_dof) < BY_CHANCE
+
+    def is_finer_than(self, sigma: float, *, dof: float) -> bool | None:
+        """Whether residuals are smaller than rounding of a standard deviation [m] leaves.
+
+        Args:
+            sigma: What rounding leaves of a reading.
+            dof: Degrees of freedom of the residuals; repeated readings may have been rounded alike.
+        """
+        if dof < 1.0 or not self.residual_dof > LEAST_DOF or math.isnan(self.residual_sigma):
+            return None
+        return chance_of_excess(dof * (self.residual_sigma / sigma) ** 2, dof) >= 1.0 - BY_CHANCE
+
+    def _chance_in_residuals(self, sigma: float) -> float:
+        chi_square = (self.residual_sigma / sigma) ** 2 * self.residual_dof
+        return chance_of_excess(chi_square, self.residual_dof)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownNoise:
+    """Noise of a reading that no model has a part in."""
+
+    sigma: float
+    """[m]; NaN if nothing tells it."""
+    source: Literal["cycles", "gauge", "unknown"]
+    dof: float
+
+    def is_exceeded(self, chi_square: float, dof: float) -> bool | None:
+        """Whether residuals are larger than this noise explains.
+
+        Args:
+            chi_square: Σ r²/σ² of single readings, zeros eliminated, by this σ.
+            dof: Degrees of freedom of the residuals.
+
+        Returns:
+            None where nothing tells the noise, or no residuals are free to tell it.
+        """
+        if not math.isfinite(self.sigma) or dof < LEAST_DOF:
+            return None
+        cycles_dof = 0.0 if math.isinf(self.dof) else self.dof
+        return chance_of_excess(chi_square, dof, cycles_dof=cycles_dof) < BY_CHANCE
 
 
 def estimate_repeatability(values: Array, observations: Observations) -> tuple[float, int]:
@@ -104,7 +187,7 @@ def estimate_noise(
     cycles_sigma, cycles_dof = repeatability
     floor = noise_floor(gauge_sigma, resolution)
     cycles_sigma = max(cycles_sigma, noise_floor(None, resolution)) if cycles_dof else cycles_sigma
-    enough = residual_dof > 0.5
+    enough = residual_dof > LEAST_DOF
     residual_sigma = math.sqrt(residual_square / residual_dof) if enough else math.nan
     source: NoiseSource
     if cycles_dof > 0:

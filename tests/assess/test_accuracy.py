@@ -284,7 +284,7 @@ def test_the_truth_behind_the_examples_is_where_it_should_be(root):
         result = calibrate(
             root / f"examples/{name}", Choice(model=model, tolerances={"*.offset_m": 2e-3})
         )
-        error = space.remove_motion(result.forward(drives) - real, space.points)
+        error = space.remove_motion(result.machine.forward(drives) - real, space.points)
         found = np.sqrt(space.weights @ (error**2).sum(axis=1))
         assert found < largest * assess_tool(result, space).after.sizes.aligned.rms
 

@@ -97,7 +97,7 @@ def test_leaving_a_setup_out_beside_a_prior(raw_cycles, cycles):
     setup = "xz"
     rest = replace(raw_cycles, readings=tuple(r for r in raw_cycles.readings if r.setup != setup))
     result = cycles["lengths"]
-    sigma = result.calibration.noise.reading_sigma
+    sigma = result.calibration.noise.sigma
     theta = NonlinearProgram(build_problem(rest, model="lengths")).solve(sigma=sigma).theta
     problem = build_problem(raw_cycles, model="lengths")
     o = problem.observations

@@ -24,7 +24,8 @@ from orthocal.assess.accuracy import assess_tool, expect_after_offsets
 from orthocal.assess.findings.calibration import decide
 from orthocal.assess.findings.finding import Finding, Kind, Severity
 from orthocal.assess.findings.validation import decide_validation
-from orthocal.show.printed_json import calibration_json, validation_json
+from orthocal.calibration.file import calibration_document
+from orthocal.show.printed_json import printed_calibration, printed_validation
 
 UNITS = ("_mm", "_um", "_mrad", "_deg")
 
@@ -139,7 +140,7 @@ def test_one_decision_follows_from_the_gravest_finding(spoilt, case):
 @pytest.mark.parametrize("case", CASES)
 def test_findings_are_of_a_known_kind_with_units_and_load_again(spoilt, case, tmp_path):
     calibration, *_ = spoilt[case]
-    document = json.loads(calibration_json(calibration))
+    document = json.loads(printed_calibration(calibration))
     for finding in document["findings"]:
         assert finding["kind"] in get_args(Kind)
         assert finding["severity"] in get_args(Severity)
@@ -156,7 +157,7 @@ def test_findings_are_of_a_known_kind_with_units_and_load_again(spoilt, case, tm
     path.write_text(json.dumps(document))
     loaded = load_calibration(path)
     assert decide(loaded).to_document() == decide(calibration).to_document()
-    assert "decision" not in loaded.to_document()
+    assert "decision" not in calibration_document(loaded)
 
 
 def test_a_turned_setup_is_found_with_its_numbers_and_place(spoilt):
@@ -308,7 +309,7 @@ def test_a_validation_is_decided(table1, plan):
     cause = found.findings[1]
     assert {p.parameter for p in cause.places} == {"x_slide", "y_slide", "z_slide"}
     assert cause.numbers["x_slide_by_mm"] == pytest.approx(-1.2, abs=0.03)
-    document = json.loads(validation_json(refused))
+    document = json.loads(printed_validation(refused))
     assert document["decision"]["answer"] == "not confirmed"
     assert document["findings"][1]["kind"] == "not entered"
     assert document["mistake"]["kind"] == "not entered"

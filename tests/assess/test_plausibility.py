@@ -12,6 +12,7 @@ from machines import write_orthoglide
 
 from orthocal import calibrate, load_plan, load_robot, load_session, simulate_session, summarize
 from orthocal.assess.plausibility import describe_machine, find_doubts
+from orthocal.calibration.file import calibration_json
 from orthocal.errors import RobotError
 from orthocal.show.explanation import advise
 
@@ -80,7 +81,7 @@ def test_the_machines_size_is_printed(session):
     result = calibrate(session)
     assert describe_machine(result) == "legs of 310.25 mm, travel 120 … 390 mm"
     assert "Machine: legs of 310.25 mm, travel 120 … 390 mm" in summarize(result)
-    document = json.loads(result.to_json())["robot"]
+    document = json.loads(calibration_json(result))["robot"]
     assert dict(document["legs"]) == pytest.approx(dict.fromkeys("xyz", 0.31025))
     assert document["travel"][0] == ["x_slide", "m", 0.12, 0.39]
 

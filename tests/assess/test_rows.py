@@ -13,6 +13,7 @@ from orthocal import assess_tool, calibrate, cli
 from orthocal.assess import rows as module
 from orthocal.assess.accuracy import Workspace
 from orthocal.assess.rows import accuracy_rows, forward_rows, inverse_rows
+from orthocal.calibration.file import write_calibration
 
 OUT_OF_REACH = [0.0, 0.0, 0.9]
 BEYOND_TRAVEL = [0.1, 0.0, 0.0]
@@ -41,7 +42,7 @@ def test_chunks_are_the_whole(calibration, points):
     chunks = list(inverse_rows(calibration, points))
     assert [c.first for c in chunks] == [0, 7, 14]
     drives = joined(chunks)
-    assert drives == pytest.approx(calibration.inverse(points), abs=1e-12)
+    assert drives == pytest.approx(calibration.machine.inverse(points), abs=1e-12)
     assert joined(forward_rows(calibration, drives)) == pytest.approx(points, abs=1e-12)
     whole = assess_tool(calibration, Workspace.even(points))
     found = joined(accuracy_rows(calibration, points))
@@ -77,7 +78,7 @@ def test_joints_beyond_the_travel_are_refused_one_by_one(calibration):
 
 @pytest.fixture
 def orthocal(monkeypatch, capsys, tmp_path, calibration):
-    calibration.save(tmp_path / "calibration.json")
+    write_calibration(calibration, tmp_path / "calibration.json")
 
     def run(command, text):
         (tmp_path / "table.csv").write_text(text)
@@ -141,7 +142,7 @@ def test_memory_does_not_grow_with_the_table(calibration, monkeypatch):
 
 
 def test_json_of_too_many_points_says_so(monkeypatch, capsys, tmp_path, calibration):
-    calibration.save(tmp_path / "calibration.json")
+    write_calibration(calibration, tmp_path / "calibration.json")
     table = tmp_path / "table.csv"
     table.write_text("x_mm,y_mm,z_mm\n" + "0,0,0\n" * 5001)
     monkeypatch.setattr(sys, "argv", ["orthocal", "accuracy", str(tmp_path), str(table), "--json"])

@@ -126,7 +126,7 @@ def test_the_calibrated_machine_in_pinocchio_shows_what_the_calibration_predicts
         assert shown == pytest.approx(row.predicted, abs=1e-9)
     for p in list(session.postures.values())[::5]:
         tool = place(machine, p.drives, "tcp")
-        assert np.abs(result.forward(p.drives) - tool).max() < 1e-9
+        assert np.abs(result.machine.forward(p.drives) - tool).max() < 1e-9
 
 
 @pytest.mark.slow

@@ -146,7 +146,7 @@ def test_hubers_loss_is_hardly_moved_by_a_wrong_reading(root):
     huber = calibrate(spoilt, solver=SolverOptions(loss=Loss("huber")))
     offsets = [np.array([p.value for p in r.free]) for r in (sound, squares, huber)]
     assert np.abs(offsets[2] - offsets[0]).max() < 0.15 * np.abs(offsets[1] - offsets[0]).max()
-    assert huber.noise.reading_sigma < 0.6 * squares.noise.reading_sigma
+    assert huber.noise.sigma < 0.6 * squares.noise.sigma
     assert huber.suspicious[0].line == session.readings[4].line
     assert huber.solver.loss == "huber"
 

@@ -94,7 +94,7 @@ def test_sigma_is_that_of_a_difference_with_three_degrees_of_freedom(results):
     assert c.rows_are_differences
     assert c.dof == 3
     assert abs(c.sigma * 1e3 - 0.276) < 0.0006
-    assert c.noise.reading_sigma == pytest.approx(c.sigma / math.sqrt(2.0))
+    assert c.noise.sigma == pytest.approx(c.sigma / math.sqrt(2.0))
     assert c.noise.source == "residuals"
 
 

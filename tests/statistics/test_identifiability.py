@@ -200,7 +200,7 @@ def test_base_and_prior_based_solutions_predict_the_same(root):
     gap = [a.predicted - b.predicted for a, b in zip(base.residuals, prior.residuals, strict=True)]
     assert np.sqrt(np.mean(np.square(gap))) < 0.4 * prior.sigma
     assert len(base.free) < 30
-    assert base.noise.reading_sigma == pytest.approx(5e-6, rel=0.15)
+    assert base.noise.sigma == pytest.approx(5e-6, rel=0.15)
 
 
 def test_base_parameters_have_no_prior(root):

@@ -8,7 +8,6 @@ from orthocal.assess.findings.finding import Finding, Place, place_of
 from orthocal.assess.wording import joined, mm, signed
 from orthocal.calibration.calibration import Calibration
 from orthocal.diagnosis.rows import ResidualRow
-from orthocal.statistics.chance import BY_CHANCE
 from orthocal.units import MM
 
 MANY_SUSPICIOUS = 0.2
@@ -142,8 +141,7 @@ def gauge_scatter(calibration: Calibration) -> float | None:
 
 def _most_scattered(calibration: Calibration) -> list[ResidualRow]:
     """Repeated readings that differ most, where they differ by more than the gauge explains."""
-    noise, gauge = calibration.noise, gauge_scatter(calibration)
-    if noise.cycles_dof == 0 or gauge is None or noise.chance_in_cycles(gauge) >= BY_CHANCE:
+    if not calibration.noise.cycles_scatter_more(gauge_scatter(calibration)):
         return []
     groups: dict[str, list[ResidualRow]] = {}
     for row in calibration.residuals:

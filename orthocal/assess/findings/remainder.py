@@ -10,7 +10,7 @@ from orthocal.assess.findings.readings import gauge_scatter, stands_out
 from orthocal.assess.wording import mm, times
 from orthocal.calibration.calibration import Calibration
 from orthocal.diagnosis.rows import root_mean_square, rows_by_setup
-from orthocal.statistics.chance import BY_CHANCE
+from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
 from orthocal.units import MM
 
 FAR_BEYOND = 4.0
@@ -63,11 +63,30 @@ def _worst_setup(calibration: Calibration) -> tuple[str, float]:
     return worst, known.get(worst, math.nan)
 
 
+def chance_within_tolerances(calibration: Calibration) -> float | None:
+    """Probability that a machine within its tolerances shows such readings, or odder ones.
+
+    Beside a prior what is left of the readings and what the parameters took of their tolerances
+    add up to χ² of the readings as the prior foretells them. None where the noise is not known
+    but from the residuals.
+    """
+    known = calibration.noise.source in ("cycles", "gauge") and calibration.sigma > 0.0
+    free = calibration.free
+    if not known or not calibration.prior or any(p.at_bound for p in free):
+        return None
+    rows = calibration.residuals
+    left = sum((r.residual / calibration.sigma) ** 2 for r in rows)
+    taken = sum(((p.value - p.mean) / p.tolerance) ** 2 for p in free if p.prior)
+    zeros = len({r.setup for r in rows if r.minus is None})
+    dof = len(rows) - zeros - sum(not p.prior for p in free)
+    return chance_of_excess(left + taken, dof) if dof > 0 else None
+
+
 def find_check(calibration: Calibration) -> list[Finding]:
     """Whether any reading is left to check the model."""
     if calibration.spare_readings > 0:
         return []
-    count, chance = calibration.identifiability.n_readings, calibration.chance_within_tolerances
+    count, chance = calibration.identifiability.n_readings, chance_within_tolerances(calibration)
     text = (
         f"The parameters can take up all {count} independent readings, and none is left to check "
         "the model"
@@ -128,7 +147,7 @@ def find_remainder(calibration: Calibration) -> list[Finding]:
 
 
 def _rests_on_gauge(calibration: Calibration) -> Finding:
-    numbers = {"sigma_mm": calibration.noise.reading_sigma / MM}
+    numbers = {"sigma_mm": calibration.noise.sigma / MM}
     if calibration.spare_readings > 0:
         return Finding(
             "fits",
@@ -143,8 +162,8 @@ def _rests_on_gauge(calibration: Calibration) -> Finding:
 
 def _within_cycles(calibration: Calibration) -> list[Finding]:
     """Residuals that repeated cycles explain; none where these scatter too much themselves."""
-    noise, scatter = calibration.noise, gauge_scatter(calibration)
-    if scatter is not None and noise.chance_in_cycles(scatter) < BY_CHANCE:
+    noise = calibration.noise
+    if noise.cycles_scatter_more(gauge_scatter(calibration)):
         return []
     text = "What remains is what repeated cycles scatter by: the model fits."
     return [Finding("fits", "informs", text, numbers={"scatter_mm": noise.cycles_sigma / MM})]
@@ -178,7 +197,7 @@ def _against_gauge(calibration: Calibration, gauge: float) -> Finding:
         "gauge_sigma_mm": gauge / MM,
         "times": ratio,
     }
-    if calibration.has_model_error:
+    if noise.leaves_more(gauge):
         stays = "" if calibration.suspicious else f" With the model '{calibration.model}' it stays."
         return Finding(
             "model error",
@@ -189,7 +208,7 @@ def _against_gauge(calibration: Calibration, gauge: float) -> Finding:
             _larger_model(calibration),
             numbers,
         )
-    if noise.chance_in_residuals(gauge) > 1.0 - BY_CHANCE:
+    if noise.leaves_less(gauge):
         return Finding(
             "gauge overstated",
             "informs",

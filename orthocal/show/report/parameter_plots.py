@@ -234,7 +234,7 @@ def _draw_singular_values(calibration: Calibration) -> Figure:
         if chosen.any():
             look = {**AFTER_LOOK, "markerfacecolor": face}
             axes.plot(index[chosen], values[chosen], label=label, **look)
-    noise = calibration.noise.reading_sigma
+    noise = calibration.noise.sigma
     kind = "σ of a reading" if noise >= found.threshold else "rounding: the noise is unknown"
     label = f"{kind}: {found.threshold / MM:.2g} mm"
     axes.axhline(found.threshold / MM, color="black", linestyle="--", label=label)

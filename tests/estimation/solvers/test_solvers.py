@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from orthocal import calibrate, load_calibration, load_session
+from orthocal.calibration.file import calibration_json
 from orthocal.errors import OrthocalError, SolverError
 from orthocal.estimation.linear import (
     SIX_ROWS,
@@ -131,7 +132,7 @@ def test_a_calibration_says_by_which_solver_it_was_found(root, tmp_path):
     for kind, result in found.items():
         assert result.solver.name == kind
         path = tmp_path / "calibration.json"
-        path.write_text(result.to_json())
+        path.write_text(calibration_json(result))
         assert load_calibration(path).solver.name == kind
     exact, other, first = found.values()
     assert other.covariance == pytest.approx(exact.covariance, rel=1e-6)

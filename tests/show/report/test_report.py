@@ -14,6 +14,7 @@ from rich.text import Text
 
 from orthocal import Choice, calibrate, load_calibration, load_session
 from orthocal.assess.entering import find_entries
+from orthocal.calibration.file import write_calibration
 from orthocal.markup import items, paragraph, table
 from orthocal.show.layout import add_row, bullets, section, table_of
 from orthocal.show.report.page import build_report
@@ -164,7 +165,7 @@ def test_full_model_says_what_the_offsets_leave(root):
 
 def test_same_calibration_makes_the_same_report(calibration, page, tmp_path):
     assert build_report(calibration) == page
-    path = calibration.save(tmp_path / "calibration.json")
+    path = write_calibration(calibration, tmp_path / "calibration.json")
     loaded = build_report(load_calibration(path))
     assert loaded == page
 

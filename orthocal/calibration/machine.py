@@ -1,0 +1,59 @@
+"""A machine with errors: where its tool is, and which drive coordinates bring it somewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.kinematics.assembly import Assembly, as_rows, find_beyond_travel
+from orthocal.robot.model import Robot
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Machine:
+    """A robot with errors."""
+
+    robot: Robot
+    errors: Mapping[str, float]
+    """Parameter to value, [SI]; others are 0."""
+
+    def forward(self, joints: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
+        """Tool centre point.
+
+        Args:
+            joints: Drive coordinates as the encoders give them, without any offset of the
+                controller, shape (K, n_drives) or (n_drives,), [m, rad].
+            names: What to call the rows in messages.
+
+        Returns:
+            Shape (K, 3) or (3,), [m].
+
+        Raises:
+            ClosureError: If the machine cannot be at such coordinates.
+        """
+        rows, single = as_rows(joints, len(self.robot.drives), "drive coordinates")
+        labels = names or [f"posture {i + 1}" for i in range(len(rows))]
+        for error in find_beyond_travel(self.robot, rows, labels).values():
+            raise error
+        points = Assembly(self.robot, fixed=self.errors).forward(rows, names=labels)
+        return points[0] if single else points
+
+    def inverse(self, points: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
+        """Drive coordinates that bring the tool to given points.
+
+        Args:
+            points: Shape (K, n_drives) or (n_drives,), [m].
+            names: What to call the rows in messages.
+
+        Returns:
+            Drive coordinates as the encoders give them, shape (K, n_drives) or (n_drives,).
+
+        Raises:
+            ClosureError: If a point cannot be reached.
+        """
+        return Assembly(self.robot, fixed=self.errors).inverse(points, names=names)
