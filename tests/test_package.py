@@ -27,8 +27,8 @@ def test_the_wheel_holds_robots_and_types(wheel):
     assert "orthocal/_robots/orthoglide/orthoglide.urdf" in names
     assert "orthocal/_robots/orthoglide/orthoglide.yaml" in names
     assert "orthocal/py.typed" in names
-    for name in ("view/web/scene.html", "view/web/scene.css", "view/web/scene.js"):
-        assert f"orthocal/output/{name}" in names
+    for name in ("web/scene.html", "web/scene.css", "web/scene.js"):
+        assert f"orthocal/viewer/{name}" in names
     assert "orthocal/show/report/report.css" in names
     assert not [n for n in names if n.startswith(("tests", "examples"))]
 

@@ -1,17 +1,19 @@
 """How well the tool's position is known: the number that users decide by.
 
 A machine with errors θ, commanded to a posture, has its tool at p(θ). What is not known of θ
-becomes a position error J dθ with J = ∂p/∂θ (`robot.sensitivity`).
+becomes a position error J dθ with J = ∂p/∂θ (`kinematics.sensitivity`).
 
 Every figure is given three times: with shift and rotation taken out, which is what a workpiece sees
-that is aligned on the machine; with the common shift taken out; and absolute (`robot.workspace`).
+that is aligned on the machine; with the common shift taken out; and absolute
+(`kinematics.workspace`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,16 +44,21 @@ DRAWS = 500
 """Errors drawn to find how large 95 % of the position errors are at most."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class ErrorSize:
     """Size of position errors over a workspace, [m]."""
 
     rms: float
     """Root mean square over the points, and over what is not known."""
-    percentile_95: float
-    """What 95 % of the errors, at any point, stay below."""
     largest: float
     """At the worst point; of what is not known, root mean square there."""
+    find_percentile: Callable[[], float] = field(repr=False)
+    """How the next is found, which takes time."""
+
+    @cached_property
+    def percentile_95(self) -> float:
+        """What 95 % of the errors, at any point, stay below."""
+        return self.find_percentile()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,8 +168,8 @@ def measure_deviations(deviations: Array, workspace: Workspace, positions: Array
         lengths = np.linalg.norm(field, axis=1)
         return ErrorSize(
             rms=float(np.sqrt(workspace.weights @ lengths**2)),
-            percentile_95=_weighted_percentile(lengths, workspace.weights),
             largest=float(lengths.max()),
+            find_percentile=lambda: _weighted_percentile(lengths, workspace.weights),
         )
 
     few = len(positions) < FEWEST_ALIGNED
@@ -343,17 +350,21 @@ def find_remaining_errors(
 def _spread_size(covariances: Array, weights: Array) -> ErrorSize:
     """Sizes of normal errors with given covariances, shape (K, 3, 3), at the points."""
     mean_square = np.trace(covariances, axis1=1, axis2=2)
-    values, vectors = np.linalg.eigh(covariances)
-    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    rng = np.random.default_rng(0)
-    draws = rng.normal(size=(3, DRAWS))
-    lengths = np.linalg.norm(roots @ draws, axis=1)
-    shares = np.broadcast_to(weights[:, None] / DRAWS, lengths.shape)
     return ErrorSize(
         rms=float(np.sqrt(weights @ mean_square)),
-        percentile_95=_weighted_percentile(lengths.reshape(-1), shares.reshape(-1)),
         largest=float(np.sqrt(mean_square.max())),
+        find_percentile=lambda: _drawn_percentile(covariances, weights),
     )
+
+
+def _drawn_percentile(covariances: Array, weights: Array) -> float:
+    """What 95 % of normal errors stay below, by draws."""
+    values, vectors = np.linalg.eigh(covariances)
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    draws = np.random.default_rng(0).normal(size=(3, DRAWS))
+    lengths = np.linalg.norm(roots @ draws, axis=1)
+    shares = np.broadcast_to(weights[:, None] / DRAWS, lengths.shape)
+    return _weighted_percentile(lengths.reshape(-1), shares.reshape(-1))
 
 
 def _weighted_percentile(lengths: Array, weights: Array) -> float:

@@ -31,6 +31,8 @@ class CalibratedTool:
     """Where a nominal machine's tool would be, shape (K, 3), [m]."""
     drives: Array
     """Drive coordinates of a nominal machine, shape (K, n_drives), [m, rad]."""
+    passive: Array
+    """Its passive coordinates, shape (K, n_passive), [m, rad]: others are near."""
     sensitivity: ToolSensitivity
     jacobian: Array
     """∂p/∂θ there, with the offsets active while measuring, shape (K, 3, n), [m per unit]."""
@@ -43,7 +45,8 @@ class CalibratedTool:
             names: What to call the points in messages.
         """
         commanded = self.drives - np.asarray(offsets, dtype=np.float64)
-        return np.asarray(self.sensitivity.assembly.forward(commanded, names=names) - self.targets)
+        found = self.sensitivity.assembly.forward(commanded, start=self.passive, names=names)
+        return np.asarray(found - self.targets)
 
 
 def find_tool(calibration: Calibration) -> CalibratedTool | None:
@@ -67,10 +70,10 @@ def _find_tool(calibration: Calibration) -> CalibratedTool | None:
     identified = np.array([errors.get(f"{d.name}.offset", 0.0) for d in robot.drives])
 
     def reach(points: Array) -> None:
-        drives = nominal_assembly(robot).inverse(points)
+        drives, passive = nominal_assembly(robot).reach(points)
         for offsets in (calibration.active_offsets, identified):
             _require_travel(robot, drives - offsets)
-            sensitivity.assembly.forward(drives - offsets)
+            sensitivity.assembly.forward(drives - offsets, start=passive)
 
     space = largest_cube(robot, reach)
     return None if space is None else _place(calibration, space, sensitivity, None)
@@ -115,13 +118,16 @@ def _place(
     names: Sequence[str] | None,
 ) -> CalibratedTool:
     nominal = nominal_assembly(calibration.robot)
-    drives = nominal.inverse(space.points, names=names)
+    drives, passive = nominal.reach(space.points, names=names)
+    commanded = drives - calibration.active_offsets
+    closed = sensitivity.assembly.close(commanded, start=passive, names=names)
     return CalibratedTool(
         workspace=space,
-        targets=read_only(nominal.forward(drives, names=names)),
+        targets=read_only(nominal.tcp(drives, passive)),
         drives=read_only(drives),
+        passive=read_only(passive),
         sensitivity=sensitivity,
-        jacobian=read_only(sensitivity(drives - calibration.active_offsets, names=names)),
+        jacobian=read_only(sensitivity(commanded, passive=closed)),
     )
 
 

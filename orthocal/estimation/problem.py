@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -30,6 +30,7 @@ from orthocal.estimation.selection import Known, Selection, select_parameters
 from orthocal.kinematics.assembly import Assembly, Machine
 from orthocal.kinematics.compiled import CompiledRobot, compiled_robot
 from orthocal.kinematics.error_map import Slopes
+from orthocal.kinematics.kept import once_a_robot
 from orthocal.kinematics.machine_map import MachineMap
 from orthocal.kinematics.symbolic import SymbolicRobot
 from orthocal.measurement.observations import Observations, build_observations, drive_table
@@ -447,7 +448,7 @@ def build_problem(
     return CalibrationProblem(session, selection)
 
 
-@lru_cache(maxsize=4)
+@once_a_robot(maxsize=8)
 def _require_independent_rows(robot: Robot) -> None:
     """Refuse closures with rows that depend on others: as constraints they cannot all be met.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.arguments import require_kind
 from orthocal.errors import ClosureError, RobotError
 from orthocal.kinematics.compiled import compiled_robot
+from orthocal.kinematics.kept import once_a_robot
 from orthocal.robot.closing import describe_opening
 from orthocal.robot.model import (
     Robot,
@@ -193,12 +194,12 @@ class Assembly:
         """
         d, single = as_rows(drives, len(self.robot.drives), "drive coordinates")
         machine = self.machine(theta)
-        if start is not None or failures is not None:
+        if failures is not None:
             passive = self._close(d, machine, start, names, failures, allow_free=allow_free)
         else:
             passive = self._once(
                 ("close", allow_free, d.tobytes(), *(part.tobytes() for part in machine)),
-                lambda: self._close(d, machine, None, names, None, allow_free=allow_free),
+                lambda: self._close(d, machine, start, names, None, allow_free=allow_free),
             )
         return passive[0] if single else passive
 
@@ -233,6 +234,7 @@ class Assembly:
         drives: ArrayLike,
         *,
         theta: ArrayLike | None = None,
+        start: ArrayLike | None = None,
         names: Sequence[str] | None = None,
         failures: Failures | None = None,
     ) -> Array:
@@ -241,6 +243,7 @@ class Assembly:
         Args:
             drives: Shape (K, n_drives) or (n_drives,), [m, rad].
             theta: Values of the free parameters, shape (n_free,); 0 by default.
+            start: As for `close`.
             names: Names of the postures, for messages.
             failures: As for `close`.
 
@@ -252,7 +255,7 @@ class Assembly:
             RobotError: If the robot has no tool centre point.
         """
         d, single = as_rows(drives, len(self.robot.drives), "drive coordinates")
-        passive = self.close(d, theta=theta, names=names, failures=failures)
+        passive = self.close(d, theta=theta, start=start, names=names, failures=failures)
         points = self.tcp(d, passive, theta=theta)
         return points[0] if single else points
 
@@ -281,7 +284,32 @@ class Assembly:
             RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
         p, single = as_rows(points, len(self._require_tcp().coordinates), "coordinates")
-        machine = self.machine(theta)
+        drives, _ = self.reach(p, theta=theta, names=names, failures=failures)
+        return drives[0] if single else drives
+
+    def reach(
+        self,
+        points: Array,
+        *,
+        theta: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+        failures: Failures | None = None,
+    ) -> tuple[Array, Array]:
+        """All joint coordinates that bring the tool centre point to given points.
+
+        Args:
+            points: As for `inverse`, shape (K, n_drives).
+            theta: As for `inverse`.
+            names: As for `inverse`.
+            failures: As for `inverse`.
+
+        Returns:
+            Drive coordinates, shape (K, n_drives), and passive ones, shape (K, n_passive).
+
+        Raises:
+            ClosureError, RobotError: As `inverse`.
+        """
+        p, machine = points, self.machine(theta)
         if failures is not None:
             x = self._solve(self._inverting, p, machine, None, names, failures)
         else:
@@ -289,8 +317,7 @@ class Assembly:
                 ("inverse", p.tobytes(), *(part.tobytes() for part in machine)),
                 lambda: self._solve(self._inverting, p, machine, None, names, None),
             )
-        drives = x[:, : len(self.robot.drives)]
-        return drives[0] if single else drives
+        return x[:, : len(self.robot.drives)], x[:, len(self.robot.drives) :]
 
     def tcp(
         self, drives: ArrayLike, passive: ArrayLike, *, theta: ArrayLike | None = None
@@ -515,7 +542,7 @@ def _far_from_singular(matrices: Array) -> NDArray[np.bool_]:
     return np.asarray(sizes < SURELY / SINGULAR_BELOW)
 
 
-@lru_cache(maxsize=4)
+@once_a_robot(maxsize=8)
 def nominal_assembly(robot: Robot) -> Assembly:
     """The assembly of a robot without errors, built once."""
     return Assembly(robot)

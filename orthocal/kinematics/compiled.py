@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from orthocal.kinematics.batch import BatchFunction
 from orthocal.kinematics.error_map import ErrorMap, error_map
-from orthocal.kinematics.kept import kept_function
+from orthocal.kinematics.kept import kept_function, once_a_robot
 from orthocal.kinematics.symbolic import Pose, SymbolicTree, hangs_on, log6
 from orthocal.robot.model import Closure, Robot, closure_row_units, joint_axis
 
@@ -324,7 +324,7 @@ class CompiledRobot:
         return kept_function(self.robot, name, build)
 
 
-@lru_cache(maxsize=4)
+@once_a_robot(maxsize=8)
 def compiled_robot(robot: Robot) -> CompiledRobot:
     """The functions of a robot, built once."""
     return CompiledRobot(robot)

@@ -1,4 +1,4 @@
-"""CasADi functions of a robot, built once and kept on disk.
+"""CasADi functions of a robot, built once, and kept on disk.
 
 They are kept by all that they depend on: the robot as it was loaded, the code that builds them, and
 the versions of CasADi and Pinocchio.
@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, wraps
 from importlib.metadata import version
 from pathlib import Path
+from typing import TypeVar
 
 import casadi as ca
 import numpy as np
 
 from orthocal import cache
 from orthocal.robot.model import Robot
+
+Made = TypeVar("Made")
 
 _BUILT_BY = ("kinematics", "sensors", "robot")
 """Folders with the code that builds functions."""
@@ -46,6 +49,47 @@ def kept_function(robot: Robot, name: str, build: Callable[[], ca.Function]) -> 
     return function
 
 
+class _Content:
+    """A robot that equals any other that moves, and is described, alike."""
+
+    __slots__ = ("key", "robot")
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot, self.key = robot, identify(robot)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Content) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+
+def once_a_robot(
+    maxsize: int,
+) -> Callable[[Callable[[Robot], Made]], Callable[[Robot], Made]]:
+    """Decorate a function of a robot: robots that are the same share what it makes.
+
+    Args:
+        maxsize: Robots whose things are kept.
+    """
+
+    def decorate(make: Callable[[Robot], Made]) -> Callable[[Robot], Made]:
+        made = lru_cache(maxsize)(lambda content: make(content.robot))
+
+        @wraps(make)
+        def find(robot: Robot) -> Made:
+            return made(_Content(robot))
+
+        return find
+
+    return decorate
+
+
+def identify(robot: Robot) -> tuple[str, str]:
+    """Equal for robots that move alike and are named alike in messages."""
+    return fingerprint(robot), str(robot.yaml)
+
+
 @lru_cache(maxsize=16)
 def fingerprint(robot: Robot) -> str:
     """A digest of all that a robot's functions depend on."""
@@ -65,6 +109,7 @@ def fingerprint(robot: Robot) -> str:
         repr(robot.passive_index.tolist()),
         repr([float(v).hex() for v in robot.drive_gain]),
         repr(tuple(robot.parameters.elementary.values())),
+        repr([(p.name, p.terms) for p in robot.parameters]),
         float(robot.characteristic_length).hex(),
     ]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from orthocal.kinematics.batch import BatchFunction
 from orthocal.kinematics.compiled import compiled_robot
-from orthocal.kinematics.kept import kept_function
+from orthocal.kinematics.kept import identify, kept_function
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Frames, Sensor, View
@@ -56,7 +56,7 @@ class _Pattern:
         self.robot, self.sensor, self.frames = robot, sensor, frames
         self.n_constants = sensor.constants(robot).size
         self._key = (
-            id(robot),
+            identify(robot),
             sensor.kind,
             frames,
             self.n_constants,

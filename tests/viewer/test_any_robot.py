@@ -14,13 +14,13 @@ from linkages import (
     write_robot,
     write_wide_linkage,
 )
-from orthocal.output.view import drawing
 from tolerances import CLOSED, KINEMATICS
 
 from orthocal import draw_scene, load_robot
 from orthocal.cli import main
 from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.robot.zero import count_free_motions
+from orthocal.show.scene import drawing
 from orthocal.viewer.visuals import load_visuals
 
 

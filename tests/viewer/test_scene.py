@@ -10,7 +10,6 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
-from orthocal.output.view import drawing, readings, stage, tool_errors
 from tolerances import KINEMATICS
 
 from orthocal import calibrate, draw_scene, load_robot, load_session
@@ -22,7 +21,9 @@ from orthocal.errors import ParameterError
 from orthocal.measurement.session_file import load_plan
 from orthocal.measurement.synthetic import simulate_session
 from orthocal.sensors.leg_indicator import DIRECTIONS
+from orthocal.show.scene import drawing, readings, tool_errors
 from orthocal.show.scene.deviations import measure_deviations
+from orthocal.viewer import stage
 from orthocal.viewer.motion import FRAMES_A_SECOND
 from orthocal.viewer.scene import round_scale
 from orthocal.viewer.shapes import arrow_parts, head_length

@@ -100,6 +100,10 @@ def render_figure(name: str, label: str, draw: Callable[[], Figure]) -> str:
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         figure = draw()
         nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        layout = figure.get_layout_engine()
+        if layout is not None:  # else savefig would lay out, and draw, twice
+            layout.execute(figure)
+            figure.set_layout_engine(None)
         figure.savefig(stream, format="svg", metadata=nothing)
     parser = etree.XMLParser(resolve_entities=False, huge_tree=True)
     root = etree.fromstring(stream.getvalue(), parser)

@@ -12,10 +12,10 @@ from xml.etree import ElementTree
 import matplotlib
 import numpy as np
 import pytest
-from orthocal.output import layout
 from scipy import stats
 
 from orthocal import Choice, calibrate, load_session
+from orthocal.show import layout
 from orthocal.show.report import figure as style
 from orthocal.show.report import parameter_plots, reading_plots
 
