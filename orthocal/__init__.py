@@ -1,8 +1,12 @@
 """orthocal: calibration of Orthoglide-type parallel robots from dial-indicator readings.
 
-session = orthocal.load_session("examples/table1/experiment-2")
-calibration = orthocal.calibrate(session)
-print(orthocal.summarize(calibration))
+Five lines do the main job:
+
+    import orthocal
+
+    session = orthocal.load_session("examples/table1/experiment-2")
+    calibration = orthocal.calibrate(session)
+    print(orthocal.summarize(calibration))
 """
 
 from __future__ import annotations
@@ -14,82 +18,164 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Calibration": "orthocal.calibration.calibration",
+    "CalibrationFileError": "orthocal.errors",
     "CalibrationProblem": "orthocal.estimation.problem",
     "Choice": "orthocal.estimation.choice",
+    "ClosureError": "orthocal.errors",
+    "Comparison": "orthocal.assess.comparison",
+    "Decision": "orthocal.assess.findings.decision",
+    "Finding": "orthocal.assess.findings.finding",
+    "Gauge": "orthocal.measurement.session",
     "LiveScene": "orthocal.viewer.live",
     "Loss": "orthocal.estimation.loss",
+    "Machine": "orthocal.calibration.machine",
     "NonlinearProgram": "orthocal.estimation.solvers.ipopt",
+    "NotIdentifiableError": "orthocal.errors",
     "OrthocalError": "orthocal.errors",
+    "OutputError": "orthocal.errors",
+    "ParameterError": "orthocal.errors",
+    "Posture": "orthocal.measurement.session",
+    "Reading": "orthocal.measurement.session",
     "Robot": "orthocal.robot.model",
+    "RobotError": "orthocal.errors",
     "Scene": "orthocal.viewer.scene",
+    "Sensor": "orthocal.sensors.protocol",
     "Session": "orthocal.measurement.session",
+    "SessionError": "orthocal.errors",
+    "Setup": "orthocal.measurement.session",
+    "SolverError": "orthocal.errors",
     "SolverOptions": "orthocal.estimation.options",
+    "ToolAccuracy": "orthocal.assess.accuracy",
+    "UnreachableError": "orthocal.errors",
+    "Validation": "orthocal.assess.validation",
+    "Workspace": "orthocal.kinematics.workspace",
     "assess_tool": "orthocal.assess.accuracy",
     "calibrate": "orthocal.calibration.calibrate",
     "compare_models": "orthocal.assess.comparison",
     "decide": "orthocal.assess.findings.calibration",
+    "decide_comparison": "orthocal.assess.findings.comparison",
+    "decide_validation": "orthocal.assess.findings.validation",
     "draw_errors": "orthocal.measurement.synthetic",
     "draw_scene": "orthocal.show.scene.drawing",
+    "join_sessions": "orthocal.measurement.joining",
     "load_calibration": "orthocal.calibration.file",
     "load_plan": "orthocal.measurement.session_file",
     "load_robot": "orthocal.robot.loading",
     "load_session": "orthocal.measurement.session_file",
+    "parameter_table": "orthocal.calibration.tables",
+    "reading_table": "orthocal.calibration.tables",
+    "register_sensor": "orthocal.sensors.registry",
+    "repeat_calibration": "orthocal.calibration.repeating",
+    "restore_session": "orthocal.calibration.repeating",
     "simulate_session": "orthocal.measurement.synthetic",
     "summarize": "orthocal.show.summary",
     "validate_calibration": "orthocal.assess.validation",
+    "write_calibration": "orthocal.calibration.file",
     "write_report": "orthocal.show.report.page",
     "write_session": "orthocal.measurement.session_output",
 }
 
 __all__ = [
     "Calibration",
+    "CalibrationFileError",
     "CalibrationProblem",
     "Choice",
+    "ClosureError",
+    "Comparison",
+    "Decision",
+    "Finding",
+    "Gauge",
     "LiveScene",
     "Loss",
+    "Machine",
     "NonlinearProgram",
+    "NotIdentifiableError",
     "OrthocalError",
+    "OutputError",
+    "ParameterError",
+    "Posture",
+    "Reading",
     "Robot",
+    "RobotError",
     "Scene",
+    "Sensor",
     "Session",
+    "SessionError",
+    "Setup",
+    "SolverError",
     "SolverOptions",
+    "ToolAccuracy",
+    "UnreachableError",
+    "Validation",
+    "Workspace",
     "assess_tool",
     "calibrate",
     "compare_models",
     "decide",
+    "decide_comparison",
+    "decide_validation",
     "draw_errors",
     "draw_scene",
+    "join_sessions",
     "load_calibration",
     "load_plan",
     "load_robot",
     "load_session",
+    "parameter_table",
+    "reading_table",
+    "register_sensor",
+    "repeat_calibration",
+    "restore_session",
     "simulate_session",
     "summarize",
     "validate_calibration",
+    "write_calibration",
     "write_report",
     "write_session",
 ]
 
 if TYPE_CHECKING:
-    from orthocal.assess.accuracy import assess_tool
-    from orthocal.assess.comparison import compare_models
+    from orthocal.assess.accuracy import ToolAccuracy, assess_tool
+    from orthocal.assess.comparison import Comparison, compare_models
     from orthocal.assess.findings.calibration import decide
-    from orthocal.assess.validation import validate_calibration
+    from orthocal.assess.findings.comparison import decide_comparison
+    from orthocal.assess.findings.decision import Decision
+    from orthocal.assess.findings.finding import Finding
+    from orthocal.assess.findings.validation import decide_validation
+    from orthocal.assess.validation import Validation, validate_calibration
     from orthocal.calibration.calibrate import calibrate
     from orthocal.calibration.calibration import Calibration
-    from orthocal.calibration.file import load_calibration
-    from orthocal.errors import OrthocalError
+    from orthocal.calibration.file import load_calibration, write_calibration
+    from orthocal.calibration.machine import Machine
+    from orthocal.calibration.repeating import repeat_calibration, restore_session
+    from orthocal.calibration.tables import parameter_table, reading_table
+    from orthocal.errors import (
+        CalibrationFileError,
+        ClosureError,
+        NotIdentifiableError,
+        OrthocalError,
+        OutputError,
+        ParameterError,
+        RobotError,
+        SessionError,
+        SolverError,
+        UnreachableError,
+    )
     from orthocal.estimation.choice import Choice
     from orthocal.estimation.loss import Loss
     from orthocal.estimation.options import SolverOptions
     from orthocal.estimation.problem import CalibrationProblem
     from orthocal.estimation.solvers.ipopt import NonlinearProgram
-    from orthocal.measurement.session import Session
+    from orthocal.kinematics.workspace import Workspace
+    from orthocal.measurement.joining import join_sessions
+    from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
     from orthocal.measurement.session_file import load_plan, load_session
     from orthocal.measurement.session_output import write_session
     from orthocal.measurement.synthetic import draw_errors, simulate_session
     from orthocal.robot.loading import load_robot
     from orthocal.robot.model import Robot
+    from orthocal.sensors.protocol import Sensor
+    from orthocal.sensors.registry import register_sensor
     from orthocal.show.report.page import write_report
     from orthocal.show.scene.drawing import draw_scene
     from orthocal.show.summary import summarize

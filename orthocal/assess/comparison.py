@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from orthocal.arguments import require_kind, require_names
+from orthocal.arguments import require_names
 from orthocal.assess.accuracy import ErrorSize
 from orthocal.assess.repetition import Repetition, measure_repetition
 from orthocal.assess.scores import ModelResult, Score, Undetermined, score_model
@@ -17,6 +17,7 @@ from orthocal.calibration.repeating import repeat_calibration
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
+from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.measurement.session import Session
 from orthocal.statistics.noise import KnownNoise, estimate_repeatability
 
@@ -36,6 +37,8 @@ class Comparison:
     undetermined: tuple[Undetermined, ...]
     repetition: Repetition | None
     """Residuals of the supported model held against those of another session."""
+    repeat_title: str
+    """Of that other session; empty without."""
     verdict: Verdict
 
     def __getitem__(self, model: str) -> ModelResult:
@@ -47,7 +50,7 @@ class Comparison:
     def to_json(self) -> str:
         """As JSON, SI units."""
         document = {
-            "schema": "orthocal/comparison/2",
+            "schema": "orthocal/comparison/3",
             "title": self.title,
             "noise": _number(self.noise.sigma),
             "noise_source": self.noise.source,
@@ -61,8 +64,6 @@ class Comparison:
             "verdict": {
                 "supported": self.verdict.supported,
                 "model_error": self.verdict.model_error,
-                "exit_code": self.verdict.exit_code,
-                "reasons": list(self.verdict.reasons),
                 "models": {
                     j.model: {"standing": j.standing, "reason": j.reason}
                     for j in self.verdict.judgements
@@ -73,21 +74,21 @@ class Comparison:
 
 
 def compare_models(
-    session: Session,
+    sessions: Given | Sequence[Given],
     *,
     models: Sequence[str] = (),
     tolerances: Mapping[str, float] | None = None,
-    repeat: Session | None = None,
+    repeat: Given | Sequence[Given] | None = None,
     options: SolverOptions | None = None,
 ) -> Comparison:
     """Identify a session by several models, both ways, and say which one it supports.
 
     Args:
-        session: The session.
+        sessions: The session, or several, or paths to them.
         models: Models of the robot's YAML; all by default.
         tolerances: Name or glob with its unit, such as *.offset_mm, to another standard deviation
             than the robot's.
-        repeat: Another session of the same rows: whether what remains repeats.
+        repeat: Another session of the same rows, or several: whether what remains repeats.
         options: Which solver, and how it is run.
 
     Raises:
@@ -96,20 +97,12 @@ def compare_models(
         SolverError: If the solver does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
-    require_kind(session, Session, expected="a Session, such as load_session(...)")
-    require_kind(repeat, (Session, type(None)), expected="a Session, such as load_session(...)")
+    chosen = gather_sessions(sessions)
     require_names(models or (), argument="models")
-    if repeat is not None and repeat.robot.sha256 != session.robot.sha256:
-        raise SessionError(
-            f"is of robot '{repeat.robot.name}'; the other session is of '{session.robot.name}', "
-            "or of another version of it",
-            where=None if repeat.path is None else str(repeat.path),
-        )
-    if repeat is not None and repeat.sha256 and repeat.sha256 == session.sha256:
-        raise SessionError(
-            "is the same session: what remains repeats by itself",
-            where=None if repeat.path is None else str(repeat.path),
-        )
+    session = join_sessions(chosen)
+    others = [] if repeat is None else gather_sessions(repeat)
+    for other in others:
+        _require_another(other, chosen)
     noise = find_known_noise(session)
     cycles = len({r.cycle for r in session.readings}) > 1
     parameters = session.robot.parameters
@@ -133,8 +126,8 @@ def compare_models(
     results.sort(key=lambda r: r.n_free)
     best, _ = judge_models(results, undetermined)
     repetition = None
-    if best is not None and repeat is not None:
-        again = repeat_calibration(best.calibration, repeat)
+    if best is not None and others:
+        again = repeat_calibration(best.calibration, others)
         repetition = measure_repetition(best.calibration, again)
     return Comparison(
         title=session.title,
@@ -144,13 +137,28 @@ def compare_models(
         results=tuple(results),
         undetermined=tuple(undetermined),
         repetition=repetition,
+        repeat_title=join_sessions(others).title if others else "",
         verdict=give_verdict(
             results,
             undetermined,
             noise=noise,
-            repetition=None if repetition is None or repeat is None else (repetition, repeat),
+            repetition=repetition,
         ),
     )
+
+
+def _require_another(other: Session, sessions: Sequence[Session]) -> None:
+    """Refuse a session to repeat with that is of another robot, or one of those compared."""
+    where = None if other.path is None else str(other.path)
+    for session in sessions:
+        if other.robot.sha256 != session.robot.sha256:
+            raise SessionError(
+                f"is of robot '{other.robot.name}'; the other session is of "
+                f"'{session.robot.name}', or of another version of it",
+                where=where,
+            )
+        if other.sha256 and other.sha256 == session.sha256:
+            raise SessionError("is the same session: what remains repeats by itself", where=where)
 
 
 def find_known_noise(session: Session) -> KnownNoise:

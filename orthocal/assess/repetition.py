@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from scipy import special
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.diagnosis.rows import ResidualRow
+from orthocal.measurement.joining import name_within
 
 CHANCE = 0.05
 """Probability below which a repetition of residuals is not put down to chance."""
@@ -53,7 +55,7 @@ class Repetition:
 
 def measure_repetition(first: Calibration, second: Calibration) -> Repetition:
     """Hold the residuals of two calibrations of the same parameters against each other."""
-    matched, correlation, cosine = _correlate(first.residuals, second.residuals)
+    matched, correlation, cosine = _correlate(first, second)
     dims = _residual_dimensions(second, matched)
     chance = math.nan
     if matched >= 3 and dims > 1.0 and not math.isnan(correlation):
@@ -66,10 +68,9 @@ def measure_repetition(first: Calibration, second: Calibration) -> Repetition:
 
 def _scatter(first: Calibration, second: Calibration) -> tuple[float, float]:
     """What does not repeat, from residuals of rows that both sessions have, cycle for cycle."""
-    rows = [
-        {(r.setup, r.posture, r.minus, r.cycle): r for r in c.residuals} for c in (first, second)
-    ]
-    if rows[0].keys() != rows[1].keys():
+    rows = [{(*key, r.cycle): r for key, r in _rows(c)} for c in (first, second)]
+    alike = rows[0].keys() == rows[1].keys()
+    if not alike or len(rows[0]) != len(first.residuals) or len(rows[1]) != len(second.residuals):
         return math.nan, 0.0
     # both fits have taken parameters and gauge zeros out, and with them out of the difference
     square = sum((rows[0][k].residual - rows[1][k].residual) ** 2 for k in rows[0])
@@ -86,15 +87,25 @@ def _residual_dimensions(refit: Calibration, matched: int) -> float:
     return matched - zeros - used
 
 
-def _correlate(
-    first: tuple[ResidualRow, ...], second: tuple[ResidualRow, ...]
-) -> tuple[int, float, float]:
+_Row = tuple[str, str, str | None]
+"""Setup, posture, and posture that was taken off, as their own session names them."""
+
+
+def _rows(calibration: Calibration) -> Iterator[tuple[_Row, ResidualRow]]:
+    joined = bool(calibration.session.parts)
+    for r in calibration.residuals:
+        setup, posture = (name_within(n, joined=joined) for n in (r.setup, r.posture))
+        minus = None if r.minus is None else name_within(r.minus, joined=joined)
+        yield (setup, posture, minus), r
+
+
+def _correlate(first: Calibration, second: Calibration) -> tuple[int, float, float]:
     """Rows that two sessions share, cycles averaged; correlation and cosine of their residuals."""
     means = []
-    for rows in (first, second):
-        collected: dict[tuple[str, str, str | None], list[float]] = defaultdict(list)
-        for r in rows:
-            collected[r.setup, r.posture, r.minus].append(r.residual)
+    for calibration in (first, second):
+        collected: dict[_Row, list[float]] = defaultdict(list)
+        for key, r in _rows(calibration):
+            collected[key].append(r.residual)
         means.append({key: sum(v) / len(v) for key, v in collected.items()})
     common = [key for key in means[0] if key in means[1]]
     a, b = (np.array([m[key] for key in common]) for m in means)

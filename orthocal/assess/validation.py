@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +26,7 @@ from orthocal.calibration.repeating import repeat_fit
 from orthocal.diagnosis.rows import ResidualRow
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import Fit
+from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.measurement.session import Session
 from orthocal.statistics.chance import BY_CHANCE, confidence_factor
 from orthocal.statistics.zeros import project_out_zeros
@@ -155,12 +157,12 @@ class Validation:
         return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
-def validate_calibration(calibration: Calibration, session: Session) -> Validation:
-    """Hold a new session against a calibration.
+def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Given]) -> Validation:
+    """Hold a new session, or several, against a calibration.
 
     Args:
         calibration: The calibration whose offsets were entered.
-        session: Taken afterwards, with its offsets active in the controller. Where the session
+        sessions: Taken afterwards, with its offsets active in the controller. Where a session
             does not state its controller's offsets, they are taken to be the identified ones.
 
     Raises:
@@ -169,28 +171,15 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
         SolverError: If a further fit does not converge.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
-    require_kind(session, Session, expected="a Session, such as load_session(...)")
-    where = None if session.path is None else str(session.path)
-    if session.robot.sha256 != calibration.robot_record.sha256:
-        raise SessionError(
-            f"is of robot '{session.robot.name}'; the calibration is of another, or of another "
-            f"version of '{calibration.robot_record.name}'",
-            where=where,
-        )
-    stated = session.controller_offsets is not None
+    given = gather_sessions(sessions)
+    session = join_sessions([_entered(calibration, one) for one in given])
     entries = find_entries(calibration)
-    if stated:
-        _require_offsets(calibration, session)
-    elif entries:
-        by_drive = {e.drive: e.enter for e in entries}
-        offsets = np.array([by_drive.get(d.name, 0.0) for d in session.robot.drives])
-        session = session.with_controller(offsets)
     fit = repeat_fit(calibration, session)
     refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
     repetition = measure_repetition(calibration, refit)
     found = Validation(
         title=session.title,
-        offsets_stated=stated,
+        offsets_stated=all(one.controller_offsets is not None for one in given),
         expected_rms=calibration.rms_after,
         expected_largest=calibration.largest_after,
         achieved_rms=refit.rms_before,
@@ -214,6 +203,24 @@ def validate_calibration(calibration: Calibration, session: Session) -> Validati
     slip = mistake is not None and mistake.kind != "one differs"
     enter = entries if slip else find_entries(refit)
     return replace(found, mistake=mistake, enter=enter)
+
+
+def _entered(calibration: Calibration, session: Session) -> Session:
+    """A new session with the offsets that were active: as it states, or as identified."""
+    if session.robot.sha256 != calibration.robot_record.sha256:
+        raise SessionError(
+            f"is of robot '{session.robot.name}'; the calibration is of another, or of another "
+            f"version of '{calibration.robot_record.name}'",
+            where=None if session.path is None else str(session.path),
+        )
+    if session.controller_offsets is not None:
+        _require_offsets(calibration, session)
+        return session
+    by_drive = {e.drive: e.enter for e in find_entries(calibration)}
+    if not by_drive:
+        return session
+    offsets = [by_drive.get(d.name, 0.0) for d in session.robot.drives]
+    return session.with_controller(np.array(offsets))
 
 
 def _find_mistake(calibration: Calibration, fit: Fit, session: Session) -> EnteringMistake | None:

@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from orthocal.assess.accuracy import assess_excess, find_excess
+from orthocal.assess.accuracy import find_excess
 from orthocal.assess.repetition import Repetition
 from orthocal.assess.scores import ModelResult, Undetermined
-from orthocal.measurement.session import Session
+from orthocal.assess.wording import count_of
 from orthocal.statistics.noise import KnownNoise
-from orthocal.units import MM, UM
+from orthocal.units import MM
 
 Standing = Literal[
     "supported", "no check", "tells no more", "no better", "does not carry over", "not determined"
@@ -61,7 +61,8 @@ class Verdict:
     """The largest model that the readings support; None if they support none."""
     model_error: bool | None
     """Whether what it leaves is error of the model, not noise; None if nothing tells."""
-    reasons: tuple[str, ...]
+    excess: float
+    """How many times their tolerances errors must be for that; 1 where they explain it."""
     judgements: tuple[Judgement, ...]
     """Of every model, those that the readings leave open first."""
 
@@ -69,20 +70,13 @@ class Verdict:
         """How a model stands."""
         return next(j.standing for j in self.judgements if j.model == model)
 
-    @property
-    def exit_code(self) -> int:
-        """0: supported, and noise remains. 3: supported, but model error remains. 4: none is."""
-        if self.supported is None:
-            return 4
-        return 3 if self.model_error else 0
-
 
 def give_verdict(
     results: Sequence[ModelResult],
     undetermined: Sequence[Undetermined],
     *,
     noise: KnownNoise,
-    repetition: tuple[Repetition, Session] | None = None,
+    repetition: Repetition | None = None,
 ) -> Verdict:
     """Which model to believe, and why.
 
@@ -93,18 +87,14 @@ def give_verdict(
         repetition: Residuals of the supported model held against those of another session.
     """
     best, judgements = judge_models(results, undetermined)
-    reasons = [f"{j.model}: {j.words}" for j in judgements]
     if best is None:
-        headline = "These readings support none of the models."
-        return Verdict(None, None, (headline, *reasons), judgements)
-    model_error, excess, words = _explain_remainder(best, noise)
-    reasons += words
-    if repetition is not None:
-        words, model_error = _explain_repetition(*repetition, model_error)
-        reasons += words
-    reasons += _explain_tool(best, excess)
-    headline = _headline(best, results, undetermined)
-    return Verdict(best.model, model_error, (headline, *reasons), judgements)
+        return Verdict(None, None, 1.0, judgements)
+    exact = best.exact
+    model_error = noise.is_exceeded(exact.chi_square, exact.dof)
+    excess = find_excess(best.calibration) if model_error else 1.0
+    if repetition is not None and repetition.repeats is True:
+        model_error = True
+    return Verdict(best.model, model_error, excess, judgements)
 
 
 def judge_models(
@@ -134,7 +124,7 @@ def judge_models(
             judge(
                 result,
                 "supported",
-                f"It leaves {_count(result.spare)} of {_count(total)} independent readings to "
+                f"It leaves {count_of(result.spare)} of {count_of(total)} independent readings to "
                 f"check it.{held}",
             )
             continue
@@ -174,97 +164,3 @@ def judge_models(
                 f"{abs(gain):.1f}, and {words}.",
             )
     return best, tuple(found)
-
-
-def _headline(
-    best: ModelResult, results: Sequence[ModelResult], undetermined: Sequence[Undetermined]
-) -> str:
-    count = _count(best.rank + best.spare).capitalize()
-    others = [*(r.n_free for r in results), *(u.n_free for u in undetermined)]
-    only = " only" if best.n_free == min(others) < max(others) else ""
-    return f"{count} independent readings support {best.model}{only}."
-
-
-def _explain_remainder(
-    best: ModelResult, noise: KnownNoise
-) -> tuple[bool | None, float, list[str]]:
-    """Whether what the supported model leaves is noise, and by how much it is beyond tolerances."""
-    calibration = best.calibration
-    dof, chi_square = best.exact.dof, best.exact.chi_square
-    found = calibration.noise.residual_sigma
-    exceeded = noise.is_exceeded(chi_square, dof)
-    if exceeded is None:
-        words = [
-            "Whether what remains is noise cannot be told: nothing says what the noise is. Repeat "
-            "readings in cycles, or give gauge.sigma_mm."
-        ]
-        return None, 1.0, words
-    factor = calibration.row_factor
-    row = "a difference" if calibration.rows_are_differences else "a reading"
-    where = {"cycles": "repeated cycles scatter", "gauge": "the gauge's own σ"}[noise.source]
-    sizes = f"σ {found * factor / MM:.3g} mm of {row} against {noise.sigma * factor / MM:.2g} mm"
-    if not exceeded:
-        return False, 1.0, [f"What {best.model} leaves is noise: {sizes} ({where})."]
-    words = [
-        f"What {best.model} leaves is error of the model rather than noise: {sizes} ({where}), "
-        f"{_times(found / noise.sigma)} as much."
-    ]
-    tolerated, scale = calibration.unmodelled.residual_rms, find_excess(calibration)
-    if tolerated > 0.0:
-        rms = calibration.rms_after
-        words.append(
-            f"Errors that {best.model} leaves out, at their tolerances, would leave "
-            f"{tolerated / MM:.3f} mm r.m.s.; found are {rms / MM:.3f} mm"
-            + (
-                f": this machine is worse than its tolerances, by about {scale:.1f} times."
-                if scale > 1.0
-                else ": they explain it."
-            )
-        )
-    return True, scale, words
-
-
-def _explain_repetition(
-    repetition: Repetition, repeat: Session, model_error: bool | None
-) -> tuple[list[str], bool | None]:
-    sizes = f"correlation {repetition.correlation:.3f} over {repetition.matched} rows"
-    if repetition.repeats is None:
-        return ["Whether what remains repeats cannot be told: too few rows are shared."], (
-            model_error
-        )
-    if repetition.repeats:
-        return [
-            f"What remains repeats in '{repeat.title}' ({sizes}; by chance {repetition.chance:.2g})"
-            ": it is error of the model, which no repetition removes."
-        ], True
-    return [f"What remains does not repeat in '{repeat.title}' ({sizes})."], model_error
-
-
-def _explain_tool(best: ModelResult, excess: float) -> list[str]:
-    """What the supported model is good for at the tool, with errors beyond their tolerances."""
-    if best.tool is None or best.tool.after is None:
-        return []
-    after, cost = best.tool.after.sizes.headline, best.linearisation_cost
-    words = [
-        f"At the tool {best.model} is good for {after.rms / UM:.0f} µm r.m.s. over "
-        f"{best.tool.workspace.words}, shift and rotation taken out, if the tolerances hold."
-    ]
-    if excess > 1.0:
-        size = assess_excess(best.calibration, best.tool, excess).sizes.headline
-        words[0] = (
-            f"At the tool {best.model} is good for about {size.rms / UM:.0f} µm r.m.s. over "
-            f"{best.tool.workspace.words}, shift and rotation taken out, with errors "
-            f"{excess:.1f} times their tolerances."
-        )
-    if cost is not None:
-        words.append(f"Linearising it costs {cost.rms / UM:.1f} µm r.m.s. there.")
-    return words
-
-
-def _times(ratio: float) -> str:
-    return f"{ratio:.1f} times" if ratio < 3.0 else f"{ratio:.0f} times"
-
-
-def _count(value: int) -> str:
-    words = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
-    return words[value] if 0 <= value < len(words) else str(value)

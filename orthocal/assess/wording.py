@@ -42,3 +42,9 @@ def times(ratio: float) -> str:
 def joined(names: Sequence[str], word: str = "and") -> str:
     """Names as a list in a sentence: a, b and c."""
     return f" {word} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def count_of(value: int) -> str:
+    """A number of things, below ten as a word."""
+    words = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
+    return words[value] if 0 <= value < len(words) else str(value)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,9 +20,7 @@ from orthocal.estimation.loss import Loss, LossKind
 from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.assembly import as_rows
-from orthocal.measurement.joining import join_sessions
-from orthocal.measurement.session import Session
-from orthocal.measurement.session_file import load_session
+from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.statistics.identifiability import (
     find_base_parameters,
 )
@@ -36,7 +33,7 @@ MAX_BASE_ROUNDS = 8
 
 
 def calibrate(
-    session: Session | str | Path | Sequence[Session | str | Path],
+    sessions: Given | Sequence[Given],
     choice: Choice | str | None = None,
     *,
     loss: Loss | LossKind | None = None,
@@ -47,7 +44,7 @@ def calibrate(
     """Identify the errors of a machine from a session, exactly, with their uncertainty.
 
     Args:
-        session: The session, or the path to one; or several, which are fitted together.
+        sessions: The session, or the path to one; or several, which are fitted together.
         choice: Which errors are free, and what is known of them; or the name of a model. Offsets
             by default.
         loss: What a residual costs: `squares` (the default), `huber`, or one with its own width.
@@ -65,7 +62,7 @@ def calibrate(
         TypeError: If an argument is of another kind.
         ValueError: If there are not as many free parameters to start from as there are.
     """
-    session = _gather(session)
+    session = join_sessions(gather_sessions(sessions))
     require_names(profile, argument="profile")
     require_kind(choice, (Choice, str, type(None)), expected="a Choice, or the name of a model")
     chosen = choice if isinstance(choice, Choice) else Choice(choice)
@@ -96,19 +93,6 @@ def _solver_options(
     if loss is None:
         return options
     return replace(options, loss=loss if isinstance(loss, Loss) else Loss(loss))
-
-
-def _gather(given: Session | str | Path | Sequence[Session | str | Path]) -> Session:
-    """What was given as one session."""
-    several: list[Session | str | Path]
-    several = list(given) if isinstance(given, (list, tuple)) else [given]  # type: ignore[list-item]
-    found = []
-    for one in several:
-        if not isinstance(one, Session):
-            require_kind(one, (str, Path), expected="a Session, or the path to one")
-            one = load_session(one)
-        found.append(one)
-    return join_sessions(found)
 
 
 def _fit_base(

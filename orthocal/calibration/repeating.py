@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -16,18 +17,24 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.fields import read_only
+from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
 from orthocal.robot.model import Robot
 
 
-def repeat_calibration(calibration: Calibration, session: Session) -> Calibration:
+def repeat_calibration(calibration: Calibration, sessions: Given | Sequence[Given]) -> Calibration:
     """The same parameters, with the same priors and bounds, identified from another session.
 
     Its rows' nominal values are those of the machine as it was calibrated before.
 
+    Args:
+        calibration: Whose parameters they are.
+        sessions: The other session, or several, or paths to them.
+
     Raises:
         NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
     """
+    session = join_sessions(gather_sessions(sessions))
     nominal = np.array([p.value for p in calibration.free])
     return assemble_calibration(repeat_fit(calibration, session), nominal=nominal)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -11,7 +11,7 @@ from orthocal.cli.options import (
     AllRows,
     CalibrationPath,
     Json,
-    SessionPath,
+    SessionPaths,
     Tolerances,
     app,
     load_each_once,
@@ -19,19 +19,10 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.printing import put_note, put_out
 
-if TYPE_CHECKING:
-    pass
-
 
 @app.command()
 def calibrate(
-    sessions: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="SESSION...",
-            help="session.yaml, or the folder that holds it; several are fitted together.",
-        ),
-    ],
+    sessions: SessionPaths,
     model: Annotated[
         str | None,
         typer.Option(
@@ -161,14 +152,17 @@ def calibrate(
 
 @app.command()
 def compare(
-    session: SessionPath,
+    sessions: SessionPaths,
     models: Annotated[
         str | None,
         typer.Option(metavar="MODELS", help="With commas between; all of the robot's by default."),
     ] = None,
     repeat: Annotated[
-        Path | None,
-        typer.Option(metavar="SESSION", help="Another session: does what remains repeat?"),
+        list[Path] | None,
+        typer.Option(
+            metavar="SESSION",
+            help="Another session: does what remains repeat? May be given several times.",
+        ),
     ] = None,
     tolerance: Tolerances = None,
     json: Json = False,
@@ -180,31 +174,33 @@ def compare(
     leaves is error of the model. 4: none is supported.
     """
     from orthocal.assess.comparison import compare_models
+    from orthocal.assess.findings.comparison import decide_comparison
     from orthocal.estimation.selection import read_tolerances
-    from orthocal.measurement.session_file import load_session
+    from orthocal.show.printed_json import printed_comparison
     from orthocal.show.summary import print_summary
 
-    loaded = load_session(session)
+    loaded = load_each_once(sessions)
+    parameters = loaded[0].robot.parameters
     result = compare_models(
         loaded,
         models=split_globs([models] if models else None),
-        tolerances=read_tolerances(tolerance or [], loaded.robot.parameters, where="--tolerance"),
-        repeat=None if repeat is None else load_session(repeat),
+        tolerances=read_tolerances(tolerance or [], parameters, where="--tolerance"),
+        repeat=load_each_once(repeat) if repeat else None,
     )
     if json:
-        put_out(result.to_json().rstrip("\n"))
+        put_out(printed_comparison(result).rstrip("\n"))
     else:
         print_summary(result, all_rows=all_rows)
-    raise typer.Exit(result.verdict.exit_code)
+    raise typer.Exit(decide_comparison(result).exit_code)
 
 
 @app.command()
 def validate(
     calibration: CalibrationPath,
-    session: Annotated[
-        Path,
+    sessions: Annotated[
+        list[Path],
         typer.Argument(
-            metavar="NEW_SESSION", help="Taken with the identified offsets in the controller."
+            metavar="NEW_SESSION...", help="Taken with the identified offsets in the controller."
         ),
     ],
     json: Json = False,
@@ -217,11 +213,10 @@ def validate(
     from orthocal.assess.findings.validation import decide_validation
     from orthocal.assess.validation import validate_calibration
     from orthocal.calibration.file import load_calibration
-    from orthocal.measurement.session_file import load_session
     from orthocal.show.printed_json import printed_validation
     from orthocal.show.summary import print_summary
 
-    result = validate_calibration(load_calibration(calibration), load_session(session))
+    result = validate_calibration(load_calibration(calibration), load_each_once(sessions))
     if json:
         put_out(printed_validation(result).rstrip("\n"))
     else:

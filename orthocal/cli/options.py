@@ -21,8 +21,12 @@ app = typer.Typer(
     help="Calibrate Orthoglide-type parallel robots from dial-indicator readings.",
 )
 
-SessionPath = Annotated[
-    Path, typer.Argument(metavar="SESSION", help="session.yaml, or the folder that holds it.")
+SessionPaths = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="SESSION...",
+        help="session.yaml, or the folder that holds it; several are fitted together.",
+    ),
 ]
 CalibrationPath = Annotated[
     Path,

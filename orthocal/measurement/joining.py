@@ -4,13 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TypeVar
 
+from orthocal.arguments import require_kind
 from orthocal.characters import composed
 from orthocal.errors import SessionError
 from orthocal.measurement.session import Posture, Session, Setup
+from orthocal.measurement.session_file import load_session
 
 Value = TypeVar("Value")
+
+Given = Session | str | Path
+"""A session, or the path to one."""
+
+
+def gather_sessions(given: Given | Sequence[Given]) -> list[Session]:
+    """What was given as one session or several, loaded where it is a path.
+
+    Raises:
+        SessionError: If a path is none of a session, or nothing was given.
+        TypeError: If an argument is of another kind.
+    """
+    several = [given] if isinstance(given, Session | str | Path) else given
+    require_kind(several, (list, tuple), expected="a Session, the path to one, or a list of them")
+    found = []
+    for one in several:
+        require_kind(one, (Session, str, Path), expected="a Session, or the path to one")
+        found.append(one if isinstance(one, Session) else load_session(one))
+    if not found:
+        raise SessionError("there is no session")
+    return found
 
 
 def join_sessions(sessions: Sequence[Session]) -> Session:
@@ -23,10 +47,8 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         sessions: In the order in which they were measured; one alone stays what it is.
 
     Raises:
-        SessionError: If there are none, or of different robots.
+        SessionError: If they are of different robots.
     """
-    if not sessions:
-        raise SessionError("there is no session to join")
     if len(sessions) == 1:
         return sessions[0]
     last = sessions[-1]
@@ -52,6 +74,11 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         sha256="",
         parts=tuple(sessions),
     )
+
+
+def name_within(name: str, *, joined: bool) -> str:
+    """A setup's or posture's name in its own session, where sessions were joined or not."""
+    return name.partition("/")[2] or name if joined else name
 
 
 def _merged(mappings: Iterable[Mapping[str, Value]]) -> dict[str, Value]:

@@ -9,6 +9,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from orthocal.assess.comparison import Comparison
+from orthocal.assess.findings.comparison import decide_comparison
 from orthocal.show.layout import (
     MANY_ROWS,
     WORST_ROWS,
@@ -38,7 +39,7 @@ def render_comparison(comparison: Comparison, *, all_rows: bool = False) -> Rend
         Text(
             f"{c.independent} independent readings; noise of one {mm(c.noise.sigma)} mm, {source}"
         ),
-        section("Verdict", bullets(list(c.verdict.reasons))),
+        section("Verdict", bullets([f.words for f in decide_comparison(c).findings])),
         section("Models side by side", _scores(c)),
         section("Estimates", _estimates(c, all_rows)),
         section("What each leaves of the readings", _residuals(c, all_rows)),

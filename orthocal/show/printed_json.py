@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 
+from orthocal.assess.comparison import Comparison
 from orthocal.assess.findings.calibration import decide
+from orthocal.assess.findings.comparison import decide_comparison
 from orthocal.assess.findings.validation import decide_validation
 from orthocal.assess.validation import Validation
 from orthocal.calibration.calibration import Calibration
@@ -17,6 +19,12 @@ def printed_calibration(calibration: Calibration) -> str:
     It loads as a calibration, too; what follows is then found anew.
     """
     document = {**calibration_document(calibration), **decide(calibration).to_document()}
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def printed_comparison(comparison: Comparison) -> str:
+    """A comparison with its `decision` and `findings`."""
+    document = {**json.loads(comparison.to_json()), **decide_comparison(comparison).to_document()}
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 

@@ -28,6 +28,7 @@ from orthocal.assess.accuracy import (
     measure_uncertainty,
 )
 from orthocal.assess.entering import entered_offsets
+from orthocal.assess.findings.comparison import decide_comparison
 from orthocal.errors import RobotError
 from orthocal.estimation.problem import build_problem
 from orthocal.kinematics.assembly import Assembly, nominal_assembly
@@ -173,7 +174,7 @@ def test_a_machine_that_does_not_reach_60_mm_has_results_at_the_tool(tmp_path):
     assert "Over a cube of ±29 mm around the zero." in text
     assert "missing" not in text
     compared = compare_models(session, models=["offsets", "lengths"])
-    assert "a cube of ±29 mm" in " ".join(compared.verdict.reasons)
+    assert "a cube of ±29 mm" in " ".join(f.text for f in decide_comparison(compared).findings)
     assert all(r.tool is not None for r in compared.results)
 
 

@@ -146,3 +146,29 @@ def test_a_calibration_of_all_errors_is_confirmed_with_its_offsets_entered(root)
     worst = max(changed.rows, key=lambda r: abs(r.deviation))
     assert f"{worst.setup} {worst.posture}" in text  # the largest deviations are listed
     assert "z_fork.rz" not in text  # nor is every parameter
+
+
+def test_several_sessions_validate_together(plan):
+    """Two days' readings with the offsets entered: as one, each with zeros of its own."""
+    calibration = calibrate(simulate_session(plan, TRUTH, seed=1).session)
+    entered = {e.drive: e.enter for e in find_entries(calibration)}
+    offsets = [entered[f"{k}_slide"] for k in "xyz"]
+    days = [simulate_session(with_offsets(plan, offsets), TRUTH, seed=s).session for s in (2, 3)]
+    both = validate_calibration(calibration, days)
+    assert both.confirmed
+    assert len(both.rows) == sum(len(d.readings) for d in days)
+    assert both.repetition.matched == 18
+    alone = validate_calibration(calibration, days[0])
+    stds = [[c.std for c in v.changes] for v in (alone, both)]
+    assert all(two < one for one, two in zip(*stds, strict=True))
+    wrong = simulate_session(with_offsets(plan, offsets), {}, seed=4).session
+    assert not validate_calibration(calibration, [days[0], wrong]).confirmed
+
+
+def test_each_of_several_sessions_must_have_the_offsets(plan):
+    calibration = calibrate(simulate_session(plan, TRUTH, seed=1).session)
+    entered = [e.enter for e in find_entries(calibration)]
+    right = simulate_session(with_offsets(plan, entered), TRUTH, seed=2).session
+    other = simulate_session(with_offsets(plan, [0.0, 0.0, 0.0]), TRUTH, seed=3).session
+    with pytest.raises(SessionError, match="x_slide has 0 mm where the calibration says to enter"):
+        validate_calibration(calibration, [right, other])

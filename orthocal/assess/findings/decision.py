@@ -16,6 +16,9 @@ Answer = Literal[
     "confirmed",
     "not confirmed",
     "cannot be told",
+    "supported",
+    "supported with model error",
+    "none supported",
 ]
 
 HEADLINES: dict[Answer, str] = {
@@ -26,10 +29,18 @@ HEADLINES: dict[Answer, str] = {
     "confirmed": "The calibration is confirmed.",
     "not confirmed": "The calibration is not confirmed.",
     "cannot be told": "Whether this is as expected cannot be told.",
+    "supported": "The readings support a model.",
+    "supported with model error": "The readings support a model, but it leaves more than noise.",
+    "none supported": "The readings support none of the models.",
 }
 
-STOPPED = 3
-"""Exit code of a decision against what was found."""
+EXIT_CODES: dict[Answer, int] = {
+    "do not enter": 3,
+    "not confirmed": 3,
+    "supported with model error": 3,
+    "none supported": 4,
+}
+"""Exit codes of decisions against what was found; 0 for all others."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,8 +62,8 @@ class Decision:
 
     @property
     def exit_code(self) -> int:
-        """0; 3 for what is not to be entered, or is not confirmed."""
-        return STOPPED if self.answer in ("do not enter", "not confirmed") else 0
+        """0; 3 or 4 for a decision against what was found."""
+        return EXIT_CODES.get(self.answer, 0)
 
     def of_kind(self, *kinds: Kind) -> tuple[Finding, ...]:
         """Findings of some kinds, in their order."""

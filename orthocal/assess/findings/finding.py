@@ -48,6 +48,10 @@ Kind = Literal[
     "below the noise",
     "at the tool",
     "out of reach",
+    # of a comparison
+    "supported",
+    "not supported",
+    "within tolerances",
     # of a validation
     "as expected",
     "more than expected",

@@ -1,0 +1,71 @@
+"""A calibration as tables: lists of plain records, as pandas, polars and csv.DictWriter take them.
+
+All is in SI; a parameter's record says its unit. What is not known is None.
+"""
+
+from __future__ import annotations
+
+import math
+
+from orthocal.calibration.calibration import Calibration
+
+Record = dict[str, str | float | int | bool | None]
+
+
+def parameter_table(calibration: Calibration) -> list[Record]:
+    """A record for each parameter: free ones, held ones, then those of sensors.
+
+    `value`, `linearised`, `std` (of scatter), `low` and `high` (95 %, all that is not known) and
+    `tolerance` are in `unit`.
+    """
+    intervals = dict(
+        zip((p.name for p in calibration.free), calibration.intervals, strict=True),
+    )
+    records: list[Record] = []
+    for of, group in (("machine", calibration.parameters), ("sensor", calibration.sensors)):
+        for p in group:
+            low, high = intervals.get(p.name, (math.nan, math.nan))
+            records.append(
+                {
+                    "name": p.name,
+                    "of": of,
+                    "unit": p.unit,
+                    "value": p.value,
+                    "linearised": p.linear,
+                    "std": _known(p.std),
+                    "low": _known(low),
+                    "high": _known(high),
+                    "tolerance": p.tolerance,
+                    "free": p.free,
+                    "identifiable": p.identifiable,
+                    "at_bound": p.at_bound,
+                }
+            )
+    return records
+
+
+def reading_table(calibration: Calibration) -> list[Record]:
+    """A record for each row of the readings, in metres but for `studentised`."""
+    return [
+        {
+            "setup": r.setup,
+            "posture": r.posture,
+            "minus": r.minus,
+            "cycle": r.cycle,
+            "measured": r.measured,
+            "nominal": r.nominal,
+            "linearised": _known(r.linear),
+            "predicted": r.predicted,
+            "deviation": r.deviation,
+            "residual": r.residual,
+            "unseen": _known(r.unseen),
+            "studentised": _known(r.studentised),
+            "file": r.file or calibration.session.readings_path,
+            "line": r.line,
+        }
+        for r in calibration.residuals
+    ]
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,116 @@
+"""A calibration made again from what its file keeps, and its numbers as tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import pytest
+
+from orthocal import (
+    Choice,
+    calibrate,
+    load_calibration,
+    load_session,
+    parameter_table,
+    reading_table,
+    repeat_calibration,
+    restore_session,
+    write_calibration,
+)
+from orthocal.calibration.file import calibration_document
+from orthocal.errors import CalibrationFileError
+
+CASES = [
+    ("table1/experiment-2", "offsets", "squares", "ipopt"),
+    ("raw-cycles", "offsets", "huber", "ipopt"),
+    ("raw-cycles", "lengths", "squares", "eliminated"),
+    ("sweep", "full", "squares", "ipopt"),
+    (["table1/experiment-2", "table1/experiment-3"], "offsets", "squares", "eliminated"),
+]
+
+
+@pytest.mark.parametrize(("name", "model", "loss", "solver"), CASES)
+def test_a_file_makes_its_calibration_again(root, tmp_path, name, model, loss, solver):
+    names = [name] if isinstance(name, str) else name
+    choice = Choice(model, bounds={"x_slide.offset_mm": (-0.5, 4.0)}, known={})
+    made = calibrate([root / "examples" / n for n in names], choice, loss=loss, solver=solver)
+    loaded = load_calibration(write_calibration(made, tmp_path / "calibration.json"))
+    again = repeat_calibration(loaded, restore_session(loaded))
+    for p, q in zip(made.parameters, again.parameters, strict=True):
+        assert q.name == p.name
+        assert q.value == pytest.approx(p.value, abs=1e-6 * p.tolerance)
+        assert q.std == pytest.approx(p.std, rel=1e-5, nan_ok=True)
+        assert q.at_bound == p.at_bound
+    for p, q in zip(made.residuals, again.residuals, strict=True):
+        assert (q.label, q.cycle, q.line, q.measured) == (p.label, p.cycle, p.line, p.measured)
+        assert q.predicted == pytest.approx(p.predicted, abs=1e-10)
+    for p, q in zip(made.setups, again.setups, strict=True):
+        assert (p.zero is None) == (q.zero is None)
+        assert p.zero is None or q.zero == pytest.approx(p.zero, abs=1e-9)
+
+
+@pytest.fixture(scope="module")
+def document(experiment_2):
+    return calibration_document(calibrate(experiment_2))
+
+
+def shifted(number):
+    return number * (1.0 + 1e-6) + 1e-9
+
+
+EDITED = [
+    ("sigma",),
+    ("dof",),
+    ("rms_before",),
+    ("rms_after",),
+    ("largest_before",),
+    ("largest_after",),
+    ("identifiability", "condition"),
+    ("identifiability", "observability", "O3"),
+    ("residuals", 4, "residual"),
+    ("residuals", 4, "predicted"),
+    ("parameters", 1, "std"),
+    ("covariance", 1, 1),
+]
+
+
+@pytest.mark.parametrize("place", EDITED, ids=lambda p: ".".join(map(str, p)))
+def test_a_number_that_does_not_follow_from_the_others_is_refused(document, tmp_path, place):
+    """Whoever edits one number of a file has made another calibration, and is told so."""
+    edited = json.loads(json.dumps(document))
+    part = edited
+    for key in place[:-1]:
+        part = part[key]
+    part[place[-1]] = shifted(part[place[-1]])
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(edited))
+    with pytest.raises(CalibrationFileError, match="by what the file says otherwise it is"):
+        load_calibration(path)
+
+
+@pytest.mark.parametrize("place", [p for p in EDITED if "residual" in p[-1:] or len(p) == 1])
+def test_a_number_that_follows_may_be_left_out(document, tmp_path, place):
+    edited = json.loads(json.dumps(document))
+    part = edited
+    for key in place[:-1]:
+        part = part[key]
+    del part[place[-1]]
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(edited))
+    assert calibration_document(load_calibration(path)) == document
+
+
+def test_tables_are_plain_records(root):
+    made = calibrate(load_session(root / "examples/raw-cycles"), "lengths")
+    parameters, readings = parameter_table(made), reading_table(made)
+    assert [p["name"] for p in parameters] == [p.name for p in made.parameters]
+    assert [r["residual"] for r in readings] == [r.residual for r in made.residuals]
+    low, high = made.intervals[0]
+    assert (parameters[0]["low"], parameters[0]["high"]) == (low, high)
+    for table in (parameters, readings):
+        assert len({tuple(record) for record in table}) == 1  # one header for all
+        assert json.loads(json.dumps(table, allow_nan=False)) == table
+        writer = csv.DictWriter(io.StringIO(), table[0])
+        writer.writerows(table)
