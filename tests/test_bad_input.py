@@ -1392,13 +1392,18 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "value-infinite",
-        f"{CALIBRATION}: dof: found 'inf'; expected a finite number",
+        f"{CALIBRATION}: noise.dof: found 'inf'; expected a finite number",
         swap(FILE, '"dof": 3.0', '"dof": 1e999'),
     ),
     calibration(
         "covariance-too-large",
-        f"{CALIBRATION}: covariance: expected 3 × 3 numbers, as free parameters",
+        f"{CALIBRATION}: covariance: expected rows of the same length",
         put(FILE, "covariance.0", [1e-9, 0.0, 0.0, 0.0]),
+    ),
+    calibration(
+        "covariance-too-small",
+        f"{CALIBRATION}: covariance: expected 3 × 3 numbers, as free parameters",
+        put(FILE, "covariance", [[1e-9, 0.0], [0.0, 1e-9]]),
     ),
     calibration(
         "section-form",
@@ -1416,7 +1421,11 @@ CALIBRATION_CASES = [
         f"{CALIBRATION}: postures[0].passive: has 1 numbers; expected 18, one a passive joint",
         put(FILE, "postures.0.passive", [0.0]),
     ),
-    calibration("no-residuals", f"{CALIBRATION}: residuals: is empty", put(FILE, "residuals", [])),
+    calibration(
+        "no-residuals",
+        f"{CALIBRATION}: residuals: found '[]'; expected at least 1 item",
+        put(FILE, "residuals", []),
+    ),
     calibration(
         "parameter-unknown",
         f"{CALIBRATION}: parameters[0].name: 'w_slide.offset' is not an error parameter; did you "
@@ -1491,8 +1500,8 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "sigma-negative",
-        f"{CALIBRATION}: sigma: found '-1.0'; expected greater than or equal to 0",
-        put(FILE, "sigma", -1.0),
+        f"{CALIBRATION}: noise.sigma: found '-1.0'; expected greater than or equal to 0",
+        put(FILE, "noise.sigma", -1.0),
     ),
     calibration(
         "covariance-asymmetric",

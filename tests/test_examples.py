@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import tempfile
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,11 +18,21 @@ from orthocal.errors import NotIdentifiableError
 SCRIPTS = sorted((ROOT / "examples").glob("[0-9]*.py"))
 
 
+@cache
+def run(*words):
+    """A script, or orthocal with arguments; once, for all that look at what it prints."""
+    script = words[0].endswith(".py")
+    command = [sys.executable, *(() if script else ("-m", "orthocal.cli")), *words]
+    with tempfile.TemporaryDirectory() as elsewhere:
+        return subprocess.run(
+            command, cwd=elsewhere if script else ROOT, capture_output=True, text=True
+        )
+
+
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda p: p.name)
-def test_an_example_runs_from_anywhere(script, tmp_path):
-    done = subprocess.run(
-        [sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
+def test_an_example_runs_from_anywhere(script):
+    done = run(str(script))
+    assert done.returncode == 0
     assert done.stderr == ""
     assert done.stdout
     assert len(script.read_text().splitlines()) <= 80
@@ -66,14 +78,9 @@ def test_the_readmes_commands_run(root, tmp_path):
         ("Verdict", "compare examples/table1/experiment-2"),
     ],
 )
-def test_the_readmes_printed_results_are_the_real_ones(root, title, command):
+def test_the_readmes_printed_results_are_the_real_ones(title, command):
     shown = next(b for b in blocks("text") if title in b)
-    done = subprocess.run(
-        [sys.executable, "-m", "orthocal.cli", *command.split()],
-        cwd=root,
-        capture_output=True,
-        text=True,
-    )
+    done = run(*command.split())
     printed = [line.rstrip() for line in done.stdout.splitlines()]
     for line in shown.splitlines():
         assert line.rstrip() in printed
@@ -84,7 +91,7 @@ def test_the_readmes_printed_results_are_the_real_ones(root, title, command):
 def test_what_the_readme_says_of_the_papers_readings_is_what_the_example_prints():
     text = " ".join((ROOT / "README.md").read_text().split())
     script = ROOT / "examples/02_what_readings_are_worth.py"
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
+    done = run(str(script))
     rows = {}
     for line in done.stdout.split("\n\n")[0].splitlines()[1:]:
         rows[line[:26].strip()] = [float(v) / 1e3 for v in line[36:].split()]

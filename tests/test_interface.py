@@ -139,8 +139,8 @@ SHAPES = [5, None, [1, 2], [[1, 2]], np.zeros((2, 2, 3)), [], "abc", {}, [1j, 0,
 def test_coordinates_of_other_shapes(value, calibration, orthoglide):
     assembly = Assembly(orthoglide)
     for act in (
-        calibration.forward,
-        calibration.inverse,
+        calibration.machine.forward,
+        calibration.machine.inverse,
         assembly.close,
         assembly.forward,
         assembly.inverse,

@@ -35,12 +35,18 @@ def test_the_wheel_holds_robots_and_types(wheel):
 
 def test_the_installed_wheel_calibrates_from_elsewhere(wheel, root, tmp_path):
     """A fresh environment: the wheel and what it declares, nothing else."""
-    subprocess.run([sys.executable, "-m", "venv", tmp_path / "env"], check=True)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "env"], check=True)
     python = tmp_path / "env/bin/python"
-    subprocess.run(
-        [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", wheel],
-        check=True,
-    )
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        python,
+        "--quiet",
+        "--disable-pip-version-check",
+    ]
+    subprocess.run([*pip, "install", "--no-compile", wheel], check=True)
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     session = elsewhere / "session"

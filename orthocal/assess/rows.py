@@ -15,13 +15,8 @@ from orthocal.assess.tool import error_covariance
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.fields import read_only
-from orthocal.kinematics.assembly import (
-    Assembly,
-    Failures,
-    as_rows,
-    find_beyond_travel,
-    nominal_assembly,
-)
+from orthocal.kinematics.assembly import Assembly, find_beyond_travel, nominal_assembly
+from orthocal.kinematics.continuation import Failures, as_rows
 from orthocal.kinematics.sensitivity import ToolSensitivity
 
 Array = NDArray[np.float64]

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.kinematics.assembly import Machine
 from orthocal.kinematics.compiled import CompiledRobot
+from orthocal.kinematics.continuation import MachineNumbers
 from orthocal.kinematics.error_map import Slopes
 from orthocal.measurement.observations import Observations
 from orthocal.measurement.sensing import SensorGroup
@@ -165,7 +165,7 @@ class Expander:
         self._reading = [_Scatter.of(g.reading.slopes.pattern("by_twists"), place) for g in groups]
 
     def __call__(
-        self, machine: Machine, slopes: Slopes, passive: Array, unknowns: Array
+        self, machine: MachineNumbers, slopes: Slopes, passive: Array, unknowns: Array
     ) -> Expansion:
         """Expand about a machine, with what errors do to it, and passive coordinates.
 

@@ -27,8 +27,9 @@ from orthocal.estimation.pieces import (
     ReadingPiece,
 )
 from orthocal.estimation.selection import Known, Selection, select_parameters
-from orthocal.kinematics.assembly import Assembly, Machine
+from orthocal.kinematics.assembly import Assembly
 from orthocal.kinematics.compiled import CompiledRobot, compiled_robot
+from orthocal.kinematics.continuation import MachineNumbers
 from orthocal.kinematics.error_map import Slopes
 from orthocal.kinematics.kept import once_a_robot
 from orthocal.kinematics.machine_map import MachineMap
@@ -397,7 +398,7 @@ class CalibrationProblem:
         selection = self.machine_selection
         return self.compiled.errors.columns(selection.names) * selection.tolerances
 
-    def _machine_and_slopes(self, theta: ArrayLike) -> tuple[Machine, Slopes]:
+    def _machine_and_slopes(self, theta: ArrayLike) -> tuple[MachineNumbers, Slopes]:
         """The machine, and what tolerances of the free parameters do to it."""
         machine = self._of_machine(theta)
         errors = self.assembly.errors(machine)
@@ -407,7 +408,7 @@ class CalibrationProblem:
         self,
         group: SensorGroup,
         part: slice,
-        machine: Machine,
+        machine: MachineNumbers,
         passive: Array,
         unknowns: Array,
     ) -> Array:

@@ -1,16 +1,14 @@
-"""Closing the loops of a robot numerically: Newton's method over many postures at once.
+"""Closing the loops of a robot numerically, many postures at once.
 
 Forward: commanded drives to passive coordinates and tool centre point. Inverse: tool centre point
-to drives. A posture that a plain start does not reach is approached along a straight path from the
-mechanical zero, so that the loops stay in the branch of assembly in which the machine was built.
+to drives.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,8 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.arguments import require_kind
 from orthocal.errors import ClosureError, RobotError
 from orthocal.kinematics.compiled import compiled_robot
+from orthocal.kinematics.continuation import (
+    Failures,
+    MachineNumbers,
+    System,
+    as_rows,
+    follow,
+    refuse_singular,
+)
 from orthocal.kinematics.kept import once_a_robot
-from orthocal.robot.closing import describe_opening
 from orthocal.robot.model import (
     Robot,
     Tcp,
@@ -28,113 +33,11 @@ from orthocal.robot.model import (
     coordinate_limits,
     coordinate_units,
 )
-from orthocal.units import DRIVE_UNITS
 
 Array = NDArray[np.float64]
-Failures = dict[int, ClosureError]
-"""Index of a posture to why it cannot be reached."""
-
-CLOSED = 1e-12
-"""Largest scaled residual of closed loops, relative to max(1 m, characteristic length), [m]."""
-
-SINGULAR_BELOW = 1e-5
-"""Ratio of smallest to largest singular value below which a posture counts as singular. Near a
-singular posture Newton stops where the residual, quadratic in the distance, is below CLOSED: a
-smaller ratio would not be seen. The Orthoglide has 1/20 to 1/60."""
-
-SURELY = 0.1
-"""Part of the bound at which rounding errors of an inverse are of no account."""
-
-TOO_FAR = 1e3
-"""A Newton step that goes farther comes from rows that depend on each other, [m or rad]."""
-
-LAST_STEP = 1e-6
-"""A step from closed loops that goes farther is that of a nearly singular posture, [m or rad]."""
-
 SOLUTIONS_REMEMBERED = 4
 MOST_REMEMBERED = 1000
 """Solutions that an assembly keeps, of at most so many postures: what asks for one asks again."""
-
-MAX_NEWTON_STEPS = 30
-SMALLEST_CONTINUATION_STEP = 1.0 / 512.0
-LARGEST_CONTINUATION_MOVE = 0.3
-"""Change of a passive coordinate in one continuation step, [rad] or characteristic lengths."""
-
-_LIMIT_SLACK = 1e-9
-
-
-class Machine(NamedTuple):
-    """What errors make of a machine: numbers that every posture shares."""
-
-    placements: Array
-    """Shape (12 n_moved,), [1, m]."""
-    offset: Array
-    """Shape (n_drives,), [m, rad]."""
-    gain: Array
-    """Shape (n_drives,)."""
-
-    def drives(self, commanded: Array) -> Array:
-        """Where drives really are, shape (..., n_drives) of commanded coordinates, [m, rad]."""
-        return np.asarray(self.gain * commanded + self.offset)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _System:
-    """A square or redundant system r(x, p) = 0 of many postures, in metres."""
-
-    evaluate: Callable[[Array, Array, Machine], tuple[Array, Array]]
-    """(x, p, machine) -> residuals (K, n_rows), Jacobians by x (K, n_rows, n_x)."""
-    n_rows: int
-    n_x: int
-    start: Array
-    """x of the mechanical zero of the nominal machine, shape (n_x,)."""
-    origin: Array
-    """p of the mechanical zero of the nominal machine, shape (n_p,)."""
-    units: Array
-    """Metres that one unit of x amounts to, shape (n_x,)."""
-    lower: Array
-    upper: Array
-    """Bounds of x, shape (n_x,)."""
-    names: tuple[str, ...]
-    """Joint of each x."""
-    row_units: Array
-    """Metres that one unit of each row amounts to, by which it was multiplied, shape (n_rows,)."""
-    turns: NDArray[np.bool_]
-    """Which rows are rotations, shape (n_rows,)."""
-    shortest: bool = False
-    """Whether steps are the shortest that close it: where motions may be free, what a solve makes
-    of a matrix that is singular but for its rounding is no step."""
-
-    def step(self, residuals: Array, jacobians: Array) -> Array:
-        """Newton steps, shape (K, n_x); least squares where rows depend on each other."""
-        if self.n_rows == self.n_x and not self.shortest:
-            try:
-                steps = np.asarray(np.linalg.solve(jacobians, -residuals[..., None])[..., 0])
-            except np.linalg.LinAlgError:
-                return self._shortest_step(residuals, jacobians)
-            lost = ~(np.abs(steps).max(axis=1, initial=0.0) < TOO_FAR)
-            if lost.any():
-                steps[lost] = self._shortest_step(residuals[lost], jacobians[lost])
-            return steps
-        return self._shortest_step(residuals, jacobians)
-
-    def _shortest_step(self, residuals: Array, jacobians: Array) -> Array:
-        steps = np.full((len(residuals), self.n_x), np.nan)  # no step: dropped by who asks
-        usable = np.isfinite(jacobians).all(axis=(1, 2))
-        inverse = np.linalg.pinv(jacobians[usable], rcond=1e-10)
-        with np.errstate(over="ignore"):  # likewise
-            steps[usable] = -(inverse @ residuals[usable][..., None])[..., 0]
-        return steps
-
-    def describe(self, x: Array, p: Array, machine: Machine) -> str:
-        """By how much the rows of one posture are open, in words."""
-        residuals, _ = self.evaluate(x[None], p[None], machine)
-        return describe_opening(residuals[0] / self.row_units, self.turns)
-
-    def within_limits(self, x: Array) -> NDArray[np.bool_]:
-        """Whether each posture keeps its joints within their limits, shape (K,)."""
-        inside = (x >= self.lower - _LIMIT_SLACK) & (x <= self.upper + _LIMIT_SLACK)
-        return np.asarray(inside.all(axis=1))
 
 
 class Assembly:
@@ -206,7 +109,7 @@ class Assembly:
     def _close(
         self,
         drives: Array,
-        machine: Machine,
+        machine: MachineNumbers,
         start: ArrayLike | None,
         names: Sequence[str] | None,
         failures: Failures | None,
@@ -214,9 +117,9 @@ class Assembly:
         allow_free: bool,
     ) -> Array:
         system = replace(self._closing, shortest=allow_free)
-        passive = self._solve(system, drives, machine, start, names, failures)
+        passive = follow(system, drives, machine, start, names, failures)
         if not allow_free:
-            self._refuse_singular(drives, passive, machine, names, failures)
+            refuse_singular(system, drives, passive, machine, names, failures)
         return passive
 
     def _once(self, key: tuple[object, ...], solve: Callable[[], Array]) -> Array:
@@ -311,11 +214,11 @@ class Assembly:
         """
         p, machine = points, self.machine(theta)
         if failures is not None:
-            x = self._solve(self._inverting, p, machine, None, names, failures)
+            x = follow(self._inverting, p, machine, None, names, failures)
         else:
             x = self._once(
                 ("inverse", p.tobytes(), *(part.tobytes() for part in machine)),
-                lambda: self._solve(self._inverting, p, machine, None, names, None),
+                lambda: follow(self._inverting, p, machine, None, names, None),
             )
         return x[:, : len(self.robot.drives)], x[:, len(self.robot.drives) :]
 
@@ -336,10 +239,10 @@ class Assembly:
         """All errors of the machine for values of the free ones, shape (n_errors,), [SI]."""
         return np.asarray(self._fixed + self._columns @ self._theta(theta))
 
-    def machine(self, theta: ArrayLike | None = None) -> Machine:
+    def machine(self, theta: ArrayLike | None = None) -> MachineNumbers:
         """The machine for values of the free parameters, shape (n_free,); 0 by default."""
         errors, at = self._compiled.errors, self.errors(theta)
-        return Machine(errors.placements(at), errors.offsets(at), errors.gains(at))
+        return MachineNumbers(errors.placements(at), errors.offsets(at), errors.gains(at))
 
     def _theta(self, theta: ArrayLike | None) -> Array:
         if theta is None:
@@ -357,15 +260,15 @@ class Assembly:
         return self.robot.tcp
 
     @cached_property
-    def _closing(self) -> _System:
+    def _closing(self) -> System:
         robot, function = self.robot, self._compiled.closing
 
-        def evaluate(x: Array, p: Array, machine: Machine) -> tuple[Array, Array]:
+        def evaluate(x: Array, p: Array, machine: MachineNumbers) -> tuple[Array, Array]:
             g, g_q = function(machine.drives(p), x, machine.placements)
             return g, g_q
 
         lower, upper = coordinate_limits(robot)
-        return _System(
+        return System(
             evaluate=evaluate,
             n_rows=robot.closure_rows,
             n_x=robot.passive_index.size,
@@ -377,10 +280,11 @@ class Assembly:
             names=_joint_names(robot, robot.passive_index),
             row_units=closure_row_units(robot),
             turns=closure_turns(robot),
+            length=robot.characteristic_length,
         )
 
     @cached_property
-    def _inverting(self) -> _System:
+    def _inverting(self) -> System:
         robot = self.robot
         tcp = self._require_tcp()
         chosen = list(tcp.coordinates)
@@ -392,7 +296,7 @@ class Assembly:
             )
         function, n_d = self._compiled.inverting, len(robot.drives)
 
-        def evaluate(x: Array, p: Array, machine: Machine) -> tuple[Array, Array]:
+        def evaluate(x: Array, p: Array, machine: MachineNumbers) -> tuple[Array, Array]:
             d, q = x[:, :n_d], x[:, n_d:]
             g, g_a, g_q, tool, t_a, t_q = function(machine.drives(d), q, machine.placements)
             residuals = np.concatenate([g, tool[:, chosen] - p], axis=1)
@@ -404,7 +308,7 @@ class Assembly:
         lower, upper = coordinate_limits(robot)
         zero_passive = robot.zero[robot.passive_index]
         origin = nominal_assembly(robot).tcp(robot.drive_zero, zero_passive)[chosen]
-        return _System(
+        return System(
             evaluate=evaluate,
             n_rows=robot.closure_rows + len(chosen),
             n_x=index.size,
@@ -416,130 +320,8 @@ class Assembly:
             names=_joint_names(robot, index),
             row_units=np.append(closure_row_units(robot), np.ones(len(chosen))),
             turns=np.append(closure_turns(robot), np.zeros(len(chosen), dtype=np.bool_)),
+            length=robot.characteristic_length,
         )
-
-    def _solve(
-        self,
-        system: _System,
-        targets: Array,
-        machine: Machine,
-        start: ArrayLike | None,
-        names: Sequence[str] | None,
-        failures: Failures | None,
-    ) -> Array:
-        """Newton along the straight path from the origin (or a given start) to each target.
-
-        The first try is the whole way; a posture that does not converge, or moves so far that it
-        may have changed its branch of assembly, is approached in halved steps.
-        """
-        tolerance = CLOSED * max(1.0, self.robot.characteristic_length)
-        count = len(targets)
-
-        labels = names if names is not None else [f"posture {i + 1}" for i in range(count)]
-        if len(labels) != count:
-            raise ValueError(f"found {len(labels)} names for {count} rows")
-
-        lost_for_good = np.zeros(count, dtype=bool)
-
-        def refuse(i: int, reason: str, residual: float | None) -> None:
-            error = ClosureError(reason, posture=labels[i], residual=residual)
-            if failures is None:
-                raise error
-            failures.setdefault(i, error)
-            lost_for_good[i] = True
-
-        for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)).tolist():
-            refuse(i, "has coordinates that are not numbers", None)
-        first = system.start if start is None else as_rows(start, system.n_x, "start values")[0]
-        x = np.array(np.broadcast_to(first, (count, system.n_x)))
-        moves = np.where(system.units == 1.0, self.robot.characteristic_length, 1.0)
-        done, step = np.zeros(count), np.ones(count)
-        pending = np.flatnonzero(~lost_for_good)
-        fresh = np.full(count, start is not None)
-        while pending.size:
-            reach = np.minimum(1.0, done[pending] + step[pending])
-            way = system.origin + reach[:, None] * (targets[pending] - system.origin)
-            trial, worst = _newton(system, x[pending], way, machine, tolerance)
-            moved = np.abs((trial - x[pending]) / moves).max(axis=1, initial=0.0)
-            good = (worst < tolerance) & (moved < LARGEST_CONTINUATION_MOVE)
-            x[pending[good]] = trial[good]
-            done[pending[good]] = reach[good]
-            lost = pending[~good & fresh[pending]]  # the given start was no help: begin at zero
-            x[lost], step[lost] = system.start, 2.0
-            fresh[pending] = False
-            step[pending[~good]] *= 0.5
-            for i in pending[~good & (step[pending] < SMALLEST_CONTINUATION_STEP)].tolist():
-                last, final = _newton(system, x[[i]], targets[[i]], machine, tolerance)
-                reason = (
-                    "cannot be reached from the mechanical zero without changing the way in "
-                    f"which the loops are assembled, {done[i]:.0%} of the way"
-                    if final[0] < tolerance
-                    else "cannot be reached: the loops stay open by "
-                    f"{system.describe(last[0], targets[i], machine)}, {done[i]:.0%} of the way "
-                    "from the mechanical zero"
-                )
-                refuse(i, reason, float(final[0]))
-            pending = pending[(done[pending] < 1.0) & ~lost_for_good[pending]]
-        for i in np.flatnonzero(~system.within_limits(x) & ~lost_for_good).tolist():
-            over = np.maximum(x[i] - system.upper, system.lower - x[i])
-            j = int(over.argmax())
-            unit, size = DRIVE_UNITS["m" if system.units[j] == 1.0 else "rad"]
-            reason = (
-                f"cannot be reached: joint '{system.names[j]}' would be at "
-                f"{x[i][j] / size:.4g} {unit}, outside its limits "
-                f"{system.lower[j] / size:g} ... {system.upper[j] / size:g} {unit}"
-            )
-            refuse(i, reason, 0.0)
-        x[lost_for_good] = np.nan
-        return x
-
-    def _refuse_singular(
-        self,
-        drives: Array,
-        passive: Array,
-        machine: Machine,
-        names: Sequence[str] | None,
-        failures: Failures | None,
-    ) -> None:
-        system = self._closing
-        if system.n_x == 0:
-            return
-        solved = np.flatnonzero(np.isfinite(passive).all(axis=1))
-        _, jacobians = system.evaluate(passive[solved], drives[solved], machine)
-        scaled = jacobians / system.units
-        doubtful = ~_far_from_singular(scaled)
-        solved, scaled = solved[doubtful], scaled[doubtful]
-        values = np.linalg.svd(scaled, compute_uv=False)
-        smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
-        largest = values.max(axis=1, initial=0.0)  # without closures there are no values
-        ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), solved.shape)
-        for k in np.argsort(ratio)[: int((ratio < SINGULAR_BELOW).sum())].tolist():
-            i = int(solved[k])
-            free = int((values[k] > SINGULAR_BELOW * largest[k]).sum())
-            error = ClosureError(
-                f"is singular: the drives leave {system.n_x - free} of "
-                f"{system.n_x} passive motions free",
-                posture=names[i] if names is not None else f"posture {i + 1}",
-            )
-            if failures is None:
-                raise error
-            failures[i] = error
-            passive[i] = np.nan
-
-
-def _far_from_singular(matrices: Array) -> NDArray[np.bool_]:
-    """Whether the ratio of singular values is above SINGULAR_BELOW for sure, shape (K,).
-
-    By Frobenius' norm it is at least 1/(|A| |A⁻¹|), which takes half the time.
-    """
-    if matrices.shape[1] != matrices.shape[2] or not matrices.size:
-        return np.zeros(len(matrices), dtype=np.bool_)
-    try:
-        inverses = np.linalg.inv(matrices)
-    except np.linalg.LinAlgError:
-        return np.zeros(len(matrices), dtype=np.bool_)
-    sizes = np.linalg.norm(matrices, axis=(1, 2)) * np.linalg.norm(inverses, axis=(1, 2))
-    return np.asarray(sizes < SURELY / SINGULAR_BELOW)
 
 
 @once_a_robot(maxsize=8)
@@ -560,66 +342,6 @@ def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str]) -> Fai
             )
             failures.setdefault(i, ClosureError(reason, posture=names[i]))
     return failures
-
-
-def as_rows(values: ArrayLike, n: int, what: str) -> tuple[Array, bool]:
-    """Numbers as an array of shape (K, n), and whether they were a single row.
-
-    Raises:
-        ValueError: If they are no numbers, or not so many a row.
-    """
-    try:
-        given = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"found {type(values).__name__}; expected {n} {what} a row") from None
-    if given.ndim not in (1, 2) or given.shape[-1] != n:
-        raise ValueError(f"found the shape {given.shape}; expected {n} {what} a row, (K, {n})")
-    return np.atleast_2d(given), given.ndim == 1
-
-
-def _newton(
-    system: _System, x: Array, p: Array, machine: Machine, tolerance: float
-) -> tuple[Array, Array]:
-    """Damped Newton of many postures at once.
-
-    Returns:
-        Solutions, shape (K, n_x), and the largest residual of each, shape (K,), [m].
-    """
-    x = np.array(x)
-    residuals, jacobians = system.evaluate(x, p, machine)
-    worst = np.abs(residuals).max(axis=1, initial=0.0)
-    active = np.flatnonzero(worst >= tolerance)
-    for _ in range(MAX_NEWTON_STEPS):
-        if not active.size:
-            break
-        step = system.step(residuals[active], jacobians[active])
-        usable = np.isfinite(step).all(axis=1)
-        active, step = active[usable], step[usable]
-        scale = np.ones(len(active))
-        pending = np.arange(len(active))
-        moved = np.zeros(len(active), dtype=bool)
-        for _ in range(6):
-            rows = active[pending]
-            trial = x[rows] + scale[pending, None] * step[pending]
-            r, j = system.evaluate(trial, p[rows], machine)
-            size = np.abs(r).max(axis=1, initial=0.0)
-            better = size < worst[rows]
-            good = rows[better]
-            x[good], residuals[good], jacobians[good] = trial[better], r[better], j[better]
-            worst[good] = size[better]
-            moved[pending[better]] = True
-            pending = pending[~better]
-            scale[pending] *= 0.25
-            if not pending.size:
-                break
-        active = active[moved]
-        active = active[worst[active] >= tolerance]
-    closed = np.flatnonzero((worst < tolerance) & np.isfinite(jacobians).all(axis=(1, 2)))
-    if closed.size and system.n_x:  # what is left goes too: residual and slope are at hand
-        step = system.step(residuals[closed], jacobians[closed])
-        small = np.abs(step).max(axis=1) < LAST_STEP
-        x[closed[small]] += step[small]
-    return x, worst
 
 
 def _joint_names(robot: Robot, index: NDArray[np.int64]) -> tuple[str, ...]:

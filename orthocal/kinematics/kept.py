@@ -21,7 +21,12 @@ from orthocal.robot.model import Robot
 
 Made = TypeVar("Made")
 
-_BUILT_BY = ("kinematics", "sensors", "robot")
+MOST_RECENT = 256
+"""Functions that a process keeps; one takes up to 2 MB."""
+
+_RECENT: dict[str, ca.Function] = {}
+
+_BUILT_BY = ("kinematics", "sensors", "robot", "estimation", "estimation/solvers")
 """Folders with the code that builds functions."""
 
 
@@ -34,19 +39,33 @@ def kept_function(robot: Robot, name: str, build: Callable[[], ca.Function]) -> 
         build: Builds it.
     """
     key = f"function {name}\n{fingerprint(robot)}\n{_code()}"
+    if key not in _RECENT:
+        function = _recall(key)
+        if function is None:
+            function = build()
+            _keep(key, function)
+        if len(_RECENT) >= MOST_RECENT:
+            _RECENT.pop(next(iter(_RECENT)))
+        _RECENT[key] = function
+    return _RECENT[key]
+
+
+def _recall(key: str) -> ca.Function | None:
     content = cache.recall(key)
-    if content is not None:
-        try:
-            return ca.Function.deserialize(content.decode("ascii"))
-        except (RuntimeError, ValueError):  # of a casadi that was built otherwise
-            pass
-    function = build()
+    if content is None:
+        return None
+    try:
+        return ca.Function.deserialize(content.decode("ascii"))
+    except (RuntimeError, ValueError):  # of a casadi that was built otherwise
+        return None
+
+
+def _keep(key: str, function: ca.Function) -> None:
     try:
         text = function.serialize()
-    except RuntimeError:
-        return function
+    except RuntimeError:  # some cannot be written
+        return
     cache.keep(key, text.encode("ascii"))
-    return function
 
 
 class _Content:

@@ -6,6 +6,7 @@ one function that is built, of a single placement, is mapped over all of them.
 
 from __future__ import annotations
 
+import hashlib
 from functools import lru_cache
 
 import casadi as ca
@@ -30,10 +31,12 @@ class MachineMap:
         placements: Symbol for the moved placements, shape (12 n_moved,).
         symbols: θ̂, placements and the nonzeros of their slopes: what pieces take as inputs.
         function: θ̂ to the values of the symbols.
+        digest: Of the numbers that are constants here.
     """
 
     def __init__(self, errors: ErrorMap, *, fixed: Array, columns: Array) -> None:
         n_moved, n_free = len(errors.moved), columns.shape[1]
+        self.digest = hashlib.sha256(fixed.tobytes() + columns.tobytes()).hexdigest()
         inner, base = errors.twists_of(columns.T).T, errors.twists_of(fixed)
         theta = ca.SX.sym("theta", n_free)
         slopes = ca.SX.sym("slopes", _slope_pattern(inner))

@@ -41,6 +41,8 @@ class CompiledReading:
     twists the nonzeros alone."""
     expression: ca.Function
     """The same with sparse rows, to be put into other expressions."""
+    words: str
+    """What distinguishes it from other readings of the robot."""
 
 
 def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
@@ -91,6 +93,7 @@ def _compile(pattern: _Pattern) -> CompiledReading:
         value=BatchFunction(value, shared=["placements"]),
         slopes=BatchFunction(slopes, shared=["placements"], matrices=rows, sparse=["by_twists"]),
         expression=slopes,
+        words=pattern.words,
     )
 
 

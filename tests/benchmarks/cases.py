@@ -19,6 +19,7 @@ from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.choice import build_program
 from orthocal.estimation.solvers.program import Program, Solution
+from orthocal.measurement.joining import join_sessions
 from orthocal.measurement.session import Session
 from orthocal.measurement.synthetic import draw_errors
 
@@ -37,6 +38,9 @@ OFFSET_SIGMA = 2e-3
 
 SWEEP = 27
 """Postures of `plans.sweep`; sessions of other sizes are made by `spread_plan`."""
+
+LARGEST_PLAN = 2000
+"""Postures of one plan; more are several sessions in one problem, as no file may be that large."""
 
 SECTIONS = [0.36, 0.425, 0.5, 0.575, 0.64]
 """Fractions of a leg that the gauge touches between -100 and 60 mm: 0.323 are left at the root
@@ -110,10 +114,17 @@ def simulate(n_postures: int, *, seed: int = 1) -> Session:
         n_postures: SWEEP, or a multiple of 3.
         seed: Of errors, noise and gauge zeros.
     """
-    plan = plans.sweep() if n_postures == SWEEP else spread_plan(n_postures)
-    with tempfile.TemporaryDirectory() as folder:
-        session = load_plan(plans.write(Path(folder), plan))
-    return resimulate(session, seed=seed)
+    parts = -(-n_postures // LARGEST_PLAN)
+    sizes = [3 * len(part) for part in np.array_split(np.arange(n_postures // 3), parts)]
+    if n_postures == SWEEP:
+        found = [plans.sweep()]
+    else:
+        found = [spread_plan(size, seed=i) for i, size in enumerate(sizes)]
+    sessions = []
+    for plan in found:
+        with tempfile.TemporaryDirectory() as folder:
+            sessions.append(load_plan(plans.write(Path(folder), plan)))
+    return resimulate(join_sessions(sessions), seed=seed)
 
 
 def resimulate(session: Session, *, seed: int) -> Session:
@@ -179,7 +190,10 @@ def measure(n_postures: int, solver: SolverKind = "ipopt") -> Timing:
 
 
 def measure_apart(n_postures: int, solver: SolverKind = "ipopt") -> Timing:
-    """Time one identification in a fresh process, whose peak of memory is its own."""
+    """Time one identification in a fresh process, whose peak of memory is its own.
+
+    With ORTHOCAL_CACHE=off it builds all that a robot needs, too.
+    """
     with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as pool:
         return pool.submit(measure, n_postures, solver).result()
 

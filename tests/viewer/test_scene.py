@@ -16,7 +16,7 @@ from orthocal import calibrate, draw_scene, load_robot, load_session
 from orthocal.assess.accuracy import assess_tool, find_excess, measure_uncertainty
 from orthocal.assess.entering import find_entries
 from orthocal.assess.tool import error_covariance
-from orthocal.calibration.file import load_calibration
+from orthocal.calibration.file import load_calibration, write_calibration
 from orthocal.errors import ParameterError
 from orthocal.measurement.session_file import load_plan
 from orthocal.measurement.synthetic import simulate_session
@@ -525,7 +525,7 @@ def test_the_page_is_what_meshcats_own_interface_gives(scene):
 
 
 def test_loaded_calibration_makes_the_same_scene(calibration, tmp_path):
-    path = calibration.save(tmp_path / "calibration.json")
+    path = write_calibration(calibration, tmp_path / "calibration.json")
     assert draw_scene(load_calibration(path)).to_html() == draw_scene(calibration).to_html()
 
 

@@ -18,6 +18,7 @@ from orthocal import Choice, calibrate, load_session
 from orthocal.show import layout
 from orthocal.show.report import figure as style
 from orthocal.show.report import parameter_plots, reading_plots
+from orthocal.units import MM
 
 PLOTS = (
     reading_plots.plot_residuals,
@@ -255,9 +256,7 @@ def test_markers_in_the_file_are_where_the_deviations_are(table1):
 
 def test_the_band_is_two_sigma_of_each_row(table1):
     mixed = [replace(r, minus=r.minus if i < 3 else None) for i, r in enumerate(table1.residuals)]
-    mixed_up = replace(
-        table1, residuals=tuple(mixed), rows_are_differences=False, sigma=table1.sigma / np.sqrt(2)
-    )
+    mixed_up = replace(table1, residuals=tuple(mixed), rows_are_differences=False)
     for calibration, word in ((table1, "difference"), (mixed_up, "row")):
         axes = draw(reading_plots._draw_residuals, calibration, 40).axes[0]
         (band,) = axes.containers
@@ -353,7 +352,7 @@ def test_the_worst_of_many_setups_are_shown(sweep):
 def test_setups_without_any_error_stay_on_a_logarithmic_axis(table1):
     rows = tuple(replace(r, predicted=r.measured, nominal=r.measured) for r in table1.residuals)
     axes = draw(reading_plots._draw_setups, replace(table1, residuals=rows), 40).axes[0]
-    assert (line(axes, "after")[0] == reading_plots.SMALLEST_LENGTH * 1e3).all()
+    assert (line(axes, "after")[0] == reading_plots.SMALLEST_LENGTH / MM).all()
     low, high = axes.get_xlim()
     assert 0.0 < low < reading_plots.SMALLEST_LENGTH * 1e3 < table1.sigma * 1e3 < high
 
