@@ -24,6 +24,7 @@ _HOMES = {
     "ClosureError": "orthocal.errors",
     "Comparison": "orthocal.assess.comparison",
     "Decision": "orthocal.assess.findings.decision",
+    "ExportError": "orthocal.errors",
     "Finding": "orthocal.assess.findings.finding",
     "Gauge": "orthocal.measurement.session",
     "LiveScene": "orthocal.viewer.live",
@@ -57,6 +58,7 @@ _HOMES = {
     "decide_validation": "orthocal.assess.findings.validation",
     "draw_errors": "orthocal.measurement.synthetic",
     "draw_scene": "orthocal.show.scene.drawing",
+    "export_calibration": "orthocal.export.formats",
     "join_sessions": "orthocal.measurement.joining",
     "load_calibration": "orthocal.calibration.file",
     "load_plan": "orthocal.measurement.session_file",
@@ -83,6 +85,7 @@ __all__ = [
     "ClosureError",
     "Comparison",
     "Decision",
+    "ExportError",
     "Finding",
     "Gauge",
     "LiveScene",
@@ -116,6 +119,7 @@ __all__ = [
     "decide_validation",
     "draw_errors",
     "draw_scene",
+    "export_calibration",
     "join_sessions",
     "load_calibration",
     "load_plan",
@@ -152,6 +156,7 @@ if TYPE_CHECKING:
     from orthocal.errors import (
         CalibrationFileError,
         ClosureError,
+        ExportError,
         NotIdentifiableError,
         OrthocalError,
         OutputError,
@@ -166,6 +171,7 @@ if TYPE_CHECKING:
     from orthocal.estimation.options import SolverOptions
     from orthocal.estimation.problem import CalibrationProblem
     from orthocal.estimation.solvers.ipopt import NonlinearProgram
+    from orthocal.export.formats import export_calibration
     from orthocal.kinematics.workspace import Workspace
     from orthocal.measurement.joining import join_sessions
     from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup

@@ -56,6 +56,12 @@ class CalibrationFileError(OrthocalError):
     """A calibration file cannot be read, or does not belong to the robot it names."""
 
 
+class ExportError(OrthocalError):
+    """A calibration is not to be entered, or cannot be what a format needs."""
+
+    exit_code = 3
+
+
 class ClosureError(OrthocalError):
     """The loops of the robot cannot be closed in a posture.
 

@@ -37,10 +37,11 @@ ALLOWED = {
     "diagnosis": f"{EDGES} robot kinematics measurement statistics estimation",
     "calibration": f"{EDGES} robot kinematics sensors measurement statistics estimation diagnosis",
     "assess": f"{EDGES} robot kinematics measurement statistics estimation diagnosis calibration",
+    "export": f"{EDGES} robot kinematics calibration assess",
     "viewer": f"{EDGES} robot",
     "show": f"{EDGES} markup robot kinematics sensors measurement statistics diagnosis calibration "
     "assess viewer",
-    "cli": f"{EDGES} robot kinematics measurement estimation calibration assess viewer show",
+    "cli": f"{EDGES} robot kinematics measurement estimation calibration assess export viewer show",
     "__main__": "cli interrupts",
 }
 """What each room may import besides itself: a viewer knows no calibration, statistics no fit,

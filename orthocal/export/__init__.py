@@ -1,0 +1,1 @@
+"""What others take: a calibration as files for controllers and for other programs."""
