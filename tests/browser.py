@@ -25,6 +25,9 @@ PATIENCE = 60.0
 
 SIZES = ((1400, 900), (800, 600))
 
+SMALL = (480, 360)
+"""Where no size is asked about: a page is drawn by software here, a pixel at a time."""
+
 
 @dataclass
 class Visit:

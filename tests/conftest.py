@@ -14,9 +14,12 @@ from orthocal import load_robot, load_session
 from orthocal.measurement.session import Session
 from orthocal.robot.model import Robot
 
-# nothing that tests keep outlives them
-os.environ["ORTHOCAL_CACHE"] = tempfile.mkdtemp(prefix="orthocal-tests-")
-atexit.register(shutil.rmtree, os.environ["ORTHOCAL_CACHE"], ignore_errors=True)
+# nothing that tests keep outlives them; the workers of one run share it
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    os.environ["ORTHOCAL_CACHE"] = tempfile.mkdtemp(prefix="orthocal-tests-")
+    atexit.register(shutil.rmtree, os.environ["ORTHOCAL_CACHE"], ignore_errors=True)
+# processes of tests need not compile what they import
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 ROOT = Path(__file__).parents[1]
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from orthocal import __version__, cli, load_calibration, load_session
+from orthocal.show.report import parameter_plots, reading_plots, tool_map
 
 
 def run(monkeypatch, capsys, *words):
@@ -25,6 +26,15 @@ def run(monkeypatch, capsys, *words):
     captured = capsys.readouterr()
     assert "Traceback" not in captured.out + captured.err
     return code, captured.out, captured.err
+
+
+@pytest.fixture(autouse=True)
+def plots(request, monkeypatch):
+    """Plots are drawn where a page is looked at, and in tests of their own; they take seconds."""
+    if request.function is test_calibrate_prints_and_writes:
+        return
+    for module in (parameter_plots, reading_plots, tool_map):
+        monkeypatch.setattr(module, "render_figure", lambda name, *_: f'<svg id="{name}"/>')
 
 
 @pytest.fixture

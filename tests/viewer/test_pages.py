@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from browser import SIZES, open_browser, require_browser, visit
+from browser import SIZES, SMALL, open_browser, require_browser, visit
 from PIL import Image
 
 from orthocal import LiveScene, calibrate, draw_scene, load_robot, load_session, write_report
@@ -84,7 +84,7 @@ def test_a_setup_with_any_name_is_drawn(name, browser, raw_cycles, tmp_path):
         readings=tuple(replace(r, setup=r.setup.replace("yx", name)) for r in raw_cycles.readings),
     )
     path = draw_scene(session).save(tmp_path / "scene.html")
-    with visit(browser, path.as_uri(), size=SIZES[0]) as found:
+    with visit(browser, path.as_uri(), size=SMALL) as found:
         found.wait_until_drawn()
         assert found.messages == []
         assert is_drawn(found.picture())
@@ -242,7 +242,7 @@ def test_other_scenes_draw_too(browser, root, tmp_path, raw_cycles):
     }
     for name, scene in scenes.items():
         path = scene.save(tmp_path / f"{name}.html")
-        with visit(browser, path.as_uri(), size=SIZES[1]) as found:
+        with visit(browser, path.as_uri(), size=SMALL) as found:
             found.wait_until_drawn()
             assert found.messages == [], name
             assert found.requests == [path.as_uri()], name
@@ -252,7 +252,7 @@ def test_other_scenes_draw_too(browser, root, tmp_path, raw_cycles):
 
 def test_live_page_draws_what_the_server_sends(browser, calibration):
     scene = draw_scene(calibration)
-    with LiveScene(scene) as live, visit(browser, live.url, online=True) as found:
+    with LiveScene(scene) as live, visit(browser, live.url, size=SMALL, online=True) as found:
         found.wait_for(f"viewer.num_messages_received >= {len(scene.commands)}")
         found.wait_until_drawn()
         found.page.wait_for_timeout(500)
