@@ -23,7 +23,7 @@ def gather_sessions(given: Given | Sequence[Given]) -> list[Session]:
     """What was given as one session or several, loaded where it is a path.
 
     Raises:
-        SessionError: If a path is none of a session, or nothing was given.
+        SessionError: If a path is none of a session.
         TypeError: If an argument is of another kind.
     """
     several = [given] if isinstance(given, Session | str | Path) else given
@@ -32,8 +32,6 @@ def gather_sessions(given: Given | Sequence[Given]) -> list[Session]:
     for one in several:
         require_kind(one, (Session, str, Path), expected="a Session, or the path to one")
         found.append(one if isinstance(one, Session) else load_session(one))
-    if not found:
-        raise SessionError("there is no session")
     return found
 
 
@@ -47,8 +45,10 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         sessions: In the order in which they were measured; one alone stays what it is.
 
     Raises:
-        SessionError: If they are of different robots.
+        SessionError: If there are none, or of different robots.
     """
+    if not sessions:
+        raise SessionError("there is no session to join")
     if len(sessions) == 1:
         return sessions[0]
     last = sessions[-1]

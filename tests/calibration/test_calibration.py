@@ -21,7 +21,7 @@ from orthocal import (
 )
 from orthocal.assess.entering import find_entries
 from orthocal.calibration.file import calibration_document, calibration_json, write_calibration
-from orthocal.errors import CalibrationFileError
+from orthocal.errors import CalibrationFileError, ClosureError
 from orthocal.kinematics import orthoglide as closed_form
 from orthocal.show.explanation import explain_fit
 
@@ -230,3 +230,9 @@ def test_one_free_parameter_alone(experiment_2):
     result = calibrate(replace(experiment_2, readings=rows), Choice(base=True))
     assert len(result.free) == 1
     assert np.isfinite(result.covariance).all()
+
+
+def test_the_machine_goes_no_further_than_its_drives(experiment_2):
+    machine = calibrate(experiment_2).machine
+    with pytest.raises(ClosureError, match="x_slide_mm is 391; the drive reaches from 120 to 390"):
+        machine.forward([0.391, 0.31, 0.31])

@@ -8,6 +8,8 @@ import pinocchio as pin
 import pytest
 from tolerances import KINEMATICS
 
+from orthocal import load_robot
+from orthocal.kinematics.assembly import Assembly
 from orthocal.kinematics.compiled import adjoint, compiled_robot, log6_jacobian
 from orthocal.kinematics.error_map import right_jacobian as right_jacobians
 from orthocal.kinematics.machine_map import MachineMap, right_jacobian
@@ -136,3 +138,14 @@ def test_the_adjoint_is_pinocchios():
     pose = pin.exp6(np.array([0.1, 0.2, 0.3, 0.5, -0.4, 0.2]))
     found = np.asarray(ca.DM(ca.evalf(adjoint(constant_pose(pose)))))
     assert np.abs(found - pose.toActionMatrix()).max() < KINEMATICS
+
+
+def test_robots_share_functions_only_where_they_are_the_same(orthoglide):
+    """One that was moved, though from the same file, has functions of its own."""
+    again, moved = load_robot("orthoglide"), orthoglide.with_errors({"x_bar_a.x": 1e-3})
+    assert again is not orthoglide
+    assert compiled_robot(again) is compiled_robot(orthoglide)
+    assert moved.yaml == orthoglide.yaml
+    assert compiled_robot(moved) is not compiled_robot(orthoglide)
+    zero = [Assembly(r).forward(orthoglide.drive_zero + 0.01) for r in (orthoglide, moved)]
+    assert np.abs(zero[1] - zero[0]).max() > 1e-4

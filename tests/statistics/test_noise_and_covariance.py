@@ -16,8 +16,8 @@ from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.measurement.observations import Observations, build_observations
 from orthocal.measurement.sensing import predict_entries
 from orthocal.statistics.chance import chance_of_excess, confidence_factor
-from orthocal.statistics.information import Information, decompose
-from orthocal.statistics.noise import estimate_noise, estimate_repeatability
+from orthocal.statistics.information import Information, decompose, marginalise
+from orthocal.statistics.noise import KnownNoise, Noise, estimate_noise, estimate_repeatability
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
@@ -180,3 +180,48 @@ def test_an_information_without_readings_has_no_rank():
     information = Information(np.zeros((0, 2)), np.zeros(2), np.eye(2))
     assert information.rank == 0
     assert not information.identifiable.any()
+
+
+def test_what_noise_explains_is_yes_no_or_unknown():
+    """Residuals of 12 degrees, 5 of them the cycles' own: an F test; or χ² of a given σ."""
+    chi_square = 5 + 7 * 4.0  # beside the cycles' own 5: F(7, 5) at 4.0, χ² of 12 at 33
+    assert 0.01 < stats.f.sf(4.0, 7, 5) < 0.1
+    assert stats.chi2.sf(chi_square, 12) < 0.001
+    assert KnownNoise(1e-5, "cycles", 5.0).is_exceeded(chi_square, 12) is False
+    assert KnownNoise(1e-5, "gauge", np.inf).is_exceeded(chi_square, 12) is True
+    assert KnownNoise(np.nan, "unknown", 0.0).is_exceeded(chi_square, 12) is None
+    assert KnownNoise(1e-5, "gauge", np.inf).is_exceeded(0.0, 0.0) is None
+
+
+@pytest.mark.parametrize(
+    ("noise", "gauge", "more", "less", "scatter"),
+    [
+        (Noise(1.0, 9.0, "residuals", np.nan, 0, 1.0, 9.0), 1.0, False, False, None),
+        (Noise(3.0, 9.0, "residuals", np.nan, 0, 3.0, 9.0), 1.0, True, False, None),
+        (Noise(0.1, 9.0, "residuals", np.nan, 0, 0.1, 9.0), 1.0, False, True, None),
+        (Noise(3.0, 9.0, "residuals", np.nan, 0, 3.0, 9.0), None, None, None, None),
+        (Noise(3.0, 9.0, "residuals", 1.0, 12, 3.0, 9.0), 1.0, True, False, False),
+        (Noise(3.0, 12.0, "cycles", 3.0, 12, 3.0, 9.0), 1.0, False, False, True),
+        (Noise(1.0, np.inf, "gauge", np.nan, 0, np.nan, 0.0), 1.0, False, None, None),
+        (Noise(np.nan, 0.0, "unknown", np.nan, 0, np.nan, 0.0), None, None, None, None),
+    ],
+)
+def test_what_residuals_and_cycles_say_of_the_gauge(noise, gauge, more, less, scatter):
+    assert noise.leaves_more(gauge) is more
+    assert noise.leaves_less(gauge) is less
+    assert noise.cycles_scatter_more(gauge) is scatter
+
+
+def test_what_is_kept_of_information_is_as_if_the_rest_were_estimated_too():
+    """The covariance of the first parameters beside a prior on the others: Schur's complement."""
+    rng = np.random.default_rng(2)
+    jacobian, sigma = rng.normal(size=(12, 5)), 0.3
+    o = observations([0] * 12, list(range(12)), [0] * 12)
+    whole = decompose(jacobian, o)
+    kept = marginalise(whole, 3, sigma=sigma)
+    prior = np.array([0.0, 0.0, 0.0, 1.0, 1.0])
+    expected = whole.covariance(sigma=sigma, precision=prior)[:3, :3]
+    found = kept.covariance(sigma=sigma, precision=np.zeros(3))
+    assert found == pytest.approx(expected, rel=1e-9)
+    alone = decompose(jacobian[:, :3], o).covariance(sigma=sigma, precision=np.zeros(3))
+    assert (np.diag(alone) < 0.99 * np.diag(expected)).all()
