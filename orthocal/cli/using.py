@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -16,9 +16,6 @@ from orthocal.cli.options import (
 from orthocal.cli.printing import print_rows, put_out
 from orthocal.errors import ClosureError, SessionError
 from orthocal.units import MM
-
-if TYPE_CHECKING:
-    pass
 
 
 @app.command()

@@ -200,8 +200,8 @@ class CompiledRobot:
         return self._batch("tool", outputs, matrices=(1, 2, 3))
 
     def _tool_frame(self) -> int:
-        assert self.robot.tcp is not None
-        return self.robot.frame_id(self.robot.tcp.frame)
+        """Of the tool, which whoever asks has made sure of."""
+        return self.robot.frame_id("" if self.robot.tcp is None else self.robot.tcp.frame)
 
     def wrench_row(
         self, frame: int, *, force: ca.SX, moment: ca.SX | None = None
@@ -337,12 +337,6 @@ def zero_poses(robot: Robot, frames: Sequence[str]) -> list[Array]:
     placements = errors.placements(np.zeros(len(errors.names)))
     zero = robot.drive_zero[None], robot.zero[robot.passive_index][None]
     return [compiled.pose(frame)(*zero, placements)[0][0] for frame in frames]
-
-
-def adjoint(pose: Pose) -> ca.SX:
-    """Action of a pose on twists (translation, rotation), shape (6, 6)."""
-    turned = ca.skew(pose.position) @ pose.rotation
-    return ca.blockcat([[pose.rotation, turned], [ca.SX(3, 3), pose.rotation]])
 
 
 def log6_jacobian(pose: Pose) -> ca.SX:

@@ -82,6 +82,10 @@ def pays(instructions: int, points: int) -> bool:
     return _spent > PATIENCE
 
 
+Compiled = Any
+"""Arrays as numba compiles for them."""
+
+
 @lru_cache(maxsize=1)
 def is_installed() -> bool:
     """Whether there is numba."""
@@ -222,20 +226,20 @@ def _interpreter() -> Callable[..., None]:
     if folder is not None and "NUMBA_CACHE_DIR" not in os.environ:
         numba.config.CACHE_DIR = str(folder)
     keep = folder is not None
-    run: Any = numba.njit(cache=keep, nogil=True, error_model="numpy")(_run)
-    return run  # type: ignore[no-any-return]
+    run: Callable[..., None] = numba.njit(cache=keep, nogil=True, error_model="numpy")(_run)
+    return run
 
 
 def _run(
-    table: Any,  # noqa: ANN401 - arrays that numba compiles for
-    constants: Any,  # noqa: ANN401
+    table: Compiled,
+    constants: Compiled,
     n_work: int,
     width: int,
-    is_shared: Any,  # noqa: ANN401
-    place: Any,  # noqa: ANN401
-    x: Any,  # noqa: ANN401
-    p: Any,  # noqa: ANN401
-    result: Any,  # noqa: ANN401
+    is_shared: Compiled,
+    place: Compiled,
+    x: Compiled,
+    p: Compiled,
+    result: Compiled,
 ) -> None:
     """Take each instruction for a lane of points; the codes are those of _OPERATIONS."""
     work, shown = np.zeros((n_work, width)), np.zeros((result.shape[1], width))

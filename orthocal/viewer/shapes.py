@@ -87,7 +87,7 @@ def material(colour: Colour, *, opacity: float = 1.0, shiny: bool = False) -> g.
         opacity: 0 to 1.
         shiny: Whether it is lit; flat otherwise.
     """
-    hexadecimal = sum(round(255 * c) << shift for c, shift in zip(colour, (16, 8, 0)))  # noqa: B905
+    hexadecimal = sum(round(255 * c) << shift for c, shift in zip(colour, (16, 8, 0), strict=True))
     extra: dict[str, object] = {}
     if opacity < 1.0:  # where it lies in what is solid, that is what is seen
         extra = {

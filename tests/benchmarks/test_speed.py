@@ -209,7 +209,6 @@ def test_the_eliminated_solver_is_faster_than_ipopt(record):
     assert ratio > BESIDE_IPOPT
 
 
-@pytest.mark.skipif(not lanes.is_installed(), reason="numba is not installed")
 def test_lanes_of_postures_are_faster_than_one_by_one(orthoglide, record):
     compiled, count = compiled_robot(orthoglide), 2000
     drives = np.tile(orthoglide.drive_zero, (count, 1))

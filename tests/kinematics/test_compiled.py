@@ -10,7 +10,7 @@ from tolerances import KINEMATICS
 
 from orthocal import load_robot
 from orthocal.kinematics.assembly import Assembly
-from orthocal.kinematics.compiled import adjoint, compiled_robot, log6_jacobian
+from orthocal.kinematics.compiled import compiled_robot, log6_jacobian
 from orthocal.kinematics.error_map import right_jacobian as right_jacobians
 from orthocal.kinematics.machine_map import MachineMap, right_jacobian
 from orthocal.kinematics.symbolic import SymbolicRobot, constant_pose
@@ -132,12 +132,6 @@ def test_jacobians_of_exp6_and_log6_equal_pinocchios(angle):
     pose = pin.exp6(xi)
     found = np.asarray(ca.DM(ca.evalf(log6_jacobian(constant_pose(pose)))))
     assert np.abs(found - pin.Jlog6(pose)).max() < 10 * KINEMATICS
-
-
-def test_the_adjoint_is_pinocchios():
-    pose = pin.exp6(np.array([0.1, 0.2, 0.3, 0.5, -0.4, 0.2]))
-    found = np.asarray(ca.DM(ca.evalf(adjoint(constant_pose(pose)))))
-    assert np.abs(found - pose.toActionMatrix()).max() < KINEMATICS
 
 
 def test_robots_share_functions_only_where_they_are_the_same(orthoglide):

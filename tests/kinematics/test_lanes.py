@@ -11,8 +11,6 @@ from orthocal.kinematics.batch import BatchFunction
 from orthocal.kinematics.compiled import compiled_robot
 from orthocal.kinematics.lanes import Way, list_instructions, running
 
-needs_numba = pytest.mark.skipif(not lanes.is_installed(), reason="numba is not installed")
-
 
 def points(robot, count):
     rng = np.random.default_rng(0)
@@ -23,7 +21,6 @@ def points(robot, count):
     return drives, passive, errors.placements(1e-2 * rng.normal(size=len(errors.names)))
 
 
-@needs_numba
 @pytest.mark.parametrize("name", ["orthoglide", "fivebar", "biglide"])
 @pytest.mark.parametrize("count", [1, 33])
 def test_both_ways_give_the_same_numbers(request, name, count):
@@ -42,7 +39,6 @@ def test_both_ways_give_the_same_numbers(request, name, count):
             assert np.array_equal(ours, theirs)
 
 
-@needs_numba
 def test_inputs_of_their_own_are_the_same_as_shared_ones(orthoglide):
     function, where = compiled_robot(orthoglide).closing, points(orthoglide, 40)
     own = (*where[:2], np.tile(where[2], (40, 1)))
@@ -52,7 +48,6 @@ def test_inputs_of_their_own_are_the_same_as_shared_ones(orthoglide):
                 assert np.array_equal(a, b)
 
 
-@needs_numba
 def test_every_operation_is_casadis():
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     found = [

@@ -85,10 +85,11 @@ class BatchProgram:
         about = _Shared(self.problem, self.options, sigma)
         start = about.linear(y)
         found = _Found.empty(len(y), self.problem)
-        if self._few(start):
+        surrogate = self._polynomials(start)
+        if surrogate is not None:
             for first in range(0, len(y), SETS_AT_ONCE):
                 part = slice(first, first + SETS_AT_ONCE)
-                self._by_polynomials(about, y[part], start[part], found.part(part))
+                self._by_polynomials(surrogate, about, y[part], start[part], found.part(part))
         else:
             found.alone[:] = True
         self._alone(y, sigma, found)
@@ -105,22 +106,22 @@ class BatchProgram:
             return np.array([o.values(rows) for rows in given]) / self.problem.noise
         raise ValueError(f"found the shape {given.shape}; expected (n_sets, {o.size})")
 
-    def _few(self, start: Array) -> bool:
-        """Whether there are polynomials for these sets; finds them."""
+    def _polynomials(self, start: Array) -> Surrogate | None:
+        """Readings as polynomials where the sets are; None for many parameters, or few sets."""
         if start.shape[1] > MOST_PARAMETERS or len(start) < FEWEST_SETS:
-            return False
+            return None
         low, high = (np.quantile(start, p, axis=0) for p in (0.001, 0.999))
         known = self._surrogate
         if known is not None and known.inside(np.array([low, high])).all():
-            return True
+            return known
         half = np.maximum(MARGIN * 0.5 * (high - low), SMALLEST_HALF)
         self._surrogate = find_surrogate(self.problem, 0.5 * (low + high), half)
-        return self._surrogate is not None
+        return self._surrogate
 
-    def _by_polynomials(self, about: _Shared, y: Array, theta: Array, found: _Found) -> None:
+    def _by_polynomials(
+        self, surrogate: Surrogate, about: _Shared, y: Array, theta: Array, found: _Found
+    ) -> None:
         """Gauss-Newton of all sets, their readings by polynomials."""
-        surrogate = self._surrogate
-        assert surrogate is not None
         theta, left = np.array(theta), np.arange(len(y))
         sizes = np.full((3, len(y)), np.inf)
         for _ in range(MOST_STEPS):
