@@ -1,4 +1,4 @@
-"""Imports go one way, nothing prints outside cli/ and output/, and start-up stays lazy."""
+"""Imports go one way, nothing prints outside cli/ and show/, and start-up stays lazy."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_modules_within_a_stage_do_not_import_in_circles():
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_nothing_prints_outside_the_edges(path):
-    if stage(path) in ("cli", "output"):
+    if stage(path) in ("cli", "show"):
         return
     calls = [n.func for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)]
     assert not [f for f in calls if isinstance(f, ast.Name) and f.id == "print"]

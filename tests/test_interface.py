@@ -176,7 +176,8 @@ def test_points_far_beyond_all_numbers(calibration):
 
 def test_other_things_than_calibrations_and_sessions(calibration, experiment_2, tmp_path):
     for act, message in (
-        (lambda: calibrate(5), "expected a Session, or the path to one"),
+        (lambda: calibrate(5), "expected a Session, the path to one, or a list of them"),
+        (lambda: calibrate([5]), "expected a Session, or the path to one"),
         (lambda: write_report(5, tmp_path / "x.html"), "expected a Calibration"),
         (lambda: summarize(5), "expected a Calibration, a Comparison or a Validation"),
         (lambda: decide(5), "expected a Calibration"),

@@ -7,6 +7,7 @@ that it reaches.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -74,19 +75,22 @@ def entered_offsets(calibration: Calibration) -> Array:
 
 
 def _find_entries(calibration: Calibration) -> tuple[ControllerEntry, ...]:
-    drives = calibration.robot.drives
-    estimates = {p.name: p for p in calibration.parameters}
-    own = {i: estimates[n] for i, d in enumerate(drives) if (n := f"{d.name}.offset") in estimates}
-    if not any(p.free for p in own.values()):
+    drives, weights = calibration.robot.drives, calibration.offset_weights
+    own = {
+        i: [calibration.parameters[j] for j in np.flatnonzero(row).tolist()]
+        for i, row in enumerate(weights)
+        if row.any()
+    }
+    if not any(p.free for parts in own.values() for p in parts):
         return ()
     names = [p.name for p in calibration.free]
-    total, scatter = (np.zeros(len(drives)) for _ in range(2))
-    enter = calibration.active_offsets
-    for i, p in own.items():
-        enter[i] = p.value
-        if p.free:
-            total[i] = calibration.total_std[names.index(p.name)]
-            scatter[i] = p.std
+    identified, enter = calibration.offsets, calibration.active_offsets
+    enter[list(own)] = identified[list(own)]
+    of_free = weights[:, [j for j, p in enumerate(calibration.parameters) if p.free]]
+    total, scatter = (
+        np.array([_size(row, covariance) for row in of_free])
+        for covariance in (calibration.total_covariance, calibration.covariance)
+    )
     tool = None if calibration.only_offsets else find_tool(calibration)
     if tool is not None:
         chosen = choose_offsets(tool, enter, drives=list(own))
@@ -100,14 +104,14 @@ def _find_entries(calibration: Calibration) -> tuple[ControllerEntry, ...]:
             drive=drives[i].name,
             unit=drives[i].unit,
             active=None if active is None else active[i],
-            identified=p.value,
+            identified=float(identified[i]),
             enter=float(enter[i]),
             change=float(enter[i]) - (0.0 if active is None else active[i]),
             std=float(total[i]),
             scatter=float(scatter[i]),
-            held=_hold(p) if tool is None else None,
+            held=_hold(parts[0]) if tool is None and len(parts) == 1 else None,
         )
-        for i, p in own.items()
+        for i, parts in own.items()
     )
 
 
@@ -117,6 +121,13 @@ def _hold(p: ParameterEstimate) -> Literal["known", "lower bound", "upper bound"
     if p.at_bound is None:
         return None
     return "lower bound" if p.at_bound == "lower" else "upper bound"
+
+
+def _size(weights: Array, covariance: Array) -> float:
+    """Standard deviation of a sum of parameters; those that are not in it may be unknown."""
+    at = np.flatnonzero(weights)
+    own = weights[at]
+    return math.sqrt(float(own @ covariance[np.ix_(at, at)] @ own)) if at.size else 0.0
 
 
 def _spread(gain: Array, covariance: Array) -> Array:

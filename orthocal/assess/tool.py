@@ -66,8 +66,7 @@ def _find_tool(calibration: Calibration) -> CalibratedTool | None:
     if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
         return None
     sensitivity = _sensitivity(calibration)
-    errors = calibration.errors
-    identified = np.array([errors.get(f"{d.name}.offset", 0.0) for d in robot.drives])
+    identified = calibration.offsets
 
     def reach(points: Array) -> None:
         drives, passive = nominal_assembly(robot).reach(points)
@@ -101,11 +100,12 @@ def place_tool(
 
 
 def _sensitivity(calibration: Calibration) -> ToolSensitivity:
-    """Of the tool, by the free parameters, then those left out, then offsets that are known."""
+    """Of the tool, by the free parameters, those left out, and offsets that are in neither."""
     robot, errors = calibration.robot, calibration.errors
     free = [*(p.name for p in calibration.free), *calibration.unmodelled.names]
-    offsets = [f"{d.name}.offset" for d in robot.drives]
-    free += [n for n in offsets if n in errors and n not in free]
+    own = [row.any() for row in calibration.offset_weights]
+    offsets = [f"{d.name}.offset" for d, has in zip(robot.drives, own, strict=True) if has]
+    free += [n for n in offsets if n not in free]
     return calibration.remember(
         "tool sensitivity", lambda: ToolSensitivity(robot, free=free, values=errors)
     )

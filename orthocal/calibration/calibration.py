@@ -147,6 +147,13 @@ class Calibration(CalibrationRecord):
         return np.asarray(np.hypot(self.standard_deviations, self._bias_std))
 
     @property
+    def total_covariance(self) -> Array:
+        """Covariance of the free parameters from all that is not known, (n_free, n_free), [SI]."""
+        open_ones = np.array([p.at_bound is None for p in self.free])
+        bias = np.where(np.outer(open_ones, open_ones), self.unmodelled.bias_covariance, 0.0)
+        return np.asarray(self.covariance + bias)
+
+    @property
     def intervals(self) -> tuple[tuple[float, float], ...]:
         """95 % intervals of the free parameters, with all that is not known, [unit].
 
@@ -200,8 +207,19 @@ class Calibration(CalibrationRecord):
     @property
     def only_offsets(self) -> bool:
         """Whether the machine as identified has no errors but offsets."""
-        offsets = {f"{d.name}.offset" for d in self.robot.drives}
-        return all(p.name in offsets for p in self.parameters if p.free or p.value != 0.0)
+        known = self.robot.parameters
+        return all(known.are_offsets(p.name) for p in self.parameters if p.free or p.value != 0.0)
+
+    @property
+    def offset_weights(self) -> Array:
+        """What each parameter adds to the drives' offsets, shape (n_drives, n_parameters)."""
+        drives = [f"{d.name}.offset" for d in self.robot.drives]
+        return self.robot.parameters.coefficients(drives, [p.name for p in self.parameters])
+
+    @property
+    def offsets(self) -> Array:
+        """Offsets of the identified machine's drives, shape (n_drives,), [m, rad]."""
+        return np.asarray(self.offset_weights @ np.array([p.value for p in self.parameters]))
 
     @property
     def machine(self) -> Machine:

@@ -77,7 +77,7 @@ def assemble_calibration(
     covariance = fit.covariance()
     # a base parameter is the whole combination: nothing of it is left out
     others = find_other_errors(fit, spoken_for=() if whole is None else whole.free)
-    unmodelled = measure_unmodelled(fit, others)
+    unmodelled, taken_on = measure_unmodelled(fit, others)
     estimates = _estimates(fit, covariance, _widen(fit, unmodelled, intervals or {}))
     diagnostics = diagnose_readings(fit)
     residuals = _residual_rows(fit, diagnostics, nominal)
@@ -97,7 +97,10 @@ def assemble_calibration(
             loss_width=loss.width,
         ),
         parameters=(*estimates[:n], *_held_estimates(problem)),
-        sensors=estimates[n:],
+        sensors=tuple(
+            replace(p, std=math.hypot(p.std, bias))
+            for p, bias in zip(estimates[n:], taken_on.tolist(), strict=True)
+        ),
         covariance=read_only(covariance[:n, :n]),
         unmodelled=unmodelled,
         identifiability=_identifiability(fit, whole),

@@ -205,7 +205,7 @@ class CalibrationRecord:
     parameters: Annotated[Many[ParameterEstimate], Field(min_length=1)]
     """Free parameters, then those held at a known value."""
     sensors: Many[ParameterEstimate]
-    """What was not known of the sensors, estimated with them."""
+    """What was not known of the sensors; their `std` is from all that is not known."""
     covariance: Matrix
     """Of the free parameters, shape (n_free, n_free), [SI]."""
     unmodelled: Unmodelled

@@ -136,22 +136,30 @@ def find_other_errors(fit: Fit, *, spoken_for: Collection[str] = ()) -> OtherErr
     return OtherErrors(tuple(names), read_only(selection.tolerances), read_only(slopes))
 
 
-def measure_unmodelled(fit: Fit, others: OtherErrors) -> Unmodelled:
-    """What errors of the machine that were not free do to an estimate."""
+def measure_unmodelled(fit: Fit, others: OtherErrors) -> tuple[Unmodelled, Array]:
+    """What errors of the machine that were not free do to an estimate.
+
+    Returns:
+        That, of the machine's parameters; and standard deviations of what the sensors' unknowns
+        take on, shape (n_unknowns,), [SI].
+    """
     problem = fit.problem
+    n = problem.n_machine
     if not others.names:
-        return Unmodelled((), read_only([]), read_only(np.zeros((problem.n_machine, 0))), 0.0)
+        none = Unmodelled((), read_only([]), read_only(np.zeros((n, 0))), 0.0)
+        return none, np.zeros(problem.n_free - n)
     o, sigma = problem.observations, max(fit.sigma, SMALLEST_SIGMA)
     slopes = project_out_zeros(fit.jacobian, o)
     inverse = fit.information.covariance(
         sigma=sigma, precision=problem.prior_precision, held=fit.held
     )
-    n = problem.n_machine
     scaled = inverse @ (slopes.T @ others.slopes) / sigma**2
     left = o.rows(others.slopes - slopes @ scaled)
-    return Unmodelled(
+    taken = scaled * problem.theta_scale[:, None]
+    found = Unmodelled(
         names=others.names,
         tolerances=others.tolerances,
-        leakage=read_only((scaled * problem.theta_scale[:, None] / others.tolerances)[:n]),
+        leakage=read_only((taken / others.tolerances)[:n]),
         residual_rms=float(np.sqrt((left**2).sum() / len(left))),
     )
+    return found, np.asarray(np.linalg.norm(taken[n:], axis=1))

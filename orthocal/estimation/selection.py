@@ -149,7 +149,7 @@ def select_parameters(
                 raise ParameterError(f"those of '{glob}' leave nothing between them")
             for name in _match_free(parameters, glob, names):
                 lower[names.index(name)], upper[names.index(name)] = low, high
-    only_offsets = all(n.endswith(".offset") for n in names if n not in own_prior)
+    only_offsets = all(parameters.are_offsets(n) for n in names if n not in own_prior)
     everywhere = not only_offsets if prior is None else prior
     return Selection(
         label=_label(base, free),

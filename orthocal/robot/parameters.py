@@ -20,6 +20,9 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from orthocal.arguments import require_numbers
 from orthocal.characters import composed
 from orthocal.errors import ParameterError
@@ -92,6 +95,27 @@ class ParameterSet:
     def names(self) -> tuple[str, ...]:
         """Names of all parameters, in order."""
         return tuple(self._parameters)
+
+    def coefficients(self, errors: Sequence[str], names: Sequence[str]) -> NDArray[np.float64]:
+        """What one unit of each named parameter adds to each error, (n_errors, n_names).
+
+        Raises:
+            ParameterError: If a name is unknown.
+        """
+        result = np.zeros((len(errors), len(names)))
+        for j, name in enumerate(names):
+            for term, coefficient in self[name].terms:
+                if term in errors:
+                    result[list(errors).index(term), j] = coefficient
+        return result
+
+    def are_offsets(self, name: str) -> bool:
+        """Whether a parameter is an offset of a drive, or of several.
+
+        Raises:
+            ParameterError: If the name is unknown.
+        """
+        return all(self.elementary[term].kind == "offset" for term, _ in self[name].terms)
 
     def select(self, patterns: Iterable[str]) -> tuple[str, ...]:
         """Names that a list of globs leaves, in the order of the set.

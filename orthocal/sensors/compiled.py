@@ -7,13 +7,18 @@ m is moved by whatever carries it.
 
 from __future__ import annotations
 
+import hashlib
+import sys
+import uuid
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.errors import OrthocalError
 from orthocal.kinematics.batch import BatchFunction
 from orthocal.kinematics.compiled import compiled_robot
 from orthocal.kinematics.kept import identify, kept_function
@@ -43,12 +48,24 @@ class CompiledReading:
     """The same with sparse rows, to be put into other expressions."""
     words: str
     """What distinguishes it from other readings of the robot."""
+    probe: float
+    """The sensor's own expression at some values."""
 
 
 def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
-    """The functions of a sensor; one build for all of its kind that look at the same frames."""
-    frames = sensor.frames(robot)
-    return _compile(_Pattern(robot, sensor, frames))
+    """The functions of a sensor; one build for all of its kind that look at the same frames.
+
+    Raises:
+        OrthocalError: If its expression is not that of another one of its kind.
+    """
+    pattern = _Pattern(robot, sensor, sensor.frames(robot))
+    found = _compile(pattern)
+    if _source(type(sensor)) and _probe(pattern) != found.probe:
+        raise OrthocalError(
+            f"the expression of a sensor '{sensor.kind}' depends on more than its frames, "
+            "constants and unknowns: what differs between setups belongs into `constants`"
+        )
+    return found
 
 
 class _Pattern:
@@ -59,16 +76,18 @@ class _Pattern:
         self.n_constants = sensor.constants(robot).size
         self._key = (
             identify(robot),
+            type(sensor),
             sensor.kind,
             frames,
             self.n_constants,
             len(sensor.unknowns),
+            _source(type(sensor)),
         )
 
     @property
     def words(self) -> str:
         """What distinguishes it from other patterns of the robot."""
-        return repr(self._key[1:])
+        return repr(self._key[2:])
 
     @cached_property
     def expressions(self) -> tuple[list[ca.SX], list[ca.SX]]:
@@ -80,6 +99,22 @@ class _Pattern:
 
     def __hash__(self) -> int:
         return hash(self._key)
+
+
+@lru_cache(maxsize=64)
+def _source(kind: type[Sensor]) -> str:
+    """A digest of the code of a kind that is not orthocal's own: with it its functions change.
+
+    One whose code is in no file, as in a notebook, has functions of this process alone.
+    """
+    if kind.__module__.startswith("orthocal."):
+        return ""
+    file = getattr(sys.modules.get(kind.__module__), "__file__", None)
+    try:
+        content = Path(file or "").read_bytes()
+    except OSError:
+        return uuid.uuid4().hex
+    return hashlib.sha256(content).hexdigest()
 
 
 @lru_cache(maxsize=256)
@@ -94,6 +129,7 @@ def _compile(pattern: _Pattern) -> CompiledReading:
         slopes=BatchFunction(slopes, shared=["placements"], matrices=rows, sparse=["by_twists"]),
         expression=slopes,
         words=pattern.words,
+        probe=_probe(pattern),
     )
 
 
@@ -119,10 +155,7 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
         *((here, robot.frame_id(f)) for f in pattern.frames.in_posture),
         *((there, robot.frame_id(f)) for f in pattern.frames.at_zero),
     ]
-    poses = [Pose(ca.SX.sym("rotation", 3, 3), ca.SX.sym("position", 3)) for _ in trees]
-    count = len(pattern.frames.in_posture)
-    view = View(poses[:count], poses[count:], constants, unknowns)
-    h = sensor.expression(view, robot)
+    poses, h = _own_expression(pattern, constants, unknowns)
     pulls = [_pull(h, pose) for pose in poses]
     local = ca.Function(
         "sensor",
@@ -148,6 +181,30 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
             by_actuated, by_passive = by_actuated + actuated, by_passive + passive
     inputs = [*here.symbols, there.actuated, constants, unknowns]
     return inputs, [value, by_actuated, by_passive, by_twists, by_zero, by_unknowns]
+
+
+def _own_expression(
+    pattern: _Pattern, constants: ca.SX, unknowns: ca.SX
+) -> tuple[list[Pose], ca.SX]:
+    """Symbols of the frames that a sensor looks at, and what it shows of them."""
+    count = len(pattern.frames.in_posture)
+    poses = [
+        Pose(ca.SX.sym("rotation", 3, 3), ca.SX.sym("position", 3))
+        for _ in range(count + len(pattern.frames.at_zero))
+    ]
+    view = View(poses[:count], poses[count:], constants, unknowns)
+    return poses, pattern.sensor.expression(view, pattern.robot)
+
+
+def _probe(pattern: _Pattern) -> float:
+    """What a sensor shows for some values: two with one expression show the same."""
+    constants = ca.SX.sym("constants", pattern.n_constants)
+    unknowns = ca.SX.sym("unknowns", len(pattern.sensor.unknowns))
+    poses, h = _own_expression(pattern, constants, unknowns)
+    symbols = [*(s for pose in poses for s in (pose.rotation, pose.position)), constants, unknowns]
+    rng = np.random.default_rng(0)
+    values = [ca.DM(rng.uniform(0.1, 1.0, s.shape)) for s in symbols]
+    return float(ca.Function("probe", symbols, [h])(*values))
 
 
 def _pull(h: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:

@@ -8,6 +8,8 @@ from rich.text import Text
 from orthocal.calibration.calibration import Calibration
 from orthocal.show.layout import add_row, mm, plain, signed, table_of
 
+NOTE = "Identified with the machine; ± of all that is not known, as of its errors."
+
 
 def render_parts(calibration: Calibration) -> tuple[RenderableType, ...]:
     """All of them in one; nothing where one gauge is all there is."""
@@ -31,9 +33,9 @@ def _gauges(calibration: Calibration) -> RenderableType:
 
 
 def _sensors(calibration: Calibration) -> RenderableType:
-    table = table_of("of the sensors", "found", "± σ", "tolerance", "unit")
+    table = table_of("of the sensors", "found", "±", "tolerance", "unit")
     for p in calibration.sensors:
         f = p.edge_factor
         cells = signed(p.value * f), plain(p.std * f), plain(p.tolerance * f)
         add_row(table, p.name, *cells, p.edge_unit)
-    return Group(table, Text("Identified with the machine; the ± of its errors have it in them."))
+    return Group(table, Text(NOTE))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from fleets import Fleet
 from machines import write_orthoglide
 
-from orthocal import calibrate, load_plan, simulate_session, summarize
+from orthocal import Choice, calibrate, decide, load_plan, simulate_session, summarize
 from orthocal.assess.accuracy import assess_tool, expect_after_offsets
 from orthocal.assess.entering import choose_offsets, entered_offsets, find_entries
 from orthocal.assess.tool import find_tool
@@ -100,3 +101,42 @@ def test_what_is_promised_with_the_offsets_entered_is_kept(quarter):
     assert rms["chosen"] < 0.9 * rms["offsets"]
     # ten machines, a handful of combinations of errors decide each
     assert rms["chosen"] == pytest.approx(rms["promised"], rel=0.3)
+
+
+@pytest.fixture(scope="module")
+def summed(tmp_path_factory, root):
+    """The Orthoglide with a sum of all its offsets, of which one names the machine's error."""
+    folder = tmp_path_factory.mktemp("summed")
+    shutil.copytree(root / "robots/orthoglide", folder / "machine")
+    for path in (folder / "machine").glob("orthoglide.*"):
+        path.rename(path.with_stem("machine"))
+    described = folder / "machine/machine.yaml"
+    listed = "  parameters:\n    common: [x_slide.offset, y_slide.offset, -z_slide.offset]\n"
+    described.write_text(described.read_text().replace("  parameters:\n", listed, 1))
+    text = (root / "examples/raw-cycles/plan.yaml").read_text()
+    (folder / "plan.yaml").write_text(text.replace("robot: orthoglide", "robot: machine"))
+    plan = load_plan(folder / "plan.yaml")
+    return simulate_session(plan, {"common": 1.4e-3}, seed=1).session
+
+
+def test_offsets_that_were_identified_as_a_sum_are_entered(summed):
+    """Whatever a parameter is called: what it adds to a drive's offset belongs to that drive."""
+    result = calibrate(summed, Choice(free=["common"]))
+    assert not result.prior  # as with offsets
+    entries = {e.drive: e for e in find_entries(result)}
+    value, std = result["common"].value, result.total_std[0]
+    assert value == pytest.approx(1.4e-3, abs=4.0 * std)
+    for drive, sign in (("x_slide", 1.0), ("y_slide", 1.0), ("z_slide", -1.0)):
+        assert entries[drive].enter == pytest.approx(sign * value, rel=1e-12)
+        assert entries[drive].std == pytest.approx(std, rel=1e-12)
+    assert decide(result).answer in ("enter", "check before entering")
+    assert expect_after_offsets(result, assess_tool(result)) > 0.0
+
+
+def test_offsets_beside_other_sums_are_entered_too(summed):
+    """With lengths free the offsets are chosen at the tool, by the sum as by single ones."""
+    result = calibrate(summed, Choice(free=["common", "*_leg.length"]))
+    entries = find_entries(result)
+    assert [e.drive for e in entries] == ["x_slide", "y_slide", "z_slide"]
+    assert all(np.isfinite(e.std) for e in entries)
+    assert entries[2].identified == -result["common"].value

@@ -30,7 +30,7 @@ def test_an_unmodelled_error_moves_the_estimate_by_its_leakage(plan, name, model
     """Perfect readings of a machine with one small error, calibrated without it."""
     probe = simulate_session(plan, {}, exact=True).session
     fit = fit_problem(build_problem(probe, model=model))
-    found = measure_unmodelled(fit, find_other_errors(fit))
+    found, _ = measure_unmodelled(fit, find_other_errors(fit))
     if name not in found.names:
         assert (model, name) == ("lengths", "y_coupler.x")  # the length of the leg has it
         return

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 
+import casadi as ca
 import numpy as np
 import pytest
 from tolerances import SAME_OPTIMUM
@@ -12,6 +16,8 @@ from tool_coordinate import ToolCoordinate
 from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
 from orthocal.calibration.file import calibration_json, write_calibration
 from orthocal.cli import app
+from orthocal.diagnosis.unmodelled import machine_errors
+from orthocal.errors import OrthocalError
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.eliminated import EliminatedProgram
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
@@ -19,7 +25,9 @@ from orthocal.measurement.observations import build_observations
 from orthocal.measurement.sensing import predict_entries
 from orthocal.measurement.session_file import load_session
 from orthocal.measurement.session_output import write_session
+from orthocal.measurement.synthetic import draw_errors
 from orthocal.sensors import registry
+from orthocal.sensors.compiled import compile_reading
 from orthocal.show.report.page import build_report
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
@@ -76,12 +84,12 @@ def test_its_readings_are_those_of_the_tool(plan):
 
 
 def test_what_is_not_known_of_it_is_identified_beside_the_machine(plan):
-    """Slopes of 2 and 3 in a thousand at 0.16 m of travel read to 2 µm: told to some 1e-5."""
+    """Slopes of 2 and 3 in a thousand: told as well as the machine's other errors let them be."""
     simulated = simulate_session(plan, TRUTH, seed=4)
     assert set(simulated.unknowns) == {"dial.d.slope", "setup.tz.slope"}
     result = calibrate(simulated.session)
     for p in result.sensors:
-        assert 0.0 < p.std < 0.2 * p.tolerance
+        assert 0.0 < p.std < 0.3 * p.tolerance
         assert abs(p.value - simulated.unknowns[p.name]) < 4.0 * p.std
     for name, value in TRUTH.items():
         assert abs(result[name].value - value) < 4.0 * result[name].std
@@ -89,16 +97,22 @@ def test_what_is_not_known_of_it_is_identified_beside_the_machine(plan):
 
 
 def test_its_deviations_are_those_of_many_simulated_calibrations(plan):
-    """Offsets and slopes, both drawn: z scores of 60 calibrations."""
-    scores = []
+    """60 machines with all errors: z scores of offsets and slopes, by all that is not known."""
+    scores, others = [], [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
     for seed in range(60):
-        simulated = simulate_session(plan, TRUTH, seed=seed)
+        errors = {**draw_errors(plan.robot, others, seed=seed), **TRUTH}
+        simulated = simulate_session(plan, errors, seed=seed)
         result = calibrate(simulated.session, solver=SolverOptions(solver="eliminated"))
         truth = {**TRUTH, **simulated.unknowns}
+        stds = [*result.total_std, *(p.std for p in result.sensors)]
         estimates = (*result.free, *result.sensors)
-        scores.append([(p.value - truth[p.name]) / p.std for p in estimates])
+        scores.append([(p.value - truth[p.name]) / s for p, s in zip(estimates, stds, strict=True)])
     spread = np.sqrt(np.mean(np.square(scores), axis=0))
-    assert spread == pytest.approx(1.0, abs=0.3)  # 3 standard deviations of a spread of 60
+    n = len(TRUTH)
+    assert spread[:n] == pytest.approx(1.0, abs=0.3)  # 3 standard deviations of a spread of 60
+    # the noise that they are told by is that of the residuals, which have the other errors in them
+    assert (spread[n:] > 0.5).all()
+    assert (spread[n:] < 1.3).all()
 
 
 @pytest.mark.parametrize("model", ["offsets", "full"])
@@ -160,3 +174,62 @@ def test_what_does_not_fit_is_refused_by_key(tmp_path):
     (tmp_path / "plan.yaml").write_text(PLAN.replace("sensor: tool, tool: z", "sensor: laser"))
     with pytest.raises(SessionError, match=r"setups.tz.sensor: found 'laser'; expected one of leg"):
         load_plan(tmp_path / "plan.yaml")
+
+
+def test_what_differs_between_setups_belongs_into_constants(plan):
+    """Setups that look at the same frames share one function: one that reads itself is refused."""
+
+    class Selfish(ToolCoordinate):
+        kind = "selfish"
+
+        def constants(self, robot):
+            return np.zeros(0)
+
+        def expression(self, view, robot):
+            return ca.dot(self._axis, view.frames[0].position) * (1.0 + view.unknowns[0])
+
+    compile_reading(plan.robot, Selfish("x", 1e-3, None))
+    compile_reading(plan.robot, Selfish("x", 2e-3, None))
+    with pytest.raises(OrthocalError, match="belongs into `constants`"):
+        compile_reading(plan.robot, Selfish("y", 1e-3, None))
+
+
+OWN = """
+import sys
+sys.path.insert(0, {folder!r})
+import numpy as np, orthocal, own
+from orthocal.sensors.compiled import compile_reading
+robot = orthocal.load_robot("orthoglide")
+value = compile_reading(robot, own.Own("x", 1e-3, None)).value
+from orthocal.kinematics.compiled import compiled_robot
+errors = compiled_robot(robot).errors
+zero = errors.placements(np.zeros(len(errors.names)))
+h, = value(robot.drive_zero[None] + 0.01, robot.zero[robot.passive_index][None], zero,
+           robot.drive_zero[None], np.array([[1.0, 0.0, 0.0]]), np.zeros((1, 1)))
+print(float(h[0, 0]))
+"""
+
+
+def test_a_sensor_that_was_changed_has_new_functions(tmp_path, root):
+    """What is kept on disk is of the code that it was built by, of sensors from outside, too."""
+    found = []
+    for factor in (1.0, 5.0):
+        (tmp_path / "own.py").write_text(
+            f"import sys; sys.path.insert(0, {str(root / 'tests/sensors')!r})\n"
+            "from tool_coordinate import ToolCoordinate\n"
+            "class Own(ToolCoordinate):\n"
+            "    kind = 'own'\n"
+            "    def expression(self, view, robot):\n"
+            f"        return {factor} * (0.1 + super().expression(view, robot))\n"
+        )
+        code = OWN.format(folder=str(tmp_path))
+        environment = {**os.environ, "ORTHOCAL_CACHE": str(tmp_path / "cache")}
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        found.append(float(done.stdout))
+    assert found[1] == pytest.approx(5.0 * found[0], rel=1e-12)

@@ -112,7 +112,7 @@ def find_trust(calibration: Calibration) -> list[Finding]:
 
 def find_held(calibration: Calibration) -> list[Finding]:
     """Parameters that a bound holds; offsets that are held so are to be looked at first."""
-    offsets = {f"{d.name}.offset" for d in calibration.robot.drives}
+    known = calibration.robot.parameters
     found = []
     for p in calibration.free:
         if p.at_bound is None:
@@ -120,7 +120,7 @@ def find_held(calibration: Calibration) -> list[Finding]:
         found.append(
             Finding(
                 "held by a bound",
-                "warns" if p.name in offsets else "informs",
+                "warns" if known.are_offsets(p.name) else "informs",
                 f"{p.name} is held by its {p.at_bound} bound, {p.value * p.edge_factor:g} "
                 f"{p.edge_unit}. The readings want it beyond; it has no ± of its own, and the "
                 "others' ± holds with it there.",

@@ -17,8 +17,8 @@ from orthocal.estimation.linear import (
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.choice import build_program
 from orthocal.estimation.solvers.eliminated import EliminatedProgram
-from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.linearised import LinearisedProgram
 
 AGREED = 1e-6
@@ -38,23 +38,24 @@ CHOICES = {
 }
 
 
-def both(problem, *, loss, sigma, **given):
-    options = SolverOptions(loss=Loss(loss))
-    programs = (
-        EliminatedProgram(problem, options=options),
-        NonlinearProgram(problem, options=options),
-    )
-    return [program.solve(sigma=sigma, **given) for program in programs]
+SOLVERS = ("eliminated",)
+"""Held against Ipopt."""
+
+
+def both(problem, *, loss, sigma, solver=SOLVERS[0], **given):
+    options = (SolverOptions(solver=kind, loss=Loss(loss)) for kind in (solver, "ipopt"))
+    return [build_program(problem, o).solve(sigma=sigma, **given) for o in options]
 
 
 @pytest.mark.parametrize("example", EXAMPLES)
 @pytest.mark.parametrize("model", ["offsets", "lengths", "full"])
 @pytest.mark.parametrize("loss", ["squares", "huber"])
 @pytest.mark.parametrize("choice", CHOICES)
-def test_two_solvers_find_one_optimum(root, example, model, loss, choice):
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_two_solvers_find_one_optimum(root, example, model, loss, choice, solver):
     session = load_session(root / "examples" / example)
     problem = build_problem(session, model=model, **CHOICES[choice])
-    ours, ipopts = both(problem, loss=loss, sigma=20e-6)
+    ours, ipopts = both(problem, loss=loss, sigma=20e-6, solver=solver)
     difference = np.abs(ours.theta - ipopts.theta) / problem.theta_scale
     assert difference.max() < AGREED
     assert np.abs(ours.zeros - ipopts.zeros).max() < 1e-9
