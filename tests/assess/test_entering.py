@@ -112,7 +112,8 @@ def summed(tmp_path_factory, root):
         path.rename(path.with_stem("machine"))
     described = folder / "machine/machine.yaml"
     listed = "  parameters:\n    common: [x_slide.offset, y_slide.offset, -z_slide.offset]\n"
-    described.write_text(described.read_text().replace("  parameters:\n", listed, 1))
+    text = described.read_text().replace("  parameters:\n", listed, 1)
+    described.write_text(text.replace("{offset_mm: 5,", "{offset_mm: 0.05,"))  # one by one
     text = (root / "examples/raw-cycles/plan.yaml").read_text()
     (folder / "plan.yaml").write_text(text.replace("robot: orthoglide", "robot: machine"))
     plan = load_plan(folder / "plan.yaml")
