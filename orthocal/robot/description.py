@@ -28,6 +28,9 @@ ClosureKind = Annotated[Literal["3d", "6d"], BeforeValidator(_in_small_letters)]
 """Gepetto's robots write it in capitals, too."""
 
 
+THICKEST_ROD_MM = 500.0
+"""No rod that a gauge touches is thicker: it is a wrong unit."""
+
 MOST_PARTS = 100
 """Legs, closures and named sums of a robot, of each."""
 
@@ -52,6 +55,16 @@ class DriveKeys(_Keys):
     """The same for a revolute drive."""
 
 
+class RodKeys(_Keys):
+    """A round rod of a leg."""
+
+    root: Name
+    """Frame on its axis, at the drive's end."""
+    tip: Name
+    """Frame on its axis, at the platform's end."""
+    radius_mm: Annotated[PositiveNumber, Field(le=THICKEST_ROD_MM)]
+
+
 class LegKeys(_Keys):
     """The line that a gauge touches."""
 
@@ -59,6 +72,8 @@ class LegKeys(_Keys):
     """Frame at the drive's end of the leg."""
     tip: Name
     """Frame at the platform's end of the leg."""
+    rods: dict[Name, RodKeys] = {}
+    """Round rods of the leg that a gauge may touch, by name."""
 
 
 class TcpKeys(_Keys):

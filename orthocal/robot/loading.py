@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 from orthocal.errors import ParameterError, RobotError
 from orthocal.fields import read_only
 from orthocal.files import is_folder, read_file, require_plain_name
-from orthocal.robot.description import RobotKeys, load_description
+from orthocal.robot.description import LegKeys, RobotKeys, RodKeys, load_description
 from orthocal.robot.model import (
     Closure,
     Drive,
     Leg,
     Robot,
+    Rod,
     Tcp,
     build_constraints,
     find_frame,
@@ -307,21 +308,13 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
     pin.updateFramePlacements(model, data)
     for name, entry in keys.orthocal.legs.items():
         here = f"{where}: orthocal.legs.{name}"
-        ids = [find_frame(model, f, where=f"{here}") for f in (entry.root, entry.tip)]
-        root, tip = (np.array(data.oMf[i].translation) for i in ids)
+        root, tip = _ends(model, data, entry, here)
         length = float(np.linalg.norm(tip - root))
-        if length > LONGEST_LEG:
-            raise RobotError(
-                f"is {length:g} m long; expected at most {LONGEST_LEG:g} m: lengths in a URDF are "
-                "in metres",
-                where=here,
-            )
-        if length < 1e-6:
-            raise RobotError(
-                f"root '{entry.root}' and tip '{entry.tip}' are at the same place", where=here
-            )
         jacobian = pin.getFrameJacobian(
-            model, data, ids[0], pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+            model,
+            data,
+            find_frame(model, entry.root, where=here),
+            pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
         )[:3]
         moved = np.abs(jacobian[:, robot.passive_index]).max(initial=0.0)
         legs[name] = Leg(
@@ -332,5 +325,46 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
             axis=read_only(_without_rounding((tip - root) / length)),
             zero_root=read_only(root),
             root_driven=bool(moved < 1e-9),
+            rods=_build_rods(model, data, entry, here),
         )
     return legs
+
+
+def _ends(
+    model: pin.Model, data: pin.Data, entry: LegKeys | RodKeys, here: str
+) -> tuple[Array, Array]:
+    """Root and tip of a line in the mechanical zero, shape (3,) each, [m].
+
+    Raises:
+        RobotError: If a frame does not exist, or the line is too long or none.
+    """
+    ids = [find_frame(model, f, where=here) for f in (entry.root, entry.tip)]
+    root, tip = (np.array(data.oMf[i].translation) for i in ids)
+    length = float(np.linalg.norm(tip - root))
+    if length > LONGEST_LEG:
+        raise RobotError(
+            f"is {length:g} m long; expected at most {LONGEST_LEG:g} m: lengths in a URDF are "
+            "in metres",
+            where=here,
+        )
+    if length < 1e-6:
+        raise RobotError(
+            f"root '{entry.root}' and tip '{entry.tip}' are at the same place", where=here
+        )
+    return root, tip
+
+
+def _build_rods(model: pin.Model, data: pin.Data, entry: LegKeys, here: str) -> dict[str, Rod]:
+    rods = {}
+    for name, rod in entry.rods.items():
+        root, tip = _ends(model, data, rod, f"{here}.rods.{name}")
+        rods[name] = Rod(
+            name=name,
+            root=rod.root,
+            tip=rod.tip,
+            radius=rod.radius_mm * MM,
+            length=float(np.linalg.norm(tip - root)),
+            zero_root=read_only(root),
+            zero_tip=read_only(tip),
+        )
+    return rods

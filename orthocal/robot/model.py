@@ -52,8 +52,27 @@ class Closure:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Rod:
+    """A round rod of a leg."""
+
+    name: str
+    root: str
+    """Frame on its axis, at the drive's end."""
+    tip: str
+    """Frame on its axis, at the platform's end."""
+    radius: float
+    """[m]."""
+    length: float
+    """Nominal distance from root to tip, [m]."""
+    zero_root: Array
+    """Root in the mechanical zero of the nominal machine, shape (3,), [m]."""
+    zero_tip: Array
+    """Likewise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Leg:
-    """The line that a gauge touches."""
+    """A leg: the line that stands for it, and its rods."""
 
     name: str
     root: str
@@ -68,6 +87,8 @@ class Leg:
     """Root in the mechanical zero of the nominal machine, shape (3,), [m]."""
     root_driven: bool
     """Whether the root moves with drives alone, not with passive joints."""
+    rods: Mapping[str, Rod]
+    """Round rods that a gauge may touch."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

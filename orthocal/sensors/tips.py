@@ -8,7 +8,7 @@ reading h grows: it stands on the rod's d side. Its tip is at c + h d.
 
       h = ((a − c) · n + r |n|)/(d · n);
 
-  without a radius that is where the edge meets the axis. An edge that is a pin adds its radius to r.
+  without a radius that is where the edge meets the axis. A pin as edge adds its radius to r.
 - A ball of radius R touches where |(c + h d − a) × u| = r + R; of the two roots the larger. Where
   there is none the plunger passes the rod.
 """

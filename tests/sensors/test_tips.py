@@ -35,6 +35,11 @@ def distance_of_lines(p, e, a, u):
     return np.linalg.norm(p + s[0] * e - (a + s[1] * u))
 
 
+def moving(distance, start, direction, *rest):
+    """A distance as a function of how far a tip has moved."""
+    return lambda h: distance(start + h * direction, *rest)
+
+
 def come_near(distance, touching, far):
     """The largest h at which solids touch, by bisection; None where they never do.
 
@@ -63,7 +68,7 @@ def test_a_ball_touches_where_solids_do():
         a, u, d, r, ball = draw(rng)
         c = a + rng.uniform(-0.2, 0.2) * u + rng.uniform(-0.01, 0.01, 3)
         found = evaluate(touch_by_ball, at=a, along=2.0 * u, radius=r + ball, tip=c, direction=d)
-        expected = come_near(lambda h: distance_to_axis(c + h * d, a, u), r + ball, 0.05)
+        expected = come_near(moving(distance_to_axis, c, d, a, u), r + ball, 0.05)
         if expected is None:
             missed += 1
             assert np.isnan(found)
@@ -85,7 +90,7 @@ def test_a_blade_touches_where_solids_do():
         found = evaluate(
             touch_by_blade, at=a, along=0.3 * u, radius=r, edge=-2.0 * e, tip=c, direction=d
         )
-        expected = come_near(lambda h: distance_of_lines(c + h * d, e, a, u), r, 0.2)
+        expected = come_near(moving(distance_of_lines, c, d, e, a, u), r, 0.2)
         assert found == pytest.approx(expected, abs=AGREED)
 
 
