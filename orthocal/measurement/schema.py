@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from orthocal.documents import Name, Number, PositiveNumber
+from orthocal.sensors.tips import TipKeys
 from orthocal.units import DEG, MM, MRAD, Unit
 
 Vector = Annotated[list[Number], Field(min_length=1, max_length=12)]
@@ -52,6 +53,8 @@ class GaugeKeys(_Keys):
     sigma_mm: GaugeLength | None = None
     resolution_mm: GaugeLength | None = None
     range_mm: Annotated[list[GaugeEnd], Field(min_length=2, max_length=2)] | None = None
+    tip: TipKeys | None = None
+    """What it touches with, in setups that do not say so themselves."""
 
     @model_validator(mode="after")
     def _range_rises(self) -> GaugeKeys:

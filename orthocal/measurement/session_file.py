@@ -141,10 +141,17 @@ _Setups = Mapping[str, tuple[SetupKeys, Sensor]]
 
 def _read_setups(file: Path, keys: SessionKeys) -> _Setups:
     """What the file says of each setup, and the sensor that stands there."""
-    return {
-        name: read_setup(data, where=str(file), under=f"setups.{name}", error=SessionError)
-        for name, data in keys.setups.items()
-    }
+    gauges = keys.gauges or {"": keys.gauge or GaugeKeys()}
+    only = next(iter(gauges.values())) if len(gauges) == 1 else GaugeKeys()
+    found = {}
+    for name, data in keys.setups.items():
+        named = data.get("gauge")
+        gauge = gauges.get(named, only) if isinstance(named, str) else only
+        given = {} if gauge.tip is None else {"tip": gauge.tip.model_dump(exclude_none=True)}
+        found[name] = read_setup(
+            data, where=str(file), under=f"setups.{name}", error=SessionError, gauge=given
+        )
+    return found
 
 
 def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:

@@ -77,7 +77,7 @@ class _Pattern:
         self._key = (
             identify(robot),
             type(sensor),
-            sensor.kind,
+            (sensor.kind, type(sensor).__qualname__),
             frames,
             self.n_constants,
             len(sensor.unknowns),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from orthocal.documents import validate
@@ -10,15 +10,17 @@ from orthocal.errors import OrthocalError
 from orthocal.fields import As
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Sensor, SetupKeys
+from orthocal.sensors.rod_indicator import RodKeys, read_leg
 
 DEFAULT = LegIndicator.kind
 
-_KINDS: dict[str, type[Sensor]] = {LegIndicator.kind: LegIndicator}
+_KINDS: dict[str, tuple[type[SetupKeys], Callable[[Any], Sensor]]] = {DEFAULT: (RodKeys, read_leg)}
+"""What a document may say of each kind, and what makes a sensor of it."""
 
 
 def register_sensor(kind: type[Sensor]) -> None:
     """Make a kind of sensor known by its name; one that is known already is replaced."""
-    _KINDS[kind.kind] = kind
+    _KINDS[kind.kind] = kind.keys, kind.from_keys
 
 
 def sensor_kinds() -> tuple[str, ...]:
@@ -27,7 +29,12 @@ def sensor_kinds() -> tuple[str, ...]:
 
 
 def read_setup(
-    data: Mapping[str, Any], *, where: str, under: str, error: type[OrthocalError]
+    data: Mapping[str, Any],
+    *,
+    where: str,
+    under: str,
+    error: type[OrthocalError],
+    gauge: Mapping[str, Any] | None = None,
 ) -> tuple[SetupKeys, Sensor]:
     """What a document says of a setup, and the sensor that stands there.
 
@@ -36,6 +43,7 @@ def read_setup(
         where: File, for messages.
         under: Key of the setup in it.
         error: Kind of error.
+        gauge: What its gauge says for all its setups, where a kind of sensor wants to know.
 
     Raises:
         OrthocalError: Of that kind, naming the key that does not fit.
@@ -46,9 +54,14 @@ def read_setup(
             f"found {name!r}; expected one of {', '.join(_KINDS)}",
             where=f"{where}: {under}.sensor",
         )
-    kind = _KINDS[name]
-    keys = validate(kind.keys, data, where=where, error=error, under=under)
-    return keys, kind.from_keys(keys)
+    schema, build = _KINDS[name]
+    known = {k: v for k, v in (gauge or {}).items() if k in schema.model_fields}
+    data = {**known, **data}
+    keys = validate(schema, data, where=where, error=error, under=under)
+    try:
+        return keys, build(keys)
+    except OrthocalError as e:
+        raise error(e.problem, where=f"{where}: {under}.{e.where}") from None
 
 
 def write_sensor(sensor: Sensor) -> dict[str, Any]:

@@ -15,7 +15,17 @@ reading h grows: it stands on the rod's d side. Its tip is at c + h d.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
 import casadi as ca
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from orthocal.documents import Number, PositiveNumber
+from orthocal.units import MM, to_mm
+
+LARGEST_TIP_MM = 100.0
+"""No ball and no blade of an indicator is larger: it is a wrong unit."""
 
 
 def touch_by_blade(
@@ -53,3 +63,63 @@ def touch_by_ball(*, at: ca.SX, along: ca.SX, radius: ca.SX, tip: ca.SX, directi
     square, mixed = ca.dot(across, across), ca.dot(apart, across)
     rest = mixed**2 - square * (ca.dot(apart, apart) - radius**2)
     return (ca.sqrt(rest) - mixed) / square
+
+
+class BallKeys(BaseModel):
+    """A ball at the end of a plunger."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    radius_mm: Annotated[PositiveNumber, Field(le=LARGEST_TIP_MM)]
+
+
+class BladeKeys(BaseModel):
+    """A straight edge across a rod."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    width_mm: Annotated[PositiveNumber, Field(le=LARGEST_TIP_MM)]
+    radius_mm: Annotated[Number, Field(ge=0.0, le=LARGEST_TIP_MM)] = 0.0
+    """Of an edge that is a pin."""
+
+
+class TipKeys(BaseModel):
+    """What touches, as in a session.yaml: one of them."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    ball: BallKeys | None = None
+    blade: BladeKeys | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> TipKeys:
+        if (self.ball is None) == (self.blade is None):
+            found = "none" if self.ball is None else "ball and blade"
+            raise ValueError(f"found {found}; expected one of ball, blade")
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class Tip:
+    """What touches a rod."""
+
+    form: Literal["ball", "blade"]
+    radius: float
+    """Of the ball, or of an edge that is a pin, [m]."""
+    width: float = 0.0
+    """Of a blade, [m]."""
+
+    @staticmethod
+    def from_keys(keys: TipKeys) -> Tip:
+        """As in a session.yaml."""
+        if keys.ball is not None:
+            return Tip("ball", keys.ball.radius_mm * MM)
+        blade = keys.blade or BladeKeys(width_mm=1.0)
+        return Tip("blade", blade.radius_mm * MM, blade.width_mm * MM)
+
+    def to_keys(self) -> dict[str, dict[str, float]]:
+        """As in a session.yaml."""
+        if self.form == "ball":
+            return {"ball": {"radius_mm": to_mm(self.radius)}}
+        radius = {"radius_mm": to_mm(self.radius)} if self.radius else {}
+        return {"blade": {"width_mm": to_mm(self.width), **radius}}

@@ -1,0 +1,162 @@
+"""An indicator on a rod, against where Pinocchio has the rod and plain geometry has the tip."""
+
+from __future__ import annotations
+
+import machines
+import numpy as np
+import pytest
+
+from orthocal import (
+    calibrate,
+    load_calibration,
+    load_plan,
+    load_session,
+    simulate_session,
+    write_calibration,
+    write_session,
+)
+from orthocal.errors import SessionError
+from orthocal.measurement.observations import build_observations
+from orthocal.measurement.sensing import locate_contacts, predict_entries
+
+PLAN = """robot: orthoglide
+gauge: {{sigma_mm: 0.005, resolution_mm: 0.001, range_mm: [-20, 20]}}
+postures:
+  zero: {{tcp_mm: [0, 0, 0]}}
+  x_max: {{tcp_mm: [60, 0, 0]}}
+  x_min: {{tcp_mm: [-100, 0, 0]}}
+  y_max: {{tcp_mm: [0, 60, 0]}}
+  y_min: {{tcp_mm: [0, -100, 0]}}
+  z_max: {{tcp_mm: [0, 0, 60]}}
+  z_min: {{tcp_mm: [0, 0, -100]}}
+setups:
+{setups}
+"""
+AXES = "xyz"
+TIPS = {
+    "ball": "{ball: {radius_mm: 1.5}}",
+    "blade": "{blade: {width_mm: 20}}",
+    "pin": "{blade: {width_mm: 20, radius_mm: 0.8}}",
+}
+TRUTH = {"x_slide.offset": 0.9e-3, "y_slide.offset": -0.6e-3, "z_slide.offset": 0.4e-3}
+
+
+def plan(folder, tip, rod="a"):
+    setups = "\n".join(
+        f"  {d}{leg}: {{leg: {leg}, touches: {rod}, tip: {TIPS[tip]}, direction: {d}, "
+        f"section: {{fraction: 0.5}}, postures: [zero, {leg}_max, {leg}_min]}}"
+        for leg in AXES
+        for d in AXES
+        if d != leg
+    )
+    (folder / "plan.yaml").write_text(PLAN.format(setups=setups))
+    return load_plan(folder / "plan.yaml")
+
+
+@pytest.mark.parametrize("tip", TIPS)
+@pytest.mark.parametrize("rod", ["a", "b"])
+def test_readings_are_those_of_solids_that_touch(tmp_path, tip, rod):
+    """The rod's axis by Pinocchio, the tip by the distance from it: exactly the radii."""
+    session = plan(tmp_path, tip, rod)
+    o = build_observations(session)
+    found = predict_entries(session, o, TRUTH)
+    robot = session.robot
+    real = robot.with_errors(TRUTH)
+    drives = np.array([p.drives for p in session.postures.values()])
+    for i in range(o.size):
+        setup = list(session.setups.values())[o.setup[i]]
+        leg = robot.legs[setup.sensor.leg]
+        root, end = (
+            machines.place(real, drives[o.posture[i]], f)
+            for f in (leg.rods[rod].root, leg.rods[rod].tip)
+        )
+        d = np.eye(3)[AXES.index(setup.sensor.direction)]
+        side = np.cross(leg.axis, d)
+        zero = 0.5 * (leg.rods[rod].zero_root + leg.rods[rod].zero_tip)
+        offset = TRUTH[f"{leg.name}_slide.offset"] * -leg.axis
+        c = (zero @ side) * side + ((zero + offset) @ leg.axis) * leg.axis
+        centre, unit = c + found[i] * d, (end - root) / np.linalg.norm(end - root)
+        if tip == "ball":
+            apart = centre - root - ((centre - root) @ unit) * unit
+            assert np.linalg.norm(apart) == pytest.approx(7e-3, abs=1e-12)
+        else:
+            normal = np.cross(side, unit)
+            apart = (centre - root) @ normal / np.linalg.norm(normal)
+            radius = 5.5e-3 + (0.8e-3 if tip == "pin" else 0.0)
+            assert abs(apart) == pytest.approx(radius, abs=1e-12)
+        assert (centre - root) @ d > 0  # on the rod's side from which the plunger comes
+
+
+@pytest.mark.parametrize("tip", TIPS)
+def test_offsets_are_identified_from_rods(tmp_path, tip):
+    session = simulate_session(plan(tmp_path, tip), TRUTH, seed=1).session
+    found = calibrate(session)
+    for name, value in TRUTH.items():
+        assert abs(found[name].value - value) < 4.0 * found[name].std
+    assert [s.sensor.to_keys() for s in found.setups.__iter__()] == [
+        s.sensor.to_keys() for s in session.setups.values()
+    ]
+
+
+def test_contacts_lie_on_the_rods_surface(tmp_path):
+    session = plan(tmp_path, "ball")
+    for setup, (_, contact) in locate_contacts(session).items():
+        assert contact.problems == [""] * len(contact.points)
+        assert len(contact.points) == 0 or np.isfinite(contact.points).all(), setup
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("touches: a", "touches: c", "touches: 'c' is not a rod of leg x; rods: a, b"),
+        ("tip: {ball: {radius_mm: 1.5}}, ", "", "tip: is missing; expected ball or blade"),
+        (
+            "{radius_mm: 1.5}",
+            "{radius_mm: 150}",
+            "tip.ball.radius_mm: found '150'; expected less than or equal to 100",
+        ),
+        ("{ball: {radius_mm: 1.5}}", "{}", "tip: found none; expected one of ball, blade"),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_key(tmp_path, old, new, message):
+    plan(tmp_path, "ball")
+    path = tmp_path / "plan.yaml"
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(SessionError, match=r"expected|rods") as refused:
+        load_plan(path)
+    assert message in str(refused.value)
+
+
+def test_a_gauges_tip_is_that_of_its_setups(tmp_path):
+    """One that names none of its own has it; beside a line between the rods it says nothing."""
+    plan(tmp_path, "ball")
+    path = tmp_path / "plan.yaml"
+    text = path.read_text().replace("tip: {ball: {radius_mm: 1.5}}, ", "")
+    text = text.replace("gauge: {", "gauge: {tip: {blade: {width_mm: 12}}, ", 1)
+    path.write_text(text.replace("touches: a, ", "", 1))
+    setups = load_plan(path).setups
+    line, *rods = (s.sensor.to_keys() for s in setups.values())
+    assert "tip" not in line
+    assert all(keys["tip"] == {"blade": {"width_mm": 12.0}} for keys in rods)
+
+
+def test_it_is_written_and_read(tmp_path):
+    session = simulate_session(plan(tmp_path, "pin"), TRUTH, seed=1).session
+    again = load_session(write_session(session, tmp_path / "out"))
+    for name, setup in session.setups.items():
+        assert again.setups[name].sensor == setup.sensor
+    made = calibrate(again)
+    loaded = load_calibration(write_calibration(made, tmp_path / "calibration.json"))
+    assert [s.sensor for s in loaded.setups] == [s.sensor for s in made.setups]
+    assert {s.sensor.describe().rpartition(", ")[2] for s in loaded.setups} == {"blade on rod a"}
+
+
+def test_a_ball_that_passes_the_rod_is_named_before_measuring(tmp_path):
+    """20 mm beside the axis the rod has moved away: DESIGN's displaced lines, by a ball."""
+    path = tmp_path / "plan.yaml"
+    plan(tmp_path, "ball")
+    path.write_text(
+        path.read_text().replace("x_max: {tcp_mm: [60, 0, 0]}", "x_max: {tcp_mm: [60, 40, 40]}")
+    )
+    with pytest.raises(SessionError, match="the ball would pass the rod"):
+        load_plan(path)
