@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,12 +46,13 @@ class Stage:
     Args:
         robot: The nominal robot.
         title: Of the scene.
+        looked_at: Further frames whose poses are wanted.
 
     Raises:
         RobotError: If the robot's visuals cannot be loaded.
     """
 
-    def __init__(self, robot: Robot, title: str) -> None:
+    def __init__(self, robot: Robot, title: str, *, looked_at: Iterable[str] = ()) -> None:
         self.robot = robot
         self.scene = Scene(title)
         self.visuals = load_visuals(robot)
@@ -60,6 +61,8 @@ class Stage:
         tool = [robot.tcp.frame] if robot.tcp else []
         self.frames = tuple(dict.fromkeys([*self.links, *ends, *tool]))
         """Links, ends of leg lines and tool centre point."""
+        self.followed = tuple(dict.fromkeys([*self.frames, *looked_at]))
+        """These, and the further ones."""
         passive = robot.zero[robot.passive_index]
         self.zero = place_frames(robot, robot.drive_zero, passive, self.frames)
         """Frame to its pose in the nominal mechanical zero, shape (1, 4, 4), [m]."""

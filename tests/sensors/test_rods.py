@@ -8,6 +8,7 @@ import pytest
 
 from orthocal import (
     calibrate,
+    draw_scene,
     load_calibration,
     load_plan,
     load_session,
@@ -160,3 +161,21 @@ def test_a_ball_that_passes_the_rod_is_named_before_measuring(tmp_path):
     )
     with pytest.raises(SessionError, match="the ball would pass the rod"):
         load_plan(path)
+
+
+def test_the_dial_that_is_drawn_touches_the_rods_surface(tmp_path):
+    """By Pinocchio's placement of the rod: a radius from its axis, on the plunger's side."""
+    session = plan(tmp_path, "ball")
+    robot = session.robot
+    scene = draw_scene(session, posture="x_max")
+    drives = session.postures["x_max"].drives
+    root, end = (
+        machines.place(robot, drives, f)
+        for f in (robot.legs["x"].rods["a"].root, robot.legs["x"].rods["a"].tip)
+    )
+    unit = (end - root) / np.linalg.norm(end - root)
+    for name, d in (("yx", np.eye(3)[1]), ("zx", np.eye(3)[2])):
+        at = scene.pose(f"Gauges/{name}")[:3, 3]
+        away = at - root - ((at - root) @ unit) * unit
+        assert np.linalg.norm(away) == pytest.approx(5.5e-3, abs=1e-9)
+        assert away @ d > 5e-3

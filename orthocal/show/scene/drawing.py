@@ -226,10 +226,10 @@ def _furthest(robot: Robot, drive: int, move: float) -> Array | None:
 
 def _draw_session(session: Session, posture: str | None) -> Scene:
     robot, measured = session.robot, measurement_of_session(session)
-    stage = Stage(robot, session.title)
+    stage = Stage(robot, session.title, looked_at=_looked_at(measured))
     stops, left_out = plan_stops(measured, posture)
     timeline = plan_motion([s.drives + measured.offsets for s in stops])
-    poses = _follow(robot, nominal_assembly(robot), timeline, stage.frames)
+    poses = _follow(robot, nominal_assembly(robot), timeline, stage.followed)
     stage.draw_links(MACHINE, poses)
     stage.draw_leg_lines(poses, timeline.stops)
     stage.look_at(poses)
@@ -253,7 +253,7 @@ def _draw_calibration(
 ) -> Scene:
     measured = measurement_of_calibration(calibration)
     title = f"{calibration.session.title} · model '{calibration.model}'"
-    stage = Stage(measured.robot, title)
+    stage = Stage(measured.robot, title, looked_at=_looked_at(measured))
     scene = stage.scene
     stops, left_out = plan_stops(measured, posture)
     machines = _place_machines(calibration, measured, stops, stage, exaggeration)
@@ -288,9 +288,9 @@ def _place_machines(
     robot = measured.robot
     timeline = plan_motion([s.drives for s in stops])
     believed = Timeline(timeline.drives + measured.offsets, timeline.times, timeline.stops)
-    nominal = _follow(robot, nominal_assembly(robot), believed, stage.frames)
+    nominal = _follow(robot, nominal_assembly(robot), believed, stage.followed)
     assembly = Assembly(robot, fixed=calibration.errors)
-    real = _follow(robot.with_errors(calibration.errors), assembly, timeline, stage.frames)
+    real = _follow(robot.with_errors(calibration.errors), assembly, timeline, stage.followed)
     largest, where = _find_largest(measured, assembly, calibration, stage)
     if exaggeration is None:
         wanted = LARGEST_DEVIATION * stage.size / largest if largest > NOTHING else 1.0
@@ -354,6 +354,12 @@ def _explain_lines(scene: Scene) -> None:
 
 
 # ---- small things
+
+
+def _looked_at(measured: Measurement) -> list[str]:
+    """Frames that sensors look at."""
+    sensors = (s.sensor for s in measured.setups.values())
+    return [f for s in sensors for f in s.frames(measured.robot).in_posture]
 
 
 def _follow(
