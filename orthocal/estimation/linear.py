@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.errors import NotIdentifiableError
+from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.orthoglide import displacement_angle
 from orthocal.statistics.information import RANK_THRESHOLD, Information, decompose
@@ -196,13 +196,30 @@ def linearise_at_reference(problem: CalibrationProblem) -> Linearisation:
 
     Raises:
         ClosureError: If the reference machine cannot reach a posture.
+        SessionError: If a sensor shows nothing in one.
     """
     prediction, jacobian = problem.linearise(problem.reference)
+    _require_numbers(problem, prediction, jacobian)
     return Linearisation(
         problem,
         project_out_zeros(problem.values - prediction, problem.observations),
         project_out_zeros(jacobian, problem.observations),
         decompose(jacobian, problem.observations),
+    )
+
+
+def _require_numbers(problem: CalibrationProblem, prediction: Array, jacobian: Array) -> None:
+    """Refuse readings that are no numbers: a tip touches nothing, or a sensor is wrong."""
+    bad = np.flatnonzero(~(np.isfinite(prediction) & np.isfinite(jacobian).all(axis=1)))
+    if not bad.size:
+        return
+    o, session = problem.observations, problem.session
+    setup = list(session.setups)[o.setup[bad[0]]]
+    posture = list(session.postures)[o.posture[bad[0]]]
+    raise SessionError(
+        f"the sensor shows nothing in posture '{posture}' on the machine as the controller knows "
+        "it, or what moves it has no derivative there",
+        where=f"{session.path or 'session'}: setups.{setup}",
     )
 
 

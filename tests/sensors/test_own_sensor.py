@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -17,7 +18,7 @@ from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simu
 from orthocal.calibration.file import calibration_json, write_calibration
 from orthocal.cli import app
 from orthocal.diagnosis.unmodelled import machine_errors
-from orthocal.errors import OrthocalError
+from orthocal.errors import OrthocalError, SessionError
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.eliminated import EliminatedProgram
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
@@ -165,7 +166,6 @@ def test_it_is_told_reported_and_drawn(plan, tmp_path, capsys):
 
 
 def test_what_does_not_fit_is_refused_by_key(tmp_path):
-    from orthocal.errors import SessionError
 
     spoilt = PLAN.replace("tool: z", "tool: w")
     (tmp_path / "plan.yaml").write_text(spoilt)
@@ -233,3 +233,22 @@ def test_a_sensor_that_was_changed_has_new_functions(tmp_path, root):
         )
         found.append(float(done.stdout))
     assert found[1] == pytest.approx(5.0 * found[0], rel=1e-12)
+
+
+def test_a_sensor_that_shows_no_number_is_named_by_setup_and_posture(plan):
+    """One that sees only tools beyond 20 mm."""
+
+    class Broken(ToolCoordinate):
+        def expression(self, view, robot):
+            return ca.sqrt(view.frames[0].position[0] - 0.02) + 0.0 * view.unknowns[0]
+
+    broken = {
+        name: replace(s, sensor=Broken("x", 1e-3, None)) if name == "tx" else s
+        for name, s in plan.setups.items()
+    }
+    session = simulate_session(plan, TRUTH, seed=1).session
+    session = replace(session, setups=broken)
+    with pytest.raises(
+        SessionError, match=r"setups\.tx: the sensor shows nothing in posture 'zero'"
+    ):
+        calibrate(session)
