@@ -185,7 +185,7 @@ SESSION_KEY_CASES = [
         "key-unknown-in-gauge",
         "sigma_mm:",
         "sigma:",
-        ": gauge.sigma: unknown key; known keys: sigma_mm, resolution_mm, range_mm",
+        ": gauge.sigma: unknown key; known keys: sigma_mm, resolution_mm, range_mm, tip",
     ),
     session(
         "key-unknown-in-posture",
@@ -198,7 +198,7 @@ SESSION_KEY_CASES = [
         "xy: {leg:",
         "xy: {legs:",
         ": setups.xy.legs: unknown key; known keys: sensor, gauge, postures, "
-        "leg, direction, section",
+        "leg, direction, section, touches, tip",
     ),
     session(
         "key-unknown-in-section",
@@ -899,7 +899,14 @@ MOTORS = "name_mot: [x_slide, y_slide, z_slide]"
 ROWS = "x_parallelogram: {rows: [x, z]}"
 SUM = "[x_coupler.x, frame.x_rod_b_tip.x]"
 ZERO = "x_slide: {zero_mm: 310.25}"
-LEG = "x: {root: x_leg_root, tip: x_leg_tip}"
+LEG = "root: x_leg_root\n      tip: x_leg_tip"
+RODS = "a: {root: x_bar_a, tip: x_coupler, radius_mm: 5.5}"
+LEGS = "  legs:\n" + "".join(
+    f"    {leg}:\n      root: {leg}_leg_root\n      tip: {leg}_leg_tip\n      rods:\n"
+    f"        a: {{root: {leg}_bar_a, tip: {leg}_coupler, radius_mm: 5.5}}\n"
+    f"        b: {{root: {leg}_bar_b, tip: {leg}_rod_b_tip, radius_mm: 5.5}}\n"
+    for leg in "xyz"
+)
 SUFFIXES = "_mm, _um, _m, _mrad, _deg, _rad, _ppm"
 MOVING = ", ".join(
     f"{leg}_{joint}"
@@ -924,8 +931,7 @@ ROBOT_CASES = [
     robot("key-missing", "type: [3d, 3d, 3d, 6d, 6d]\n", "", ": type: is missing"),
     robot(
         "nothing-below-orthocal",
-        "  legs:\n    x: {root: x_leg_root, tip: x_leg_tip}\n    y: {root: y_leg_root, "
-        "tip: y_leg_tip}\n    z: {root: z_leg_root, tip: z_leg_tip}\n",
+        LEGS,
         "  legs:\n",
         ": orthocal.legs: found nothing; expected keys and values",
     ),
@@ -1088,6 +1094,30 @@ ROBOT_CASES = [
         LEG,
         LEG.replace("x_leg_tip", "x_leg_end"),
         ": orthocal.legs.x: the URDF has no frame 'x_leg_end'",
+    ),
+    robot(
+        "rod-without-length",
+        RODS,
+        RODS.replace("x_coupler", "x_bar_a"),
+        ": orthocal.legs.x.rods.a: root 'x_bar_a' and tip 'x_bar_a' are at the same place",
+    ),
+    robot(
+        "rod-frame-unknown",
+        RODS,
+        RODS.replace("x_coupler", "x_coupling"),
+        ": orthocal.legs.x.rods.a: the URDF has no frame 'x_coupling'",
+    ),
+    robot(
+        "rod-radius-zero",
+        RODS,
+        RODS.replace("5.5", "0"),
+        ": orthocal.legs.x.rods.a.radius_mm: found '0'; expected greater than 0",
+    ),
+    robot(
+        "rod-radius-wrong-unit",
+        RODS,
+        RODS.replace("5.5", "5500"),
+        ": orthocal.legs.x.rods.a.radius_mm: found '5500'; expected less than or equal to 500",
     ),
     robot(
         "tcp-unknown",
