@@ -1452,6 +1452,11 @@ CALIBRATION_CASES = [
         put(FILE, "postures.0.passive", [0.0]),
     ),
     calibration(
+        "sensor-bias-too-long",
+        f"{CALIBRATION}: sensor_bias: has 1 numbers; expected 0, as sensors",
+        put(FILE, "sensor_bias", [1e-3]),
+    ),
+    calibration(
         "no-residuals",
         f"{CALIBRATION}: residuals: found '[]'; expected at least 1 item",
         put(FILE, "residuals", []),

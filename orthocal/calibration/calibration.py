@@ -147,6 +147,11 @@ class Calibration(CalibrationRecord):
         return np.asarray(np.hypot(self.standard_deviations, self._bias_std))
 
     @property
+    def sensor_total_std(self) -> Array:
+        """As `total_std`, of what was not known of the sensors, shape (n_sensors,), [SI]."""
+        return np.asarray(np.hypot([p.std for p in self.sensors], self.sensor_bias))
+
+    @property
     def total_covariance(self) -> Array:
         """Covariance of the free parameters from all that is not known, (n_free, n_free), [SI]."""
         open_ones = np.array([p.at_bound is None for p in self.free])

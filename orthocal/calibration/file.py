@@ -118,6 +118,11 @@ def _read_document(data: Any, file: str, *, path: Path | None = None) -> Calibra
     record = validate(CalibrationRecord, data, where=file, error=CalibrationFileError)
     _check_estimates(record, file)
     _check_unmodelled(record, file)
+    if record.sensor_bias.shape != (len(record.sensors),):
+        raise CalibrationFileError(
+            f"has {record.sensor_bias.size} numbers; expected {len(record.sensors)}, as sensors",
+            where=f"{file}: sensor_bias",
+        )
     _check_singular_values(record.identifiability, file)
     calibration = Calibration(
         **{name: getattr(record, name) for name in CalibrationRecord.__slots__}, path=path

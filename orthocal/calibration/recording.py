@@ -97,10 +97,8 @@ def assemble_calibration(
             loss_width=loss.width,
         ),
         parameters=(*estimates[:n], *_held_estimates(problem)),
-        sensors=tuple(
-            replace(p, std=math.hypot(p.std, bias))
-            for p, bias in zip(estimates[n:], taken_on.tolist(), strict=True)
-        ),
+        sensors=estimates[n:],
+        sensor_bias=read_only(taken_on),
         covariance=read_only(covariance[:n, :n]),
         unmodelled=unmodelled,
         identifiability=_identifiability(fit, whole),

@@ -14,7 +14,7 @@ from orthocal.diagnosis.unmodelled import Unmodelled
 from orthocal.documents import Count, Number, PositiveInSI
 from orthocal.estimation.loss import LossKind
 from orthocal.estimation.options import SolverKind
-from orthocal.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN
+from orthocal.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN, Sizes
 from orthocal.sensors.protocol import Sensor
 from orthocal.sensors.registry import RECORDED
 from orthocal.statistics.identifiability import Identifiability
@@ -205,7 +205,9 @@ class CalibrationRecord:
     parameters: Annotated[Many[ParameterEstimate], Field(min_length=1)]
     """Free parameters, then those held at a known value."""
     sensors: Many[ParameterEstimate]
-    """What was not known of the sensors; their `std` is from all that is not known."""
+    """What was not known of the sensors, estimated with them."""
+    sensor_bias: Sizes
+    """Standard deviations of what these take on of errors that were not free, (n,), [SI]."""
     covariance: Matrix
     """Of the free parameters, shape (n_free, n_free), [SI]."""
     unmodelled: Unmodelled

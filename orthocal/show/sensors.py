@@ -34,8 +34,8 @@ def _gauges(calibration: Calibration) -> RenderableType:
 
 def _sensors(calibration: Calibration) -> RenderableType:
     table = table_of("of the sensors", "found", "±", "tolerance", "unit")
-    for p in calibration.sensors:
+    for p, std in zip(calibration.sensors, calibration.sensor_total_std.tolist(), strict=True):
         f = p.edge_factor
-        cells = signed(p.value * f), plain(p.std * f), plain(p.tolerance * f)
+        cells = signed(p.value * f), plain(std * f), plain(p.tolerance * f)
         add_row(table, p.name, *cells, p.edge_unit)
     return Group(table, Text(NOTE))

@@ -85,12 +85,12 @@ def test_its_readings_are_those_of_the_tool(plan):
 
 
 def test_what_is_not_known_of_it_is_identified_beside_the_machine(plan):
-    """Slopes of 2 and 3 in a thousand: told as well as the machine's other errors let them be."""
+    """Slopes of 2 and 3 in a thousand at 0.16 m of travel read to 2 µm: told to some 1e-5."""
     simulated = simulate_session(plan, TRUTH, seed=4)
     assert set(simulated.unknowns) == {"dial.d.slope", "setup.tz.slope"}
     result = calibrate(simulated.session)
     for p in result.sensors:
-        assert 0.0 < p.std < 0.3 * p.tolerance
+        assert 0.0 < p.std < 0.2 * p.tolerance
         assert abs(p.value - simulated.unknowns[p.name]) < 4.0 * p.std
     for name, value in TRUTH.items():
         assert abs(result[name].value - value) < 4.0 * result[name].std
@@ -98,14 +98,27 @@ def test_what_is_not_known_of_it_is_identified_beside_the_machine(plan):
 
 
 def test_its_deviations_are_those_of_many_simulated_calibrations(plan):
-    """60 machines with all errors: z scores of offsets and slopes, by all that is not known."""
+    """Offsets and slopes, both drawn: z scores of 60 calibrations."""
+    scores = []
+    for seed in range(60):
+        simulated = simulate_session(plan, TRUTH, seed=seed)
+        result = calibrate(simulated.session, solver=SolverOptions(solver="eliminated"))
+        truth = {**TRUTH, **simulated.unknowns}
+        estimates = (*result.free, *result.sensors)
+        scores.append([(p.value - truth[p.name]) / p.std for p in estimates])
+    spread = np.sqrt(np.mean(np.square(scores), axis=0))
+    assert spread == pytest.approx(1.0, abs=0.3)  # 3 standard deviations of a spread of 60
+
+
+def test_all_that_is_not_known_of_it_holds_on_machines_with_all_errors(plan):
+    """60 of them: offsets and slopes by all that is not known, no more told than is so."""
     scores, others = [], [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
     for seed in range(60):
         errors = {**draw_errors(plan.robot, others, seed=seed), **TRUTH}
         simulated = simulate_session(plan, errors, seed=seed)
         result = calibrate(simulated.session, solver=SolverOptions(solver="eliminated"))
         truth = {**TRUTH, **simulated.unknowns}
-        stds = [*result.total_std, *(p.std for p in result.sensors)]
+        stds = [*result.total_std, *result.sensor_total_std]
         estimates = (*result.free, *result.sensors)
         scores.append([(p.value - truth[p.name]) / s for p, s in zip(estimates, stds, strict=True)])
     spread = np.sqrt(np.mean(np.square(scores), axis=0))
