@@ -1,13 +1,15 @@
 """Many sets of readings of one plan, calibrated at once: the optimum of each, as alone.
 
 Where few parameters are free the readings are polynomials of them (`surrogate`), and Gauss-Newton
-is a product of small matrices for all sets together. Sets that do not settle, that leave the box of
-the polynomials, or that a bound may hold, are solved one by one, as are all where many parameters
-are free.
+is a product of small matrices for all sets together. Where many are, the curvature that all
+machines share (`curved`) gives each its normal equations, and what pulls at it is exact
+(`fleet_slopes`). Sets that do not settle, that leave the box of the polynomials, or that a bound
+may hold, are solved one by one, as are all where there are only a few.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.solvers.curved import CurvedReadings, find_curvature
 from orthocal.estimation.solvers.eliminated import EliminatedProgram
+from orthocal.estimation.solvers.fleet_slopes import FleetSlopes
 from orthocal.estimation.solvers.surrogate import MOST_PARAMETERS, Surrogate, find_surrogate
 
 Array = NDArray[np.float64]
@@ -35,6 +39,15 @@ SMALLEST_HALF = 0.05
 
 FEWEST_SETS = 50
 """Sets from which on polynomials are worth finding."""
+
+FEWEST_SETS_A_PARAMETER = 0.7
+"""Those from which on the curvature is, which takes an expansion a parameter."""
+
+FAR = 100.0
+"""A step of a set that is left to be solved alone, [tolerances]."""
+
+MOST_NUMBERS = 2**21
+"""Of the Jacobians that are held at a time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +80,7 @@ class BatchProgram:
         self.problem = problem
         self.options = options or SolverOptions(solver="eliminated")
         self._surrogate: Surrogate | None = None
+        self._curved: CurvedReadings | None = None
 
     def solve(self, values: ArrayLike, *, sigma: float) -> BatchSolution:
         """Solve for each set of readings.
@@ -85,11 +99,12 @@ class BatchProgram:
         about = _Shared(self.problem, self.options, sigma)
         start = about.linear(y)
         found = _Found.empty(len(y), self.problem)
-        surrogate = self._polynomials(start)
-        if surrogate is not None:
-            for first in range(0, len(y), SETS_AT_ONCE):
-                part = slice(first, first + SETS_AT_ONCE)
+        if (surrogate := self._polynomials(start)) is not None:
+            for part in _parts(len(y), SETS_AT_ONCE):
                 self._by_polynomials(surrogate, about, y[part], start[part], found.part(part))
+        elif (curved := self._curvature(start)) is not None:
+            for part in _parts(len(y), max(1, MOST_NUMBERS // curved.jacobian.size)):
+                self._by_curvature(curved, about, y[part], start[part], found.part(part))
         else:
             found.alone[:] = True
         self._alone(y, sigma, found)
@@ -138,6 +153,57 @@ class BatchProgram:
         done[left] = False
         done &= surrogate.inside(theta)
         reading, _ = surrogate(np.where(done[:, None], theta, surrogate.centre))
+        about.finish(y, theta, reading, done, found)
+
+    def _curvature(self, start: Array) -> CurvedReadings | None:
+        """Readings to second order; None for few parameters, few sets or singular machines."""
+        n = start.shape[1]
+        if n <= MOST_PARAMETERS or len(start) < FEWEST_SETS_A_PARAMETER * n:
+            return self._curved
+        if self._curved is None:
+            try:
+                self._curved = find_curvature(self.problem)
+            except np.linalg.LinAlgError:
+                return None
+        return self._curved
+
+    def _by_curvature(
+        self, curved: CurvedReadings, about: _Shared, y: Array, theta: Array, found: _Found
+    ) -> None:
+        """All sets by normal equations to second order, and what exactly pulls at each."""
+        problem, left, done = self.problem, np.arange(len(y)), np.zeros(len(y), dtype=np.bool_)
+        sizes = np.full((3, len(y)), np.inf)
+        reading, jacobian = curved(theta)
+        residual, _, _ = about.residual((y - reading) / about.sigma)
+        theta = theta + about.newton(theta, residual, jacobian / about.sigma)
+        reading, jacobian = curved(theta)
+        jacobian /= about.sigma
+        passive = problem.reference_passive + curved.machine.follow(theta - curved.reference)
+        inverses, before = None, None
+        for _ in range(MOST_STEPS):
+            try:
+                exact = FleetSlopes(problem, theta[left], passive[left])
+            except np.linalg.LinAlgError:  # one of them is far off: each by itself
+                break
+            residual, _, _ = about.residual((y[left] - exact.reading) / about.sigma)
+            if inverses is None or about.loss.robust:
+                inverses = np.asarray(np.linalg.inv(about.square(residual, jacobian[left])))
+            pull = about.pull(theta[left], exact.pull(about.loss.influence(residual) / about.sigma))
+            if before is not None:
+                _learn(inverses, before[0], before[1] - pull)
+            step = (inverses @ pull[..., None])[..., 0]
+            theta[left] += step
+            passive[left] += exact.follow(step)
+            moved = (jacobian[left] @ step[..., None])[..., 0]
+            reading[left] = exact.reading + about.sigma * moved
+            sizes = np.roll(sizes, 1, axis=0)
+            sizes[0, left] = np.abs(step).max(axis=1)
+            settled = _settled(sizes[:, left])
+            done[left] = settled
+            on = ~settled & (sizes[0, left] < FAR)
+            left, inverses, before = left[on], inverses[on], (step[on], pull[on])
+            if not left.size:
+                break
         about.finish(y, theta, reading, done, found)
 
     def _alone(self, y: Array, sigma: float, found: _Found) -> None:
@@ -228,14 +294,22 @@ class _Shared:
 
     def newton(self, theta: Array, residual: Array, jacobian: Array) -> Array:
         """Gauss-Newton's steps with a Jacobian for each set, shape (n_sets, n_free)."""
+        square = self.square(residual, jacobian)
+        pull = self.pull(theta, (self.loss.influence(residual)[:, None] @ jacobian)[:, 0])
+        return np.asarray(np.linalg.solve(square, pull[..., None])[..., 0])
+
+    def square(self, residual: Array, jacobian: Array) -> Array:
+        """Normal equations of each set, gauge zeros eliminated, shape (n_sets, n_free, n_free)."""
         weights = self.loss.weight(residual)[..., None]
         sums = np.swapaxes(self._zeros.T @ weights, 1, 2)
         means = np.swapaxes(np.swapaxes(weights * jacobian, 1, 2) @ self._zeros / sums, 1, 2)
         centred = jacobian - means[:, self.problem.observations.zero]
-        square = np.swapaxes(centred, 1, 2) @ (weights * centred) + np.diag(self._precision)
-        pull = (self.loss.influence(residual)[:, None] @ jacobian)[:, 0]
-        pull = pull - self._precision * (theta - self._mean)
-        return np.asarray(np.linalg.solve(square, pull[..., None])[..., 0])
+        own = np.diag(self._precision)
+        return np.asarray(np.swapaxes(centred, 1, 2) @ (weights * centred) + own)
+
+    def pull(self, theta: Array, of_readings: Array) -> Array:
+        """What pulls at θ̂, readings and prior, shape (n_sets, n_free)."""
+        return np.asarray(of_readings - self._precision * (theta - self._mean))
 
     def finish(
         self, y: Array, theta: Array, reading: Array, done: NDArray[np.bool_], found: _Found
@@ -252,3 +326,20 @@ class _Shared:
         """Rows less the mean of those with the same zero, shape as given."""
         means = self._zeros.T @ values / self._counts[:, None]
         return np.asarray(values - means[self.problem.observations.zero])
+
+
+def _parts(count: int, size: int) -> Iterator[slice]:
+    for first in range(0, count, size):
+        yield slice(first, first + size)
+
+
+def _learn(inverses: Array, step: Array, answer: Array) -> None:
+    """Make inverse normal equations give the step for its answer, in place (BFGS)."""
+    along = (step * answer).sum(axis=1)
+    with np.errstate(divide="ignore"):
+        share = np.where(along > 0.0, 1.0 / along, 0.0)[:, None]
+    turned = (inverses @ answer[..., None])[..., 0]
+    own = share * (1.0 + share * (answer * turned).sum(axis=1, keepdims=True)) * step
+    both = 0.5 * own - share * turned
+    inverses += both[:, :, None] * step[:, None, :]
+    inverses += step[:, :, None] * both[:, None, :]

@@ -1,0 +1,78 @@
+"""Readings to second order in many parameters: the curvature that many machines share.
+
+To first order one Jacobian serves all machines of a plan, and solves none of them: readings tell
+some sums of errors a thousand times better than others, so that a change of the Jacobian by a
+hundredth couples the two. To second order what is left is a hundredth of that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.solvers.fleet_slopes import FleetSlopes
+
+Array = NDArray[np.float64]
+
+STEP = 0.01
+"""Over which slopes are compared, [tolerances]."""
+
+MOST_BYTES = 2**28
+"""Of the curvature; problems with more than that are solved one by one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CurvedReadings:
+    """Readings about the reference of a problem."""
+
+    reference: Array
+    """θ̂ there, shape (n_free,)."""
+    reading: Array
+    """Shape (n_entries,), [m of the first gauge]."""
+    jacobian: Array
+    """Shape (n_entries, n_free), [m per tolerance]."""
+    curvature: NDArray[np.float32]
+    """d²h/dθ̂² at [k, j n_free + i] of entry j, shape (n_free, n_entries n_free)."""
+
+    machine: FleetSlopes
+    """The one there."""
+
+    def __call__(self, theta: Array) -> tuple[Array, Array]:
+        """Readings and slopes, shape (n_sets, n_entries[, n_free]), of θ̂, (n_sets, n_free)."""
+        change = theta - self.reference
+        curved = (change.astype(np.float32) @ self.curvature).reshape(-1, *self.jacobian.shape)
+        slopes = self.jacobian + 0.5 * curved
+        reading = self.reading + (slopes @ change[..., None])[..., 0]
+        return reading, slopes + 0.5 * curved
+
+
+def find_curvature(problem: CalibrationProblem) -> CurvedReadings | None:
+    """Readings to second order, by differences of slopes; None where that takes too much memory.
+
+    Raises:
+        LinAlgError: If the machine is singular in a posture near the reference.
+    """
+    n, m = problem.n_free, problem.observations.size
+    if 4 * n * n * m > MOST_BYTES:
+        return None
+    scale = problem.theta_scale
+    about = problem.expand(problem.reference, problem.reference_passive)
+    curvature = np.empty((n, m, n), dtype=np.float32)
+    for k, moved in enumerate(STEP * np.eye(n)):
+        passive = problem.reference_passive + about.follow(moved)
+        found = problem.expand(problem.reference + moved * scale, passive)
+        curvature[k] = (found.jacobian - about.jacobian) / STEP
+    for k in range(n):  # by either parameter first
+        half = 0.5 * (curvature[k, :, k:] + curvature[k:, :, k].T)
+        curvature[k, :, k:], curvature[k:, :, k] = half, half.T
+    there = problem.reference / scale
+    return CurvedReadings(
+        reference=there,
+        reading=about.reading + about.opening,
+        jacobian=about.jacobian,
+        curvature=curvature.reshape(n, m * n),
+        machine=FleetSlopes(problem, there[None], problem.reference_passive[None]),
+    )

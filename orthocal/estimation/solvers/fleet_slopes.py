@@ -1,0 +1,173 @@
+"""One plan of readings on many machines to first order, without a Jacobian of any.
+
+For forces f on the readings, the passive coordinates following the loops,
+
+    Σ f dh = (f h_θ − λ g_θ) dθ,  g_qᵀ λ = h_qᵀ f
+
+so that the slope of a cost takes one small solve a posture, however many parameters there are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.kinematics.error_map import right_jacobian
+from orthocal.measurement.sensing import SensorGroup
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """Readings of one expression on all machines, with their slopes; shape (n_sets, n, …)."""
+
+    group: SensorGroup
+    posture: Indices
+    """Of each entry, shape (n,)."""
+    reading: Array
+    by_actuated: Array
+    by_passive: Array
+    by_twists: Array
+    """Nonzeros."""
+    by_zero: Array
+    by_unknowns: Array
+
+
+class FleetSlopes:
+    """Machines near closed loops, to first order.
+
+    Args:
+        problem: The problem.
+        theta: θ̂ of each machine, shape (n_sets, n_free).
+        passive: Passive coordinates that nearly close the loops, shape (n_sets, n_postures,
+            n_passive), [m, rad].
+
+    Attributes:
+        correction: What closes the loops, shape as `passive`.
+        reading: With the loops closed, gauge zeros at 0, shape (n_sets, n_entries), [m of the
+            first gauge].
+
+    Raises:
+        LinAlgError: If a posture of a machine is singular.
+    """
+
+    def __init__(self, problem: CalibrationProblem, theta: Array, passive: Array) -> None:
+        self._problem, self._size = problem, len(theta)
+        compiled, errors = problem.compiled, problem.compiled.errors
+        self._columns, k = problem.columns, problem.n_postures
+        at = problem.assembly.errors() + theta[:, : problem.n_machine] @ self._columns.T
+        twists = errors.twists_of(at).reshape(self._size, len(errors.moved), 6)
+        self._turned = right_jacobian(twists)
+        self._offsets, self._gains = errors.offsets(at), errors.gains(at)
+        placements = errors.placements(at)
+        actuated = self._actuated(problem.drives)
+        found = compiled.sparse_slopes.unshared(
+            actuated.reshape(self._size * k, -1),
+            passive.reshape(self._size * k, -1),
+            np.repeat(placements, k, axis=0),
+        )
+        opening, self._by_actuated, by_passive, self._by_twists = (
+            v.reshape(self._size, k, *v.shape[1:]) for v in found
+        )
+        self._pattern = compiled.sparse_slopes.pattern(compiled.expressions.name_out(3))
+        self._inverse = _inverse(by_passive)
+        self.correction = -(self._inverse @ opening[..., None])[..., 0]
+        self._rows = [
+            self._read(group, theta, actuated, passive, placements)
+            for group in problem.sensor_groups
+        ]
+        self.reading = np.empty((self._size, problem.observations.size))
+        for rows in self._rows:
+            closing = (rows.by_passive * self.correction[:, rows.posture]).sum(axis=-1)
+            self.reading[:, rows.group.entries] = rows.reading + closing
+        self.reading /= problem.noise
+
+    def pull(self, forces: Array) -> Array:
+        """Σ f dh/dθ̂ of forces on the readings, shape (n_sets, n_free) of (n_sets, n_entries)."""
+        problem, errors = self._problem, self._problem.compiled.errors
+        shape = (self._size, problem.n_postures)
+        on_passive = np.zeros((*shape, self.correction.shape[2]))
+        on_drives = np.zeros((*shape, self._offsets.shape[1]))
+        twists = np.zeros((self._size, 6 * len(errors.moved)))
+        offsets, gains = np.zeros((2, self._size, self._offsets.shape[1]))
+        unknowns = np.zeros((self._size, problem.n_free - problem.n_machine))
+        for rows in self._rows:
+            f = (forces / problem.noise)[:, rows.group.entries, None]
+            at_posture = np.zeros((problem.n_postures, rows.posture.size))
+            at_posture[rows.posture, np.arange(rows.posture.size)] = 1.0
+            on_passive += at_posture @ (f * rows.by_passive)
+            on_drives += at_posture @ (f * rows.by_actuated)
+            _, columns = rows.group.reading.slopes.pattern("by_twists")
+            twists[:, columns] += (np.swapaxes(f, 1, 2) @ rows.by_twists)[:, 0]
+            at_zero = f * rows.by_zero
+            offsets += at_zero.sum(axis=1)
+            gains += (at_zero * problem.session.zero_drives[rows.group.setups]).sum(axis=1)
+            for j, own in enumerate(np.moveaxis(f * rows.by_unknowns, 2, 0)):
+                np.add.at(unknowns.T, rows.group.unknowns[:, j], own.T)
+        held = (on_passive[:, :, None] @ self._inverse)[:, :, 0]
+        on_drives -= (held[:, :, None] @ self._by_actuated)[:, :, 0]
+        offsets += on_drives.sum(axis=1)
+        gains += (on_drives * problem.drives).sum(axis=1)
+        of_rows, columns = self._pattern
+        np.subtract.at(twists.T, columns, (held[..., of_rows] * self._by_twists).sum(axis=1).T)
+        turned = twists.reshape(self._size, -1, 1, 6) @ self._turned
+        machine = turned.reshape(self._size, -1) @ errors.twists_of(self._columns.T).T
+        machine += offsets @ errors.offsets(self._columns.T).T
+        machine += gains @ errors.scales(self._columns.T).T
+        return np.hstack([machine, unknowns * problem.theta_scale[problem.n_machine :]])
+
+    def follow(self, change: Array) -> Array:
+        """Change of the passive coordinates that closes the loops, with θ̂ changed.
+
+        Args:
+            change: dθ̂, shape (n_sets, n_free); what is of sensors moves nothing.
+
+        Returns:
+            Shape (n_sets, n_postures, n_passive), [m, rad].
+        """
+        problem, errors = self._problem, self._problem.compiled.errors
+        moved = change[:, : problem.n_machine] @ self._columns.T
+        inner = errors.twists_of(moved).reshape(len(change), -1, 6, 1)
+        twists = (self._turned @ inner).reshape(len(change), -1)
+        drives = errors.offsets(moved)[:, None] + errors.scales(moved)[:, None] * problem.drives
+        rows, columns = self._pattern
+        by_row = np.zeros((rows.size, self._inverse.shape[3]))
+        by_row[np.arange(rows.size), rows] = 1.0
+        opened = (self._by_twists * twists[:, None, columns]) @ by_row
+        opened += (self._by_actuated @ drives[..., None])[..., 0]
+        return np.asarray(self.correction - (self._inverse @ opened[..., None])[..., 0])
+
+    def _actuated(self, commanded: Array) -> Array:
+        """Where drives are: (n_sets, ..., n_drives) of (..., n_drives) commanded, [m, rad]."""
+        shape = (self._size,) + (1,) * (commanded.ndim - 1) + (-1,)
+        return np.asarray(self._gains.reshape(shape) * commanded + self._offsets.reshape(shape))
+
+    def _read(
+        self, group: SensorGroup, theta: Array, actuated: Array, passive: Array, placements: Array
+    ) -> _Rows:
+        problem, s = self._problem, self._size
+        posture = problem.observations.posture[group.entries]
+        zero, n = self._actuated(problem.session.zero_drives), posture.size
+        unknowns = theta[:, problem.n_machine :] * problem.theta_scale[problem.n_machine :]
+        h, h_a, h_q, h_t, h_z, h_u = group.reading.slopes.unshared(
+            actuated[:, posture].reshape(s * n, -1),
+            passive[:, posture].reshape(s * n, -1),
+            np.repeat(placements, n, axis=0),
+            zero[:, group.setups].reshape(s * n, -1),
+            np.tile(group.constants, (s, 1)),
+            unknowns[:, group.unknowns].reshape(s * n, -1),
+        )
+        slopes = (v.reshape(s, n, -1) for v in (h_a, h_q, h_t, h_z, h_u))
+        return _Rows(group, posture, h.reshape(s, n), *slopes)
+
+
+def _inverse(matrices: Array) -> Array:
+    """Inverses of square matrices, shape (..., n, n); least squares of others."""
+    if matrices.shape[-1] == matrices.shape[-2]:
+        return np.asarray(np.linalg.inv(matrices))
+    return np.asarray(np.linalg.pinv(matrices, rcond=1e-10))
