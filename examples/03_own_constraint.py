@@ -29,7 +29,7 @@ solver = ca.nlpsol(
 )
 sigma = orthocal.calibrate(session, choice).noise.sigma
 found = solver(x0=program.begin(sigma=sigma), p=program.pack(sigma=sigma), lbg=0.0, ubg=0.0)
-own = found["x"].full()[: problem.n_free, 0] * problem.theta_scale
+own = (found["x"].full()[: problem.n_free, 0] * problem.theta_scale)[: problem.n_machine]
 
 free = orthocal.calibrate(session, choice)
 print("parameter        free [mm]   the sum held at 0 [mm]")

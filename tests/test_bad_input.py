@@ -185,7 +185,8 @@ SESSION_KEY_CASES = [
         "key-unknown-in-gauge",
         "sigma_mm:",
         "sigma:",
-        ": gauge.sigma: unknown key; known keys: sigma_mm, resolution_mm, range_mm, tip",
+        ": gauge.sigma: unknown key; known keys: sigma_mm, resolution_mm, range_mm, tip, "
+        "scale_tolerance",
     ),
     session(
         "key-unknown-in-posture",
@@ -198,7 +199,8 @@ SESSION_KEY_CASES = [
         "xy: {leg:",
         "xy: {legs:",
         ": setups.xy.legs: unknown key; known keys: sensor, gauge, postures, "
-        "leg, direction, section, touches, tip",
+        "direction_tolerance_mrad, section_tolerance_mm, lateral_tolerance_mm, scale_tolerance, "
+        "stand, square_tolerance_mrad, leg, direction, section, touches, tip",
     ),
     session(
         "key-unknown-in-section",
@@ -1390,12 +1392,12 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "schema-other",
-        f"{CALIBRATION}: schema is 'orthocal/calibration/9'; expected 'orthocal/calibration/4'",
-        swap(FILE, "orthocal/calibration/4", "orthocal/calibration/9"),
+        f"{CALIBRATION}: schema is 'orthocal/calibration/9'; expected 'orthocal/calibration/5'",
+        swap(FILE, "orthocal/calibration/5", "orthocal/calibration/9"),
     ),
     calibration(
         "schema-missing",
-        f"{CALIBRATION}: schema: is missing; expected 'orthocal/calibration/4'",
+        f"{CALIBRATION}: schema: is missing; expected 'orthocal/calibration/5'",
         write(FILE, "{}"),
     ),
     calibration(
@@ -1423,7 +1425,7 @@ CALIBRATION_CASES = [
     calibration(
         "value-infinite",
         f"{CALIBRATION}: noise.dof: found 'inf'; expected a finite number",
-        swap(FILE, '"dof": 3.0', '"dof": 1e999'),
+        swap(FILE, '"dof": 2.99', '"dof": 1e999'),
     ),
     calibration(
         "covariance-too-large",
@@ -1453,7 +1455,7 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "sensor-bias-too-long",
-        f"{CALIBRATION}: sensor_bias: has 1 numbers; expected 0, as sensors",
+        f"{CALIBRATION}: sensor_bias: has 1 numbers; expected 19, as sensors",
         put(FILE, "sensor_bias", [1e-3]),
     ),
     calibration(

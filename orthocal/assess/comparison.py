@@ -122,7 +122,7 @@ def compare_models(
                     score_model(held, noise=noise.sigma, by_choice=False, options=options)
                 )
             except NotIdentifiableError as e:
-                undetermined.append(Undetermined(model, problem.n_free, e.problem))
+                undetermined.append(Undetermined(model, problem.n_machine, e.problem))
     results.sort(key=lambda r: r.n_free)
     best, _ = judge_models(results, undetermined)
     repetition = None

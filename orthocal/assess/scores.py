@@ -19,7 +19,7 @@ from orthocal.estimation.linear import Linearisation
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.weighting import SMALLEST_SIGMA
-from orthocal.statistics.information import decompose
+from orthocal.statistics.information import decompose, take_for_known
 from orthocal.statistics.zeros import project_out_zeros
 
 Array = NDArray[np.float64]
@@ -114,16 +114,16 @@ def score_model(
     """
     fit = fit_problem(problem, options=options)
     linearisation = fit.linearisation
-    rank = linearisation.information.rank
+    rank = take_for_known(linearisation.information, problem.n_machine).rank
     calibration = assemble_calibration(fit)
     tool = _assess(calibration)
     return ModelResult(
         model=problem.selection.label,
-        n_free=problem.n_free,
+        n_free=problem.n_machine,
         rank=rank,
         spare=fit.independent_readings - rank,
         effective=_effective(fit),
-        prior=problem.prior,
+        prior=bool(problem.machine_selection.prior.any()),
         by_choice=by_choice,
         linearised=_score(fit, linearisation, "linearised", noise),
         exact=_score(fit, linearisation, "exact", noise),
@@ -208,5 +208,6 @@ def _predict_unseen(fit: Fit, linearisation: Linearisation, method: Method) -> A
 def _linearisation_cost(fit: Fit, tool: ToolAccuracy) -> ErrorSize:
     """Tool distance between the linearised and the exact estimate, to first order."""
     change = np.zeros(len(tool.names))
-    change[: fit.problem.n_free] = fit.linear - fit.solution.theta
+    n = fit.problem.n_machine
+    change[:n] = (fit.linear - fit.solution.theta)[:n]
     return tool.measure(tool.jacobian @ change).headline

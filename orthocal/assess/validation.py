@@ -22,7 +22,7 @@ from orthocal.assess.mistakes import EnteringMistake, find_mistake
 from orthocal.assess.repetition import Repetition, measure_repetition
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.recording import assemble_calibration
-from orthocal.calibration.repeating import repeat_fit
+from orthocal.calibration.repeating import repeat_fit, restore_gauge_covariance
 from orthocal.diagnosis.rows import ResidualRow
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import Fit
@@ -175,6 +175,7 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
     session = join_sessions([_entered(calibration, one) for one in given])
     entries = find_entries(calibration)
     fit = repeat_fit(calibration, session)
+    stood = restore_gauge_covariance(calibration), fit.gauge_covariance
     refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
     repetition = measure_repetition(calibration, refit)
     found = Validation(
@@ -186,8 +187,8 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
         achieved_largest=refit.largest_before,
         refit_rms=refit.rms_after,
         refit_largest=refit.largest_after,
-        excess_probability=_excess_probability(calibration, refit),
-        changes=_further_changes(calibration, refit, repetition),
+        excess_probability=_excess_probability(calibration, fit, refit, stood),
+        changes=_further_changes(calibration, refit, repetition, stood),
         mistake=None,
         enter=entries,
         repetition=repetition,
@@ -226,7 +227,8 @@ def _entered(calibration: Calibration, session: Session) -> Session:
 def _find_mistake(calibration: Calibration, fit: Fit, session: Session) -> EnteringMistake | None:
     """The mistake in entering offsets that explains a session, if one does."""
     drives, o, problem = session.robot.drives, fit.problem.observations, fit.problem
-    theta = np.array([p.value for p in calibration.free])
+    stood = fit.solution.theta[problem.n_machine :]
+    theta = np.append([p.value for p in calibration.free], stood)
     deviations = project_out_zeros(problem.values - problem.predict(theta), o)
     slopes = np.zeros((o.size, len(drives)))
     for i, drive in enumerate(drives):
@@ -254,12 +256,13 @@ def _find_mistake(calibration: Calibration, fit: Fit, session: Session) -> Enter
 
 
 def _further_changes(
-    calibration: Calibration, refit: Calibration, repetition: Repetition
+    calibration: Calibration, refit: Calibration, repetition: Repetition, stood: Sequence[Array]
 ) -> tuple[FurtherChange, ...]:
     """New less old estimates, against the standard error of the difference of the two.
 
     What repeats in both sessions, as errors of the model do, moves both estimates alike: where the
-    readings tell how much does not repeat, only that counts.
+    readings tell how much does not repeat, only that counts, and how the gauges stood, each time
+    otherwise.
     """
     pairs = list(zip(calibration.free, refit.free, strict=True))
     scale, dof = (1.0, 1.0), min(calibration.dof, refit.dof)
@@ -270,9 +273,15 @@ def _further_changes(
     # so many chances to be wrong by chance: each gets its share
     factor = confidence_factor(dof, 1.0 - CHANGE_CHANCE / len(pairs))
     changes = []
-    for old, new in pairs:
+    variances = np.maximum([np.diag(g) for g in stood], 0.0).T
+    for pair, by_gauges in zip(pairs, variances.tolist(), strict=True):
+        old, new = pair
         change = new.value - old.value
-        std = math.hypot(old.std * scale[0], new.std * scale[1])
+        scattered = (
+            share**2 * max(p.std**2 - g, 0.0)
+            for p, g, share in zip(pair, by_gauges, scale, strict=True)
+        )
+        std = math.sqrt(sum(scattered) + sum(by_gauges))
         changes.append(FurtherChange(new.name, new.unit, change, std, abs(change) > factor * std))
     return tuple(changes)
 
@@ -299,16 +308,29 @@ def _require_offsets(calibration: Calibration, session: Session) -> None:
         )
 
 
-def _excess_probability(calibration: Calibration, refit: Calibration) -> float:
-    """Upper tail of the ratio of achieved to expected mean squares."""
+def _excess_probability(
+    calibration: Calibration, fit: Fit, refit: Calibration, stood: Sequence[Array]
+) -> float:
+    """Upper tail of the ratio of achieved to expected mean squares.
+
+    Expected is what the calibration left, once more for what it did not know of its parameters,
+    and what both are off for how the gauges stood; that is of a few directions, which counts for
+    as few degrees of freedom (Satterthwaite).
+    """
     expected = calibration.noise.residual_sigma
     dof = calibration.noise.residual_dof
     if not (expected > 0.0 and dof > 0.0):
         return math.nan
+    problem, o = fit.problem, fit.problem.observations
     rows = refit.residuals
     zeros = len({r.setup for r in rows if r.minus is None})
     achieved = sum(r.deviation**2 / (2.0 if r.minus else 1.0) for r in rows)
     count = len(rows) - zeros
-    # what the calibration did not know of its parameters adds to what the new readings show
-    mean = expected**2 * (1.0 + (count - refit.noise.residual_dof) / count)
-    return float(special.fdtrc(count, dof, achieved / count / mean))
+    n = problem.n_machine
+    slopes = project_out_zeros(fit.jacobian[:, :n] / problem.theta_scale[:n], o)
+    each = expected**2 * (1.0 + (count - refit.noise.residual_dof) / count)
+    gram = slopes.T @ slopes @ sum(stood)
+    mean = each + float(np.trace(gram)) / count
+    square = count * each**2 + 2.0 * each * float(np.trace(gram)) + float(np.trace(gram @ gram))
+    independent = (count * mean) ** 2 / square
+    return float(special.fdtrc(independent, dof, achieved / count / mean))

@@ -69,10 +69,11 @@ def calibrate(
     options = _solver_options(solver, loss)
     problem = CalibrationProblem(session, chosen.select(session.robot.parameters))
     if start is not None:
-        start, _ = as_rows(start, problem.n_free, "free parameters to start from")
-        if start.shape != (1, problem.n_free) or not np.isfinite(start).all():
-            raise ValueError(f"expected {problem.n_free} finite numbers to start from")
-        start = start[0]
+        n = problem.n_machine
+        start, _ = as_rows(start, n, "free parameters to start from")
+        if start.shape != (1, n) or not np.isfinite(start).all():
+            raise ValueError(f"expected {n} finite numbers to start from")
+        start = np.append(start[0], np.zeros(problem.n_free - n))
     whole = None
     if chosen.base:
         whole = problem
@@ -112,7 +113,8 @@ def _fit_base(
         found = find_base_parameters(factor, machine, threshold=sigma)
         if not found:
             raise NotIdentifiableError(
-                "the readings tell none of the free parameters", parameters=problem.free
+                "the readings tell none of the free parameters",
+                parameters=problem.machine_selection.names,
             )
         chosen = [c.terms[0][0] for c in found]
         if chosen == leads:

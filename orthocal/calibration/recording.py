@@ -76,7 +76,9 @@ def assemble_calibration(
     n = problem.n_machine
     covariance = fit.covariance()
     # a base parameter is the whole combination: nothing of it is left out
-    others = find_other_errors(fit, spoken_for=() if whole is None else whole.free)
+    others = find_other_errors(
+        fit, spoken_for=() if whole is None else whole.machine_selection.names
+    )
     unmodelled, taken_on = measure_unmodelled(fit, others)
     estimates = _estimates(fit, covariance, _widen(fit, unmodelled, intervals or {}))
     diagnostics = diagnose_readings(fit)
@@ -265,8 +267,10 @@ def _residual_rows(
         residual = project_out_zeros(measured - prediction, o, weights=fit.weights)
         return session.values - noise * o.rows(residual)
 
-    reference = problem.reference if nominal_theta is None else nominal_theta
-    nominal = fitted(problem.predict(reference))
+    n = problem.n_machine
+    reference = problem.reference[:n] if nominal_theta is None else nominal_theta
+    # gauges stood as they did, whatever the machine is held to be
+    nominal = fitted(problem.predict(np.append(reference, fit.solution.theta[n:])))
     try:
         by_linear = fitted(problem.predict(fit.linear))
     except ClosureError:  # the linearised machine cannot be assembled

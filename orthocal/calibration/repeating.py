@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.recording import assemble_calibration
-from orthocal.estimation.fit import Fit, fit_problem
+from orthocal.estimation.fit import Fit, find_gauge_covariance, fit_problem
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
+from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.fields import read_only
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
 from orthocal.robot.model import Robot
+from orthocal.statistics.information import decompose
+
+Array = NDArray[np.float64]
 
 
 def repeat_calibration(calibration: Calibration, sessions: Given | Sequence[Given]) -> Calibration:
@@ -41,6 +47,33 @@ def repeat_calibration(calibration: Calibration, sessions: Given | Sequence[Give
 
 def repeat_fit(calibration: Calibration, session: Session) -> Fit:
     """The fit of `repeat_calibration`."""
+    solver = calibration.solver
+    options = SolverOptions(solver=solver.name, loss=Loss(solver.loss, solver.loss_width))
+    return fit_problem(_repeat_problem(calibration, session), options=options)
+
+
+def restore_gauge_covariance(calibration: Calibration) -> Array:
+    """`find_gauge_covariance` of a calibration, from what its file keeps.
+
+    Shape (n_free, n_free), [SI]; zeros where the noise is not known.
+    """
+    problem = _repeat_problem(calibration, restore_session(calibration))
+    if not math.isfinite(calibration.noise.sigma):
+        return np.zeros((problem.n_machine, problem.n_machine))
+    noise = {g.name: g.noise / calibration.noise.sigma for g in calibration.gauges}
+    of_setup = np.array([noise[s.gauge] for s in problem.session.setups.values()])
+    problem = problem.with_noise(of_setup[problem.observations.setup])
+    theta = np.array([p.value for p in (*calibration.free, *calibration.sensors)])
+    _, jacobian = problem.linearise(theta)
+    return find_gauge_covariance(
+        problem,
+        decompose(jacobian, problem.observations),
+        sigma=max(calibration.noise.sigma, SMALLEST_SIGMA),
+        held=np.array([p.at_bound for p in (*calibration.free, *calibration.sensors)], dtype=bool),
+    )
+
+
+def _repeat_problem(calibration: Calibration, session: Session) -> CalibrationProblem:
     free = calibration.free
     parameters = session.robot.parameters
     selection = Selection(
@@ -52,9 +85,7 @@ def repeat_fit(calibration: Calibration, session: Session) -> Fit:
         upper=read_only([np.inf if p.upper is None else p.upper for p in free]),
         fixed={p.name: p.value for p in calibration.parameters if not p.free},
     )
-    solver = calibration.solver
-    options = SolverOptions(solver=solver.name, loss=Loss(solver.loss, solver.loss_width))
-    return fit_problem(CalibrationProblem(session, selection), options=options)
+    return CalibrationProblem(session, selection)
 
 
 def restore_session(calibration: Calibration) -> Session:
@@ -99,6 +130,7 @@ def restore_session(calibration: Calibration) -> Session:
         path=None if record.path is None else Path(record.path),
         readings_path=None if record.readings_path is None else Path(record.readings_path),
         sha256=record.sha256,
+        joined=bool(record.parts),
     )
 
 

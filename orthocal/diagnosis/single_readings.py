@@ -50,7 +50,8 @@ class Diagnostics:
     deleted: Array
     """That error, [m]: measured less what the others predict."""
     influence: Array
-    """Largest change of a parameter when the row is left out, in its standard deviations."""
+    """Largest change of an error of the machine when the row is left out, in its standard
+    deviations."""
     influenced: NDArray[np.int64]
     """Which parameter that is."""
     critical: float
@@ -96,9 +97,11 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
         deleted = projected / left
         share = projected**2 / left
     spread, dof = _spread_without(fit, share)
-    std = np.sqrt(np.diag(inverse))
+    n = problem.n_machine
+    std = np.sqrt(np.diag(inverse))[:n]
     with np.errstate(divide="ignore", invalid="ignore"):
-        shifts = np.abs(moved * (weights * deleted)[:, None]) / np.where(std > 0.0, std, np.inf)
+        shifts = np.abs(moved[:, :n] * (weights * deleted)[:, None])
+        shifts /= np.where(std > 0.0, std, np.inf)
     influenced = np.nan_to_num(shifts).argmax(axis=1)
     return Diagnostics(
         studentised=deleted * np.sqrt(left) / spread,

@@ -32,6 +32,7 @@ from orthocal.statistics.information import (
     decompose,
     marginalise,
     require_identifiable,
+    take_for_known,
 )
 from orthocal.statistics.noise import Noise, estimate_noise, estimate_repeatability
 from orthocal.statistics.zeros import project_out_zeros
@@ -128,6 +129,41 @@ class Fit:
             held=self.held,
             loss=factors,
         )
+
+    @property
+    def gauge_covariance(self) -> Array:
+        """As of `find_gauge_covariance`."""
+        return find_gauge_covariance(
+            self.problem, self.information, sigma=self.sigma, held=self.held
+        )
+
+
+def find_gauge_covariance(
+    problem: CalibrationProblem,
+    information: Information,
+    *,
+    sigma: float,
+    held: NDArray[np.bool_] | None = None,
+) -> Array:
+    """What of the covariance of the machine's parameters is from how its gauges stood.
+
+    Other setups have it anew. It is what would be gone were all known to stand as found, shape
+    (n_machine, n_machine), [SI].
+
+    Args:
+        problem: The problem.
+        information: Of all its parameters.
+        sigma: Standard deviation of a reading, [m].
+        held: Parameters that a bound holds, shape (n_free,).
+    """
+    n, precision = problem.n_machine, problem.prior_precision
+    held = np.zeros(problem.n_free, dtype=np.bool_) if held is None else held
+    whole = information.covariance(sigma=sigma, precision=precision, held=held)
+    known = take_for_known(information, n).covariance(
+        sigma=sigma, precision=precision[:n], held=held[:n]
+    )
+    scale = problem.theta_scale[:n]
+    return np.asarray((whole[:n, :n] - known) * np.outer(scale, scale))
 
 
 def fit_problem(
@@ -297,7 +333,7 @@ def require_determined(problem: CalibrationProblem, information: Information) ->
     where = session.readings_path or session.path
     require_identifiable(
         information,
-        problem.free,
+        problem.machine_selection.names,
         precision=problem.prior_precision,
         where=None if where is None else str(where),
     )

@@ -73,6 +73,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         readings_path=None,
         sha256="",
         parts=tuple(sessions),
+        joined=True,
     )
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from orthocal.documents import Name, Number, PositiveNumber
+from orthocal.sensors.standing import LARGEST_SCALE
 from orthocal.sensors.tips import TipKeys
 from orthocal.units import DEG, MM, MRAD, Unit
 
@@ -55,6 +56,8 @@ class GaugeKeys(_Keys):
     range_mm: Annotated[list[GaugeEnd], Field(min_length=2, max_length=2)] | None = None
     tip: TipKeys | None = None
     """What it touches with, in setups that do not say so themselves."""
+    scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] | None = None
+    """How well it shows a millimetre, likewise."""
 
     @model_validator(mode="after")
     def _range_rises(self) -> GaugeKeys:

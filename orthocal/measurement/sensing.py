@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from orthocal.kinematics.assembly import Assembly, nominal_assembly
 from orthocal.kinematics.compiled import compiled_robot, zero_poses
 from orthocal.measurement.observations import Observations, drive_table
-from orthocal.measurement.session import Session
+from orthocal.measurement.session import Session, Setup
 from orthocal.robot.parameters import Parameter
 from orthocal.sensors.compiled import CompiledReading, compile_reading
-from orthocal.sensors.protocol import Contact
+from orthocal.sensors.protocol import Contact, Unknown
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -59,12 +59,22 @@ def sensor_unknowns(session: Session) -> SensorUnknowns:
     for setup in session.setups.values():
         own = []
         for unknown in setup.sensor.unknowns if setup.name in read else ():
-            owner = unknown.shared_by or f"setup.{setup.name}"
-            name = f"{owner}.{unknown.name}"
+            name = f"{_owner(unknown, setup, session)}.{unknown.name}"
             found.setdefault(name, Parameter(name, unknown.unit, unknown.tolerance, ()))
             own.append(list(found).index(name))
         places.append(tuple(own))
     return SensorUnknowns(tuple(found.values()), tuple(places))
+
+
+def _owner(unknown: Unknown, setup: Setup, session: Session) -> str:
+    """Whose it is: a gauge's of that name in every session, a session's, or the setup's own."""
+    label, joined, _ = setup.name.partition("/") if session.joined else ("", "", "")
+    if unknown.of_gauge:
+        gauge = setup.gauge if not label else setup.gauge.partition("/")[2]
+        return f"gauge.{gauge}" if gauge else "gauge"
+    if unknown.shared_by is not None:
+        return f"{label}{joined}{unknown.shared_by}"
+    return f"setup.{setup.name}"
 
 
 def group_sensors(session: Session, observations: Observations) -> tuple[SensorGroup, ...]:

@@ -105,7 +105,9 @@ class Session:
     readings_path: Path | None
     sha256: str
     parts: tuple[Session, ...] = ()
-    """The sessions that were joined into this one."""
+    """The sessions that were joined into this one, where they are at hand."""
+    joined: bool = False
+    """Whether several were, so that names begin with that of their session and a slash."""
 
     @property
     def gauge(self) -> Gauge:

@@ -31,7 +31,7 @@ from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
 from orthocal.measurement.session_robot import build_offsets, require_given_zero
 from orthocal.robot.loading import load_robot
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import Sensor, SetupKeys
+from orthocal.sensors.protocol import Sensor, SetupKeys, Unknown
 from orthocal.sensors.registry import read_setup
 from orthocal.units import DRIVE_UNITS, MM
 
@@ -147,7 +147,7 @@ def _read_setups(file: Path, keys: SessionKeys) -> _Setups:
     for name, data in keys.setups.items():
         named = data.get("gauge")
         gauge = gauges.get(named, only) if isinstance(named, str) else only
-        given = {} if gauge.tip is None else {"tip": gauge.tip.model_dump(exclude_none=True)}
+        given = gauge.model_dump(include={"tip", "scale_tolerance"}, exclude_none=True)
         found[name] = read_setup(
             data, where=str(file), under=f"setups.{name}", error=SessionError, gauge=given
         )
@@ -170,6 +170,7 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         where = f"{file}: setups.{name}"
         sensor.require_fit(robot, where=where)
         setups[name] = Setup(name, sensor, _gauge_of(setup, gauges, where))
+    _check_shared(setups, str(file))
     _check_planned_postures(file, keys, read)
     return Session(
         robot=robot,
@@ -185,6 +186,27 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         readings_path=None,
         sha256="",
     )
+
+
+def _check_shared(setups: Mapping[str, Setup], file: str) -> None:
+    """Refuse setups that share what they cannot: at another place, or known otherwise."""
+    first: dict[tuple[str, str], tuple[Setup, Unknown]] = {}
+    for setup in setups.values():
+        for unknown in setup.sensor.unknowns:
+            owner = f"gauge {setup.gauge}" if unknown.of_gauge else unknown.shared_by
+            if owner is None:
+                continue
+            before, known = first.setdefault((owner, unknown.name), (setup, unknown))
+            if not unknown.of_gauge and before.sensor.place != setup.sensor.place:
+                problem = f"stands at {' '.join(before.sensor.place)}"
+            elif known.tolerance != unknown.tolerance:
+                problem = f"has it known to {known.tolerance:g} {known.unit}"
+            else:
+                continue
+            raise SessionError(
+                f"shares the {unknown.name} of '{owner}' with '{before.name}', which {problem}",
+                where=f"{file}: setups.{setup.name}",
+            )
 
 
 def _build_gauges(keys: SessionKeys) -> dict[str, Gauge]:

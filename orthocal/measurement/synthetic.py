@@ -111,7 +111,9 @@ def simulate_session(
     unknown = sensor_unknowns(plan).parameters
     drawn = np.zeros(len(unknown))
     if unknown and not exact:
-        drawn = rng.normal(size=len(unknown)) * [p.tolerance for p in unknown]
+        # their own, so that noise is the same whatever is not known of the gauges
+        own = np.random.default_rng((seed, 1)).normal(size=len(unknown))
+        drawn = own * [p.tolerance for p in unknown]
     entries = predict_entries(plan, observations, errors, unknowns=drawn)
     gauges = [plan.gauges[s.gauge] for s in plan.setups.values()]
     deviation = np.array([_noise_of(plan, s.gauge, sigma, exact) for s in plan.setups.values()])

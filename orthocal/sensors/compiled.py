@@ -80,7 +80,7 @@ class _Pattern:
             (sensor.kind, type(sensor).__qualname__),
             frames,
             self.n_constants,
-            len(sensor.unknowns),
+            tuple(u.name for u in sensor.unknowns),
             _source(type(sensor)),
         )
 

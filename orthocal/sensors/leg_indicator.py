@@ -1,7 +1,8 @@
 """The paper's sensor: an indicator on the base reads a leg that is not parallel to its motion.
 
-It touches the leg where the leg's line, from root to tip, crosses the plane of the section. Its
-reading is the coordinate of that point along its direction:
+It touches the leg where the leg's line, from root to tip, crosses the plane of the section, as an
+edge across leg and plunger does. Where the plunger is square to the leg its reading is the
+coordinate of that point along its direction:
 
     h = d · (root + t (tip − root)),  t = (c − a · root)/(a · (tip − root))
 
@@ -24,6 +25,8 @@ from orthocal.documents import Name, Number
 from orthocal.errors import SessionError
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.protocol import Contact, Frames, SetupKeys, Unknown, View
+from orthocal.sensors.standing import USUAL, Standing, StandingKeys, stand
+from orthocal.sensors.tips import touch_by_blade
 from orthocal.units import MM, to_mm
 
 Array = NDArray[np.float64]
@@ -66,7 +69,7 @@ class SectionKeys(BaseModel):
         return self
 
 
-class LegKeys(SetupKeys):
+class LegKeys(StandingKeys, SetupKeys):
     """A setup of an indicator on a leg, as in a session.yaml."""
 
     leg: Name
@@ -104,6 +107,7 @@ class LegIndicator:
     direction: str
     """x, y, z, -x, -y or -z of the world: the direction of a growing reading."""
     section: Section
+    standing: Standing = USUAL
 
     kind: ClassVar[str] = "leg"
     keys: ClassVar[type[SetupKeys]] = LegKeys
@@ -112,12 +116,13 @@ class LegIndicator:
     @classmethod
     def from_keys(cls, keys: LegKeys) -> LegIndicator:
         """As in a session.yaml."""
-        return cls(keys.leg, keys.direction, Section.from_keys(keys.section))
+        section = Section.from_keys(keys.section)
+        return cls(keys.leg, keys.direction, section, Standing.from_keys(keys))
 
     def to_keys(self) -> dict[str, Any]:
         """As in a session.yaml."""
-        section = self.section.to_keys()
-        return {"leg": self.leg, "direction": self.direction, "section": section}
+        section, standing = self.section.to_keys(), self.standing.to_keys()
+        return {"leg": self.leg, "direction": self.direction, "section": section, **standing}
 
     def require_fit(self, robot: Robot, *, where: str) -> None:
         """Refuse a leg, direction or section that the robot does not have.
@@ -167,8 +172,8 @@ class LegIndicator:
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        """None but the zero of its setup."""
-        return ()
+        """How it stands."""
+        return self.standing.unknowns(ball=False)
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """What it shows, [m]."""
@@ -178,8 +183,22 @@ class LegIndicator:
         direction, plane, axis = c[:3], c[3], c[5:8]
         if view.at_zero:
             plane += c[4] * ca.dot(axis, view.at_zero[0].position)
-        t = (plane - ca.dot(axis, root)) / ca.dot(axis, tip - root)
-        return ca.dot(direction, root + t * (tip - root))
+        stood = stand(
+            self.unknowns,
+            view.unknowns,
+            direction=direction,
+            side=ca.cross(axis, direction),
+            axis=axis,
+        )
+        found = touch_by_blade(
+            at=root,
+            along=tip - root,
+            radius=ca.SX(0.0),
+            edge=stood.edge,
+            tip=plane * axis + stood.moved,
+            direction=stood.direction,
+        )
+        return stood.scale * found
 
     def describe(self) -> str:
         """Leg, direction and section."""

@@ -34,7 +34,10 @@ class Unknown:
     tolerance: float
     """One standard deviation, [unit]; its mean is 0."""
     shared_by: str | None = None
-    """Name of what all setups share that have the same of it, such as a dial; None for its own."""
+    """Name of what setups of a session share that have the same of it, at one place, such as a
+    block they stand on; None for its own."""
+    of_gauge: bool = False
+    """Whether all setups share it whose readings are shown by the same gauge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,6 +18,7 @@ from orthocal.errors import SessionError
 from orthocal.robot.model import Robot, Rod
 from orthocal.sensors.leg_indicator import DIRECTIONS, LegIndicator, LegKeys, Section
 from orthocal.sensors.protocol import Contact, Frames, SetupKeys, Unknown, View
+from orthocal.sensors.standing import USUAL, Standing, stand
 from orthocal.sensors.tips import Tip, TipKeys, touch_by_ball, touch_by_blade
 from orthocal.units import MM
 
@@ -57,6 +58,7 @@ class RodIndicator:
     """x, y, z, -x, -y or -z of the world: the direction of a growing reading."""
     section: Section
     tip: Tip
+    standing: Standing = USUAL
 
     kind: ClassVar[str] = "leg"
     keys: ClassVar[type[SetupKeys]] = RodKeys
@@ -66,7 +68,8 @@ class RodIndicator:
     def from_keys(cls, keys: Any) -> Self:  # noqa: ANN401 - RodKeys that name a rod and a tip
         """As in a session.yaml."""
         section, tip = Section.from_keys(keys.section), Tip.from_keys(keys.tip)
-        return cls(keys.leg, keys.touches, keys.direction, section, tip)
+        standing = Standing.from_keys(keys)
+        return cls(keys.leg, keys.touches, keys.direction, section, tip, standing)
 
     def to_keys(self) -> dict[str, Any]:
         """As in a session.yaml."""
@@ -115,8 +118,8 @@ class RodIndicator:
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        """None but the zero of its setup."""
-        return ()
+        """How it stands."""
+        return self.standing.unknowns(ball=self.tip.form == "ball")
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """What it shows, [m]."""
@@ -126,15 +129,16 @@ class RodIndicator:
         direction, plane, axis, side = c[:3], c[3], c[5:8], c[8:11]
         if view.at_zero:
             plane += c[4] * ca.dot(axis, view.at_zero[0].position)
+        stood = stand(self.unknowns, view.unknowns, direction=direction, side=side, axis=axis)
         found: ca.SX = self._touch(
             at=root,
             along=end - root,
             radius=c[12],
-            tip=plane * axis + c[11] * side,
-            direction=direction,
-            side=side,
+            tip=plane * axis + c[11] * side + stood.moved,
+            direction=stood.direction,
+            side=stood.edge,
         )
-        return found
+        return ca.SX(stood.scale * found)
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
         """Where the tip touches the rod's surface."""
@@ -230,7 +234,7 @@ class RodIndicator:
 
     @property
     def _line(self) -> LegIndicator:
-        return LegIndicator(self.leg, self.direction, self.section)
+        return LegIndicator(self.leg, self.direction, self.section, self.standing)
 
     def _rod(self, robot: Robot) -> Rod:
         return robot.legs[self.leg].rods[self.rod]

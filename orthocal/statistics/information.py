@@ -142,6 +142,11 @@ def marginalise(information: Information, kept: int, *, sigma: float) -> Informa
     return _information(sigma * left)
 
 
+def take_for_known(information: Information, kept: int) -> Information:
+    """What readings say of the first parameters, so many, all others known exactly."""
+    return _information(information.factor[:, :kept])
+
+
 def decompose(jacobian: Array, observations: Observations) -> Information:
     """Decompose an identification Jacobian.
 
@@ -172,8 +177,8 @@ def require_identifiable(
 
     Args:
         information: Of the readings.
-        names: Of the free parameters.
-        precision: What the prior knows of each: 1 or 0, shape (n_free,).
+        names: Of the parameters that are asked for, the first ones.
+        precision: What the prior knows of each of all: 1 or 0, shape (n_free,).
         where: File, for messages.
 
     Raises:
@@ -184,9 +189,10 @@ def require_identifiable(
     largest = max(float(information.singular_values[0]), 1e-300)
     stacked = np.vstack([information.factor / largest, np.diag(precision)])
     _, values, directions = np.linalg.svd(stacked, full_matrices=False)
-    null = directions[values <= RANK_THRESHOLD * values[0]]
+    null = directions[values <= RANK_THRESHOLD * values[0], : len(names)]
     lost = tuple(n for n, size in zip(names, (null**2).sum(axis=0), strict=True) if size > 1e-12)
     if lost:
+        information = take_for_known(information, len(names))
         named = ", ".join(lost[:MOST_NAMED])
         more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
         raise NotIdentifiableError(

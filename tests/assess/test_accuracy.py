@@ -9,6 +9,7 @@ import numpy as np
 import plans
 import pytest
 from derivatives import assert_derivative
+from gauges import exact
 from machines import place, write_orthoglide
 
 from orthocal import (
@@ -200,7 +201,7 @@ def test_what_three_plans_are_worth(
     full_aligned,
     offsets_aligned,
 ):
-    session = load_plan(plans.write(tmp_path, plan()))
+    session = exact(load_plan(plans.write(tmp_path, plan())))
     own = dict(zip(tool.free, tolerances, strict=True))
     problem = build_problem(session, free=tool.free, tolerances=own)
     _, slopes = problem.linearise(np.zeros(problem.n_free))

@@ -47,7 +47,7 @@ def test_offsets_alone_are_entered_as_they_are(root):
 def test_offsets_are_chosen_by_least_error_at_the_tool(quarter):
     """No offsets nearby leave less; the gain is how the choice follows from the parameters."""
     fleet = Fleet(quarter)
-    errors = dict(zip(fleet.machine.free, fleet.draw(np.random.default_rng(1)), strict=True))
+    errors = fleet.machine.split_errors(fleet.draw(np.random.default_rng(1)))
     result = calibrate(simulate_session(quarter, errors, seed=1).session, "full")
     tool = find_tool(result)
     space = tool.workspace
@@ -81,7 +81,7 @@ def test_what_is_promised_with_the_offsets_entered_is_kept(quarter):
     left = {"chosen": [], "identified": [], "offsets": [], "promised": []}
     for seed in range(10):
         drawn = fleet.draw(np.random.default_rng(100 + seed))
-        errors = dict(zip(fleet.machine.free, drawn, strict=True))
+        errors = fleet.machine.split_errors(drawn)
         session = simulate_session(quarter, errors, seed=seed).session
         full, alone = calibrate(session, "full"), calibrate(session)
         space = find_tool(alone).workspace

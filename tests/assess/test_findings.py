@@ -186,7 +186,8 @@ def test_a_suspicious_reading_is_found_with_file_and_line(spoilt, cycles):
     assert place.file == str(cycles.readings_path)
     n = found.numbers
     assert n["measured_mm"] == pytest.approx((row.value + 0.2e-3) * 1e3)
-    assert n["measured_mm"] - n["expected_mm"] == pytest.approx(0.2, abs=0.03)
+    # one of three cycles: a sixth of its error is taken for the machine's
+    assert 0.15 < n["measured_mm"] - n["expected_mm"] < 0.2
 
 
 def test_where_readings_stand_out_they_are_to_be_looked_at_before_a_setup(root):
@@ -281,7 +282,7 @@ def test_sound_machines_are_never_accused(plan, seed):
     drawn = fleet.draw(np.random.default_rng(70 + seed))
     for scale in (1.0, 0.0):
         values = np.where(fleet.is_offset, scale * drawn, drawn)
-        errors = dict(zip(fleet.machine.free, values, strict=True))
+        errors = fleet.machine.split_errors(values)
         session = simulate_session(plan, errors, seed=seed).session
         for model in ("offsets", "full"):
             found = decide(calibrate(session, model))

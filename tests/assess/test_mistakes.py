@@ -24,7 +24,7 @@ def machines(plan):
         drawn = fleet.draw(np.random.default_rng(40 + seed))
         # offsets that differ clearly between the drives
         drawn[fleet.is_offset] = np.roll([1.4e-3, -0.9e-3, 0.7e-3], seed)
-        errors = dict(zip(fleet.machine.free, drawn, strict=True))
+        errors = fleet.machine.split_errors(drawn)
         found.append((errors, calibrate(simulate_session(plan, errors, seed=seed).session)))
     return found
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gauges import exact
 from machines import place, reading_by_pinocchio
 
 from orthocal import Choice, calibrate, draw_errors, load_plan, load_session
@@ -11,7 +12,8 @@ from orthocal.assess.accuracy import assess_tool, measure_uncertainty
 from orthocal.calibration.recording import assemble_calibration
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.fleet import Fleet
 from orthocal.kinematics.assembly import Assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import cube
@@ -35,9 +37,9 @@ class Machines:
     """A plan, its full problem, and the tool of machines with given errors."""
 
     def __init__(self, root, name):
-        self.plan = load_plan(root / f"examples/{name}/plan.yaml")
+        self.plan = exact(load_plan(root / f"examples/{name}/plan.yaml"))
         self.problem = build_problem(self.plan, model="full", tolerances=IN_SI)
-        self.program = NonlinearProgram(self.problem)
+        self.batch = BatchProgram(self.problem)
         self.workspace = cube(self.plan.robot, points_a_side=5)
         assembly = Assembly(self.plan.robot)
         self.drives = assembly.inverse(self.workspace.points)
@@ -51,6 +53,13 @@ class Machines:
             tolerances=OFFSETS,
         )
         return np.array([errors[n] for n in self.problem.free])
+
+    def solve(self, truths, rng):
+        """What is identified of machines from their readings, of the same shape, [SI]."""
+        fleet = Fleet(self.problem, truths / self.problem.theta_scale)
+        assert fleet.close().all()
+        values = fleet.predict()
+        return self.batch.solve(values + SIGMA * rng.normal(size=values.shape), sigma=SIGMA).theta
 
     def tool(self, theta):
         return self.assembly.forward(self.drives, theta=theta)
@@ -77,14 +86,10 @@ def test_the_tools_error_is_what_the_posterior_predicts(machines):
         jacobian, covariance, m.workspace, m.workspace.points
     ).sizes.relative.rms
     assert predicted * 1e3 == pytest.approx(PREDICTED[m.name], rel=0.05, abs=0.0006)
+    truths = np.array([m.draw(100 + seed) for seed in range(MACHINES[m.name])])
     squares = []
-    for seed in range(MACHINES[m.name]):
-        truth = m.draw(100 + seed)
-        rng = np.random.default_rng(seed)
-        entries = problem.predict(truth)
-        values = entries + SIGMA * rng.normal(size=entries.size)
-        solution = m.program.solve(sigma=SIGMA, values=values, start=truth)
-        error = m.tool(solution.theta) - m.tool(truth)
+    for truth, found in zip(truths, m.solve(truths, np.random.default_rng(0)), strict=True):
+        error = m.tool(found) - m.tool(truth)
         error -= weights @ error
         squares.append(weights @ (error**2).sum(axis=1))
     found = np.sqrt(np.mean(squares))
@@ -116,7 +121,7 @@ def test_perfect_readings_give_the_tool_where_they_determine_it(machines):
 
 def test_the_calibrated_machine_in_pinocchio_shows_what_the_calibration_predicts(root):
     """All 126 errors in the placements of a pin.Model: its readings and its tool, to 1e-9 m."""
-    session = load_session(root / "examples/sweep")
+    session = exact(load_session(root / "examples/sweep"))
     result = calibrate(session, Choice(model="full", tolerances=OFFSETS))
     machine = session.robot.with_errors(result.errors)
     zeros = {s.name: s.zero for s in result.setups}
@@ -135,16 +140,14 @@ def test_the_covariance_of_the_full_model_is_that_of_300_calibrations(root):
     m = Machines(root, "sweep")
     problem, rng = m.problem, np.random.default_rng(0)
     errors, scaled = [], []
-    for _ in range(300):
-        truth = rng.normal(size=problem.n_free)
-        entries = problem.predict(truth * problem.theta_scale)
-        values = entries + SIGMA * rng.normal(size=entries.size)
-        solution = m.program.solve(sigma=SIGMA, values=values)
-        _, slopes = problem.linearise(solution.theta, solution.passive)
+    truths = rng.normal(size=(300, problem.n_free))
+    solved = m.solve(truths * problem.theta_scale, rng)
+    for truth, found in zip(truths, solved, strict=True):
+        _, slopes = problem.linearise(found)
         covariance = decompose(slopes, problem.observations).covariance(
             sigma=SIGMA, precision=problem.prior_precision
         )
-        error = solution.theta / problem.theta_scale - truth
+        error = found / problem.theta_scale - truth
         errors.append(np.linalg.solve(np.linalg.cholesky(covariance), error))
         scaled.append(error / np.sqrt(np.diag(covariance)))
     z, n = np.array(errors), len(errors)

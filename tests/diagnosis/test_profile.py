@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gauges import exact
 from scipy.optimize import least_squares
 
 from orthocal import Choice, calibrate, load_session
@@ -52,7 +53,7 @@ def test_its_ends_cost_what_they_should_by_another_solver(experiment_2):
 
 def test_where_the_problem_bends_it_is_not_symmetric(experiment_2):
     """At 99.9 % and three degrees of freedom the interval is 10 mm wide."""
-    fit = fit_problem(build_problem(experiment_2))
+    fit = fit_problem(build_problem(exact(experiment_2)))
     p = fit.solution.theta[0]
     low, high = profile_interval(fit, "x_slide.offset", level=0.999)
     skew = (high + low - 2 * p) / (high - low)

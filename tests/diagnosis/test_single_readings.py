@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gauges import exact
 
 from orthocal import SolverOptions, calibrate, load_plan, load_session, simulate_session
 from orthocal.diagnosis.single_readings import diagnose_readings
@@ -41,7 +42,7 @@ def differences_of(session: Session) -> Session:
 
 @pytest.fixture(scope="module")
 def readings(root):
-    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
     rows = tuple(r for r in plan.readings if r.cycle == 1)
     session = simulate_session(replace(plan, readings=rows), TRUTH, seed=5).session
     return session.with_gauge(Gauge(None, None, None))  # the residuals alone tell the noise
@@ -53,7 +54,7 @@ def test_leaving_a_row_out_changes_the_estimate_as_predicted(readings, experimen
     session = {
         "readings": readings,
         "differences": differences_of(readings),
-        "Table 1": experiment_2,
+        "Table 1": exact(experiment_2),
     }[form]
     fit = fit_problem(build_problem(session, model=model))
     found = diagnose_readings(fit)
@@ -91,7 +92,7 @@ def test_studentised_residuals_are_those_of_a_regression_with_an_extra_column(re
 @pytest.mark.parametrize("form", ["readings", "differences"])
 def test_studentised_residuals_of_noise_are_students(root, form):
     """Over many sessions: a variance of dof/(dof − 2), and rarely anything suspicious."""
-    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
     rows = tuple(r for r in plan.readings if r.cycle == 1)
     plan = replace(plan, readings=rows).with_gauge(replace(plan.gauge, resolution=None))
     values, alarms = [], 0

@@ -8,6 +8,7 @@ import numpy as np
 import plans
 import pytest
 from fleets import Fleet
+from gauges import exact
 from machines import write_orthoglide
 
 from orthocal import calibrate, load_plan, load_session, simulate_session
@@ -53,7 +54,7 @@ def test_a_setup_with_its_sign_turned_is_found(root, session, model, setup):
 @pytest.mark.parametrize("setup", ["zx", "xy", "xz", "yz"])
 def test_a_turned_setup_is_found_among_coarse_readings(root, setup):
     """Deviations of 0.12 to 0.26 mm, two cycles with 20 µm."""
-    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
     truth = {"x_slide.offset": 0.8e-3, "y_slide.offset": -0.45e-3, "z_slide.offset": 0.3e-3}
     session = simulate_session(plan, truth, sigma=20e-6, seed=1).session
     two = replace(session, readings=tuple(r for r in session.readings if r.cycle < 3))
@@ -148,7 +149,7 @@ def test_the_main_loop_walked_twice_accuses_nobody(raw_plan):
     """Through sessions, with the entered offsets stated: what the fleet takes a short way to."""
     fleet = Fleet(raw_plan)
     rng = np.random.default_rng(3)
-    errors = dict(zip(fleet.machine.free, fleet.draw(rng), strict=True))
+    errors = fleet.machine.split_errors(fleet.draw(rng))
     first = calibrate(simulate_session(raw_plan, errors, seed=1).session)
     assert first.turned is None
     offsets = np.array([first[f"{d.name}.offset"].value for d in raw_plan.robot.drives])
@@ -160,5 +161,5 @@ def test_the_main_loop_walked_twice_accuses_nobody(raw_plan):
     short = fleet.fit(session.values)
     entered = fit_problem(build_problem(session))
     np.testing.assert_allclose(
-        short.solution.theta + offsets, entered.solution.theta, rtol=0.0, atol=1e-9
+        short.solution.theta[:3] + offsets, entered.solution.theta[:3], rtol=0.0, atol=1e-9
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fleets import Fleet
+from gauges import exact
 
 from orthocal import calibrate, load_plan, simulate_session
 from orthocal.calibration import recording
@@ -21,7 +22,7 @@ from orthocal.statistics.zeros import project_out_zeros
 
 @pytest.fixture(scope="module")
 def plan(root):
-    return load_plan(root / "examples/raw-cycles/plan.yaml")
+    return exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
 
 
 @pytest.mark.parametrize("name", ["x_slide.rz", "x_swivel.x", "y_coupler.x", "z_bar_b.z"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gauges import exact
 from scipy.optimize import lsq_linear
 from tolerances import SAME_OPTIMUM
 
@@ -12,6 +13,7 @@ from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.linear import linearise_at_reference
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.batch import BatchProgram
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.show.explanation import explain_fit
 from orthocal.statistics.information import decompose
@@ -25,7 +27,7 @@ LINEAR = 0.02e-3
 
 @pytest.fixture(scope="module")
 def plan(root):
-    return load_plan(root / "examples/raw-cycles/plan.yaml")
+    return exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
 
 
 @pytest.fixture(scope="module")
@@ -102,23 +104,23 @@ def test_the_robust_covariance_is_that_of_many_simulated_calibrations(plan):
     """Huber's loss on normal noise: whitened errors are standard normal."""
     sigma = 20e-6
     problem = build_problem(plan)
-    program = NonlinearProgram(problem, options=SolverOptions(loss=Loss("huber")))
+    options = SolverOptions(loss=Loss("huber"))
     entries = problem.predict(np.array(list(TRUTH.values())))
     rng, white, loss = np.random.default_rng(0), [], Loss("huber")
     truth, o = np.array(list(TRUTH.values())), problem.observations
     _, jacobian = problem.linearise(truth)
     information = decompose(jacobian, o)
-    for _ in range(300):
-        values = entries + sigma * rng.normal(size=entries.size)
-        solution = program.solve(sigma=sigma, values=values, start=truth)
-        left = values - problem.predict(solution.theta, solution.passive)
+    measured = entries + sigma * rng.normal(size=(300, entries.size))
+    solved = BatchProgram(problem, options=options).solve(measured, sigma=sigma)
+    for values, theta in zip(measured, solved.theta, strict=True):
+        left = values - problem.predict(theta)
         residual = project_out_zeros(left, o) / sigma
         covariance = information.covariance(
             sigma=sigma,
             precision=problem.prior_precision,
             loss=(loss.gain(residual, used=3 + o.n_zeros), loss.normal_square),
         )
-        error = (solution.theta - truth) / problem.theta_scale
+        error = (theta - truth) / problem.theta_scale
         white.append(np.linalg.solve(np.linalg.cholesky(covariance), error))
     # 900 squares have a standard error of 5 %; the formula is one for many readings
     assert np.mean(np.square(white)) == pytest.approx(1.0, abs=0.15)

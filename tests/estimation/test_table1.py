@@ -92,7 +92,7 @@ def test_what_remains_of_experiments_2_and_3_is_the_same(results):
 def test_sigma_is_that_of_a_difference_with_three_degrees_of_freedom(results):
     c = results["experiment-2"]
     assert c.rows_are_differences
-    assert c.dof == 3
+    assert 2.998 < c.dof < 3.0  # of which the gauge's own unknowns take 0.0014
     assert abs(c.sigma * 1e3 - 0.276) < 0.0006
     assert c.noise.sigma == pytest.approx(c.sigma / math.sqrt(2.0))
     assert c.noise.source == "residuals"

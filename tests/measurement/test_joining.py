@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gauges import exact
 
 from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
 from orthocal.calibration.file import calibration_document, write_calibration
@@ -58,7 +59,7 @@ def test_two_halves_are_the_whole(sweep, model, solver):
 
 
 def test_a_session_counted_twice_halves_the_variance(raw_cycles):
-    stated = raw_cycles.with_gauge(replace(raw_cycles.gauge, sigma=50e-6, resolution=None))
+    stated = exact(raw_cycles).with_gauge(replace(raw_cycles.gauge, sigma=50e-6, resolution=None))
     once, twice = calibrate(stated), calibrate([stated, stated])
     assert twice.covariance == pytest.approx(0.5 * once.covariance, rel=1e-7)
     for p, q in zip(once.free, twice.free, strict=True):
@@ -83,7 +84,7 @@ def test_offsets_that_were_active_may_differ(root):
 
 def test_noise_is_told_for_each_session(root):
     """A dial of 5 µm and one of 40: as each alone is found, and the better one counts more."""
-    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
     plan = plan.with_gauge(replace(plan.gauge, sigma=None, resolution=None))
     fine = simulate_session(plan, TRUTH, seed=1, sigma=5e-6).session
     coarse = simulate_session(plan, TRUTH, seed=2, sigma=40e-6).session

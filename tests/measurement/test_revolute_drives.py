@@ -109,13 +109,15 @@ def test_offsets_survive_a_round_trip(tmp_path, robot):
 
 def test_what_was_identified_is_validated(tmp_path, robot):
     """Entered as found, it is confirmed; entered otherwise, the key that states it is named."""
-    found = calibrate(
-        simulate_session(load_plan(write_plan(tmp_path / "a", robot)), OFFSETS, seed=1).session
-    )
-    entered = [round(e.enter * 1e3, 4) for e in find_entries(found)]
-    plan = load_plan(write_plan(tmp_path / "b", robot, f"{{offsets_mrad: {entered}}}"))
-    new = simulate_session(plan, OFFSETS, seed=2).session
-    assert validate_calibration(found, new).confirmed
+    before, confirmed = load_plan(write_plan(tmp_path / "a", robot)), []
+    for seed in range(20, 30):  # legs that turn by 6 degrees: how a gauge stands matters most
+        found = calibrate(simulate_session(before, OFFSETS, seed=seed).session)
+        entered = [round(e.enter * 1e3, 4) for e in find_entries(found)]
+        folder = tmp_path / f"b{seed}"
+        plan = load_plan(write_plan(folder, robot, f"{{offsets_mrad: {entered}}}"))
+        new = simulate_session(plan, OFFSETS, seed=seed + 100).session
+        confirmed.append(validate_calibration(found, new).confirmed)
+    assert sum(confirmed) >= 9  # of 80 there were 76
     wrong = load_plan(write_plan(tmp_path / "c", robot, "{offsets_deg: [0, 0]}"))
     with pytest.raises(
         SessionError, match=r"controller.*: motor_a has 0 mrad where the calibration"

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gauges import exact
 from tolerances import KINEMATICS
 
 from orthocal import draw_errors, load_plan, load_session, simulate_session
@@ -56,7 +57,7 @@ def test_one_seed_one_session(plan):
 
 
 def test_noise_zeros_and_rounding_are_as_asked(plan):
-    fine = plan.with_gauge(replace(plan.gauge, resolution=None))
+    fine = exact(plan).with_gauge(replace(plan.gauge, resolution=None))
     predicted = predict_entries(plan, build_observations(plan), ERRORS)
     residuals = []
     for seed in range(40):

@@ -11,6 +11,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from gauges import exact
 from tolerances import SAME_OPTIMUM
 from tool_coordinate import ToolCoordinate
 
@@ -68,7 +69,7 @@ def known():
 @pytest.fixture
 def plan(tmp_path):
     (tmp_path / "plan.yaml").write_text(PLAN)
-    return load_plan(tmp_path / "plan.yaml")
+    return exact(load_plan(tmp_path / "plan.yaml"))
 
 
 def test_its_readings_are_those_of_the_tool(plan):
@@ -228,7 +229,7 @@ def test_a_sensor_that_was_changed_has_new_functions(tmp_path, root):
     found = []
     for factor in (1.0, 5.0):
         (tmp_path / "own.py").write_text(
-            f"import sys; sys.path.insert(0, {str(root / 'tests/sensors')!r})\n"
+            f"import sys; sys.path.insert(0, {str(root / 'tests')!r})\n"
             "from tool_coordinate import ToolCoordinate\n"
             "class Own(ToolCoordinate):\n"
             "    kind = 'own'\n"

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gauges import exact
 
 from orthocal import Choice, calibrate, load_plan, load_session, simulate_session
 from orthocal.errors import ParameterError
@@ -122,7 +123,8 @@ def jacobians(root):
     """Identification Jacobians of the full model at nominal, of sweep and lines."""
     found = {}
     for name in ("sweep", "lines"):
-        problem = build_problem(load_plan(root / f"examples/{name}/plan.yaml"), model="full")
+        plan = exact(load_plan(root / f"examples/{name}/plan.yaml"))
+        problem = build_problem(plan, model="full")
         _, jacobian = problem.linearise(np.zeros(problem.n_free))
         found[name] = problem, jacobian
     return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from gauges import exact
 from tool_coordinate import ToolCoordinate
 
 from orthocal import load_plan, load_session
@@ -76,7 +77,7 @@ def several_sensors(tmp_path):
     ids=["plain", "prior", "bounds", "known"],
 )
 def test_each_set_has_the_optimum_that_it_has_alone(root, loss, given):
-    session = load_session(root / "examples/table1/experiment-2")
+    session = exact(load_session(root / "examples/table1/experiment-2"))
     problem = build_problem(session, model="offsets", **given)
     options = SolverOptions(loss=Loss(loss))
     values, _ = draw(problem)
@@ -99,7 +100,7 @@ def test_each_set_has_the_optimum_that_it_has_alone(root, loss, given):
 
 @pytest.fixture(scope="module")
 def sweep(root):
-    return build_problem(load_session(root / "examples/sweep"), model="full")
+    return build_problem(exact(load_session(root / "examples/sweep")), model="full")
 
 
 @pytest.mark.parametrize("loss", ["squares", "huber"])
@@ -122,7 +123,7 @@ def test_many_parameters_are_solved_by_the_curvature_they_share(sweep, loss):
 
 def test_a_bound_or_a_machine_far_off_is_solved_alone(root):
     bounds = {"x_slide.offset": (-1e-3, 1e-3)}
-    session = load_session(root / "examples/sweep")
+    session = exact(load_session(root / "examples/sweep"))
     problem = build_problem(session, model="full", bounds=bounds)
     values, fleet = draw(problem, spread=0.4, sets=90)
     values[3] += 2e-3 * np.sin(np.arange(values.shape[1]))  # hardly a machine reads like this
@@ -182,7 +183,7 @@ def test_curved_readings_leave_the_third_order(sweep):
 
 
 def test_a_set_far_from_the_others_is_solved_alone(root):
-    session = load_session(root / "examples/table1/experiment-2")
+    session = exact(load_session(root / "examples/table1/experiment-2"))
     problem = build_problem(session, model="offsets")
     values, _ = draw(problem, spread=0.01)
     values = np.tile(values, (40, 1))
@@ -195,7 +196,7 @@ def test_a_set_far_from_the_others_is_solved_alone(root):
 
 
 def test_rows_of_the_session_are_readings_too(root):
-    session = load_session(root / "examples/table1/experiment-2")
+    session = exact(load_session(root / "examples/table1/experiment-2"))
     problem = build_problem(session, model="offsets")
     rows = np.tile(session.values, (3, 1))
     found = BatchProgram(problem).solve(rows, sigma=SIGMA)
@@ -206,7 +207,7 @@ def test_rows_of_the_session_are_readings_too(root):
 
 
 def test_a_fleet_shows_what_each_of_its_machines_does(root):
-    problem = build_problem(load_session(root / "examples/sweep"), model="full")
+    problem = build_problem(exact(load_session(root / "examples/sweep")), model="full")
     values, fleet = draw(problem, spread=0.3)
     for i in (0, SETS - 1):
         expected = problem.predict(fleet.theta[i] * problem.theta_scale)

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from derivatives import central_differences
+from gauges import exact
 from scipy.optimize import least_squares
 from tolerances import DERIVATIVE, SAME_OPTIMUM, TRUTH_BACK
 
@@ -25,7 +26,7 @@ TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 
 
 @pytest.fixture(scope="module")
 def plan(root):
-    return load_plan(root / "examples/raw-cycles/plan.yaml")
+    return exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +205,7 @@ def test_another_robot_is_calibrated_the_same_way(biglide, tmp_path, root):
         "  yx: {leg: x, direction: y, section: {fraction: 0.5}, postures: [zero, x_max, x_min]}\n"
         "  xy: {leg: y, direction: x, section: {fraction: 0.5}, postures: [zero, y_max, y_min]}\n"
     )
-    plan = load_plan(tmp_path / "plan.yaml")
+    plan = exact(load_plan(tmp_path / "plan.yaml"))
     truth = {"x_slide.offset": 0.7e-3, "y_slide.offset": -1.1e-3}
     session = simulate_session(plan, truth, exact=True).session
     solution = NonlinearProgram(build_problem(session)).solve(sigma=1e-5)
