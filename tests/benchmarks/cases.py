@@ -26,6 +26,7 @@ from orthocal.measurement.synthetic import draw_errors
 sys.path.append(str(Path(__file__).parents[1]))
 
 import plans
+from gauges import exact
 
 Array = NDArray[np.float64]
 
@@ -124,7 +125,8 @@ def simulate(n_postures: int, *, seed: int = 1) -> Session:
     for plan in found:
         with tempfile.TemporaryDirectory() as folder:
             sessions.append(load_plan(plans.write(Path(folder), plan)))
-    return resimulate(join_sessions(sessions), seed=seed)
+    # gauges known exactly, as the peer takes them
+    return resimulate(exact(join_sessions(sessions)), seed=seed)
 
 
 def resimulate(session: Session, *, seed: int) -> Session:

@@ -11,6 +11,7 @@ import cases
 import numpy as np
 import pytest
 from cases import MODEL, SIGMA, SWEEP
+from gauges import exact
 from peer import PeerProblem
 from tolerances import KINEMATICS, SAME_OPTIMUM
 
@@ -227,8 +228,8 @@ def test_lanes_of_postures_are_faster_than_one_by_one(orthoglide, record):
 
 
 def test_many_sets_at_once_are_faster_than_one_by_one(root, record):
-    problem = build_problem(load_session(root / "examples/table1/experiment-2"), model="offsets")
-    count = 2000
+    session = exact(load_session(root / "examples/table1/experiment-2"))
+    problem, count = build_problem(session, model="offsets"), 2000
     fleet = Fleet(problem, 0.4 * np.random.default_rng(0).normal(size=(count, problem.n_free)))
     assert fleet.close().all()
     values, batch = fleet.predict(), BatchProgram(problem)
