@@ -1,0 +1,124 @@
+"""Readings as a workshop takes them: a dial that stands crooked beside a rod, found by touching.
+
+Rods are where Pinocchio has them, and the plunger moves until the distance between two solids is
+none: nothing here is a formula of orthocal's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from scipy.spatial.transform import Rotation
+
+from orthocal.sensors.leg_indicator import DIRECTIONS
+
+
+@dataclass(frozen=True)
+class Crooked:
+    """How a gauge stands, beside what is said of it."""
+
+    roll: float = 0.0
+    """About the leg, from its root to its tip, [rad]."""
+    pitch: float = 0.0
+    """Of the plunger towards the leg's tip, [rad]."""
+    section: float = 0.0
+    """Along the leg, [m]."""
+    lateral: float = 0.0
+    """Across leg and plunger, [m]."""
+    scale: float = 0.0
+    zero: float = 0.0
+    """[m]"""
+
+
+def draw_crooked(rng, *, direction=10e-3, place=0.5e-3):
+    """One standing, as a hand and an eye make it; what belongs to the dial is not its."""
+    roll, pitch = direction * rng.normal(size=2)
+    section, lateral = place * rng.normal(size=2)
+    return Crooked(roll, pitch, section, lateral)
+
+
+class Workshop:
+    """A machine with given errors, and what dials show of its rods.
+
+    Args:
+        session: Postures and setups, with a rod and a tip each.
+        errors: Of the machine, name to value, [SI].
+    """
+
+    def __init__(self, session, errors):
+        self.session = session
+        self.machine = session.robot.with_errors(errors)
+        self.frames = [self._place(p.drives) for p in session.postures.values()]
+        self.at_zero = self._place(session.robot.drive_zero)
+
+    def _place(self, drives):
+        """Positions of all frames, loops closed by Pinocchio."""
+        m = self.machine
+        passive = m.close_with_pinocchio(drives, m.zero[m.passive_index])
+        data = m.model.createData()
+        q = m.configuration(m.joint_coordinates(drives, passive))
+        pin.framesForwardKinematics(m.model, data, q)
+        return {f.name: np.array(data.oMf[i].translation) for i, f in enumerate(m.model.frames)}
+
+    def read(self, setup, posture, crooked):
+        """What a dial shows, [m]."""
+        sensor = self.session.setups[setup].sensor
+        leg = self.session.robot.legs[sensor.leg]
+        rod, axis = leg.rods[sensor.rod], leg.axis
+        said = np.array(DIRECTIONS[sensor.direction])
+        side = np.cross(axis, said)
+        rolled = Rotation.from_rotvec(crooked.roll * axis)
+        pitched = Rotation.from_rotvec(-crooked.pitch * side)
+        plunger, edge = rolled.apply(pitched.apply(said)), rolled.apply(side)
+        # beside the rod as drawn, where the ruler says from this machine's root
+        drawn = rod.zero_root + 0.5 * (rod.zero_tip - rod.zero_root)
+        assert sensor.section.form == "fraction"
+        along = axis @ self.at_zero[leg.root] + sensor.section.value * leg.length
+        start = (along + crooked.section) * axis + (side @ drawn + crooked.lateral) * side
+        frames = self.frames[list(self.session.postures).index(posture)]
+        root, end = frames[rod.root], frames[rod.tip]
+        touching = rod.radius + sensor.tip.radius
+        ball = sensor.tip.form == "ball"
+        distance = _to_axis(root, end) if ball else _between(root, end, edge)
+        h = _touch(lambda h: distance(start + h * plunger), touching)
+        return (1.0 + crooked.scale) * h + crooked.zero
+
+
+def _to_axis(root, end):
+    """Distance of a point from a line."""
+    unit = (end - root) / np.linalg.norm(end - root)
+
+    def distance(point):
+        apart = point - root
+        return np.sqrt(max(apart @ apart - (apart @ unit) ** 2, 0.0))
+
+    return distance
+
+
+def _between(root, end, edge):
+    """Distance of two lines, one through a point along the edge."""
+    across = np.cross(end - root, edge)
+    across /= np.linalg.norm(across)
+    return lambda point: abs((point - root) @ across)
+
+
+def _touch(distance, touching):
+    """How far a plunger is out when its tip touches, by bisection; NaN where it passes.
+
+    The distance is convex: first where it is least, then from there outwards.
+    """
+    low, far = -0.1, 0.1
+    high = far
+    for _ in range(80):
+        a, b = low + (high - low) / 3.0, high - (high - low) / 3.0
+        low, high = (low, b) if distance(a) < distance(b) else (a, high)
+    inner, outer = 0.5 * (low + high), far
+    if distance(inner) > touching:
+        return np.nan
+    assert distance(outer) > touching
+    while outer - inner > 1e-13:
+        middle = 0.5 * (inner + outer)
+        inner, outer = (middle, outer) if distance(middle) < touching else (inner, middle)
+    return 0.5 * (inner + outer)
