@@ -5,6 +5,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 SESSION ?= examples/table1/experiment-2
+# one more than there are cores: some tests wait for pages and processes
+WORKERS ?= $(shell expr 1 + `getconf _NPROCESSORS_ONLN`)
 
 INSTALLED = $(VENV)/.installed
 TESTED = $(VENV)/.installed-test
@@ -15,7 +17,7 @@ calibrate: $(INSTALLED)
 	$(VENV)/bin/orthocal calibrate $(SESSION) --out out/$(notdir $(SESSION))
 
 test: $(TESTED) check
-	$(VENV)/bin/python -m pytest --numprocesses auto --dist loadscope --ignore tests/benchmarks
+	$(VENV)/bin/python -m pytest --numprocesses $(WORKERS) --dist worksteal --ignore tests/benchmarks
 	$(VENV)/bin/python -m pytest tests/benchmarks  # by themselves: they compare times
 
 check: $(TESTED)

@@ -30,6 +30,8 @@ _HOMES = {
     "LiveScene": "orthocal.viewer.live",
     "Loss": "orthocal.estimation.loss",
     "Machine": "orthocal.calibration.machine",
+    "Means": "orthocal.planning.means",
+    "MeasuringPlan": "orthocal.planning.plan",
     "NonlinearProgram": "orthocal.estimation.solvers.ipopt",
     "NotIdentifiableError": "orthocal.errors",
     "OrthocalError": "orthocal.errors",
@@ -44,13 +46,20 @@ _HOMES = {
     "Session": "orthocal.measurement.session",
     "SessionError": "orthocal.errors",
     "Setup": "orthocal.measurement.session",
+    "Sizes": "orthocal.robot.making",
     "SolverError": "orthocal.errors",
     "SolverOptions": "orthocal.estimation.options",
+    "Study": "orthocal.study.study",
+    "StudyTable": "orthocal.study.running",
     "ToolAccuracy": "orthocal.assess.accuracy",
     "UnreachableError": "orthocal.errors",
     "Validation": "orthocal.assess.validation",
     "Workspace": "orthocal.kinematics.workspace",
     "assess_tool": "orthocal.assess.accuracy",
+    "build_accuracy_study": "orthocal.study.accuracy_choice",
+    "build_bootstrap_study": "orthocal.study.bootstrap",
+    "build_linearisation_study": "orthocal.study.linearisation",
+    "build_sensitivity_study": "orthocal.study.sensitivity",
     "calibrate": "orthocal.calibration.calibrate",
     "compare_models": "orthocal.assess.comparison",
     "decide": "orthocal.assess.findings.calibration",
@@ -64,11 +73,14 @@ _HOMES = {
     "load_plan": "orthocal.measurement.session_file",
     "load_robot": "orthocal.robot.loading",
     "load_session": "orthocal.measurement.session_file",
+    "make_robot": "orthocal.robot.making",
     "parameter_table": "orthocal.calibration.tables",
     "reading_table": "orthocal.calibration.tables",
+    "plan_readings": "orthocal.planning.plan",
     "register_sensor": "orthocal.sensors.registry",
     "repeat_calibration": "orthocal.calibration.repeating",
     "restore_session": "orthocal.calibration.repeating",
+    "run_study": "orthocal.study.running",
     "simulate_session": "orthocal.measurement.synthetic",
     "summarize": "orthocal.show.summary",
     "validate_calibration": "orthocal.assess.validation",
@@ -91,6 +103,8 @@ __all__ = [
     "LiveScene",
     "Loss",
     "Machine",
+    "Means",
+    "MeasuringPlan",
     "NonlinearProgram",
     "NotIdentifiableError",
     "OrthocalError",
@@ -105,13 +119,20 @@ __all__ = [
     "Session",
     "SessionError",
     "Setup",
+    "Sizes",
     "SolverError",
     "SolverOptions",
+    "Study",
+    "StudyTable",
     "ToolAccuracy",
     "UnreachableError",
     "Validation",
     "Workspace",
     "assess_tool",
+    "build_accuracy_study",
+    "build_bootstrap_study",
+    "build_linearisation_study",
+    "build_sensitivity_study",
     "calibrate",
     "compare_models",
     "decide",
@@ -125,11 +146,14 @@ __all__ = [
     "load_plan",
     "load_robot",
     "load_session",
+    "make_robot",
     "parameter_table",
+    "plan_readings",
     "reading_table",
     "register_sensor",
     "repeat_calibration",
     "restore_session",
+    "run_study",
     "simulate_session",
     "summarize",
     "validate_calibration",
@@ -178,13 +202,22 @@ if TYPE_CHECKING:
     from orthocal.measurement.session_file import load_plan, load_session
     from orthocal.measurement.session_output import write_session
     from orthocal.measurement.synthetic import draw_errors, simulate_session
+    from orthocal.planning.means import Means
+    from orthocal.planning.plan import MeasuringPlan, plan_readings
     from orthocal.robot.loading import load_robot
+    from orthocal.robot.making import Sizes, make_robot
     from orthocal.robot.model import Robot
     from orthocal.sensors.protocol import Sensor
     from orthocal.sensors.registry import register_sensor
     from orthocal.show.report.page import write_report
     from orthocal.show.scene.drawing import draw_scene
     from orthocal.show.summary import summarize
+    from orthocal.study.accuracy_choice import build_accuracy_study
+    from orthocal.study.bootstrap import build_bootstrap_study
+    from orthocal.study.linearisation import build_linearisation_study
+    from orthocal.study.running import StudyTable, run_study
+    from orthocal.study.sensitivity import build_sensitivity_study
+    from orthocal.study.study import Study
     from orthocal.viewer.live import LiveScene
     from orthocal.viewer.scene import Scene
 

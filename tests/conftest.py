@@ -3,6 +3,8 @@ from __future__ import annotations
 import atexit
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -22,6 +24,26 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 ROOT = Path(__file__).parents[1]
+
+WANTED_BY_ALL = """
+from orthocal import load_robot
+from orthocal.kinematics.assembly import nominal_assembly
+from orthocal.kinematics.lanes import Way, is_installed, running
+
+robot = load_robot("orthoglide")
+with running(Way.NUMBA if is_installed() else Way.CASADI):
+    nominal_assembly(robot).close(robot.drive_zero)
+"""
+"""Fills the cache with what takes long to compile."""
+
+
+def pytest_sessionstart(session):
+    """While workers begin, one process compiles what else each of them would."""
+    if session.config.getoption("numprocesses", None) and "PYTEST_XDIST_WORKER" not in os.environ:
+        process = subprocess.Popen(
+            [sys.executable, "-c", WANTED_BY_ALL], stdout=subprocess.DEVNULL, cwd=ROOT
+        )
+        session.config.add_cleanup(process.wait)
 
 
 @pytest.fixture(scope="session")

@@ -34,14 +34,19 @@ ALLOWED = {
     "measurement": f"{EDGES} markup robot kinematics sensors",
     "statistics": f"{EDGES} robot measurement",
     "estimation": f"{EDGES} robot kinematics sensors measurement statistics",
-    "diagnosis": f"{EDGES} robot kinematics measurement statistics estimation",
+    "diagnosis": f"{EDGES} robot kinematics sensors measurement statistics estimation",
     "calibration": f"{EDGES} robot kinematics sensors measurement statistics estimation diagnosis",
     "assess": f"{EDGES} robot kinematics measurement statistics estimation diagnosis calibration",
+    "planning": f"{EDGES} robot kinematics sensors measurement statistics estimation diagnosis "
+    "assess",
+    "study": f"{EDGES} robot kinematics sensors measurement statistics estimation diagnosis assess "
+    "planning",
     "export": f"{EDGES} robot kinematics calibration assess",
     "viewer": f"{EDGES} robot",
     "show": f"{EDGES} markup robot kinematics sensors measurement statistics diagnosis calibration "
-    "assess viewer",
-    "cli": f"{EDGES} robot kinematics measurement estimation calibration assess export viewer show",
+    "assess planning study viewer",
+    "cli": f"{EDGES} robot kinematics measurement estimation calibration assess planning study "
+    "export viewer show",
     "__main__": "cli interrupts",
 }
 """What each room may import besides itself: a viewer knows no calibration, statistics no fit,

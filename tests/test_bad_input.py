@@ -200,7 +200,8 @@ SESSION_KEY_CASES = [
         "xy: {legs:",
         ": setups.xy.legs: unknown key; known keys: sensor, gauge, postures, "
         "direction_tolerance_mrad, section_tolerance_mm, lateral_tolerance_mm, scale_tolerance, "
-        "stand, square_tolerance_mrad, leg, direction, section, touches, tip",
+        "stand, square_tolerance_mrad, leg, direction, section, touches, tip, "
+        "beside_mm",
     ),
     session(
         "key-unknown-in-section",
@@ -447,7 +448,7 @@ SESSION_SENSE_CASES = [
         "direction-unknown",
         XY,
         XY.replace("direction: x", "direction: up"),
-        ": setups.xy.direction: found 'up'; expected one of x, y, z, -x, -y, -z",
+        ": setups.xy.direction: found 'up'; expected one of x, y, z, -x, -y, -z, or a vector",
     ),
     session(
         "section-two-forms",
@@ -792,7 +793,12 @@ READINGS_CASES = [
         "minus-itself", "xy,y_max,y_min", "xy,y_max,y_max", ":2: takes posture 'y_max' off itself"
     ),
     readings("not-a-number", "-0.43", "n/a", ":2: reading_mm is 'n/a'; expected a number"),
-    readings("empty-field", "-0.43", "", ":2: reading_mm is ''; expected a number"),
+    readings(
+        "empty-field",
+        "-0.43",
+        "",
+        ":2: reading_mm is empty; expected what the gauge showed, or no row where nothing was read",
+    ),
     readings(
         "unit-in-field", "-0.43", "-0.43 mm", ":2: reading_mm is '-0.43 mm'; expected a number"
     ),
@@ -1560,12 +1566,12 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "unmodelled-too-few",
-        f"{CALIBRATION}: unmodelled.tolerances: has 1 numbers; expected 174, as names",
+        f"{CALIBRATION}: unmodelled.tolerances: has 1 numbers; expected 126, as names",
         put(FILE, "unmodelled.tolerances", [1e-4]),
     ),
     calibration(
         "leakage-too-small",
-        f"{CALIBRATION}: unmodelled.leakage: expected 3 × 174 numbers, free parameters by names",
+        f"{CALIBRATION}: unmodelled.leakage: expected 3 × 126 numbers, free parameters by names",
         put(FILE, "unmodelled.leakage", [[0.0]]),
     ),
     calibration(
@@ -1804,7 +1810,7 @@ VIEW_CASES = [
             (
                 "setups.0.reads.direction",
                 "setups[0].reads.direction",
-                "found 'w'; expected one of x, y, z, -x, -y, -z",
+                "found 'w'; expected one of x, y, z, -x, -y, -z, or a vector",
             ),
             (
                 "residuals.2.posture",

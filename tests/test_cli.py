@@ -80,7 +80,7 @@ def test_view_writes_a_page_of_anything(orthocal, experiment, root, tmp_path):
         (tmp_path, "Machine, calibrated"),
         (tmp_path / "calibration.json", "Machine, calibrated"),
         (experiment, "Machine, nominal"),
-        (root / "examples/lines/plan.yaml", "none taken yet"),
+        (root / "tests/sessions/lines/plan.yaml", "none taken yet"),
         ("orthoglide", "Mechanical zero"),
         (root / "tests/robots/fivebar", "motor_a"),
     ):

@@ -76,6 +76,7 @@ def test_the_readmes_commands_run(root, tmp_path):
         ("What was identified\n", "calibrate examples/table1/experiment-2 --details"),
         ("At the tool\n", "calibrate examples/table1/experiment-2 --details"),
         ("Verdict", "compare examples/table1/experiment-2"),
+        ("The paper's six equations miss", "study linearisation orthoglide"),
     ],
 )
 def test_the_readmes_printed_results_are_the_real_ones(title, command):
@@ -94,15 +95,22 @@ def test_what_the_readme_says_of_the_papers_readings_is_what_the_example_prints(
     done = run(str(script))
     rows = {}
     for line in done.stdout.split("\n\n")[0].splitlines()[1:]:
-        rows[line[:26].strip()] = [float(v) / 1e3 for v in line[36:].split()]
-    (nominal,) = rows["nominal"]
-    (promised, left), (promised_full, left_full) = (
-        rows[f"the paper's, {model}"] for model in ("offsets", "full")
-    )
+        rows[line[:36].strip()] = [float(v) / 1e3 for v in line[36:].split()]
+    kept = {label: sizes[1] for label, sizes in rows.items()}
     assert (
-        f"from {nominal:.2f} mm to {left:.3f} mm with offsets alone, and to {left_full:.3f} mm"
+        f"leave about {kept['first round, offsets']:.2f} mm with offsets alone and "
+        f"{kept['first round, full']:.2f} mm with all errors"
     ) in text
-    assert f"for such machines is {promised:.3f} and {promised_full:.3f} mm" in text
+    assert (
+        f"once more {kept['offsets entered, offsets']:.2f} and "
+        f"{kept['offsets entered, full']:.3f} mm"
+    ) in text
+    promised, left = rows["as of a line, exactly"]
+    assert f"the first 18 leave {left:.2f} mm and promise half of that" in text
+    assert promised == pytest.approx(0.5 * left, rel=0.1)
+    for label in ("first round, full", "offsets entered, full"):
+        promised, left = rows[label]
+        assert left < 1.15 * promised  # as promised
 
 
 def test_what_the_readme_says_of_its_picture_and_of_what_remains_is_so(root):

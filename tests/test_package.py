@@ -6,8 +6,10 @@ import json
 import subprocess
 import sys
 import zipfile
+from email.parser import HeaderParser
 
 import pytest
+from environments import declared, make_environment
 
 
 @pytest.fixture(scope="module")
@@ -20,6 +22,16 @@ def wheel(root, tmp_path_factory):
     )
     (built,) = folder.glob("*.whl")
     return built
+
+
+def requirements_of(wheel):
+    """What the wheel says that it needs."""
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
+        text = archive.read(name).decode()
+    found = HeaderParser().parsestr(text).get_all("Requires-Dist")
+    assert found
+    return found
 
 
 def test_the_wheel_holds_robots_and_types(wheel):
@@ -35,18 +47,15 @@ def test_the_wheel_holds_robots_and_types(wheel):
 
 def test_the_installed_wheel_calibrates_from_elsewhere(wheel, root, tmp_path):
     """A fresh environment: the wheel and what it declares, nothing else."""
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", tmp_path / "env"], check=True)
-    python = tmp_path / "env/bin/python"
-    pip = [
-        sys.executable,
-        "-m",
-        "pip",
-        "--python",
-        python,
-        "--quiet",
-        "--disable-pip-version-check",
-    ]
-    subprocess.run([*pip, "install", "--no-compile", wheel], check=True)
+    needed = declared(requirements_of(wheel))
+    python = make_environment(tmp_path / "env", needed)
+    pip = [sys.executable, "-m", "pip", "--python", python, "--disable-pip-version-check"]
+    install = ["install", "--quiet", "--no-compile", "--no-index", "--no-deps", wheel]
+    subprocess.run([*pip, *install], check=True)
+    check = subprocess.run([*pip, "check"], capture_output=True, text=True)
+    assert check.returncode == 0, check.stdout
+    listed = subprocess.run([*pip, "freeze", "--all"], capture_output=True, text=True, check=True)
+    assert len(listed.stdout.splitlines()) == 1 + len(needed)
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     session = elsewhere / "session"

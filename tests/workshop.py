@@ -67,16 +67,20 @@ class Workshop:
         sensor = self.session.setups[setup].sensor
         leg = self.session.robot.legs[sensor.leg]
         rod, axis = leg.rods[sensor.rod], leg.axis
-        said = np.array(DIRECTIONS[sensor.direction])
+        given = sensor.direction
+        said = np.array(DIRECTIONS[given] if isinstance(given, str) else given)
+        said = said / np.linalg.norm(said)
         side = np.cross(axis, said)
+        side = side / np.linalg.norm(side)
         rolled = Rotation.from_rotvec(crooked.roll * axis)
         pitched = Rotation.from_rotvec(-crooked.pitch * side)
         plunger, edge = rolled.apply(pitched.apply(said)), rolled.apply(side)
-        # beside the rod as drawn, where the ruler says from this machine's root
+        # in the rod as drawn, where the ruler says from this machine's root
         drawn = rod.zero_root + 0.5 * (rod.zero_tip - rod.zero_root)
+        drawn = drawn - (drawn @ axis) * axis + sensor.beside
         assert sensor.section.form == "fraction"
         along = axis @ self.at_zero[leg.root] + sensor.section.value * leg.length
-        start = (along + crooked.section) * axis + (side @ drawn + crooked.lateral) * side
+        start = (along + crooked.section) * axis + drawn + crooked.lateral * side
         frames = self.frames[list(self.session.postures).index(posture)]
         root, end = frames[rod.root], frames[rod.tip]
         touching = rod.radius + sensor.tip.radius

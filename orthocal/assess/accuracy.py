@@ -28,9 +28,6 @@ from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
 
 Array = NDArray[np.float64]
 
-NOTABLE = 0.1
-"""Tolerances by which a parameter must be off to be named in a combination."""
-
 ROUNDING = 1e-9
 """Residuals below which there are none: as many parameters as readings leave that, [m]."""
 
@@ -117,16 +114,6 @@ class ToolAccuracy:
     def measure(self, deviations: Array) -> ErrorSizes:
         """Size of known position errors, shape (K, 3), [m]."""
         return measure_deviations(deviations, self.workspace, self.targets)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RemainingError:
-    """A combination of parameters that is not well known, and what it does at the tool."""
-
-    rms: float
-    """Over the workspace, shift and rotation taken out, [m]."""
-    parts: tuple[tuple[str, float], ...]
-    """Parameters and by how many tolerances each is off, the largest first."""
 
 
 def measure_uncertainty(
@@ -313,40 +300,6 @@ def expect_after_offsets(calibration: Calibration, accuracy: ToolAccuracy) -> fl
     return math.hypot(left.headline.rms, remaining.sizes.headline.rms)
 
 
-def find_remaining_errors(
-    calibration: Calibration, accuracy: ToolAccuracy, *, count: int = 3
-) -> tuple[RemainingError, ...]:
-    """The combinations of errors that matter most at the tool after a calibration.
-
-    Principal directions of what is not known of the parameters, weighed by the mean square that it
-    makes at the tool with shift and rotation taken out; the largest first.
-    """
-    weights = accuracy.workspace.weights
-    relative = accuracy.align(accuracy.jacobian)
-    root = _square_root(error_covariance(calibration))
-    effect = relative @ root
-    _, directions = np.linalg.eigh(np.einsum("k,kin,kim->nm", weights, effect, effect))
-    tolerances = np.r_[[p.tolerance for p in calibration.free], calibration.unmodelled.tolerances]
-    found = []
-    for direction in directions.T[::-1][:count]:
-        change = root @ direction
-        moved = relative @ change
-        in_tolerances = change / tolerances
-        order = np.argsort(-np.abs(in_tolerances))
-        lead = np.sign(in_tolerances[order[0]]) or 1.0
-        found.append(
-            RemainingError(
-                rms=float(np.sqrt(weights @ (moved**2).sum(axis=1))),
-                parts=tuple(
-                    (accuracy.names[i], float(lead * in_tolerances[i]))
-                    for i in order
-                    if abs(in_tolerances[i]) > NOTABLE
-                ),
-            )
-        )
-    return tuple(found)
-
-
 def _spread_size(covariances: Array, weights: Array) -> ErrorSize:
     """Sizes of normal errors with given covariances, shape (K, 3, 3), at the points."""
     mean_square = np.trace(covariances, axis1=1, axis2=2)
@@ -372,9 +325,3 @@ def _weighted_percentile(lengths: Array, weights: Array) -> float:
     order = np.argsort(lengths)
     share = np.cumsum(weights[order])
     return float(lengths[order][min(int(np.searchsorted(share, 0.95)), lengths.size - 1)])
-
-
-def _square_root(covariance: Array) -> Array:
-    """A matrix whose product with its transpose is the covariance, which may be singular."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

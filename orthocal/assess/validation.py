@@ -69,7 +69,7 @@ class Validation:
     offsets_stated: bool
     """Whether the session says which offsets were active; else the identified ones are taken."""
     expected_rms: float
-    """Of the residuals of the calibration, [m]."""
+    """Of the residuals of the calibration, with what readings are off for how gauges stood, [m]."""
     expected_largest: float
     achieved_rms: float
     """Of the deviations in the new session, [m]."""
@@ -177,12 +177,14 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
     fit = repeat_fit(calibration, session)
     stood = restore_gauge_covariance(calibration), fit.gauge_covariance
     refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
+    differ = _gauges_differ(fit, refit, stood)
+    more = math.hypot(calibration.rms_after, differ) / (calibration.rms_after or math.nan)
     repetition = measure_repetition(calibration, refit)
     found = Validation(
         title=session.title,
         offsets_stated=all(one.controller_offsets is not None for one in given),
-        expected_rms=calibration.rms_after,
-        expected_largest=calibration.largest_after,
+        expected_rms=math.hypot(calibration.rms_after, differ),
+        expected_largest=more * calibration.largest_after if math.isfinite(more) else differ,
         achieved_rms=refit.rms_before,
         achieved_largest=refit.largest_before,
         refit_rms=refit.rms_after,
@@ -308,6 +310,25 @@ def _require_offsets(calibration: Calibration, session: Session) -> None:
         )
 
 
+def _gauges_differ(fit: Fit, refit: Calibration, stood: Sequence[Array]) -> float:
+    """What rows of the new session are off for how the gauges stood, then and now, r.m.s., [m]."""
+    rows = refit.residuals
+    gram = _gauge_gram(fit, stood)
+    of_differences = sum(2.0 if r.minus else 1.0 for r in rows) / len(rows)
+    return math.sqrt(of_differences * max(float(np.trace(gram)), 0.0) / len(rows))
+
+
+def _gauge_gram(fit: Fit, stood: Sequence[Array]) -> Array:
+    """Of readings, zeros eliminated, what parameters are off for how gauges stood: its Gram matrix.
+
+    Shape (n_machine, n_machine); its trace is the sum of squares that it makes, [m²].
+    """
+    problem, n = fit.problem, fit.problem.n_machine
+    scaled = fit.jacobian[:, :n] / problem.theta_scale[:n]
+    slopes = project_out_zeros(scaled, problem.observations)
+    return np.asarray(slopes.T @ slopes @ sum(stood))
+
+
 def _excess_probability(
     calibration: Calibration, fit: Fit, refit: Calibration, stood: Sequence[Array]
 ) -> float:
@@ -321,15 +342,12 @@ def _excess_probability(
     dof = calibration.noise.residual_dof
     if not (expected > 0.0 and dof > 0.0):
         return math.nan
-    problem, o = fit.problem, fit.problem.observations
     rows = refit.residuals
     zeros = len({r.setup for r in rows if r.minus is None})
     achieved = sum(r.deviation**2 / (2.0 if r.minus else 1.0) for r in rows)
     count = len(rows) - zeros
-    n = problem.n_machine
-    slopes = project_out_zeros(fit.jacobian[:, :n] / problem.theta_scale[:n], o)
     each = expected**2 * (1.0 + (count - refit.noise.residual_dof) / count)
-    gram = slopes.T @ slopes @ sum(stood)
+    gram = _gauge_gram(fit, stood)
     mean = each + float(np.trace(gram)) / count
     square = count * each**2 + 2.0 * each * float(np.trace(gram)) + float(np.trace(gram @ gram))
     independent = (count * mean) ** 2 / square

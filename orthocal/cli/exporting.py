@@ -18,7 +18,8 @@ def export(
         str,
         typer.Option(
             metavar="FORMAT",
-            help="yaml: parameters with their units; table: corrections of the tool over a grid.",
+            help="yaml: parameters with their units; table: corrections of the tool over a grid; "
+            "urdf: the calibrated machine as a robot folder.",
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the files; made if need be.")],

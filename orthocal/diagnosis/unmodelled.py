@@ -23,7 +23,7 @@ from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.fields import CLOSED, Many, Matrix, Sizes, read_only
-from orthocal.kinematics.symbolic import hangs_on
+from orthocal.kinematics.kept import once_a_robot
 from orthocal.robot.model import Robot
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -65,38 +65,24 @@ class OtherErrors:
     """∂h of one tolerance of each, gauge zeros eliminated, shape (n_entries, n_others), [m]."""
 
 
+@once_a_robot(maxsize=8)
 def machine_errors(robot: Robot) -> tuple[str, ...]:
     """Names of all errors that a machine is taken to have, in the robot's order.
 
-    Those of its model `full`; the scales of its drives; and where the parts of its loops end (the
-    far ends of rods and what they meet, the feet of legs). A frame that the tool hangs on is left
-    out: its error moves the tool alone, and says where on the platform that is. So are the ends of
-    legs' lines: they are drawn in the air.
+    All that change something; and of joint placements only those of its model `full`, where a
+    robot lists them itself: what it leaves out there a machine has not.
     """
     parameters = robot.parameters
     try:
         whole = set(parameters.select_model(WHOLE_MODEL))
     except ParameterError:
         whole = set()
-    tool = set() if robot.tcp is None else _carriers(robot, robot.tcp.frame)
-    ends = {frame for closure in robot.closures for frame in (closure.frame_a, closure.frame_b)}
-    ends = {frame for frame in ends if robot.frame_id(frame) not in tool}
     whole |= {
         e.name
-        for e in parameters.elementary.values()
-        if e.kind == "scale" or (e.of_frame and e.owner in ends)
+        for e in (parameters.elementary[n] for n in parameters.complete)
+        if e.kind == "scale" or e.of_frame
     }
     return tuple(name for name in parameters.names if name in whole)
-
-
-def _carriers(robot: Robot, frame: str) -> set[int]:
-    """A frame, and the frames of the same joint that it hangs on."""
-    found: set[int] = set()
-    current: int | None = robot.frame_id(frame)
-    while current is not None:
-        found.add(current)
-        current = hangs_on(robot.model, current)
-    return found
 
 
 def find_other_errors(fit: Fit, *, spoken_for: Collection[str] = ()) -> OtherErrors:

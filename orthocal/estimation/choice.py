@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from orthocal.arguments import require_kind, require_names, require_numbers
 from orthocal.errors import ParameterError
@@ -49,6 +50,23 @@ class Choice:
         require_numbers(self.bounds, argument="bounds", counts=(2,))
         for value in (self.prior, self.base):
             require_kind(value, (bool, type(None)), expected="True or False as prior or base")
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The choice as plain data."""
+
+        def plain(values: Mapping[str, Known]) -> dict[str, Any]:
+            return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
+
+        return {
+            "model": self.model,
+            "free": list(self.free),
+            "prior": self.prior,
+            "known": plain(self.known),
+            "tolerances": plain(self.tolerances),
+            "bounds": plain(self.bounds),
+            "base": self.base,
+        }
 
     def select(self, parameters: ParameterSet) -> Selection:
         """The free parameters among those of a robot, in SI.

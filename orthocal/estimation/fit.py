@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError, SolverError
+from orthocal.estimation.gauges import find_gauge_covariance
 from orthocal.estimation.linear import Linearisation, linearise_at_reference
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
@@ -32,7 +33,6 @@ from orthocal.statistics.information import (
     decompose,
     marginalise,
     require_identifiable,
-    take_for_known,
 )
 from orthocal.statistics.noise import Noise, estimate_noise, estimate_repeatability
 from orthocal.statistics.zeros import project_out_zeros
@@ -44,6 +44,12 @@ SIGMA_SETTLED = 0.03
 parameter by more than a twentieth of its standard deviation."""
 
 MAX_SIGMA_ROUNDS = 8
+
+SMALL_DOF = 20.0
+"""Residuals that are few, for a first sigma."""
+
+OUT_OF_QUESTION = 10.0
+"""Times a stated sigma that residuals of a linearised problem never are by what bends in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,34 +144,6 @@ class Fit:
         )
 
 
-def find_gauge_covariance(
-    problem: CalibrationProblem,
-    information: Information,
-    *,
-    sigma: float,
-    held: NDArray[np.bool_] | None = None,
-) -> Array:
-    """What of the covariance of the machine's parameters is from how its gauges stood.
-
-    Other setups have it anew. It is what would be gone were all known to stand as found, shape
-    (n_machine, n_machine), [SI].
-
-    Args:
-        problem: The problem.
-        information: Of all its parameters.
-        sigma: Standard deviation of a reading, [m].
-        held: Parameters that a bound holds, shape (n_free,).
-    """
-    n, precision = problem.n_machine, problem.prior_precision
-    held = np.zeros(problem.n_free, dtype=np.bool_) if held is None else held
-    whole = information.covariance(sigma=sigma, precision=precision, held=held)
-    known = take_for_known(information, n).covariance(
-        sigma=sigma, precision=precision[:n], held=held[:n]
-    )
-    scale = problem.theta_scale[:n]
-    return np.asarray((whole[:n, :n] - known) * np.outer(scale, scale))
-
-
 def fit_problem(
     problem: CalibrationProblem,
     *,
@@ -200,7 +178,7 @@ def fit_problem(
         program = program.with_problem(problem)
     built = time.perf_counter()
     seconds, iterations = 0.0, 0
-    sigma = _linearised_sigma(program, linearisation, repeatability)
+    sigma, larger = _linearised_sigma(program, linearisation, repeatability)
     first = linearisation.solve(sigma=sigma) if start is None else np.asarray(start)
     passive: Array | None = None
     for _ in range(MAX_SIGMA_ROUNDS):
@@ -210,6 +188,12 @@ def fit_problem(
             if start is not None or passive is not None:
                 raise
             solution = program.solve(sigma=sigma)  # the linearised machine cannot be assembled
+        except SolverError:
+            if start is not None or passive is not None or not larger > sigma:
+                raise
+            # what the model leaves out may be too much for a sigma that leaves no room for it
+            sigma, first = larger, linearisation.solve(sigma=larger)
+            solution = program.solve(sigma=sigma, start=first)
         seconds, iterations = seconds + solution.seconds_solve, iterations + solution.iterations
         prediction, jacobian = problem.linearise(solution.theta, solution.passive)
         information = decompose(jacobian, problem.observations)
@@ -303,19 +287,42 @@ def _settled(found: float, sigma: float) -> bool:
 
 def _linearised_sigma(
     program: Program, linearisation: Linearisation, repeatability: tuple[float, int]
-) -> float:
-    """Sigma as the linearised problem has it, [m]: mostly near enough for one exact solution."""
+) -> tuple[float, float]:
+    """Sigma as the linearised problem has it, [m]: mostly near enough for one exact solution.
+
+    Where few residuals are free beside the prior, and the gauge's sigma is stated, that, unless it
+    is out of the question: what bends in the problem would be taken for noise, which leaves larger
+    residuals, and so on.
+
+    Returns:
+        That, and the linearised problem's own, which is larger where that is the stated one.
+    """
     problem = program.problem
     sigma = first_sigma(problem.session, repeatability)
-    for _ in range(MAX_SIGMA_ROUNDS if _matters(program) else 0):
+    stated = sigma
+    keeps = problem.session.gauge.sigma is not None and _few_are_free(linearisation, sigma)
+    for i in range(MAX_SIGMA_ROUNDS if _matters(program) else 0):
         change = (linearisation.solve(sigma=sigma) - problem.reference) / problem.theta_scale
         residual = linearisation.residual - linearisation.slopes @ change
+        if i == 0:
+            far = residual @ residual > residual.size * (OUT_OF_QUESTION * sigma) ** 2
+            keeps = keeps and not far
         noise = _noise(program, residual, linearisation.information, sigma, repeatability)
         found = max(noise.sigma, SMALLEST_SIGMA)
         if _settled(found, sigma):
             break
         sigma = found
-    return sigma
+    return (stated, sigma) if keeps else (sigma, sigma)
+
+
+def _few_are_free(linearisation: Linearisation, sigma: float) -> bool:
+    """Whether parameters that are held by a prior take up nearly all readings."""
+    problem = linearisation.problem
+    o = problem.observations
+    used = linearisation.information.effective_parameters(
+        sigma=sigma, precision=problem.prior_precision
+    )
+    return o.size - o.n_zeros - used < SMALL_DOF
 
 
 def first_sigma(session: Session, repeatability: tuple[float, int]) -> float:

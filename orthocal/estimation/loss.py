@@ -108,6 +108,8 @@ class Loss:
             return np.asarray(total, dtype=np.float64)
 
         result = sums(values) / sums(np.ones_like(values))
+        if not np.isfinite(values).all():  # a reading that does not exist
+            return result
         low, high = np.full(count, np.inf), np.full(count, -np.inf)
         np.minimum.at(low, group, values)
         np.maximum.at(high, group, values)

@@ -115,8 +115,7 @@ def select_parameters(
     base = DEFAULT_MODEL if model is None and not free else model
     patterns: list[str] = []
     if base is not None:
-        parameters.select_model(base)  # refuses an unknown model
-        patterns += parameters.models[base]
+        patterns += parameters.patterns(base)
     with _named("free"):
         chosen = set(parameters.select([*patterns, *free]))
     held: dict[str, float] = {}
@@ -256,7 +255,8 @@ def _match_free(parameters: ParameterSet, glob: str, free: Sequence[str]) -> lis
         raise ParameterError(f"'{glob}' matches no free parameter")
     units: set[Unit] = {parameters[n].unit for n in found}
     if len(units) > 1:
-        raise ParameterError(f"'{glob}' matches parameters in {' and '.join(sorted(units))}")
+        *others, last = sorted("ppm" if u == "1" else u for u in units)
+        raise ParameterError(f"'{glob}' matches parameters in {', '.join(others)} and {last}")
     return found
 
 

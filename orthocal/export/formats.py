@@ -9,6 +9,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError, ParameterError
 from orthocal.export.corrections import export_corrections
 from orthocal.export.parameters import export_parameters
+from orthocal.export.urdf import export_urdf
 
 Exporter = Callable[[Calibration], dict[str, str]]
 """A calibration to the texts of files, by their names."""
@@ -16,6 +17,7 @@ Exporter = Callable[[Calibration], dict[str, str]]
 EXPORTERS: dict[str, Exporter] = {
     "yaml": export_parameters,
     "table": export_corrections,
+    "urdf": export_urdf,
 }
 
 

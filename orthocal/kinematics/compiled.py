@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from orthocal.kinematics.batch import BatchFunction
 from orthocal.kinematics.error_map import ErrorMap, error_map
 from orthocal.kinematics.kept import kept_function, once_a_robot
-from orthocal.kinematics.symbolic import Pose, SymbolicTree, hangs_on, log6
+from orthocal.kinematics.symbolic import Pose, SymbolicTree, log6
+from orthocal.robot.frames import hangs_on
 from orthocal.robot.model import Closure, Robot, closure_row_units, joint_axis
 
 Array = NDArray[np.float64]

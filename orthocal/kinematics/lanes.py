@@ -39,7 +39,7 @@ PATIENCE = 400e6
 _OPERATIONS = (
     *("CONST", "INPUT", "OUTPUT", "ASSIGN", "ADD", "SUB", "MUL", "DIV", "NEG", "SQ", "TWICE"),
     *("INV", "SQRT", "SIN", "COS", "TAN", "ASIN", "ACOS", "ATAN", "ATAN2", "FABS", "LT", "LE"),
-    *("EQ", "NE", "NOT", "AND", "OR", "IF_ELSE_ZERO"),
+    *("EQ", "NE", "NOT", "AND", "OR", "IF_ELSE_ZERO", "SIGN"),
 )
 _CODE = {getattr(ca, f"OP_{name}"): code for code, name in enumerate(_OPERATIONS)}
 _SOURCES = (_CODE[ca.OP_CONST], _CODE[ca.OP_INPUT])
@@ -345,6 +345,10 @@ def _run(
             elif code == 27:
                 for lane in range(width):
                     work[to, lane] = 1.0 if work[i, lane] != 0.0 or work[j, lane] != 0.0 else 0.0
+            elif code == 29:
+                for lane in range(width):
+                    value = work[i, lane]
+                    work[to, lane] = -1.0 if value < 0.0 else 1.0 if value > 0.0 else value
         for lane in range(size):
             for to in range(result.shape[1]):
                 result[first + lane, to] = shown[to, lane]

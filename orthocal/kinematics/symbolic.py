@@ -17,6 +17,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from orthocal.errors import RobotError
+from orthocal.robot.frames import hangs_on
 from orthocal.robot.model import Closure, Robot, joint_axis
 
 SERIES_BELOW = 0.04
@@ -230,15 +231,6 @@ class SymbolicTree:
             found.append(joint)
             joint = int(self.model.parents[joint])
         return found
-
-
-def hangs_on(model: pin.Model, frame: int) -> int | None:
-    """The frame of the same joint that a frame hangs on, whose errors move it; None if none."""
-    f = model.frames[frame]
-    parent = int(f.parentFrame)
-    if f.type == pin.FrameType.JOINT or frame == parent:
-        return None
-    return parent if model.frames[parent].parentJoint == f.parentJoint else None
 
 
 def nominal_frame_placement(model: pin.Model, frame: int) -> pin.SE3:

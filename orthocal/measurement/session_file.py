@@ -56,7 +56,9 @@ def load_session(path: str | Path) -> Session:
     return _load_session(file, content, keys)
 
 
-def _load_session(file: Path, content: bytes, keys: SessionKeys) -> Session:
+def _load_session(
+    file: Path, content: bytes, keys: SessionKeys, *, planned: bool = False
+) -> Session:
     if keys.readings is None:
         raise SessionError("is missing; expected the name of a CSV file", where=f"{file}: readings")
     require_plain_name(file, error=SessionError)
@@ -67,7 +69,7 @@ def _load_session(file: Path, content: bytes, keys: SessionKeys) -> Session:
         )
     readings_path = file.parent / keys.readings
     table = read_file(readings_path, error=SessionError)
-    readings = _read_readings(readings_path, table, plan)
+    readings = _read_readings(readings_path, table, plan, planned=planned)
     digest = hashlib.sha256(content + b"\0" + table).hexdigest()
     session = replace(plan, readings=readings, readings_path=readings_path, sha256=digest)
     check_contacts(session)
@@ -78,7 +80,7 @@ def load_plan(path: str | Path) -> Session:
     """Read a plan: a session.yaml without `readings`; each planned reading is 0.
 
     A setup is read in all postures, or in those its `postures` names; `cycles` times. A session
-    that has readings is a plan too: that of its rows.
+    that has readings is a plan too: that of its rows, filled in or not.
 
     Raises:
         SessionError: Naming file and key.
@@ -86,7 +88,7 @@ def load_plan(path: str | Path) -> Session:
     """
     file, content, keys = _read_keys(Path(path))
     if keys.readings is not None:
-        return _load_session(file, content, keys)
+        return _load_session(file, content, keys, planned=True)
     read = _read_setups(file, keys)
     count = keys.cycles * sum(len(s.postures or keys.postures) for s, _ in read.values())
     if count > MOST_READINGS:
@@ -336,7 +338,9 @@ def _check_travel(robot: Robot, drives: Array, *, where: str, joiner: str = ": "
             raise SessionError(problem, where=file)
 
 
-def _read_readings(path: Path, content: bytes, plan: Session) -> tuple[Reading, ...]:
+def _read_readings(
+    path: Path, content: bytes, plan: Session, *, planned: bool
+) -> tuple[Reading, ...]:
     readings: list[Reading] = []
     seen: dict[tuple[Any, ...], int] = {}
     raw: dict[tuple[str, int], int] = {}
@@ -363,7 +367,14 @@ def _read_readings(path: Path, content: bytes, plan: Session) -> tuple[Reading, 
         if minus == posture:
             raise SessionError(f"takes posture '{posture}' off itself", where=where)
         cycle = _parse_cycle(row.get("cycle", ""), where)
-        value = parse_number(row["reading_mm"], where=where, name="reading_mm", error=SessionError)
+        if not row["reading_mm"] and not planned:
+            raise SessionError(
+                "reading_mm is empty; expected what the gauge showed, or no row where nothing was "
+                "read",
+                where=where,
+            )
+        text = row["reading_mm"] or "0"
+        value = parse_number(text, where=where, name="reading_mm", error=SessionError)
         reading = Reading(setup, posture, minus or None, cycle, value * MM, line)
         key = (setup, posture, minus, cycle)
         if key in seen:

@@ -74,6 +74,7 @@ def write_session(
     decimals: int = 6,
     comment: str = "",
     extra: Mapping[str, str] | None = None,
+    blank: bool = False,
 ) -> Path:
     """Write session.yaml and readings.csv into a folder, both or neither.
 
@@ -83,6 +84,7 @@ def write_session(
         decimals: Decimals of a reading in mm.
         comment: Lines put first into the YAML.
         extra: Other files of the folder, name to text, written with them.
+        blank: Whether readings are left empty, to be filled in.
 
     Returns:
         Path of the session.yaml.
@@ -109,7 +111,7 @@ def write_session(
             "posture": r.posture,
             "minus": r.minus or "",
             "cycle": str(r.cycle),
-            "reading_mm": _trim(f"{r.value / MM:.{decimals}f}"),
+            "reading_mm": "" if blank else _trim(f"{r.value / MM:.{decimals}f}"),
         }
         table.write(",".join(fields[c] for c in columns) + "\n")
     files = {"session.yaml": text, "readings.csv": table.getvalue(), **(extra or {})}

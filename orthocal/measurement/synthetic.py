@@ -16,9 +16,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from orthocal.arguments import require_kind, require_names, require_numbers, require_seed
 from orthocal.documents import Number, parse_number, read_yaml, validate
 from orthocal.errors import ParameterError, SessionError
-from orthocal.measurement.observations import build_observations
+from orthocal.measurement.observations import Observations, build_observations
 from orthocal.measurement.sensing import predict_entries, sensor_unknowns
-from orthocal.measurement.session import Session
+from orthocal.measurement.session import Reading, Session
 from orthocal.robot.model import Robot
 from orthocal.units import MM, to_mm
 
@@ -98,7 +98,8 @@ def simulate_session(
         exact: No noise, no rounding to the gauge's resolution; dials show 0 where they begin.
 
     Raises:
-        SessionError: If the noise is not known, or a reading leaves the gauge's range.
+        SessionError: If the noise is not known, or a reading does not exist or leaves the gauge's
+            range.
         ClosureError: If the machine cannot reach a posture.
     """
     require_kind(plan, Session, expected="a Session, such as load_plan(...)")
@@ -115,6 +116,61 @@ def simulate_session(
         own = np.random.default_rng((seed, 1)).normal(size=len(unknown))
         drawn = own * [p.tolerance for p in unknown]
     entries = predict_entries(plan, observations, errors, unknowns=drawn)
+    entries, zeros = show_readings(plan, observations, entries, rng=rng, sigma=sigma, exact=exact)
+    rows = observations.rows(entries)
+    for reading, value in zip(plan.readings, rows, strict=True):
+        if not math.isfinite(value):
+            raise SessionError(
+                f"the simulated reading {reading.label} does not exist: on this machine the tip "
+                "passes what it should touch"
+            )
+        gauge_name, limits = plan.setups[reading.setup].gauge, limits_of(plan, reading)
+        if limits is not None and not limits[0] <= value <= limits[1]:
+            beyond = limits[0] if value < limits[0] else limits[1]
+            raise SessionError(
+                f"the simulated reading {reading.label} is {value / MM:.3f} mm; the gauge's "
+                f"range ends at {beyond / MM:g} mm",
+                where=_where(plan, gauge_name, "range_mm") if plan.path is not None else None,
+            )
+    session = replace(
+        plan.with_values(rows),
+        gauges={
+            name: replace(g, resolution=None) if exact else g for name, g in plan.gauges.items()
+        },
+        title=plan.title if plan.title.startswith("Simulated") else f"Simulated: {plan.title}",
+        source=f"Simulated by orthocal, not measured (seed {seed})",
+        path=None,
+        readings_path=None,
+    )
+    found = {p.name: float(v) for p, v in zip(unknown, drawn, strict=True)}
+    return SimulatedSession(session, dict(errors), zeros, found)
+
+
+def show_readings(
+    plan: Session,
+    observations: Observations,
+    entries: Array,
+    *,
+    rng: np.random.Generator,
+    sigma: float | None = None,
+    exact: bool = False,
+) -> tuple[Array, dict[str, float]]:
+    """What dials show of what there is to read: with their zeros, noise and rounding.
+
+    Args:
+        plan: What is read where.
+        observations: Its readings as single ones.
+        entries: What there is to read, gauge zeros at 0, shape (n_entries,), [m].
+        rng: Draws zeros and noise.
+        sigma: Standard deviation of a reading, [m]; the plan's gauge by default.
+        exact: No noise, no rounding to the gauge's resolution; dials show 0 where they begin.
+
+    Returns:
+        Shape (n_entries,), [m], and setup to the zero of its gauge, [m].
+
+    Raises:
+        SessionError: If the noise is not known.
+    """
     gauges = [plan.gauges[s.gauge] for s in plan.setups.values()]
     deviation = np.array([_noise_of(plan, s.gauge, sigma, exact) for s in plan.setups.values()])
     # the dial is set where its setup begins
@@ -130,32 +186,15 @@ def simulate_session(
             if gauge.resolution is not None:
                 own = observations.setup == i
                 entries[own] = np.round(entries[own] / gauge.resolution) * gauge.resolution
-    rows = observations.rows(entries)
-    for reading, value in zip(plan.readings, rows, strict=True):
-        gauge_name = plan.setups[reading.setup].gauge
-        limits = plan.gauges[gauge_name].range
-        if limits is not None:
-            lowest, highest = (
-                limits if reading.minus is None else (limits[0] - limits[1], limits[1] - limits[0])
-            )
-            if not lowest <= value <= highest:
-                raise SessionError(
-                    f"the simulated reading {reading.label} is {value / MM:.3f} mm; the gauge's "
-                    f"range ends at {(lowest if value < lowest else highest) / MM:g} mm",
-                    where=_where(plan, gauge_name, "range_mm") if plan.path is not None else None,
-                )
-    session = replace(
-        plan.with_values(rows),
-        gauges={
-            name: replace(g, resolution=None) if exact else g for name, g in plan.gauges.items()
-        },
-        title=plan.title if plan.title.startswith("Simulated") else f"Simulated: {plan.title}",
-        source=f"Simulated by orthocal, not measured (seed {seed})",
-        path=None,
-        readings_path=None,
-    )
-    found = {p.name: float(v) for p, v in zip(unknown, drawn, strict=True)}
-    return SimulatedSession(session, dict(errors), zeros, found)
+    return entries, zeros
+
+
+def limits_of(plan: Session, reading: Reading) -> tuple[float, float] | None:
+    """Lowest and highest value that a reading can have, [m]; None where the gauge says none."""
+    found = plan.gauges[plan.setups[reading.setup].gauge].range
+    if found is None or reading.minus is None:
+        return found
+    return found[0] - found[1], found[1] - found[0]
 
 
 def _noise_of(plan: Session, gauge: str, sigma: float | None, exact: bool) -> float:
@@ -222,7 +261,8 @@ def collect_errors(
     errors: dict[str, float] = {}
     if draw is not None:
         models = robot.parameters.models
-        patterns = models[draw] if draw in models else tuple(draw.split(","))
+        own = draw in models
+        patterns = robot.parameters.patterns(draw) if own else tuple(draw.split(","))
         try:
             errors.update(draw_errors(robot, patterns, seed=seed, tolerances=tolerances))
         except ParameterError:

@@ -113,7 +113,8 @@ class OrthocalKeys(_Keys):
     ] = {}
     """Named sums of elementary errors; a leading '-' subtracts."""
     tolerances: ToleranceKeys = ToleranceKeys()
-    models: dict[Name, Annotated[list[Name], Field(min_length=1)]] = {}
+    models: dict[Name, Annotated[list[Name], Field(min_length=1)] | Literal["complete"]] = {}
+    """Patterns of names; or every error that changes something."""
 
 
 class RobotKeys(_Keys):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from importlib import resources
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from orthocal.errors import ParameterError, RobotError
 from orthocal.fields import read_only
 from orthocal.files import is_folder, read_file, require_plain_name
 from orthocal.robot.description import LegKeys, RobotKeys, RodKeys, load_description
+from orthocal.robot.frames import find_frame, hangs_on
+from orthocal.robot.idle import find_idle_errors
 from orthocal.robot.model import (
     Closure,
     Drive,
@@ -24,11 +27,11 @@ from orthocal.robot.model import (
     Rod,
     Tcp,
     build_constraints,
-    find_frame,
     joint_axis,
 )
 from orthocal.robot.parameters import (
     AXES,
+    COMPLETE,
     ElementaryError,
     Kind,
     ParameterSet,
@@ -90,7 +93,7 @@ def _load_folder(folder: Path) -> Robot:
     passive_index = [i for i in range(model.nv) if i not in drive_index]
     closures = _build_closures(model, keys, where)
     try:
-        parameters = _build_parameter_set(model, keys, drives, closures)
+        parameters = _build_parameter_set(model, keys, drives, closures, where)
     except ParameterError as e:
         raise RobotError(e.problem, where=f"{where}: orthocal") from None
     name = folder.resolve().name
@@ -114,7 +117,9 @@ def _load_folder(folder: Path) -> Robot:
     )
     given = [_is_zero_given(keys, d.name) for d in drives]
     robot = stand_at_zero(robot, _passive_start(robot, keys, where), given=given)
-    return replace(robot, legs=_build_legs(robot, keys, where))
+    robot = replace(robot, legs=_build_legs(robot, keys, where))
+    parameters.find_idle = partial(find_idle_errors, robot)
+    return robot
 
 
 def _find_files(folder: Path) -> tuple[Path, Path]:
@@ -209,7 +214,11 @@ def _build_tcp(model: pin.Model, keys: RobotKeys, where: str) -> Tcp | None:
 
 
 def _build_parameter_set(
-    model: pin.Model, keys: RobotKeys, drives: Sequence[Drive], closures: Sequence[Closure]
+    model: pin.Model,
+    keys: RobotKeys,
+    drives: Sequence[Drive],
+    closures: Sequence[Closure],
+    where: str,
 ) -> ParameterSet:
     """All elementary errors: drives, then joints, then the frames that are used.
 
@@ -251,15 +260,7 @@ def _build_parameter_set(
     t = extra.tolerances
     models = dict(extra.models)
     models.setdefault("offsets", ["*.offset"])
-    models.setdefault(
-        "full",
-        [
-            "*",
-            "!*.scale",
-            *(["!frame.*"] if frames else []),
-            *(f"!{name}" for name in extra.parameters),
-        ],
-    )
+    models.setdefault("full", COMPLETE)
     return build_parameters(
         elementary,
         sums=extra.parameters,
@@ -272,7 +273,27 @@ def _build_parameter_set(
         },
         overrides=t.overrides,
         models=models,
+        parts=_find_parts(model, keys, closures, where),
     )
+
+
+def _find_parts(
+    model: pin.Model, keys: RobotKeys, closures: Sequence[Closure], where: str
+) -> frozenset[str]:
+    """Frames that are parts of a machine: where its loops end.
+
+    An error of a frame that the tool hangs on moves the tool alone: it says where on the platform
+    that is. The ends of legs' lines are drawn in the air.
+    """
+    tool: set[int] = set()
+    if keys.orthocal.tcp is not None:
+        tcp = keys.orthocal.tcp.frame
+        current: int | None = find_frame(model, tcp, where=f"{where}: orthocal.tcp.frame")
+        while current is not None:
+            tool.add(current)
+            current = hangs_on(model, current)
+    ends = {frame for closure in closures for frame in (closure.frame_a, closure.frame_b)}
+    return frozenset(frame for frame in ends if find_frame(model, frame, where=where) not in tool)
 
 
 def _passive_start(robot: Robot, keys: RobotKeys, where: str) -> Array:

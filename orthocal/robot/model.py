@@ -10,9 +10,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.errors import ClosureError, RobotError
+from orthocal.errors import ClosureError
 from orthocal.fields import read_only
 from orthocal.robot.closing import close_loops, describe_opening
+from orthocal.robot.frames import find_frame, place_frames
 from orthocal.robot.parameters import (
     ParameterSet,
 )
@@ -356,35 +357,6 @@ def joint_turns(model: pin.Model, joint: int) -> bool:
     """Whether a joint turns, and does not slide: revolute, bounded or not."""
     axis = joint_axis(model, joint) if model.joints[joint].nv == 1 else np.zeros(6)
     return bool(np.any(axis[3:]) and not np.any(axis[:3]))
-
-
-def find_frame(model: pin.Model, name: str, *, where: str) -> int:
-    """Index of the frame of a link, or else of a fixed or moving joint, of this name.
-
-    Raises:
-        RobotError: If there is none.
-    """
-    for kind in (pin.FrameType.BODY, pin.FrameType.FIXED_JOINT, pin.FrameType.JOINT):
-        if model.existFrame(name, kind):
-            return int(model.getFrameId(name, kind))
-    raise RobotError(f"the URDF has no frame '{name}'", where=where)
-
-
-def place_frames(model: pin.Model, nominal: pin.Model, twists: Mapping[str, Array]) -> None:
-    """Write frame errors into a model; frames that hang on a frame move with it."""
-    moved: dict[int, pin.SE3] = {}
-    targets = {find_frame(nominal, name, where="frame"): t for name, t in twists.items()}
-    for i, frame in enumerate(nominal.frames):
-        parent = frame.parentFrame
-        shift = targets.get(i)
-        hangs = nominal.frames[parent].parentJoint == frame.parentJoint and parent in moved
-        if frame.type == pin.FrameType.JOINT or (shift is None and not hangs):
-            continue
-        placement = frame.placement
-        if hangs:
-            placement = moved[parent] * nominal.frames[parent].placement.inverse() * placement
-        moved[i] = placement if shift is None else placement * pin.exp6(shift)
-        model.frames[i].placement = moved[i]
 
 
 def build_constraints(

@@ -15,9 +15,11 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cached_property
+from glob import escape, has_magic
 from typing import Literal
 
 import numpy as np
@@ -29,6 +31,9 @@ from orthocal.errors import ParameterError
 from orthocal.units import UNIT_SUFFIXES, InUnit, Unit
 
 Kind = Literal["offset", "scale", "translation", "rotation"]
+
+COMPLETE: Literal["complete"] = "complete"
+"""A model of every error that changes something."""
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Components of a twist, translation first."""
@@ -69,10 +74,15 @@ class ParameterSet:
         elementary: Iterable[ElementaryError],
         parameters: Iterable[Parameter],
         models: Mapping[str, Sequence[str]],
+        *,
+        parts: Collection[str] = (),
     ) -> None:
         self.elementary = {e.name: e for e in elementary}
         self._parameters = {p.name: p for p in parameters}
-        self.models = {name: tuple(patterns) for name, patterns in models.items()}
+        self._models = dict(models)
+        self._parts = frozenset(parts)
+        self.find_idle: Callable[[], frozenset[str]] = frozenset
+        """Finds the elementary errors that change nothing; asked once, and only when needed."""
 
     def __iter__(self) -> Iterator[Parameter]:
         return iter(self._parameters.values())
@@ -95,6 +105,45 @@ class ParameterSet:
     def names(self) -> tuple[str, ...]:
         """Names of all parameters, in order."""
         return tuple(self._parameters)
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Names of the robot's models."""
+        return tuple(self._models)
+
+    def patterns(self, model: str) -> tuple[str, ...]:
+        """What a model frees: names and globs, as for `select`.
+
+        Raises:
+            ParameterError: If there is no such model.
+        """
+        if model not in self._models:
+            raise ParameterError(
+                f"'{model}' is not a model of this robot; models: {', '.join(self._models)}"
+            )
+        given = self._models[model]
+        return tuple(escape(n) for n in self.complete) if given == COMPLETE else tuple(given)
+
+    @cached_property
+    def complete(self) -> tuple[str, ...]:
+        """Elementary errors of the machine's parts that change something, in order.
+
+        What changes something is found by rank (`find_idle`), not by a list. Sums of errors are no
+        further ones.
+        """
+        return tuple(n for n in self.of_parts if n not in self.idle)
+
+    @cached_property
+    def of_parts(self) -> tuple[str, ...]:
+        """Elementary errors of drives, joints and where loops end, in order."""
+        return tuple(
+            e.name for e in self.elementary.values() if not e.of_frame or e.owner in self._parts
+        )
+
+    @cached_property
+    def idle(self) -> frozenset[str]:
+        """Elementary errors that change neither the tool nor what a gauge touches."""
+        return self.find_idle()
 
     def coefficients(self, errors: Sequence[str], names: Sequence[str]) -> NDArray[np.float64]:
         """What one unit of each named parameter adds to each error, (n_errors, n_names).
@@ -129,7 +178,7 @@ class ParameterSet:
         for pattern in patterns:
             without = pattern.startswith("!")
             glob = composed(pattern.removeprefix("!"))
-            found = [name for name in self._parameters if fnmatchcase(name, glob)]
+            found = self._matched(glob)
             if not found:
                 raise ParameterError(
                     f"'{glob}' matches no error parameter{_suggest(glob, self._parameters)}"
@@ -137,17 +186,18 @@ class ParameterSet:
             chosen.difference_update(found) if without else chosen.update(found)
         return tuple(name for name in self._parameters if name in chosen)
 
+    def _matched(self, glob: str) -> list[str]:
+        if has_magic(glob):
+            return [name for name in self._parameters if fnmatchcase(name, glob)]
+        return [glob] if glob in self._parameters else []
+
     def select_model(self, model: str) -> tuple[str, ...]:
         """Names of the free parameters of a model of the robot's YAML.
 
         Raises:
             ParameterError: If there is no such model.
         """
-        if model not in self.models:
-            raise ParameterError(
-                f"'{model}' is not a model of this robot; models: {', '.join(self.models)}"
-            )
-        return self.select(self.models[model])
+        return self.select(self.patterns(model))
 
     def read_quantity(self, key: str, value: float) -> tuple[str, float]:
         """Parameter name and SI value of a key that carries its unit, such as x_slide.offset_mm.
@@ -233,6 +283,7 @@ def build_parameters(
     tolerances: Mapping[str, float],
     overrides: Mapping[str, float],
     models: Mapping[str, Sequence[str]],
+    parts: Collection[str] = (),
 ) -> ParameterSet:
     """The parameter set of a robot.
 
@@ -242,7 +293,8 @@ def build_parameters(
         tolerances: Keys `offset:m`, `offset:rad`, `translation`, `rotation`, `scale` to one
             standard deviation, [m, rad, m, rad, 1].
         overrides: Parameter name or glob with its unit as suffix to a tolerance; later ones win.
-        models: Model name to patterns.
+        models: Model name to patterns, or to COMPLETE.
+        parts: Frames that are parts of the machine.
 
     Raises:
         ParameterError: If a name is unknown, taken twice, or of another unit than its sum.
@@ -290,8 +342,10 @@ def build_parameters(
             old = parameters[name]
             _check_unit(key, unit, old)
             parameters[name] = Parameter(name, old.unit, value * factor, old.terms)
-    result = ParameterSet(elementary, parameters.values(), models)
-    for model, patterns in result.models.items():
+    result = ParameterSet(elementary, parameters.values(), models, parts=parts)
+    for model, patterns in models.items():
+        if patterns == COMPLETE:
+            continue
         try:
             chosen = result.select(patterns)
         except ParameterError as e:

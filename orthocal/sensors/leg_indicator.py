@@ -12,14 +12,15 @@ zero posture (the paper's X-leg midpoint, section 3.2).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, model_validator
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from orthocal.documents import Name, Number
 from orthocal.errors import SessionError
@@ -41,13 +42,16 @@ DIRECTIONS: dict[str, tuple[float, float, float]] = {
 }
 """Names of measured directions, and their unit vectors in the world."""
 
+Direction = str | tuple[float, float, float]
+"""A name of `DIRECTIONS`, or a vector in the world, of any length."""
+
 SectionForm = Literal["coordinate_mm", "from_root_mm", "fraction"]
 """How a section is given."""
 
 
 LARGEST_OBLIQUITY_DEG = 1.0
 """How far a measured direction may be from square to the leg; the nominal leg, in the mechanical
-zero."""
+zero. What touches a line has no side that an oblique plunger could slide on."""
 
 
 class SectionKeys(BaseModel):
@@ -73,8 +77,19 @@ class LegKeys(StandingKeys, SetupKeys):
     """A setup of an indicator on a leg, as in a session.yaml."""
 
     leg: Name
-    direction: str
+    direction: str | Annotated[list[Number], Field(min_length=3, max_length=3)]
     section: SectionKeys
+
+    @field_validator("direction", mode="before")
+    @classmethod
+    def _name_or_vector(cls, value: object) -> object:
+        vector = isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))
+        if not vector and not isinstance(value, str):
+            raise ValueError(
+                f"found {value}; expected one of {', '.join(DIRECTIONS)}, or a vector of three "
+                "numbers such as [0, 1, 1]"
+            )
+        return value
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +119,8 @@ class LegIndicator:
     """An indicator on a leg."""
 
     leg: str
-    direction: str
-    """x, y, z, -x, -y or -z of the world: the direction of a growing reading."""
+    direction: Direction
+    """Of a growing reading: x, y, z, -x, -y or -z of the world, or a vector."""
     section: Section
     standing: Standing = USUAL
 
@@ -117,12 +132,13 @@ class LegIndicator:
     def from_keys(cls, keys: LegKeys) -> LegIndicator:
         """As in a session.yaml."""
         section = Section.from_keys(keys.section)
-        return cls(keys.leg, keys.direction, section, Standing.from_keys(keys))
+        return cls(keys.leg, read_direction(keys), section, Standing.from_keys(keys))
 
     def to_keys(self) -> dict[str, Any]:
         """As in a session.yaml."""
         section, standing = self.section.to_keys(), self.standing.to_keys()
-        return {"leg": self.leg, "direction": self.direction, "section": section, **standing}
+        direction = self.direction if isinstance(self.direction, str) else list(self.direction)
+        return {"leg": self.leg, "direction": direction, "section": section, **standing}
 
     def require_fit(self, robot: Robot, *, where: str) -> None:
         """Refuse a leg, direction or section that the robot does not have.
@@ -130,6 +146,10 @@ class LegIndicator:
         Raises:
             SessionError: Naming the key.
         """
+        self.require_fit_within(LARGEST_OBLIQUITY_DEG, robot, where=where)
+
+    def require_fit_within(self, largest_deg: float, robot: Robot, *, where: str) -> None:
+        """The same where a plunger may be further from square to the leg."""
         if not robot.legs:
             raise SessionError(
                 f"'{robot.name}' has no legs for a gauge to touch; add orthocal.legs to "
@@ -141,12 +161,19 @@ class LegIndicator:
                 f"'{self.leg}' is not a leg of {robot.name}; legs: {', '.join(robot.legs)}",
                 where=f"{where}.leg",
             )
-        if self.direction not in DIRECTIONS:
+        if isinstance(self.direction, str) and self.direction not in DIRECTIONS:
             raise SessionError(
-                f"found '{self.direction}'; expected one of {', '.join(DIRECTIONS)}",
+                f"found '{self.direction}'; expected one of {', '.join(DIRECTIONS)}, or a vector",
                 where=f"{where}.direction",
             )
-        check_direction(self.direction, robot.legs[self.leg], where=f"{where}.direction")
+        if not np.any(direction_vector(self.direction)):
+            raise SessionError(
+                "found [0, 0, 0], which has no direction; expected a vector such as [0, 1, 1]",
+                where=f"{where}.direction",
+            )
+        check_direction(
+            self.direction, robot.legs[self.leg], largest_deg, where=f"{where}.direction"
+        )
         if self.section.form == "fraction" and not 0.0 <= self.section.value <= 1.0:
             raise SessionError(
                 f"found {self.section.value:g}; expected 0 (root) to 1 (tip)",
@@ -168,7 +195,7 @@ class LegIndicator:
         """Direction (3), plane, whether that counts from the root; and the leg's axis (3)."""
         plane, from_root = self.plane(robot)
         axis = robot.legs[self.leg].axis
-        return np.array([*DIRECTIONS[self.direction], plane, float(from_root), *axis])
+        return np.array([*direction_vector(self.direction), plane, float(from_root), *axis])
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
@@ -205,7 +232,7 @@ class LegIndicator:
         form, place = self.section.form, self.section.value
         words = form.removesuffix("_mm").replace("_", " ")
         where = f"{words} {place:g}" if form == "fraction" else f"{words} {place / MM:g} mm"
-        return f"leg {self.leg}, {self.direction}, {where}"
+        return f"leg {self.leg}, {direction_name(self.direction)}, {where}"
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
         """Where the leg's line crosses the plane of the section."""
@@ -218,7 +245,7 @@ class LegIndicator:
         length = leg.length / MM
         return Contact(
             points=root + fraction[:, None] * (tip - root),
-            direction=np.array(DIRECTIONS[self.direction]),
+            direction=direction_vector(self.direction),
             along=leg.axis,
             problems=[
                 ""
@@ -275,34 +302,64 @@ def _crooked(leg: Leg) -> str:
     )
 
 
-def check_direction(direction: str, leg: Leg, *, where: str) -> None:
-    """Refuse a gauge that does not measure square to the leg, as its model takes for granted.
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def read_direction(keys: LegKeys) -> Direction:
+    """A direction as a session.yaml has it."""
+    given = keys.direction
+    return given if isinstance(given, str) else (given[0], given[1], given[2])
+
+
+def direction_vector(direction: Direction) -> Array:
+    """Of a growing reading in the world, a unit vector, shape (3,); 0 where a vector is 0."""
+    vector = np.array(DIRECTIONS[direction] if isinstance(direction, str) else direction)
+    if isinstance(direction, str) or not vector.any():
+        return vector
+    vector = vector / np.abs(vector).max()  # its square is not too large for a number
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def direction_name(direction: Direction) -> str:
+    """A direction in words: its name, or its vector in brackets."""
+    if isinstance(direction, str):
+        return direction
+    return f"({', '.join(f'{v:g}' for v in direction)})"
+
+
+def check_direction(
+    direction: Direction, leg: Leg, largest_deg: float = LARGEST_OBLIQUITY_DEG, *, where: str
+) -> None:
+    """Refuse a gauge that does not measure square to the leg, as far as what touches it needs that.
 
     An oblique plunger also sees how far the leg moves along itself.
 
     Args:
-        direction: One of `DIRECTIONS`.
+        direction: Of the plunger.
         leg: The leg it touches.
+        largest_deg: How far from square it may be, [°].
         where: File and key, for messages.
 
     Raises:
         SessionError: With the angle to the leg, and the directions that are square to it.
     """
-    angles = {
-        name: float(np.degrees(np.arccos(np.clip(np.dot(axis, leg.axis), -1.0, 1.0))))
-        for name, axis in DIRECTIONS.items()
-    }
-    if abs(angles[direction] - 90.0) <= LARGEST_OBLIQUITY_DEG:
+
+    def angle(axis: ArrayLike) -> float:
+        return float(np.degrees(np.arccos(np.clip(np.dot(axis, leg.axis), -1.0, 1.0))))
+
+    own = angle(direction_vector(direction))
+    if abs(own - 90.0) <= largest_deg:
         return
-    square = [n for n, a in angles.items() if abs(a - 90.0) <= LARGEST_OBLIQUITY_DEG]
+    square = [n for n, a in DIRECTIONS.items() if abs(angle(a) - 90.0) <= largest_deg]
     choice = f"; square to it: {', '.join(square)}" if square else ""
-    found = min(angles[direction], 180.0 - angles[direction])
+    found, named = min(own, 180.0 - own), f"'{direction_name(direction)}'"
     if found < LARGEST_OBLIQUITY_DEG:
-        problem = f"'{direction}' is along leg {leg.name}; a gauge measures across it{choice}"
+        problem = f"{named} is along leg {leg.name}; a gauge measures across it{choice}"
     else:
         problem = (
-            f"'{direction}' is at {found:.1f}° to leg {leg.name} in the mechanical zero; expected "
-            f"a direction square to the leg, to within {LARGEST_OBLIQUITY_DEG:g}°{choice}"
+            f"{named} is at {found:.1f}° to leg {leg.name} in the mechanical zero; expected "
+            f"a direction square to the leg, to within {largest_deg:g}°{choice}"
             + ("" if square else _crooked(leg))
         )
     raise SessionError(problem, where=where)

@@ -63,6 +63,18 @@ class Frames:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TouchingTip:
+    """What touches, as it is: a ball, or a blade or pin along an edge."""
+
+    radius: float
+    """Of the ball or the pin, [m]; 0 for a blade's edge."""
+    edge: Array | None = None
+    """Way of the edge, a unit vector, shape (3,); None for a ball."""
+    width: float = 0.0
+    """Of the edge, [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Contact:
     """Where and how a sensor touches, in K postures: for scenes and checks."""
 
@@ -76,6 +88,8 @@ class Contact:
     """Why it cannot touch there, in words; empty where it can. K of them."""
     key: str
     """Key of the setup that says where it touches, for messages."""
+    tip: TouchingTip | None = None
+    """What touches there, where that is said."""
 
 
 class SetupKeys(BaseModel):

@@ -1,30 +1,54 @@
 """An indicator on a round rod of a leg, with a ball or a blade: what a dial really touches.
 
-The tip begins beside the rod as it lies in the mechanical zero of the nominal machine, at the
-setup's section along the leg; the zero of the setup takes what it is off along the plunger.
+The tip begins in the rod as it lies in the mechanical zero of the nominal machine, at the setup's
+section along the leg; the zero of the setup takes what it is off along the plunger.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from functools import lru_cache
+from typing import Annotated, Any, ClassVar, Self
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from orthocal.documents import Number
 from orthocal.errors import SessionError
 from orthocal.robot.model import Robot, Rod
-from orthocal.sensors.leg_indicator import DIRECTIONS, LegIndicator, LegKeys, Section
-from orthocal.sensors.protocol import Contact, Frames, SetupKeys, Unknown, View
+from orthocal.sensors.leg_indicator import (
+    Direction,
+    LegIndicator,
+    LegKeys,
+    Section,
+    direction_vector,
+    read_direction,
+)
+from orthocal.sensors.protocol import Contact, Frames, SetupKeys, TouchingTip, Unknown, View
 from orthocal.sensors.standing import USUAL, Standing, stand
 from orthocal.sensors.tips import Tip, TipKeys, touch_by_ball, touch_by_blade
-from orthocal.units import MM
+from orthocal.units import MM, to_mm
 
 Array = NDArray[np.float64]
 Matrix = Any
 """Symbols or numbers of CasADi."""
+
+
+OBLIQUITY_DEG = {"ball": 30.0, "blade": 10.0}
+"""How far from square to the leg a plunger may be: beyond that the rod pushes it aside, and a blade
+touches with its back."""
+
+
+LARGEST_BESIDE_MM = 500.0
+"""No rod moves further aside: it is a wrong unit."""
+
+NOT_ACROSS = 1e-5
+"""How far from across leg and plunger a tip may be said to begin, [m]: what rounding leaves."""
+
+Millimetres = Annotated[Number, Field(ge=-LARGEST_BESIDE_MM, le=LARGEST_BESIDE_MM)]
 
 
 class RodKeys(LegKeys):
@@ -33,6 +57,9 @@ class RodKeys(LegKeys):
     touches: str | None = None
     """Which of the leg's rods; the line between them where not given."""
     tip: TipKeys | None = None
+    beside_mm: Annotated[list[Millimetres], Field(min_length=3, max_length=3)] | None = None
+    """Where the tip begins, from where the rod lies in the mechanical zero: across leg and plunger,
+    in the world. For readings in postures in which the rod lies elsewhere."""
 
 
 def read_leg(keys: RodKeys) -> LegIndicator | RodIndicator:
@@ -42,6 +69,8 @@ def read_leg(keys: RodKeys) -> LegIndicator | RodIndicator:
         SessionError: If a rod is touched with nothing, or a line with something.
     """
     if keys.touches is None:
+        if keys.beside_mm is not None:
+            raise SessionError("found without `touches`, a rod; expected one", where="beside_mm")
         return LegIndicator.from_keys(keys)
     if keys.tip is None:
         raise SessionError("is missing; expected ball or blade", where="tip")
@@ -54,11 +83,13 @@ class RodIndicator:
 
     leg: str
     rod: str
-    direction: str
-    """x, y, z, -x, -y or -z of the world: the direction of a growing reading."""
+    direction: Direction
+    """Of a growing reading: x, y, z, -x, -y or -z of the world, or a vector."""
     section: Section
     tip: Tip
     standing: Standing = USUAL
+    beside: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the tip begins, from where the rod lies in the mechanical zero, [m]."""
 
     kind: ClassVar[str] = "leg"
     keys: ClassVar[type[SetupKeys]] = RodKeys
@@ -69,11 +100,14 @@ class RodIndicator:
         """As in a session.yaml."""
         section, tip = Section.from_keys(keys.section), Tip.from_keys(keys.tip)
         standing = Standing.from_keys(keys)
-        return cls(keys.leg, keys.touches, keys.direction, section, tip, standing)
+        x, y, z = keys.beside_mm or (0.0, 0.0, 0.0)
+        beside = (x * MM, y * MM, z * MM)
+        return cls(keys.leg, keys.touches, read_direction(keys), section, tip, standing, beside)
 
     def to_keys(self) -> dict[str, Any]:
         """As in a session.yaml."""
-        return {**self._line.to_keys(), "touches": self.rod, "tip": self.tip.to_keys()}
+        beside = {"beside_mm": [to_mm(v) for v in self.beside]} if any(self.beside) else {}
+        return {**self._line.to_keys(), "touches": self.rod, "tip": self.tip.to_keys(), **beside}
 
     def require_fit(self, robot: Robot, *, where: str) -> None:
         """Refuse a leg, rod, direction or section that the robot does not have.
@@ -81,12 +115,20 @@ class RodIndicator:
         Raises:
             SessionError: Naming the key.
         """
-        self._line.require_fit(robot, where=where)
+        self._line.require_fit_within(OBLIQUITY_DEG[self.tip.form], robot, where=where)
         rods = robot.legs[self.leg].rods
         if self.rod not in rods:
             known = f"; rods: {', '.join(rods)}" if rods else ": it has none in the robot's YAML"
             raise SessionError(
                 f"'{self.rod}' is not a rod of leg {self.leg}{known}", where=f"{where}.touches"
+            )
+        side = self._side(robot)
+        if np.abs(np.cross(self.beside, side)).max() > NOT_ACROSS:
+            given = ", ".join(f"{v / MM:g}" for v in self.beside)
+            across = ", ".join(f"{v:.3g}" for v in side)
+            raise SessionError(
+                f"found [{given}]; expected a multiple of ({across}), across leg and plunger",
+                where=f"{where}.beside_mm",
             )
 
     @property
@@ -96,7 +138,10 @@ class RodIndicator:
 
     def describe(self) -> str:
         """Leg, rod, direction, section and tip."""
-        return f"{self._line.describe()}, {self.tip.form} on rod {self.rod}"
+        words = f"{self._line.describe()}, {self.tip.form} on rod {self.rod}"
+        if not any(self.beside):
+            return words
+        return f"{words}, ({', '.join(f'{v / MM:g}' for v in self.beside)}) mm beside its zero"
 
     def frames(self, robot: Robot) -> Frames:
         """Ends of the rod; the leg's root at zero, where a section may count from it."""
@@ -104,17 +149,10 @@ class RodIndicator:
         return Frames((rod.root, rod.tip), self._line.frames(robot).at_zero)
 
     def constants(self, robot: Robot) -> Array:
-        """As of the line (8); where the tip is across the leg, and the radius of the contact."""
-        rod, axis = self._rod(robot), robot.legs[self.leg].axis
-        side = self._side(robot)
-        return np.array(
-            [
-                *self._line.constants(robot),
-                *side,
-                self._lateral(robot, rod, axis, side),
-                rod.radius + self.tip.radius,
-            ]
-        )
+        """As of the line (8); the blade's edge (3), the tip across the leg (3), radii (1)."""
+        rod = self._rod(robot)
+        across, radius = self._across(robot, rod), rod.radius + self.tip.radius
+        return np.array([*self._line.constants(robot), *self._side(robot), *across, radius])
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
@@ -130,11 +168,12 @@ class RodIndicator:
         if view.at_zero:
             plane += c[4] * ca.dot(axis, view.at_zero[0].position)
         stood = stand(self.unknowns, view.unknowns, direction=direction, side=side, axis=axis)
-        found: ca.SX = self._touch(
+        found = _touch(
+            self.tip.form,
             at=root,
             along=end - root,
-            radius=c[12],
-            tip=plane * axis + c[11] * side + stood.moved,
+            radius=c[14],
+            tip=plane * axis + c[11:14] + stood.moved,
             direction=stood.direction,
             side=stood.edge,
         )
@@ -151,86 +190,69 @@ class RodIndicator:
         )
         if at_zero:
             plane += constants[4] * float(axis @ at_zero[0][:3, 3])
-        start = plane * axis + constants[11] * side
-        points, problems = [], []
-        for root, end in zip(*(pose[:, :3, 3] for pose in frames), strict=True):
-            point, problem = self._meet(root, end, start, direction, side, rod)
-            points.append(point)
-            problems.append(problem)
+        roots, ends = (pose[:, :3, 3] for pose in frames)
+        start = plane * axis + constants[11:14]
+        points, problems = self._meet(roots, ends, start, direction, side, rod)
         return Contact(
-            points=np.array(points),
+            points=points,
             direction=direction,
             along=axis,
             problems=problems,
             key="section",
+            tip=TouchingTip(
+                self.tip.radius, None if self.tip.form == "ball" else side, self.tip.width
+            ),
         )
 
     def _meet(
-        self, root: Array, end: Array, start: Array, direction: Array, side: Array, rod: Rod
-    ) -> tuple[Array, str]:
-        """Where the tip touches in one posture, and why it cannot."""
-        along = end - root
-        length = float(np.linalg.norm(along))
-        unit = along / length
+        self, roots: Array, ends: Array, start: Array, direction: Array, side: Array, rod: Rod
+    ) -> tuple[Array, list[str]]:
+        """Where the tip touches in K postures, (K, 3), and why it cannot."""
+        along = ends - roots
+        lengths = np.linalg.norm(along, axis=1)
+        units = along / lengths[:, None]
         radius = rod.radius + self.tip.radius
-        h = float(
-            self._touch(
-                at=ca.DM(root),
-                along=ca.DM(along),
-                radius=ca.DM(radius),
-                tip=ca.DM(start),
-                direction=ca.DM(direction),
-                side=ca.DM(side),
-            )
-        )
-        if not np.isfinite(h):
-            apart = start - root
-            lateral = np.cross(unit, direction) @ apart / np.linalg.norm(np.cross(unit, direction))
-            return start, (
-                f"the ball would pass the rod: it is {abs(lateral) / MM:.1f} mm beside its axis, "
-                f"and they touch up to {radius / MM:.1f} mm"
-            )
-        centre = start + h * direction
+        h = _touching(self.tip.form)(roots.T, along.T, radius, start, direction, side)
+        h = np.asarray(h)[0]
+        apart = start - roots
+        across = np.cross(units, direction)
+        lateral = np.einsum("ki,ki->k", across, apart) / np.linalg.norm(across, axis=1)
+        centres = start + h[:, None] * direction
         if self.tip.form == "blade":
-            normal = np.cross(side, unit)
-            normal *= np.sign(normal @ direction) / np.linalg.norm(normal)
-            shift = np.linalg.lstsq(
-                np.column_stack([side, -unit, normal]), root - centre, rcond=None
-            )[0]
-            foot, off = root + shift[1] * unit, abs(float(shift[0]))
-            surface = foot + rod.radius * normal
-            if off > 0.5 * self.tip.width:
-                return surface, (
-                    f"the blade would slide off: it would touch {off / MM:.1f} mm from its "
+            # the edge passes a radius from the rod's axis, along both their normal
+            normals = np.cross(side, units)
+            normals *= (np.sign(normals @ direction) / np.linalg.norm(normals, axis=1))[:, None]
+            edges = np.broadcast_to(side, units.shape)
+            frames = np.stack([edges, -units, normals], axis=2)
+            shifts = np.linalg.solve(frames, (roots - centres)[:, :, None])[:, :, 0]
+            feet, off = roots + shifts[:, 1:2] * units, np.abs(shifts[:, 0])
+        else:
+            feet = roots + np.einsum("ki,ki->k", centres - roots, units)[:, None] * units
+            normals, off = centres - feet, np.zeros(len(roots))
+            normals /= np.linalg.norm(normals, axis=1)[:, None]
+        surface = feet + rod.radius * normals
+        ways = np.einsum("ki,ki->k", feet - roots, units)
+        problems = []
+        for k, way in enumerate(ways.tolist()):
+            problem = ""
+            if not np.isfinite(h[k]):
+                surface[k] = start
+                problem = (
+                    f"the ball would pass the rod: it is {abs(lateral[k]) / MM:.1f} mm beside its "
+                    f"axis, and they touch up to {radius / MM:.1f} mm"
+                )
+            elif off[k] > 0.5 * self.tip.width and self.tip.form == "blade":
+                problem = (
+                    f"the blade would slide off: it would touch {off[k] / MM:.1f} mm from its "
                     f"middle, and is {self.tip.width / MM:.1f} mm wide"
                 )
-        else:
-            foot = root + float((centre - root) @ unit) * unit
-            surface = foot + rod.radius * (centre - foot) / np.linalg.norm(centre - foot)
-        way = float((foot - root) @ unit)
-        if 0.0 <= way <= length:
-            return surface, ""
-        return surface, (
-            f"the gauge would touch at {way / MM:.1f} mm from the root; the rod reaches from 0 "
-            f"to {length / MM:.1f} mm"
-        )
-
-    def _touch(
-        self,
-        *,
-        at: Matrix,
-        along: Matrix,
-        radius: Matrix,
-        tip: Matrix,
-        direction: Matrix,
-        side: Matrix,
-    ) -> Matrix:
-        """What it reads where a rod lies; of each form its own expression."""
-        if self.tip.form == "ball":
-            return touch_by_ball(at=at, along=along, radius=radius, tip=tip, direction=direction)
-        return touch_by_blade(
-            at=at, along=along, radius=radius, edge=side, tip=tip, direction=direction
-        )
+            elif not 0.0 <= way <= lengths[k]:
+                problem = (
+                    f"the gauge would touch at {way / MM:.1f} mm from the root; the rod reaches "
+                    f"from 0 to {lengths[k] / MM:.1f} mm"
+                )
+            problems.append(problem)
+        return surface, problems
 
     @property
     def _line(self) -> LegIndicator:
@@ -241,17 +263,45 @@ class RodIndicator:
 
     def _side(self, robot: Robot) -> Array:
         """Across leg and plunger: the blade's edge, unit vector."""
-        side = np.cross(robot.legs[self.leg].axis, DIRECTIONS[self.direction])
+        side = np.cross(robot.legs[self.leg].axis, direction_vector(self.direction))
         return np.asarray(side / np.linalg.norm(side))
 
-    def _lateral(self, robot: Robot, rod: Rod, axis: Array, side: Array) -> float:
-        """Where the rod lies across the leg in the mechanical zero, at the section, [m]."""
+    def _across(self, robot: Robot, rod: Rod) -> Array:
+        """Where the tip begins across the leg: in the rod as it lies in the mechanical zero."""
+        axis = robot.legs[self.leg].axis
         plane, from_root = self._line.plane(robot)
         if from_root:
             plane += float(axis @ robot.legs[self.leg].zero_root)
         along = rod.zero_tip - rod.zero_root
         share = (plane - axis @ rod.zero_root) / (axis @ along)
-        return float(side @ (rod.zero_root + share * along))
+        found = rod.zero_root + share * along
+        return np.asarray(found - (axis @ found) * axis + self.beside)
+
+
+def _touch(
+    form: str,
+    *,
+    at: ca.SX,
+    along: ca.SX,
+    radius: ca.SX,
+    tip: ca.SX,
+    direction: ca.SX,
+    side: ca.SX,
+) -> ca.SX:
+    """What a tip reads where a rod lies; of each form its own expression."""
+    if form == "ball":
+        return touch_by_ball(at=at, along=along, radius=radius, tip=tip, direction=direction)
+    return touch_by_blade(
+        at=at, along=along, radius=radius, edge=side, tip=tip, direction=direction
+    )
+
+
+@lru_cache
+def _touching(form: str) -> ca.Function:
+    """The same as a function of rods, one a column."""
+    names = ("at", "along", "radius", "tip", "direction", "side")
+    symbols = {n: ca.SX.sym(n, 1 if n == "radius" else 3) for n in names}
+    return ca.Function("touching", list(symbols.values()), [_touch(form, **symbols)])
 
 
 class RodByBall(RodIndicator):

@@ -16,11 +16,11 @@ from orthocal.assess.accuracy import (
     ToolAccuracy,
     assess_remaining,
     assess_tool,
-    find_remaining_errors,
 )
 from orthocal.assess.entering import find_entries
 from orthocal.assess.findings.remainder import find_tolerances
 from orthocal.assess.findings.tool import promise
+from orthocal.assess.remaining import find_remaining_errors
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
 from orthocal.show.layout import add_row, print_rich, table_of, um

@@ -33,6 +33,7 @@ FURTHER: tuple[Kind, ...] = (
     "nothing to check by",
     "held by a bound",
     "may stay",
+    "line in the air",
 )
 """Kinds of findings that are told here though they only inform."""
 
@@ -59,7 +60,7 @@ def render_answer(calibration: Calibration, *, heading: bool = True) -> Renderab
     if listed and shows_entries(decision):
         parts.append(Text())
     parts += listed
-    parts.append(bullets([f.text for f in _further(decision)]))
+    parts.append(bullets([f.text for f in _further(calibration, decision)]))
     if decision.action:
         parts.append(Text.assemble(("Next: ", "bold"), decision.action))
     return Group(*parts)
@@ -153,7 +154,7 @@ def _suspicion(finding: Finding) -> str:
     )
 
 
-def _further(decision: Decision) -> list[Finding]:
+def _further(calibration: Calibration, decision: Decision) -> list[Finding]:
     """What else is to be known before anything is entered, the gravest first."""
     decided = decision.reason
     found = [
@@ -165,6 +166,8 @@ def _further(decision: Decision) -> list[Finding]:
     ]
     if not shows_entries(decision) or decision.of_kind(*TOUCHES_NOTHING):
         found = [f for f in found if f.kind != "may stay"]
+    if calibration.only_offsets:  # they leave out more than that
+        found = [f for f in found if f.kind != "line in the air"]
     if decision.of_kind("turned setup"):
         found = [f for f in found if f.kind != "suspicious setup"]
     return found[:MOST_FURTHER]

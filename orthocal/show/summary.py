@@ -9,6 +9,7 @@ from orthocal.arguments import require_kind
 from orthocal.assess.comparison import Comparison
 from orthocal.assess.validation import Validation
 from orthocal.calibration.calibration import Calibration
+from orthocal.planning.plan import MeasuringPlan
 from orthocal.show.accuracy import render_tool
 from orthocal.show.answer import MORE, render_answer
 from orthocal.show.comparison import render_comparison
@@ -16,6 +17,7 @@ from orthocal.show.entering import render_controller
 from orthocal.show.explanation import explain_fit
 from orthocal.show.heading import render_origin
 from orthocal.show.layout import bullets, print_rich, section, to_text
+from orthocal.show.plan import render_plan
 from orthocal.show.report.rich_markup import to_markup
 from orthocal.show.sensors import render_parts
 from orthocal.show.tables import (
@@ -25,14 +27,15 @@ from orthocal.show.tables import (
     render_residuals,
 )
 from orthocal.show.validation import render_validation
+from orthocal.study.running import StudyTable
 
-Result = Calibration | Validation | Comparison
+Result = Calibration | Validation | Comparison | MeasuringPlan | StudyTable
 
 
 def summarize(
     result: Result, *, details: bool = False, all_rows: bool = False, html: bool = False
 ) -> str:
-    """A calibration, validation or comparison as plain text.
+    """A calibration, validation, comparison, plan or study as plain text.
 
     Args:
         result: What to summarise.
@@ -45,13 +48,20 @@ def summarize(
 
 
 def print_summary(result: Result, *, details: bool = False, all_rows: bool = False) -> None:
-    """Print a calibration, validation or comparison: in colour where there is a terminal."""
+    """Print a calibration, validation, comparison or plan: in colour where there is a terminal."""
     print_rich(_render(result, details, all_rows))
 
 
 def _render(result: Result, details: bool, all_rows: bool) -> RenderableType:
-    kinds = (Calibration, Comparison, Validation)
-    require_kind(result, kinds, expected="a Calibration, a Comparison or a Validation")
+    kinds = (Calibration, Comparison, Validation, MeasuringPlan, StudyTable)
+    expected = "a Calibration, a Comparison, a Validation, a MeasuringPlan or a StudyTable"
+    require_kind(result, kinds, expected=expected)
+    if isinstance(result, StudyTable):
+        from orthocal.show.study.views import render_study, summarise_study
+
+        return render_study(result, summarise_study(result), all_rows=all_rows or details)
+    if isinstance(result, MeasuringPlan):
+        return render_plan(result, details=details)
     if isinstance(result, Calibration):
         return render_calibration(result, details=details, all_rows=all_rows)
     if isinstance(result, Comparison):

@@ -19,6 +19,10 @@ from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
 
 Array = NDArray[np.float64]
 
+FEW_DOF = 5.0
+"""Below this residuals overrule what is stated of a gauge only where chance does not explain them:
+beside a prior a larger sigma leaves larger residuals, and would be its own proof."""
+
 LEAST_DOF = 0.5
 """Degrees of freedom below which residuals say nothing of the noise."""
 
@@ -156,11 +160,10 @@ def estimate_repeatability(values: Array, observations: Observations) -> tuple[f
 def noise_floor(gauge_sigma: float | None, resolution: float | None) -> float:
     """Standard deviation of a reading that no scatter can argue away, [m].
 
-    What is stated of the gauge, and what rounding to its resolution leaves, 1/√12 of it: readings
+    What is stated of the gauge, and what rounding to its resolution adds, 1/√12 of it: readings
     that happen to be alike, or are few, say nothing against either.
     """
-    finest = 0.0 if resolution is None else resolution / math.sqrt(12.0)
-    return max(gauge_sigma or 0.0, finest)
+    return math.hypot(gauge_sigma or 0.0, (resolution or 0.0) / math.sqrt(12.0))
 
 
 def estimate_noise(
@@ -198,7 +201,9 @@ def estimate_noise(
             misfit = chance_of_excess(chi_square, residual_dof, cycles_dof=known_dof) < BY_CHANCE
         source = "residuals" if misfit else "cycles"
     elif enough:
-        source = "residuals"
+        few = residual_dof < FEW_DOF and floor > 0.0 and gauge_sigma is not None
+        by_chance = few and not _exceeds(residual_square, residual_dof, floor)
+        source = "gauge" if by_chance else "residuals"
     else:
         source = "gauge" if gauge_sigma is not None else "unknown"
     sigma, dof = {
@@ -212,3 +217,8 @@ def estimate_noise(
     return Noise(
         sigma, dof, source, cycles_sigma, cycles_dof, residual_sigma, max(residual_dof, 0.0)
     )
+
+
+def _exceeds(square: float, dof: float, sigma: float) -> bool:
+    """Whether residuals are larger than a standard deviation [m] explains."""
+    return chance_of_excess(square / sigma**2, dof) < BY_CHANCE

@@ -115,6 +115,8 @@ class _Recorder:
         if isinstance(value, dict):
             return {k: self._plain(v) for k, v in value.items()}
         if isinstance(value, list | tuple):
+            if all(type(v) is float for v in value):  # most of what there is
+                return list(value)
             return [self._plain(v) for v in value]
         if isinstance(value, np.generic):
             return value.item()

@@ -59,18 +59,19 @@ def cone(height: float, radius: float, *, start: float = 0.0) -> g.Geometry:
 
 
 def pose_along(origin: Array, direction: Array) -> Array:
-    """A pose whose z is along a unit vector, shape (4, 4).
+    """Poses whose z is along unit vectors, shape (..., 4, 4).
 
     Args:
-        origin: Shape (3,), [m].
-        direction: Unit vector, shape (3,).
+        origin: Shape (..., 3), [m].
+        direction: Unit vectors, shape (..., 3).
     """
-    helper = np.eye(3)[int(np.abs(direction).argmin())]
+    helper = np.eye(3)[np.abs(direction).argmin(axis=-1)]
     x = np.cross(helper, direction)
-    x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3] = np.column_stack([x, np.cross(direction, x), direction])
-    pose[:3, 3] = origin
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    pose = np.zeros((*direction.shape[:-1], 4, 4))
+    pose[..., :3, :3] = np.stack([x, np.cross(direction, x), direction], axis=-1)
+    pose[..., :3, 3] = origin
+    pose[..., 3, 3] = 1.0
     return pose
 
 
@@ -172,7 +173,15 @@ def dial_distance(size: float) -> float:
 
 
 def draw_gauge(
-    scene: Scene, path: str, tip: Array, direction: Array, face: Array, size: float
+    scene: Scene,
+    path: str,
+    tip: Array,
+    direction: Array,
+    face: Array,
+    size: float,
+    *,
+    ball: float | None = None,
+    edge: Array | None = None,
 ) -> None:
     """A dial indicator that touches a point, its stem along the measured direction.
 
@@ -183,24 +192,26 @@ def draw_gauge(
         direction: Away from the leg: that of a growing reading, shape (3,).
         face: Which way the dial faces, across the direction, shape (3,).
         size: Radius of the dial, [m].
+        ball: Radius of what touches, as it is, [m]: of a ball, or of an edge that is a pin.
+        edge: From one end of an edge that touches to the other, shape (3,), [m].
     """
-    scene.place(
-        path,
-        np.block(
-            [
-                [np.column_stack([np.cross(direction, face), face, direction]), tip[:, None]],
-                [np.zeros(3), np.ones(1)],
-            ]
-        ),
-    )
+    axes = np.column_stack([np.cross(direction, face), face, direction])
+    scene.place(path, np.block([[axes, tip[:, None]], [np.zeros(3), np.ones(1)]]))
     dark, steel, white = (
         material((0.16, 0.17, 0.2), shiny=True),
         material((0.75, 0.76, 0.8), shiny=True),
         material((0.97, 0.97, 0.95)),
     )
     stem, reach = 0.16 * size, dial_distance(size)
-    scene.add(f"{path}/probe", cylinder(reach - size, 0.55 * stem), steel)
-    scene.add(f"{path}/tip", g.Sphere(stem), dark)
+    if edge is not None:
+        _draw_edge(scene, f"{path}/tip", axes.T @ edge, radius=ball or 0.0, height=stem)
+    else:
+        scene.add(f"{path}/tip", g.Sphere(ball or stem), dark)
+    if ball and edge is None:
+        scene.place(f"{path}/tip", pose_along(np.array([0.0, 0.0, ball]), np.eye(3)[2]))
+    probe = 0.55 * stem if not ball else min(0.55 * stem, 0.7 * ball)
+    above = ball or (stem if edge is not None else 0.0)
+    scene.add(f"{path}/probe", cylinder(reach - size - above, probe, start=above), steel)
     scene.add(f"{path}/stem", cylinder(0.75 * size, stem, start=reach - 1.6 * size), dark)
     # the dial's axis, z of a cylinder, along the face: y of the gauge
     turn = np.eye(4)
@@ -215,6 +226,20 @@ def draw_gauge(
     needle[:3, 3] = [0.0, thick / 2.0 + 0.06 * size, reach + 0.3 * size]
     scene.add(f"{path}/needle", g.Box([0.09 * size, 0.04 * size, 0.75 * size]), dark)
     scene.place(f"{path}/needle", needle)
+
+
+def _draw_edge(scene: Scene, path: str, edge: Array, *, radius: float, height: float) -> None:
+    """A blade, or a pin of a radius, above the origin, [m]."""
+    steel, length = material((0.75, 0.76, 0.8), shiny=True), float(np.linalg.norm(edge))
+    if radius > 0.0:
+        scene.add(path, cylinder(length, radius, start=-length / 2.0), steel)
+        scene.place(path, pose_along(np.array([0.0, 0.0, radius]), edge / length))
+        return
+    scene.add(path, g.Box([length, 0.1 * height, height]), steel)
+    along, up = edge / length, np.array([0.0, 0.0, 1.0])
+    pose = np.eye(4)
+    pose[:3] = np.column_stack([along, np.cross(up, along), up, height / 2.0 * up])
+    scene.place(path, pose)
 
 
 def draw_ground(scene: Scene, path: str, *, side: float, pitch: float) -> None:

@@ -192,5 +192,4 @@ def _line_poses(root: Array, tip: Array) -> tuple[Array, Array]:
     """Poses with z from root to tip, shape (F, 4, 4), and the distances, shape (F,), [m]."""
     along = tip[:, :3, 3] - root[:, :3, 3]
     length = np.linalg.norm(along, axis=1)
-    poses = [pose_along(r[:3, 3], a / n) for r, a, n in zip(root, along, length, strict=True)]
-    return np.array(poses), length
+    return pose_along(root[:, :3, 3], along / length[:, None]), length

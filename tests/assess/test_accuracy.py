@@ -9,8 +9,10 @@ import numpy as np
 import plans
 import pytest
 from derivatives import assert_derivative
+from folders import session_folder
 from gauges import exact
 from machines import place, write_orthoglide
+from models import JOINTS
 
 from orthocal import (
     Choice,
@@ -25,11 +27,11 @@ from orthocal import (
 from orthocal.assess.accuracy import (
     assess_tool,
     find_excess,
-    find_remaining_errors,
     measure_uncertainty,
 )
 from orthocal.assess.entering import entered_offsets
 from orthocal.assess.findings.comparison import decide_comparison
+from orthocal.assess.remaining import find_remaining_errors
 from orthocal.errors import RobotError
 from orthocal.estimation.problem import build_problem
 from orthocal.kinematics.assembly import Assembly, nominal_assembly
@@ -60,7 +62,7 @@ SAMPLING = 0.03
 
 @pytest.fixture(scope="module")
 def tool(orthoglide):
-    return ToolSensitivity(orthoglide, free=orthoglide.parameters.select_model("full"))
+    return ToolSensitivity(orthoglide, free=orthoglide.parameters.select(JOINTS))
 
 
 @pytest.fixture(scope="module")
@@ -278,13 +280,13 @@ def test_offsets_alone_are_as_good_as_the_machines_are(root):
 def test_the_truth_behind_the_examples_is_where_it_should_be(root):
     """Sweep and lines are of one machine: its tool against what each calibration says."""
     robot = load_robot("orthoglide")
-    truth = load_errors(root / "examples/lines/truth.yaml", robot)
+    truth = load_errors(root / "tests/sessions/lines/truth.yaml", robot)
     space = cube(robot)
     drives = Assembly(robot).inverse(space.points)
     real = Assembly(robot, fixed=truth).forward(drives)
     for name, model, largest in (("sweep", "offsets", 2.0), ("lines", "full", 1.5)):
         result = calibrate(
-            root / f"examples/{name}", Choice(model=model, tolerances={"*.offset_m": 2e-3})
+            session_folder(root, name), Choice(model=model, tolerances={"*.offset_m": 2e-3})
         )
         error = space.remove_motion(result.machine.forward(drives) - real, space.points)
         found = np.sqrt(space.weights @ (error**2).sum(axis=1))

@@ -39,7 +39,7 @@ def cycles(raw_cycles):
 
 @pytest.fixture(scope="module")
 def lines(root):
-    session = load_session(root / "examples/lines")
+    session = load_session(root / "tests/sessions/lines")
     return compare_models(session, models=["offsets", "full"], tolerances=OFFSETS)
 
 
@@ -48,7 +48,7 @@ def test_six_readings_support_offsets_only(table1):
     assert verdict.supported == "offsets"
     assert reasons(table1)[0] == "Six independent readings support offsets only."
     assert (table1["offsets"].spare, table1["full"].spare) == (3, 0)
-    assert any(s.startswith("full: not supported. Its 126 parameters") for s in reasons(table1))
+    assert any(s.startswith("full: not supported. Its 129 parameters") for s in reasons(table1))
     assert any(s.startswith("lengths: no") for s in reasons(table1))
 
 

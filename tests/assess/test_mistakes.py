@@ -29,7 +29,7 @@ def machines(plan):
     return found
 
 
-BEFORE = np.array([0.5e-3, -1.0e-3, 0.3e-3])
+BEFORE = np.array([-0.5e-3, -1.0e-3, 0.3e-3])
 """Offsets that are active already when a machine is calibrated for the second time."""
 
 

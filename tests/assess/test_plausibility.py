@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import plans
 import pytest
+from folders import session_folder
 from machines import write_orthoglide
 
 from orthocal import calibrate, load_plan, load_robot, load_session, simulate_session, summarize
@@ -38,7 +39,7 @@ def kinds(calibration):
     ["raw-cycles", "sweep", "lines", *(f"table1/experiment-{n}" for n in ("1-printed", "2", "3"))],
 )
 def test_the_examples_are_sound(root, name):
-    assert kinds(calibrate(load_session(root / "examples" / name))) == []
+    assert kinds(calibrate(load_session(session_folder(root, name)))) == []
 
 
 def test_readings_in_inches_are_noticed(session):

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from folders import session_folder
 from gauges import exact
 from machines import place, reading_by_pinocchio
+from models import JOINTS
 
 from orthocal import Choice, calibrate, draw_errors, load_plan, load_session
 from orthocal.assess.accuracy import assess_tool, measure_uncertainty
@@ -29,7 +31,7 @@ MACHINES = {"sweep": 100, "lines": 40}
 that of 100 by 6 %. Of 200 machines it is 1.03 and 0.98 of what is predicted."""
 
 # r.m.s. error of the tool over the cube, common shift taken out, that an independent rigid-body
-# model predicts for the full model (mm)
+# model predicts for the 126 errors of joints and offsets (mm)
 PREDICTED = {"sweep": 0.062, "lines": 0.008}
 
 
@@ -37,8 +39,8 @@ class Machines:
     """A plan, its full problem, and the tool of machines with given errors."""
 
     def __init__(self, root, name):
-        self.plan = exact(load_plan(root / f"examples/{name}/plan.yaml"))
-        self.problem = build_problem(self.plan, model="full", tolerances=IN_SI)
+        self.plan = exact(load_plan(session_folder(root, name) / "plan.yaml"))
+        self.problem = build_problem(self.plan, free=JOINTS, prior=True, tolerances=IN_SI)
         self.batch = BatchProgram(self.problem)
         self.workspace = cube(self.plan.robot, points_a_side=5)
         assembly = Assembly(self.plan.robot)
@@ -48,7 +50,7 @@ class Machines:
     def draw(self, seed):
         errors = draw_errors(
             self.plan.robot,
-            self.plan.robot.parameters.models["full"],
+            self.problem.machine_selection.names,
             seed=seed,
             tolerances=OFFSETS,
         )
@@ -103,7 +105,7 @@ def test_perfect_readings_give_the_tool_where_they_determine_it(machines):
     truth = m.draw(7)
     plan = m.plan.with_gauge(Gauge(None, None, None))  # nothing is rounded
     session = plan.with_values(problem.observations.rows(problem.predict(truth)))
-    fit = fit_problem(build_problem(session, model="full", tolerances=IN_SI))
+    fit = fit_problem(build_problem(session, free=JOINTS, prior=True, tolerances=IN_SI))
     accuracy = assess_tool(assemble_calibration(fit), m.workspace)
     error = m.tool(fit.solution.theta) - m.tool(truth)
     error -= m.workspace.weights @ error
@@ -120,7 +122,7 @@ def test_perfect_readings_give_the_tool_where_they_determine_it(machines):
 
 
 def test_the_calibrated_machine_in_pinocchio_shows_what_the_calibration_predicts(root):
-    """All 126 errors in the placements of a pin.Model: its readings and its tool, to 1e-9 m."""
+    """All errors of the model in a pin.Model: its readings and its tool, to 1e-9 m."""
     session = exact(load_session(root / "examples/sweep"))
     result = calibrate(session, Choice(model="full", tolerances=OFFSETS))
     machine = session.robot.with_errors(result.errors)

@@ -126,9 +126,9 @@ def test_a_calibration_without_readings_to_spare_expects_nothing(table1):
 
 def test_a_calibration_of_all_errors_is_confirmed_with_its_offsets_entered(root):
     """The other errors cannot be entered: the new readings are expected to show them."""
-    plan = load_plan(root / "examples/lines/plan.yaml")
-    truth = load_errors(root / "examples/lines/truth.yaml", plan.robot)
-    session = load_session(root / "examples/lines")
+    plan = load_plan(root / "tests/sessions/lines/plan.yaml")
+    truth = load_errors(root / "tests/sessions/lines/truth.yaml", plan.robot)
+    session = load_session(root / "tests/sessions/lines")
     calibration = calibrate(session, Choice(model="full", tolerances={"*.offset_m": 2e-3}))
     offsets = np.array([e.enter for e in find_entries(calibration)])
     entered = with_offsets(plan, offsets)

@@ -7,7 +7,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.choice import build_program
 from orthocal.estimation.solvers.program import Program, Solution
 from orthocal.measurement.joining import join_sessions
-from orthocal.measurement.session import Session
+from orthocal.measurement.session import Gauge, Session
 from orthocal.measurement.synthetic import draw_errors
 
 sys.path.append(str(Path(__file__).parents[1]))
@@ -108,6 +108,13 @@ def spread_plan(n_postures: int, *, seed: int = 0) -> dict:
     return {"robot": "orthoglide", "postures": postures, "setups": plans.setups(read, SECTIONS)}
 
 
+def sweep() -> Session:
+    """The plan of the sweep, its gauges known as they usually are."""
+    with tempfile.TemporaryDirectory() as folder:
+        plan = load_plan(plans.write(Path(folder), plans.sweep()))
+    return plan.with_gauge(Gauge(SIGMA, None, None))
+
+
 def simulate(n_postures: int, *, seed: int = 1) -> Session:
     """Readings of a machine with all errors of the model: 6 a posture in the sweep, else 10.
 
@@ -139,7 +146,7 @@ def resimulate(session: Session, *, seed: int) -> Session:
     parameters = session.robot.parameters
     errors = draw_errors(
         session.robot,
-        parameters.models[MODEL],
+        parameters.patterns(MODEL),
         seed=seed,
         tolerances={f"{axis}_slide.offset_m": OFFSET_SIGMA for axis in plans.AXES},
     )
@@ -198,6 +205,29 @@ def measure_apart(n_postures: int, solver: SolverKind = "ipopt") -> Timing:
     """
     with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as pool:
         return pool.submit(measure, n_postures, solver).result()
+
+
+def measure_first(values: Array, other: Array) -> Timing:
+    """Time one identification of the sweep in a process that has not moved the robot before.
+
+    Args:
+        values: Its readings, [m]: simulated elsewhere, for that builds functions of the robot.
+        other: Those of another machine.
+    """
+    session = exact(sweep()).with_values(values)
+    run = identify(session, session.with_values(other))
+    seconds = [run.timing.seconds_again]
+    for _ in range(4):  # the fastest is what a busy machine disturbed least
+        began = time.perf_counter()
+        run.program.solve(sigma=SIGMA, values=run.program.problem.observations.values(other))
+        seconds.append(time.perf_counter() - began)
+    return replace(run.timing, seconds_again=min(seconds))
+
+
+def measure_first_apart(values: Array, other: Array) -> Timing:
+    """The same in a fresh process; with ORTHOCAL_CACHE=off it builds all that a robot needs."""
+    with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(measure_first, values, other).result()
 
 
 def peak_memory() -> float:

@@ -135,7 +135,7 @@ def test_as_many_parameters_as_readings_leave_sigma_to_the_gauge(experiment_2):
     result = calibrate(few)
     assert result.noise.source == "gauge"
     assert math.isinf(result.dof)
-    assert result.sigma == pytest.approx(0.02e-3 * math.sqrt(2.0))
+    assert result.sigma == pytest.approx(math.hypot(0.02e-3, 0.01e-3 / math.sqrt(12.0)) * 2**0.5)
     silent = calibrate(few.with_gauge(replace(few.gauge, sigma=None)))
     assert silent.noise.source == "unknown"
     assert math.isnan(silent.free[0].std)

@@ -165,7 +165,7 @@ def test_without_word_on_the_noise_nothing_is_suspicious(experiment_2):
 @pytest.mark.parametrize("model", ["offsets", "full"])
 def test_only_the_wrong_reading_is_suspicious(root, model):
     """A wrong sign of 14 mm; by squares too, but it pulls ten times as far."""
-    session = load_session(root / "examples/lines")
+    session = load_session(root / "tests/sessions/lines")
     row = next(i for i, r in enumerate(session.readings) if r.value > 13.5e-3)
     values = session.values.copy()
     values[row] *= -1.0
@@ -180,7 +180,7 @@ def test_only_the_wrong_reading_is_suspicious(root, model):
 
 
 def test_readings_of_a_wrong_setup_are_said_to_be_of_one(root):
-    session = load_session(root / "examples/lines")
+    session = load_session(root / "tests/sessions/lines")
     sign = np.where([r.setup == "yx" for r in session.readings], -1.0, 1.0)
     text = " ".join(explain_fit(calibrate(session.with_values(sign * session.values))))
     assert "suspicious readings are of setup yx. Look at its sign, direction and section" in text

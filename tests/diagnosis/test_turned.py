@@ -8,6 +8,7 @@ import numpy as np
 import plans
 import pytest
 from fleets import Fleet
+from folders import session_folder
 from gauges import exact
 from machines import write_orthoglide
 
@@ -37,7 +38,7 @@ def test_a_setup_with_its_sign_turned_is_found(root, session, model, setup):
 
     All others read the same, turned or not; sigma, which weighs a prior, is that of the turned one.
     """
-    right = load_session(root / "examples" / session)
+    right = load_session(session_folder(root, session))
     assert calibrate(right, model).turned is None
     found = calibrate(turn(right, setup), model).turned
     assert found.name == setup

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from fleets import Fleet
 from gauges import exact
+from models import JOINTS
 
-from orthocal import calibrate, load_plan, simulate_session
+from orthocal import Choice, calibrate, load_plan, simulate_session
 from orthocal.calibration import recording
 from orthocal.diagnosis.unmodelled import (
     find_other_errors,
@@ -16,6 +17,8 @@ from orthocal.diagnosis.unmodelled import (
 )
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.fleet import Fleet as Machines
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -49,15 +52,15 @@ def machines(plan):
     offsets = build_problem(plan)
     errors = [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
     others = build_problem(plan, free=errors)
-    program, rng = NonlinearProgram(offsets), np.random.default_rng(0)
-    found, left = [], []
-    for _ in range(200):
-        values = others.predict(rng.normal(size=others.n_free) * others.theta_scale)
-        solution = program.solve(sigma=1e-5, values=values)
-        residual = values - offsets.predict(solution.theta, solution.passive)
-        found.append(solution.theta)
-        left.append(project_out_zeros(residual, offsets.observations))
-    return np.array(found), np.array(left)
+    rng = np.random.default_rng(0)
+    drawn = Machines(others, rng.normal(size=(200, others.n_free)))
+    assert drawn.close().all()
+    values = drawn.predict()
+    theta = BatchProgram(offsets).solve(values, sigma=1e-5).theta
+    found = Machines(offsets, theta / offsets.theta_scale)
+    assert found.close().all()
+    left = [project_out_zeros(r, offsets.observations) for r in values - found.predict()]
+    return theta, np.array(left)
 
 
 def test_residuals_of_machines_with_all_errors_are_as_large_as_foretold(plan, machines):
@@ -78,9 +81,9 @@ def test_the_offsets_of_machines_with_all_errors_scatter_as_foretold(plan, machi
 
 
 def test_a_machine_has_all_errors_of_its_parts(orthoglide, biglide):
-    """21 placements and offsets, three scales, both ends of what its loops join (DESIGN: 177)."""
+    """21 placements and offsets, three scales, both ends of what its loops join, but idle ones."""
     names = machine_errors(orthoglide)
-    assert len(names) == 126 + 3 + 8 * 6
+    assert names == orthoglide.parameters.select_model("full")
     assert {n for n in names if n.endswith(".scale")} == {f"{k}_slide.scale" for k in "xyz"}
     owners = {n.rsplit(".", 1)[0] for n in names if n.startswith("frame.")}
     rods = {f"frame.{k}_{end}" for k in "xyz" for end in ("crossbar_end", "rod_b_tip")}
@@ -89,13 +92,14 @@ def test_a_machine_has_all_errors_of_its_parts(orthoglide, biglide):
     assert not any(n.startswith("frame.x_tip") for n in machine_errors(biglide))
 
 
-def test_the_full_model_leaves_out_what_is_at_the_ends_of_rods_and_in_the_drives(plan):
+def test_the_full_model_leaves_nothing_out(plan):
     session = simulate_session(plan, {"x_slide.offset": 1e-3}, seed=1).session
-    found = calibrate(session, "full").unmodelled
-    assert set(found.names) == set(machine_errors(plan.robot)) - set(
-        plan.robot.parameters.select_model("full")
-    )
-    assert found.leakage.shape == (126, 51)
+    assert calibrate(session, "full").unmodelled.names == ()
+    free = plan.robot.parameters.select(JOINTS)
+    found = calibrate(session, Choice(free=JOINTS, prior=True)).unmodelled
+    assert set(found.names) == set(machine_errors(plan.robot)) - set(free)
+    assert found.leakage.shape == (126, len(found.names))
+    assert len(found.names) == 3 * 4 + 12 + 3  # ends of rods, feet, scales
 
 
 def test_with_a_sum_free_its_parts_may_still_differ(plan):

@@ -84,7 +84,7 @@ def test_readings_depend_on_few_variables(plan):
     for piece in problem.reading_pieces:
         (leg,) = {setups[i].sensor.leg for i in problem.observations.setup[piece.entries]}
         assert piece.passive_index.size == 3
-        assert piece.theta_index.size == 24
+        assert piece.theta_index.size == 21
         names = {problem.free[i].split("_")[0] for i in piece.theta_index}
         assert names == {leg}
 

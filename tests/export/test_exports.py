@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,14 +16,17 @@ from orthocal import (
     calibrate,
     export_calibration,
     load_plan,
+    load_robot,
     load_session,
     simulate_session,
     write_calibration,
 )
 from orthocal.assess.entering import entered_offsets
 from orthocal.cli import main
+from orthocal.export.urdf import _correct, _find_twists
 from orthocal.kinematics.assembly import Assembly, nominal_assembly
 from orthocal.measurement.synthetic import load_errors
+from orthocal.robot.parameters import ElementaryError
 
 ROUNDED = 0.5e-9 * np.sqrt(3.0) * 1.5
 """[m] Corrections are written to 1e-6 mm."""
@@ -103,3 +108,76 @@ def run(words):
         return e.code
     finally:
         sys.argv = old
+
+
+def written(files, folder):
+    folder.mkdir()
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_the_urdf_is_the_calibrated_machine(full, tmp_path):
+    """Loaded anew, with its own closures: its tool is where the calibrated machine's is."""
+    files = export_calibration(full, "urdf")
+    robot = load_robot(written(files, tmp_path / "real"))
+    scales = {r["drive"]: r["scale_ppm"] for r in csv.DictReader(io.StringIO(files["scales.csv"]))}
+    gain = 1.0 + 1e-6 * np.array([float(scales[d.name]) for d in robot.drives])
+    points = np.random.default_rng(0).uniform(-0.06, 0.06, (20, 3))
+    drives = nominal_assembly(full.robot).inverse(points)
+    expected = full.machine.forward(drives)
+    assert np.abs(Assembly(robot).forward(drives * gain) - expected).max() < 1e-9
+    assert np.abs(expected - points).max() > 1e-3
+
+
+def test_nothing_but_origins_changes_in_it(full):
+    text = export_calibration(full, "urdf")["orthoglide.urdf"]
+    before = full.robot.urdf.read_text()
+    origin = re.compile(r'(<origin) xyz="[^"]*" rpy="[^"]*"')
+    assert origin.sub(r"\1", text) == origin.sub(r"\1", before)
+    assert text != before
+    changed = [a for a, b in zip(text.splitlines(), before.splitlines(), strict=True) if a != b]
+    # idle errors stay 0; visuals are where they were
+    assert 20 < len(changed) < 40
+
+
+@pytest.mark.parametrize(
+    ("origin", "shape"),
+    [
+        ("", '<origin xyz="0.001 0 0" rpy="0 0 0"/>'),
+        ("<!-- <origin/> --><origin/>", '<origin xyz="0.001 0 0" rpy="0 0 0"/>'),
+        ("<origin rpy = '0 0 0' />", '<origin rpy="0 0 0" xyz="0.001 0 0" />'),
+        ('<origin\n xyz="1 2\n3"></origin>', '<origin\n xyz="1.001 2 3" rpy="0 0 0"></origin>'),
+    ],
+)
+def test_any_way_to_write_an_origin_is_understood(orthoglide, origin, shape):
+    text = (
+        f'<robot><!-- <joint name="a" type="fixed"></joint> -->'
+        f'<joint type="fixed" name="a">{origin}<parent link="b"/></joint>'
+        f'<transmission><joint name="a"/></transmission></robot>'
+    )
+    twist = np.array([1e-3, 0, 0, 0, 0, 0])
+    found = _correct(text, {"a": [twist]}, orthoglide)
+    assert shape in found
+    assert found.count("<joint") == text.count("<joint")
+    assert found.endswith('<transmission><joint name="a"/></transmission></robot>')
+    with pytest.raises(ExportError, match="has no joint 'c' of its own to correct"):
+        _correct(text, {"c": [twist]}, orthoglide)
+
+
+def test_an_offset_moves_its_drives_origin(root, tmp_path):
+    session = load_session(root / "examples/table1/experiment-2")
+    found = calibrate(session)
+    files = export_calibration(found, "urdf")
+    assert set(files) == {"orthoglide.urdf", "orthoglide.yaml"}
+    robot = load_robot(written(files, tmp_path / "real"))
+    tool = Assembly(robot).forward(robot.drive_zero)
+    assert np.abs(tool - found.machine.forward(robot.drive_zero)).max() < 1e-9
+
+
+def test_an_error_of_a_frame_on_a_moving_link_has_no_place(orthoglide):
+    error = ElementaryError("frame.x_crossbar.x", "translation", "x_crossbar", True, 0, "m")
+    parameters = SimpleNamespace(elementary={error.name: error})
+    robot = SimpleNamespace(parameters=parameters, urdf=orthoglide.urdf, model=orthoglide.model)
+    with pytest.raises(ExportError, match="is an error of a frame on a moving link"):
+        _find_twists(robot, {error.name: 1e-3})

@@ -6,10 +6,13 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from orthocal import load_plan
 from orthocal.kinematics import lanes
 from orthocal.kinematics.batch import BatchFunction
 from orthocal.kinematics.compiled import compiled_robot
 from orthocal.kinematics.lanes import Way, list_instructions, running
+from orthocal.measurement.observations import build_observations
+from orthocal.measurement.sensing import group_sensors
 
 
 def points(robot, count):
@@ -54,7 +57,7 @@ def test_every_operation_is_casadis():
         *(x + y, x - y, x * y, x / y, -x, x**2, 2.0 * x, 1.0 / x, ca.sqrt(ca.fabs(x)), ca.sin(x)),
         *(ca.cos(x), ca.tan(x), ca.asin(x / 9), ca.acos(x / 9), ca.atan(x), ca.atan2(x, y)),
         *(x < y, x <= y, x == y, x != y, ca.logic_not(x), ca.logic_and(x, y)),
-        *(ca.logic_or(x, y), ca.if_else(x < y, x, y), ca.SX(3.5), x),
+        *(ca.logic_or(x, y), ca.if_else(x < y, x, y), ca.sign(x), ca.SX(3.5), x),
     ]
     function = ca.Function("all", [x, y], [ca.densify(ca.vertcat(*found))])
     assert list_instructions(function) is not None
@@ -68,6 +71,15 @@ def test_every_operation_is_casadis():
     with running(Way.NUMBA):
         (ours,) = batch(*values)
     assert np.array_equal(ours, expected, equal_nan=True)
+
+
+@pytest.mark.parametrize("example", ["raw-cycles", "workshop"])
+def test_what_gauges_read_is_all_known(root, example):
+    """Of the line between rods, and of a ball on one: else large sessions take twice as long."""
+    session = load_plan(root / "examples" / example / "plan.yaml")
+    for group in group_sensors(session, build_observations(session)):
+        for function in (group.reading.value, group.reading.slopes):
+            assert list_instructions(function._function) is not None
 
 
 def test_an_operation_that_is_not_known_is_left_to_casadi():

@@ -20,7 +20,7 @@ from orthocal.kinematics.symbolic import (
     exp6,
     log6,
 )
-from orthocal.robot.model import find_frame, place_frames
+from orthocal.robot.frames import find_frame, place_frames
 from orthocal.robot.urdf import load_urdf
 
 

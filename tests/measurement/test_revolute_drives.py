@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from linkages import joint, write_robot, write_wide_linkage
+from scipy.stats import binom
 from tolerances import KINEMATICS, TRUTH_BACK
 
 from orthocal import calibrate, load_plan, load_session, write_session
 from orthocal.assess.entering import find_entries
-from orthocal.assess.validation import validate_calibration
+from orthocal.assess.validation import CHANGE_CHANCE, validate_calibration
 from orthocal.errors import SessionError
 from orthocal.measurement.synthetic import simulate_session
+from orthocal.statistics.chance import BY_CHANCE
 
 OFFSETS = {"motor_a.offset": 8e-3, "motor_b.offset": -5e-3}
 """[rad]"""
@@ -109,15 +111,22 @@ def test_offsets_survive_a_round_trip(tmp_path, robot):
 
 def test_what_was_identified_is_validated(tmp_path, robot):
     """Entered as found, it is confirmed; entered otherwise, the key that states it is named."""
-    before, confirmed = load_plan(write_plan(tmp_path / "a", robot)), []
-    for seed in range(20, 30):  # legs that turn by 6 degrees: how a gauge stands matters most
+    before, confirmed, sizes = load_plan(write_plan(tmp_path / "a", robot)), [], []
+    for seed in range(40):  # legs that turn by 6 degrees: how a gauge stands matters most
         found = calibrate(simulate_session(before, OFFSETS, seed=seed).session)
         entered = [round(e.enter * 1e3, 4) for e in find_entries(found)]
         folder = tmp_path / f"b{seed}"
         plan = load_plan(write_plan(folder, robot, f"{{offsets_mrad: {entered}}}"))
-        new = simulate_session(plan, OFFSETS, seed=seed + 100).session
-        confirmed.append(validate_calibration(found, new).confirmed)
-    assert sum(confirmed) >= 9  # of 80 there were 76
+        new = simulate_session(plan, OFFSETS, seed=seed + 1000).session
+        result = validate_calibration(found, new)
+        confirmed.append(result.confirmed)
+        sizes.append((result.expected_rms, result.achieved_rms))
+    # one in a hundred is refused for its noise, one in twenty for a change
+    assert binom.cdf(sum(confirmed), 40, (1 - BY_CHANCE) * (1 - CHANGE_CHANCE)) > 0.01
+    # how gauges stood is what is expected to differ most
+    expected, achieved = np.sqrt(np.mean(np.square(sizes), axis=0))
+    assert expected > 2.0 * found.rms_after
+    assert achieved == pytest.approx(expected, rel=0.2)
     wrong = load_plan(write_plan(tmp_path / "c", robot, "{offsets_deg: [0, 0]}"))
     with pytest.raises(
         SessionError, match=r"controller.*: motor_a has 0 mrad where the calibration"

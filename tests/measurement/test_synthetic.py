@@ -38,7 +38,7 @@ def test_exact_readings_are_the_predictions_from_where_a_setup_begins(plan):
 
 def test_a_dial_is_set_where_it_stands_also_on_displaced_lines(root):
     """At the coordinate of a line displaced by 20 mm no dial of ±5 mm could be read."""
-    lines = load_plan(root / "examples/lines/plan.yaml")
+    lines = load_plan(root / "tests/sessions/lines/plan.yaml")
     session = simulate_session(lines, ERRORS, seed=1).session
     first = {r.setup: r.value for r in reversed(session.readings)}
     assert max(abs(v) for v in first.values()) < 0.25e-3

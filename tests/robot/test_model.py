@@ -76,8 +76,9 @@ def test_gepettos_three_keys_are_enough(fivebar):
     assert fivebar.tcp is None
     assert fivebar.parameters.select_model("offsets") == ("motor_a.offset", "motor_b.offset")
     assert fivebar.parameters["motor_a.offset"].unit == "rad"
-    # five joints: all six components each, less the two that are offsets, and the offsets
-    assert len(fivebar.parameters.select_model("full")) == 5 * 6
+    # five joints: all six components each, less the two that are offsets, and the offsets; two
+    # scales, and both frames that the loop joins
+    assert len(fivebar.parameters.select_model("full")) == 5 * 6 + 2 + 2 * 6
 
 
 def test_a_path_and_a_name_load_the_same_robot(root, orthoglide):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import pytest
+from models import JOINTS
 
 from orthocal.errors import ParameterError
 
 
-def test_the_full_model_has_the_designed_126_parameters(orthoglide):
+def test_joints_and_drives_have_the_designed_126_parameters(orthoglide):
     p = orthoglide.parameters
-    full = p.select_model("full")
+    full = p.select(JOINTS)
     assert len(full) == 126
     assert sum(n.endswith(".offset") for n in full) == 3
     # of 21 × 6 components the three along the drives are left out: the offsets are the same

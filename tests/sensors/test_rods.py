@@ -11,6 +11,7 @@ from orthocal import (
     draw_scene,
     load_calibration,
     load_plan,
+    load_robot,
     load_session,
     simulate_session,
     write_calibration,
@@ -75,7 +76,7 @@ def test_readings_are_those_of_solids_that_touch(tmp_path, tip, rod):
         side = np.cross(leg.axis, d)
         zero = 0.5 * (leg.rods[rod].zero_root + leg.rods[rod].zero_tip)
         offset = TRUTH[f"{leg.name}_slide.offset"] * -leg.axis
-        c = (zero @ side) * side + ((zero + offset) @ leg.axis) * leg.axis
+        c = zero + (offset @ leg.axis) * leg.axis
         centre, unit = c + found[i] * d, (end - root) / np.linalg.norm(end - root)
         if tip == "ball":
             apart = centre - root - ((centre - root) @ unit) * unit
@@ -117,6 +118,34 @@ def test_contacts_lie_on_the_rods_surface(tmp_path):
             "tip.ball.radius_mm: found '150'; expected less than or equal to 100",
         ),
         ("{ball: {radius_mm: 1.5}}", "{}", "tip: found none; expected one of ball, blade"),
+        (
+            "direction: y",
+            "direction: [0, 1]",
+            "setups.yx.direction: found [0, 1]; expected one of x, y, z, -x, -y, -z, or a vector",
+        ),
+        ("direction: y", "direction: [0, 0, 0]", "found [0, 0, 0], which has no direction"),
+        (
+            "direction: y",
+            "direction: [0, .inf, 0]",
+            "setups.yx.direction: found [0, inf, 0]; expected one",
+        ),
+        (
+            "direction: y",
+            "direction: [1, 1, 0]",
+            "direction: '(1, 1, 0)' is at 45.0° to leg x in the mechanical zero; expected a "
+            "direction square to the leg, to within 30°; square to it: y, z, -y, -z",
+        ),
+        (
+            "direction: y",
+            "direction: y, beside_mm: [0, 1, 10]",
+            "setups.yx.beside_mm: found [0, 1, 10]; expected a multiple of (0, 0, -1), across",
+        ),
+        (
+            "touches: a, tip: {ball: {radius_mm: 1.5}}",
+            "beside_mm: [0, 0, 1]",
+            "setups.yx.beside_mm: found without `touches`, a rod; expected",
+        ),
+        ("direction: y", "direction: up", "found 'up'; expected one of x, y, z, -x, -y, -z, or"),
     ],
 )
 def test_what_does_not_fit_is_refused_by_key(tmp_path, old, new, message):
@@ -126,6 +155,19 @@ def test_what_does_not_fit_is_refused_by_key(tmp_path, old, new, message):
     with pytest.raises(SessionError, match=r"expected|rods") as refused:
         load_plan(path)
     assert message in str(refused.value)
+
+
+@pytest.mark.parametrize(("tip", "lean", "good"), [("ball", 0.5, True), ("blade", 0.5, False)])
+def test_a_ball_may_lean_further_than_a_blade(tmp_path, tip, lean, good):
+    plan(tmp_path, tip)
+    path = tmp_path / "plan.yaml"
+    path.write_text(path.read_text().replace("direction: y", f"direction: [{lean}, 1, 0]"))
+    if good:
+        vector = load_plan(path).setups["yx"].sensor.constants(load_robot("orthoglide"))[:3]
+        assert vector == pytest.approx(np.array([lean, 1.0, 0.0]) / np.hypot(lean, 1.0))
+    else:
+        with pytest.raises(SessionError, match=r"is at 63.4° to leg x.* to within 10°"):
+            load_plan(path)
 
 
 def test_a_gauges_tip_is_that_of_its_setups(tmp_path):

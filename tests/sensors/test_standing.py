@@ -57,9 +57,23 @@ def names(session):
 
 
 @pytest.mark.parametrize("tip", TIPS)
-def test_crooked_readings_are_those_of_solids_that_touch(tmp_path, tip):
-    """Many times over, three times the tolerances: the plunger moves until solids touch."""
+@pytest.mark.parametrize("oblique", [False, True])
+def test_crooked_readings_are_those_of_solids_that_touch(tmp_path, tip, oblique):
+    """Many times over, three times the tolerances: the plunger moves until solids touch.
+
+    Square to the leg where the rod lies in the zero posture; and oblique, beside it.
+    """
     session = plan(tmp_path, tip)
+    if oblique:  # by 4 degrees along the leg, and between the axes across it
+        path = tmp_path / "plan.yaml"
+        for name, vector in (
+            ("y", "[0.07, 0.8, 0.6], beside_mm: [0, 1.2, -1.6]"),
+            ("-z", "[-0.1, 0.5, -2], beside_mm: [0, -1, -0.25]"),
+        ):
+            path.write_text(
+                path.read_text().replace(f"direction: {name},", f"direction: {vector},")
+            )
+        session = load_plan(path)
     o, workshop = build_observations(session), Workshop(session, ERRORS)
     rng, known = np.random.default_rng(0), sensor_unknowns(session)
     setups, missed = list(session.setups), 0
@@ -80,7 +94,7 @@ def test_crooked_readings_are_those_of_solids_that_touch(tmp_path, tip):
 
 def test_a_line_is_read_as_by_an_edge_without_a_radius(tmp_path, root):
     """Turned and moved, an edge in the plane of plunger and edge; square, the paper's section."""
-    session = load_plan(root / "examples/lines/plan.yaml")
+    session = load_plan(root / "tests/sessions/lines/plan.yaml")
     o, rng = build_observations(session), np.random.default_rng(1)
     known = sensor_unknowns(session)
     values = rng.normal(size=len(known.parameters)) * [p.tolerance for p in known.parameters]

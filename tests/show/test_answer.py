@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import plans
 import pytest
+from folders import session_folder
 from machines import write_orthoglide
 from rich.console import Group
 
@@ -51,11 +52,11 @@ def machine_of_250_mm(folder):
 @pytest.fixture(scope="module")
 def answers(root, tmp_path_factory):
     """Calibrations of all examples, and of what may be the matter with them."""
-    found = {n: calibrate(load_session(root / "examples" / n)) for n in EXAMPLES}
+    found = {n: calibrate(load_session(session_folder(root, n))) for n in EXAMPLES}
     cycles = load_session(root / "examples/raw-cycles")
     sign = np.where([r.setup == "zx" for r in cycles.readings], -1.0, 1.0)
     found["turned"] = calibrate(cycles.with_values(sign * cycles.values))
-    lines = load_session(root / "examples/lines")
+    lines = load_session(root / "tests/sessions/lines")
     sign = np.where([r.setup == "yx" for r in lines.readings], -1.0, 1.0)
     found["turned lines"] = calibrate(lines.with_values(sign * lines.values))
     slips = cycles.values.copy()

@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from folders import session_folder
 from gauges import exact
+from models import JOINTS
 
 from orthocal import Choice, calibrate, load_plan, load_session, simulate_session
 from orthocal.errors import ParameterError
@@ -123,8 +125,8 @@ def jacobians(root):
     """Identification Jacobians of the full model at nominal, of sweep and lines."""
     found = {}
     for name in ("sweep", "lines"):
-        plan = exact(load_plan(root / f"examples/{name}/plan.yaml"))
-        problem = build_problem(plan, model="full")
+        plan = exact(load_plan(session_folder(root, name) / "plan.yaml"))
+        problem = build_problem(plan, free=JOINTS, prior=True)
         _, jacobian = problem.linearise(np.zeros(problem.n_free))
         found[name] = problem, jacobian
     return found

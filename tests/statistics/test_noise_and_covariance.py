@@ -13,7 +13,8 @@ from tolerances import KINEMATICS
 from orthocal import calibrate, load_plan
 from orthocal.errors import NotIdentifiableError
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.fleet import Fleet
 from orthocal.measurement.observations import Observations, build_observations
 from orthocal.measurement.sensing import predict_entries
 from orthocal.statistics.chance import chance_of_excess, confidence_factor
@@ -151,19 +152,23 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations(root, model
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     sigma = 20e-6
     problem = build_problem(plan, model=model)
-    program = NonlinearProgram(problem)
     rng = np.random.default_rng(0)
+    # as the prior says, where there is one
+    truths = rng.normal(size=(300, problem.n_free))
+    machines = Fleet(problem, truths)
+    assert machines.close().all()
+    entries = machines.predict()
+    measured = entries + sigma * rng.normal(size=entries.shape)
+    solved = BatchProgram(problem).solve(measured, sigma=sigma)
+    found = Fleet(problem, solved.theta / problem.theta_scale)
+    assert found.close().all()
     whitened = []
-    for _ in range(300):
-        truth = rng.normal(size=problem.n_free)  # as the prior says, where there is one
-        entries = problem.predict(truth * problem.theta_scale)
-        values = entries + sigma * rng.normal(size=entries.size)
-        solution = program.solve(sigma=sigma, values=values)
-        _, jacobian = problem.linearise(solution.theta, solution.passive)
+    for truth, theta, passive in zip(truths, solved.theta, found.passive, strict=True):
+        _, jacobian = problem.linearise(theta, passive)
         covariance = decompose(jacobian, problem.observations).covariance(
             sigma=sigma, precision=problem.prior_precision
         )
-        error = solution.theta / problem.theta_scale - truth
+        error = theta / problem.theta_scale - truth
         whitened.append(np.linalg.solve(np.linalg.cholesky(covariance), error))
     z = np.array(whitened)
     n = len(z)

@@ -285,8 +285,7 @@ def test_nothing_is_left_after_a_kill_of_its_parent():
     process.wait(PATIENCE)
     process.stdout.close()
     process.stderr.close()
-    wait_until(lambda: not is_open(port), "the port's end")
-    wait_until(lambda: not alive(view), "the view's end")
+    wait_until(lambda: not alive(view), "the view's end")  # its port may be another's by then
 
 
 def test_nothing_is_left_after_an_exception():

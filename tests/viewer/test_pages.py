@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from browser import SIZES, SMALL, open_browser, require_browser, visit
+from folders import session_folder
 from PIL import Image
 
 from orthocal import LiveScene, calibrate, draw_scene, load_robot, load_session, write_report
@@ -17,6 +18,14 @@ from orthocal.measurement.session_file import load_plan
 from orthocal.viewer.browser import take_picture
 
 EXPECTED = ("zx −1.140 → −0.130 mm", "x_max − x_min", "Before: measured − nominal", "leg z")
+
+
+def by_size(size):
+    return f"{size[0]}x{size[1]}"
+
+
+def by_name_and_size(case):
+    return f"{case[0]}-{by_size(case[1])}"
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +42,25 @@ def calibration(experiment_2):
 @pytest.fixture(scope="module")
 def page(calibration, tmp_path_factory):
     return draw_scene(calibration).save(tmp_path_factory.mktemp("page") / "scene.html")
+
+
+@pytest.fixture(scope="module", params=SIZES, ids=by_size)
+def drawn(browser, page, request):
+    """The calibration's page, open and drawn: tests only look at it."""
+    with visit(browser, page.as_uri(), size=request.param) as found:
+        found.wait_until_drawn()
+        yield found, request.param
+
+
+@pytest.fixture(scope="module")
+def session_drawn(browser, root, tmp_path_factory, request):
+    """A session's page, likewise, and its size."""
+    name, size = request.param
+    scene = draw_scene(load_session(session_folder(root, name)))
+    path = scene.save(tmp_path_factory.mktemp("session") / "page.html")
+    with visit(browser, path.as_uri(), size=size) as found:
+        found.wait_until_drawn()
+        yield found, size
 
 
 @pytest.fixture(scope="module")
@@ -90,27 +118,46 @@ def test_a_setup_with_any_name_is_drawn(name, browser, raw_cycles, tmp_path):
         assert is_drawn(found.picture())
 
 
-@pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")
-def test_scene_draws_and_asks_for_nothing(browser, page, size):
-    with visit(browser, page.as_uri(), size=size) as found:
-        found.wait_until_drawn()
-        assert found.messages == []
-        assert found.requests == [page.as_uri()]
-        assert is_drawn(found.canvas())
-        text = found.page.inner_text("body")
-        for expected in EXPECTED:
-            assert expected in text
-        assert "Leg x is furthest from parallel: −1.140 mm" in text
-        assert "deviation × 12" in text
+def test_scene_draws_and_asks_for_nothing(drawn, page):
+    found, _ = drawn
+    assert found.messages == []
+    assert found.requests == [page.as_uri()]
+    assert is_drawn(found.canvas())
+    text = found.page.inner_text("body")
+    for expected in EXPECTED:
+        assert expected in text
+    assert "Leg x is furthest from parallel: −1.140 mm" in text
+    assert "deviation × 12" in text
 
 
-@pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")
-@pytest.mark.parametrize("name", ["table1/experiment-2", "sweep", "lines"])
-def test_no_label_covers_another_or_a_panel(browser, root, tmp_path, name, size):
-    page = draw_scene(load_session(root / "examples" / name)).save(tmp_path / "page.html")
-    with visit(browser, page.as_uri(), size=size) as found:
-        found.wait_until_drawn()
-        rectangles = boxes(found.page)
+def test_whole_machine_is_in_view_beside_the_panels(drawn):
+    found, size = drawn
+    left, right, top, bottom = found.page.evaluate(
+        """() => {
+             const data = JSON.parse(document.getElementById('scene-data').textContent);
+             const at = data.camera.points.map(([x, y, z]) =>
+               new MeshCat.THREE.Vector3(x, z, -y).project(viewer.camera));
+             const x = at.map((p) => ((p.x + 1) / 2) * window.innerWidth);
+             const y = at.map((p) => ((1 - p.y) / 2) * window.innerHeight);
+             return [Math.min(...x), Math.max(...x), Math.min(...y), Math.max(...y)];
+           }"""
+    )
+    panel = found.page.evaluate("document.getElementById('panel').getBoundingClientRect().right")
+    assert left > panel
+    assert right < size[0]
+    assert top > 0
+    assert bottom < size[1]
+    assert (right - left) * (bottom - top) > 0.2 * size[0] * size[1]
+
+
+NAMES = ("table1/experiment-2", "lines", "sweep")
+LABELLED = [(name, size) for name in NAMES for size in SIZES]
+
+
+@pytest.mark.parametrize("session_drawn", LABELLED, ids=by_name_and_size, indirect=True)
+def test_no_label_covers_another_or_a_panel(session_drawn):
+    found, size = session_drawn
+    rectangles = boxes(found.page)
     assert sum("mm" in r[4] for r in rectangles) >= 6
     for i, (left, top, right, bottom, text) in enumerate(rectangles):
         for l2, t2, r2, b2, other in rectangles[i + 1 :]:
@@ -122,7 +169,30 @@ def test_no_label_covers_another_or_a_panel(browser, root, tmp_path, name, size)
         assert bottom <= size[1] + 1
 
 
-@pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")
+SWEPT = [("sweep", size) for size in SIZES]
+
+
+@pytest.mark.parametrize("session_drawn", SWEPT, ids=by_name_and_size, indirect=True)
+def test_labels_cover_no_dial_of_all_eighteen(session_drawn):
+    """Six of them have a label, the worst of each leg and direction."""
+    found, _ = session_drawn
+    dials = found.page.evaluate(
+        """() => JSON.parse(document.getElementById('scene-data').textContent).labels
+             .filter((label) => label.node.startsWith('Gauges/'))
+             .map(({ at: [[x, y, z]] }) => new MeshCat.THREE.Vector3(x, z, -y)
+               .project(viewer.camera))
+             .map((p) => [((p.x + 1) / 2) * window.innerWidth,
+                          ((1 - p.y) / 2) * window.innerHeight])"""
+    )
+    labels = [r for r in boxes(found.page) if " mm" in r[4] and len(r[4]) < 80]
+    assert len(dials) == 18
+    assert len(labels) == 6
+    for left, top, right, bottom, text in labels:
+        covered = [d for d in dials if left <= d[0] <= right and top <= d[1] <= bottom]
+        assert not covered, f"{text!r} covers {covered}"
+
+
+@pytest.mark.parametrize("size", SIZES, ids=by_size)
 def test_all_that_the_panel_says_is_in_the_picture(browser, calibration, tmp_path, size):
     page = draw_scene(calibration, show="all").save(tmp_path / "page.html")
     with visit(browser, f"{page.as_uri()}#picture", size=size) as found:
@@ -134,55 +204,9 @@ def test_all_that_the_panel_says_is_in_the_picture(browser, calibration, tmp_pat
     assert text <= room
 
 
-@pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")
-def test_labels_cover_no_dial_of_all_eighteen(browser, root, tmp_path, size):
-    """Six of them have a label, the worst of each leg and direction."""
-    page = draw_scene(load_session(root / "examples/sweep")).save(tmp_path / "page.html")
-    with visit(browser, page.as_uri(), size=size) as found:
-        found.wait_until_drawn()
-        dials = found.page.evaluate(
-            """() => JSON.parse(document.getElementById('scene-data').textContent).labels
-                 .filter((label) => label.node.startsWith('Gauges/'))
-                 .map(({ at: [[x, y, z]] }) => new MeshCat.THREE.Vector3(x, z, -y)
-                   .project(viewer.camera))
-                 .map((p) => [((p.x + 1) / 2) * window.innerWidth,
-                              ((1 - p.y) / 2) * window.innerHeight])"""
-        )
-        labels = [r for r in boxes(found.page) if " mm" in r[4] and len(r[4]) < 80]
-    assert len(dials) == 18
-    assert len(labels) == 6
-    for left, top, right, bottom, text in labels:
-        covered = [d for d in dials if left <= d[0] <= right and top <= d[1] <= bottom]
-        assert not covered, f"{text!r} covers {covered}"
-
-
-def test_whole_machine_is_in_view_beside_the_panels(browser, page):
-    for size in SIZES:
-        with visit(browser, page.as_uri(), size=size) as found:
-            found.wait_until_drawn()
-            left, right, top, bottom = found.page.evaluate(
-                """() => {
-                     const data = JSON.parse(document.getElementById('scene-data').textContent);
-                     const at = data.camera.points.map(([x, y, z]) =>
-                       new MeshCat.THREE.Vector3(x, z, -y).project(viewer.camera));
-                     const x = at.map((p) => ((p.x + 1) / 2) * window.innerWidth);
-                     const y = at.map((p) => ((1 - p.y) / 2) * window.innerHeight);
-                     return [Math.min(...x), Math.max(...x), Math.min(...y), Math.max(...y)];
-                   }"""
-            )
-            panel = found.page.evaluate(
-                "document.getElementById('panel').getBoundingClientRect().right"
-            )
-        assert left > panel
-        assert right < size[0]
-        assert top > 0
-        assert bottom < size[1]
-        assert (right - left) * (bottom - top) > 0.2 * size[0] * size[1]
-
-
 def test_measurement_plays(browser, page):
     """By the scrubber of meshcat's controls, and by the button; labels follow the posture."""
-    with visit(browser, page.as_uri()) as found:
+    with visit(browser, page.as_uri(), size=SIZES[1]) as found:
         found.wait_until_drawn()
         steps = found.page.evaluate(
             "JSON.parse(document.getElementById('scene-data').textContent).steps"
@@ -212,7 +236,7 @@ def test_measurement_plays(browser, page):
 
 
 def test_boxes_of_the_legend_show_and_hide(browser, page):
-    with visit(browser, page.as_uri()) as found:
+    with visit(browser, page.as_uri(), size=SIZES[1]) as found:
         found.wait_until_drawn()
         before = found.canvas()
         found.page.click("#legend label:has-text('Machine where it really is')")
@@ -232,13 +256,14 @@ def test_boxes_of_the_legend_show_and_hide(browser, page):
 
 
 def test_other_scenes_draw_too(browser, root, tmp_path, raw_cycles):
+    calibrated = calibrate(raw_cycles)
     scenes = {
         "robot": draw_scene(load_robot("orthoglide")),
         "fivebar": draw_scene(load_robot(root / "tests/robots/fivebar")),
-        "plan": draw_scene(load_plan(root / "examples/lines/plan.yaml")),
+        "plan": draw_scene(load_plan(root / "tests/sessions/lines/plan.yaml")),
         "session": draw_scene(raw_cycles),
-        "tool": draw_scene(calibrate(raw_cycles), show="all"),
-        "true": draw_scene(calibrate(raw_cycles), posture="x_max", exaggeration=1.0),
+        "tool": draw_scene(calibrated, show="all"),
+        "true": draw_scene(calibrated, posture="x_max", exaggeration=1.0),
     }
     for name, scene in scenes.items():
         path = scene.save(tmp_path / f"{name}.html")

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
+from folders import session_folder
 from gauges import exact
 from tolerances import KINEMATICS
 
@@ -159,7 +160,7 @@ def test_deviation_is_drawn_larger_by_the_factor_that_is_stated(full):
 
 @pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles", "lines"])
 def test_default_factor_makes_the_largest_deviation_a_twentieth_of_the_machine(root, name):
-    found = calibrate(load_session(root / "examples" / name))
+    found = calibrate(load_session(session_folder(root, name)))
     scene = draw_scene(found)
     size = np.ptp(scene.camera.points, axis=0).max()
     true = draw_scene(found, exaggeration=1.0)
@@ -276,7 +277,7 @@ def test_of_many_gauges_the_overview_names_the_worst(full):
 @pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles", "lines", "sweep"])
 def test_deviations_of_a_session_are_those_of_its_calibration(root, name):
     """Two ways to the same numbers: without any solution, and as the solved problem reports."""
-    session = exact(load_session(root / "examples" / name))  # else it is found how gauges stood
+    session = exact(load_session(session_folder(root, name)))  # else it is found how gauges stood
     rows = calibrate(session).residuals
     mean = {}
     for row in rows:
@@ -297,7 +298,7 @@ def test_session_alone_shows_the_nominal_machine_and_what_was_seen(raw_cycles):
 
 
 def test_plan_shows_where_gauges_will_stand(root):
-    scene = draw_scene(load_plan(root / "examples/lines/plan.yaml"))
+    scene = draw_scene(load_plan(root / "tests/sessions/lines/plan.yaml"))
     assert scene.headline == "A plan: 270 readings in 135 postures, none taken yet."
     assert not [p for p in scene.nodes if p.startswith(readings.BEFORE)]
     assert {label.texts[0] for label in scene.labels if label.rank >= 0.0} == {

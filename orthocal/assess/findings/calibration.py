@@ -15,7 +15,12 @@ from orthocal.assess.findings.parameters import (
     find_trust,
     find_worth,
 )
-from orthocal.assess.findings.readings import find_scattered, find_suspicious, find_turned
+from orthocal.assess.findings.readings import (
+    find_line,
+    find_scattered,
+    find_suspicious,
+    find_turned,
+)
 from orthocal.assess.findings.remainder import find_check, find_remainder, find_tolerances
 from orthocal.assess.findings.tool import find_at_tool
 from orthocal.assess.plausibility import find_doubts
@@ -61,6 +66,7 @@ def find_findings(calibration: Calibration) -> tuple[Finding, ...]:
         *find_held(calibration),
         *find_linearisation(calibration),
         *find_hidden(calibration),
+        *find_line(calibration),
     ]
     # postures of another machine say more than what they leave of its tolerances
     order = {"turned setup": -2, "wrong size": -1}

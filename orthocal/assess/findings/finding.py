@@ -35,6 +35,7 @@ Kind = Literal[
     "noise as given",
     "gauge overstated",
     "fits",
+    "line in the air",
     # of what is entered, and of single parameters
     "no offset",
     "nothing moved",

@@ -7,8 +7,14 @@ import math
 from orthocal.assess.findings.finding import Finding, Place, place_of
 from orthocal.assess.wording import joined, mm, signed
 from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.repeating import restore_session
+from orthocal.diagnosis.idealisation import find_idealised
 from orthocal.diagnosis.rows import ResidualRow
+from orthocal.errors import ClosureError, RobotError
 from orthocal.units import MM
+
+NOTABLE_IDEALISATION = 1 / 3
+"""Of a reading's standard deviation that an idealisation must exceed to be told."""
 
 MANY_SUSPICIOUS = 0.2
 """Part of the readings above which it is not the readings that are wrong."""
@@ -46,6 +52,29 @@ def find_turned(calibration: Calibration) -> list[Finding]:
                 "log_likelihood_ratio": turned.evidence,
             },
             places=tuple(Place(setup=name) for name in names),
+        )
+    ]
+
+
+def find_line(calibration: Calibration) -> list[Finding]:
+    """Whether it matters that a gauge touches a rod, where readings are said to be of a line."""
+    sigma = calibration.noise.sigma
+    try:
+        found = find_idealised(restore_session(calibration))
+    except (ClosureError, RobotError):  # the findings of the tool say so
+        return []
+    if found is None or not found.size > NOTABLE_IDEALISATION * sigma:
+        return []
+    return [
+        Finding(
+            "line in the air",
+            "informs",
+            f"Readings are taken as of the line between a leg's rods. On a rod itself they may "
+            f"be {mm(found.size)} mm off that (one standard deviation, setup {found.setup}).",
+            f"Say in the session what is touched (`touches: {found.touches}`, and the gauge's "
+            "`tip`).",
+            {"off_line_mm": found.size / MM, "sigma_mm": sigma / MM},
+            (Place(setup=found.setup),),
         )
     ]
 

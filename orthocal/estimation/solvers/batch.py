@@ -81,6 +81,24 @@ class BatchProgram:
         self.options = options or SolverOptions(solver="eliminated")
         self._surrogate: Surrogate | None = None
         self._curved: CurvedReadings | None = None
+        self._fixed = False
+
+    def fixed_by(self, values: ArrayLike, *, sigma: float, count: int) -> BatchProgram:
+        """The same with what many sets share found once: each is solved alike beside any others.
+
+        Args:
+            values: Some of the sets, as for `solve`.
+            sigma: Standard deviation of one reading, [m].
+            count: How many sets there will be.
+        """
+        fixed = BatchProgram(self.problem, options=self.options)
+        fixed._fixed = True
+        if self.problem.n_free <= MOST_PARAMETERS:
+            start = _Shared(self.problem, self.options, sigma).linear(self._entries(values))
+            fixed._surrogate = self._find_surrogate(start) if count >= FEWEST_SETS else None
+        elif count >= FEWEST_SETS_A_PARAMETER * self.problem.n_free:
+            fixed._curved = find_curvature(self.problem)
+        return fixed
 
     def solve(self, values: ArrayLike, *, sigma: float) -> BatchSolution:
         """Solve for each set of readings.
@@ -123,15 +141,17 @@ class BatchProgram:
 
     def _polynomials(self, start: Array) -> Surrogate | None:
         """Readings as polynomials where the sets are; None for many parameters, or few sets."""
-        if start.shape[1] > MOST_PARAMETERS or len(start) < FEWEST_SETS:
-            return None
-        low, high = (np.quantile(start, p, axis=0) for p in (0.001, 0.999))
+        if self._fixed or start.shape[1] > MOST_PARAMETERS or len(start) < FEWEST_SETS:
+            return self._surrogate if self._fixed else None
         known = self._surrogate
-        if known is not None and known.inside(np.array([low, high])).all():
-            return known
-        half = np.maximum(MARGIN * 0.5 * (high - low), SMALLEST_HALF)
-        self._surrogate = find_surrogate(self.problem, 0.5 * (low + high), half)
+        if known is None or not known.inside(_ends(start)).all():
+            self._surrogate = self._find_surrogate(start)
         return self._surrogate
+
+    def _find_surrogate(self, start: Array) -> Surrogate | None:
+        low, high = _ends(start)
+        half = np.maximum(MARGIN * 0.5 * (high - low), SMALLEST_HALF)
+        return find_surrogate(self.problem, 0.5 * (low + high), half)
 
     def _by_polynomials(
         self, surrogate: Surrogate, about: _Shared, y: Array, theta: Array, found: _Found
@@ -158,13 +178,9 @@ class BatchProgram:
     def _curvature(self, start: Array) -> CurvedReadings | None:
         """Readings to second order; None for few parameters, few sets or singular machines."""
         n = start.shape[1]
-        if n <= MOST_PARAMETERS or len(start) < FEWEST_SETS_A_PARAMETER * n:
-            return self._curved
-        if self._curved is None:
-            try:
-                self._curved = find_curvature(self.problem)
-            except np.linalg.LinAlgError:
-                return None
+        worth = n > MOST_PARAMETERS and len(start) >= FEWEST_SETS_A_PARAMETER * n
+        if self._curved is None and worth and not self._fixed:
+            self._curved = find_curvature(self.problem)
         return self._curved
 
     def _by_curvature(
@@ -213,6 +229,11 @@ class BatchProgram:
             solution = program.solve(sigma=sigma, values=y[i])
             found.theta[i], found.zeros[i] = solution.theta, solution.zeros
             found.objective[i], found.at_bound[i] = solution.objective, solution.at_bound
+
+
+def _ends(start: Array) -> Array:
+    """Where nearly all sets lie between, θ̂, shape (2, n_free)."""
+    return np.quantile(start, [0.001, 0.999], axis=0)
 
 
 def _settled(sizes: Array) -> NDArray[np.bool_]:

@@ -50,14 +50,21 @@ class CurvedReadings:
 
 
 def find_curvature(problem: CalibrationProblem) -> CurvedReadings | None:
-    """Readings to second order, by differences of slopes; None where that takes too much memory.
+    """Readings to second order, by differences of slopes.
 
-    Raises:
-        LinAlgError: If the machine is singular in a posture near the reference.
+    None where that takes too much memory, or the machine is singular in a posture near the
+    reference.
     """
-    n, m = problem.n_free, problem.observations.size
-    if 4 * n * n * m > MOST_BYTES:
+    if 4 * problem.n_free**2 * problem.observations.size > MOST_BYTES:
         return None
+    try:
+        return _find_curvature(problem)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _find_curvature(problem: CalibrationProblem) -> CurvedReadings:
+    n, m = problem.n_free, problem.observations.size
     scale = problem.theta_scale
     about = problem.expand(problem.reference, problem.reference_passive)
     curvature = np.empty((n, m, n), dtype=np.float32)

@@ -142,6 +142,41 @@ class FleetSlopes:
         opened += (self._by_actuated @ drives[..., None])[..., 0]
         return np.asarray(self.correction - (self._inverse @ opened[..., None])[..., 0])
 
+    def along(self, change: Array) -> Array:
+        """Change of the readings with θ̂ changed, loops closed, to first order.
+
+        Args:
+            change: dθ̂, shape (n_sets, n_free).
+
+        Returns:
+            Shape (n_sets, n_entries), [m of the first gauge].
+        """
+        problem, errors = self._problem, self._problem.compiled.errors
+        n = problem.n_machine
+        moved = change[:, :n] @ self._columns.T
+        inner = errors.twists_of(moved).reshape(len(change), -1, 6, 1)
+        twists = (self._turned @ inner).reshape(len(change), -1)
+        offsets, gains = errors.offsets(moved)[:, None], errors.scales(moved)[:, None]
+        drives = offsets + gains * problem.drives
+        passive = self.follow(change) - self.correction
+        of_sensors = change[:, n:] * problem.theta_scale[n:]
+        result = np.empty_like(self.reading)
+        for rows in self._rows:
+            _, columns = rows.group.reading.slopes.pattern("by_twists")
+            zero = offsets + gains * problem.session.zero_drives[rows.group.setups]
+            own = (rows.by_passive * passive[:, rows.posture]).sum(axis=-1)
+            own += (rows.by_actuated * drives[:, rows.posture]).sum(axis=-1)
+            own += (rows.by_twists * twists[:, None, columns]).sum(axis=-1)
+            own += (rows.by_zero * zero).sum(axis=-1)
+            own += (rows.by_unknowns * of_sensors[:, rows.group.unknowns]).sum(axis=-1)
+            result[:, rows.group.entries] = own
+        return np.asarray(result / problem.noise)
+
+    def jacobian(self) -> Array:
+        """dh/dθ̂ of each machine, a parameter at a time, shape (n_sets, n_entries, n_free)."""
+        change = np.eye(self._problem.n_free)
+        return np.stack([self.along(np.tile(c, (self._size, 1))) for c in change], axis=-1)
+
     def _actuated(self, commanded: Array) -> Array:
         """Where drives are: (n_sets, ..., n_drives) of (..., n_drives) commanded, [m, rad]."""
         shape = (self._size,) + (1,) * (commanded.ndim - 1) + (-1,)

@@ -303,6 +303,7 @@ class NonlinearProgram:
                 "jac_g": self._functions["jac_g"],
                 "hess_lag": self._functions["hess_lag"],
                 "print_time": False,
+                "show_eval_warnings": False,  # a tip that passes its rod has no reading
                 "calc_lam_p": False,
                 "ipopt": ipopt,
             },

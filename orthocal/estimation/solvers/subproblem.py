@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.errors import SolverError
 from orthocal.estimation.expansion import Expansion
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import CalibrationProblem
@@ -107,6 +108,7 @@ class Task:
 
         Raises:
             ClosureError: If the machine cannot reach a posture there.
+            SolverError: If a sensor shows nothing there.
         """
         problem, at = self.problem, self.start(theta)
         if passive is None:
@@ -116,6 +118,13 @@ class Task:
         else:
             passive = problem.close(at * problem.theta_scale, start=passive)
         expansion = self.expand(at, passive)
+        if not np.isfinite(expansion.jacobian).all():
+            raise SolverError(
+                "cannot begin: on the machine that the readings lead to a tip passes what it "
+                "touched, or a sensor shows nothing; look for a wrong sign, row or setup",
+                status="Invalid_Number_Detected",
+                iterations=0,
+            )
         return self.near(at, passive, expansion), expansion
 
     def expand(self, theta: Array, passive: Array) -> Expansion:

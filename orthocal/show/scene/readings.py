@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from orthocal.kinematics.compiled import zero_poses
 from orthocal.measurement.session import Setup
-from orthocal.sensors.protocol import Contact
+from orthocal.sensors.protocol import Contact, TouchingTip
 from orthocal.show.layout import counted, list_places, short_name, typeset
 from orthocal.show.scene.deviations import (
     Deviation,
@@ -63,6 +63,9 @@ LONGEST_LABEL = 16
 """Characters of a setup's name in a label."""
 
 NOTHING = 1e-9
+
+SQUARE = 1e-6
+"""Cosine below which a direction is square to an axis of the world."""
 """Deviations below this are none, [m]."""
 
 
@@ -118,7 +121,17 @@ def draw_readings(
         rows = [next((r for r in s.rows if r.setup == setup.name), None) for s in stops]
         contact, direction = found[setup.name].points[0], found[setup.name].direction
         gauge = f"{GAUGES}/{node_name(setup.name)}"
-        draw_gauge(scene, gauge, contact, direction, _facing(direction), dial)
+        touching = found[setup.name].tip
+        draw_gauge(
+            scene,
+            gauge,
+            contact,
+            direction,
+            _facing(direction),
+            dial,
+            ball=None if touching is None else touching.radius,
+            edge=None if touching is None or touching.edge is None else _whole_edge(touching),
+        )
         tips = [contact for _ in rows]
         # arrows of gauges that touch at the same place stand beside each other
         beside = sum(float(np.linalg.norm(contact - other)) < dial for other in contacts)
@@ -202,9 +215,21 @@ def _find_contact(stage: Stage, setup: Setup, poses: Mapping[str, Array]) -> Con
     return setup.sensor.contact([poses[f][:1] for f in frames.in_posture], at_zero, stage.robot)
 
 
+def _whole_edge(tip: TouchingTip) -> Array:
+    """From one end of a blade's edge to the other, shape (3,), [m]."""
+    return np.asarray(tip.width * (np.zeros(3) if tip.edge is None else tip.edge))
+
+
 def _facing(direction: Array) -> Array:
-    """Way along an axis of the world across a direction that the camera sees best, shape (3,)."""
-    view = np.where(np.abs(direction) > 0.5, 0.0, VIEW)
+    """Way across a direction that the camera sees best, shape (3,).
+
+    Along an axis of the world where one is square to it.
+    """
+    square = np.abs(direction) < SQUARE
+    if not square.any():
+        across = np.array(VIEW) - np.dot(VIEW, direction) * direction
+        return np.asarray(across / np.linalg.norm(across))
+    view = np.where(square, VIEW, 0.0)
     axis = int(np.abs(view).argmax())
     return np.asarray(np.eye(3)[axis] * np.sign(view[axis]))
 

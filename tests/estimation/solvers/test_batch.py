@@ -125,7 +125,7 @@ def test_a_bound_or_a_machine_far_off_is_solved_alone(root):
     bounds = {"x_slide.offset": (-1e-3, 1e-3)}
     session = exact(load_session(root / "examples/sweep"))
     problem = build_problem(session, model="full", bounds=bounds)
-    values, fleet = draw(problem, spread=0.4, sets=90)
+    values, fleet = draw(problem, spread=0.4, sets=100)
     values[3] += 2e-3 * np.sin(np.arange(values.shape[1]))  # hardly a machine reads like this
     found = BatchProgram(problem).solve(values, sigma=SIGMA)
     held = np.abs(fleet.theta[:, 0] * problem.theta_scale[0]) > 1.2e-3

@@ -189,3 +189,13 @@ def test_it_says_when_it_does_not_converge(root):
     problem = build_problem(load_session(root / "examples/sweep"), model="full")
     with pytest.raises(SolverError, match=r"the step is still .* after 1 iterations"):
         EliminatedProgram(problem, options=SolverOptions(max_iterations=1)).solve(sigma=5e-6)
+
+
+def test_a_tip_that_passes_where_a_solver_begins_is_told(root):
+    """Absurd readings of a ball lead there; no number comes of it."""
+    session = load_session(root / "examples/workshop")
+    problem = build_problem(session, model="offsets")
+    start = np.zeros(problem.n_free)
+    start[problem.free.index("z_slide.offset")] = 25e-3
+    with pytest.raises(SolverError, match="cannot begin: on the machine that the readings lead to"):
+        EliminatedProgram(problem).solve(sigma=1e-5, start=start)

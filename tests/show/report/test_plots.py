@@ -480,7 +480,7 @@ def test_few_parameters_of_one_unit_are_in_that(table1):
 def test_many_parameters_are_in_tolerances_what_is_told_best_first(sweep):
     figure = draw(parameter_plots._draw_parameters, sweep, 30)
     axes, beside = figure.axes
-    assert title(figure) == "Estimates with 95 % intervals: 30 of 126, offsets, then the best told"
+    assert title(figure) == "Estimates with 95 % intervals: 30 of 129, offsets, then the best told"
     assert axes.get_xlabel() == "estimate [tolerances]"
     names = row_names(axes)
     assert len(names) == 30
@@ -562,7 +562,7 @@ def test_numbers_have_the_signs_that_axes_have():
 
 def test_of_many_parameters_those_with_the_strongest_correlations_are_shown(sweep):
     figure = draw(parameter_plots._draw_correlations, sweep, 10)
-    assert title(figure).endswith("the 10 of 126 parameters with the strongest")
+    assert title(figure).endswith("the 10 of 129 parameters with the strongest")
     axes = figure.axes[0]
     names = [axes.get_xticklabels()[0].get_text(), *row_names(axes)]
     order = [p.name for p in sweep.free]
@@ -600,7 +600,7 @@ def test_correlations_need_two_parameters_that_have_any(table1, bound, unknown):
 def test_singular_values_above_the_noise_are_filled(sweep):
     found = sweep.identifiability
     figure = draw(parameter_plots._draw_singular_values, sweep)
-    assert title(figure).endswith(f"{found.rank} of 126 combinations rise above the noise")
+    assert title(figure).endswith(f"{found.rank} of 129 combinations rise above the noise")
     axes = figure.axes[0]
     values = found.singular_values * 1e3
     x, y = line(axes, "told better")
@@ -613,7 +613,7 @@ def test_singular_values_above_the_noise_are_filled(sweep):
     assert faces == [style.AFTER, "white"]
     np.testing.assert_allclose(line(axes, "σ of a reading")[1], found.threshold * 1e3)
     assert axes.get_yscale() == "log"
-    assert axes.get_xlabel().endswith(f"({126 - found.structural_rank} more are zero)")
+    assert axes.get_xlabel().endswith(f"({129 - found.structural_rank} more are zero)")
 
 
 def test_all_singular_values_are_named_where_none_is_zero(table1):

@@ -243,7 +243,7 @@ def test_calibration_with_many_parameters_lists_what_to_enter(root):
     found = calibrate(load_session(root / "examples/sweep"), "full")
     read = Reader(found._repr_html_())
     assert [r[0] for r in read.rows[1:]] == ["x_slide", "y_slide", "z_slide"]
-    assert "In a controller that knows all errors: 12.9 µm" in " ".join(read.text["p"])
+    assert "In a controller that knows all errors: 12.7 µm" in " ".join(read.text["p"])
 
 
 def test_session_in_a_notebook(raw_cycles):

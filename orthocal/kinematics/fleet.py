@@ -1,0 +1,96 @@
+"""Machines that differ in their errors, in the same postures: their loops, all at once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.kinematics.compiled import compiled_robot
+from orthocal.robot.model import Robot
+
+Array = NDArray[np.float64]
+
+POSTURES_AT_ONCE = 2048
+"""Of all machines together, for the memory of their derivatives."""
+
+NEWTON_STEPS = 12
+CLOSED = 1e-13
+"""Last Newton step of loops that are closed, [m, rad]."""
+
+
+class Machines:
+    """Machines of one robot.
+
+    Args:
+        robot: The nominal robot.
+        errors: All elementary errors of each machine, shape (n_sets, n_errors), [SI].
+        drives: Commanded drive coordinates, shape (n_postures, n_drives), [m, rad].
+        passive: Passive coordinates near those of all machines, shape (n_postures, n_passive),
+            [m, rad].
+
+    Attributes:
+        passive: Passive coordinates of each machine, shape (n_sets, n_postures, n_passive).
+        placements: Of all that is moved by errors, shape (n_sets, n).
+    """
+
+    def __init__(self, robot: Robot, errors: Array, drives: Array, passive: Array) -> None:
+        self._robot = robot
+        self._compiled = compiled_robot(robot)
+        own = self._compiled.errors
+        self._drives = drives
+        self.passive = np.tile(passive, (len(errors), 1, 1))
+        self.placements = own.placements(errors)
+        self._offsets, self._gains = own.offsets(errors), own.gains(errors)
+
+    @property
+    def size(self) -> int:
+        """Number of machines."""
+        return len(self.passive)
+
+    def close(self) -> NDArray[np.bool_]:
+        """Close all loops by Newton's method; whether each machine's were, shape (n_sets,)."""
+        closing, k = self._compiled.closing.unshared, len(self._drives)
+        actuated = self.actuated(self._drives).reshape(self.size * k, -1)
+        q = self.passive.reshape(self.size * k, -1)
+        active = np.arange(self.size * k)
+        for _ in range(NEWTON_STEPS):
+            for first in range(0, active.size, POSTURES_AT_ONCE):
+                at = active[first : first + POSTURES_AT_ONCE]
+                g, g_q = closing(actuated[at], q[at], self.placements[at // k])
+                step = _solve(g_q, g[..., None])[..., 0]
+                q[at] -= step
+                size = np.abs(step).max(axis=1, initial=0.0)
+                active[first : first + POSTURES_AT_ONCE] = np.where(size < CLOSED, -1, at)
+            active = active[active >= 0]
+            if not active.size:
+                break
+        self.passive = q.reshape(self.size, k, -1)
+        done = np.ones(self.size, dtype=np.bool_)
+        done[active // k] = False
+        return done & np.isfinite(self.passive).all(axis=(1, 2))
+
+    def tool(self) -> Array:
+        """Where the tool of each is in each posture, shape (n_sets, n_postures, 3), [m]."""
+        tcp = self._robot.tcp
+        k = len(self._drives)
+        (found,) = self._compiled.position("" if tcp is None else tcp.frame).unshared(
+            self.actuated(self._drives).reshape(self.size * k, -1),
+            self.passive.reshape(self.size * k, -1),
+            np.repeat(self.placements, k, axis=0),
+        )
+        return np.asarray(found.reshape(self.size, k, 3))
+
+    def actuated(self, commanded: Array) -> Array:
+        """Where drives are: (n_sets, ..., n_drives) of (..., n_drives) commanded, [m, rad]."""
+        shape = (self.size,) + (1,) * (commanded.ndim - 1) + (-1,)
+        return np.asarray(self._gains.reshape(shape) * commanded + self._offsets.reshape(shape))
+
+
+def _solve(matrices: Array, right: Array) -> Array:
+    """Solutions of square systems, NaN where any is singular; least squares of others."""
+    if matrices.shape[-1] == matrices.shape[-2]:
+        try:
+            return np.asarray(np.linalg.solve(matrices, right))
+        except np.linalg.LinAlgError:
+            return np.full_like(right, np.nan)
+    return np.asarray(np.linalg.pinv(matrices, rcond=1e-10) @ right)

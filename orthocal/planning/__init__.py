@@ -1,0 +1,1 @@
+"""Which readings to take: candidates, a choice among them, and what it will be worth."""

@@ -1,0 +1,1 @@
+"""Studies as text, plain data and pictures: a file a kind."""

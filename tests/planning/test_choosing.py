@@ -1,0 +1,117 @@
+"""The choice among candidates: against enumeration, and what it says against least squares."""
+
+from __future__ import annotations
+
+from itertools import combinations, permutations
+
+import numpy as np
+import pytest
+
+from orthocal.planning.candidates import Candidates, Kind
+from orthocal.planning.choosing import Opened, choose_setups, information_of
+from orthocal.planning.ordering import order_postures
+
+SIGMA = 0.5
+STATE = 4
+ZERO = 1e3
+"""Standard deviation of a zero, large beside SIGMA."""
+
+
+def draw_candidates(rng, *, kinds=3, readings=4, own=1):
+    """Kinds of a random problem, and their unknowns, which the choice never sees."""
+    found, unknowns = [], []
+    for k in range(kinds):
+        slopes, mine = rng.normal(size=(readings, STATE)), 0.5 * rng.normal(size=(readings, own))
+        h = np.sort(rng.uniform(0.0, 3.0, readings))
+        together = np.abs(h[:, None] - h[None]) < 2.0
+        spread = mine @ mine.T + ZERO**2
+        found.append(Kind(f"k{k}", np.arange(readings), slopes, spread, together))
+        unknowns.append(mine)
+    return Candidates(None, None, tuple(found), SIGMA, tuple("abcd"), 0.0), unknowns
+
+
+def posterior(candidates, unknowns, setups, prior):
+    """Covariance of the state by least squares over state, unknowns and zeros together."""
+    count = len(setups)
+    width = unknowns[0].shape[1] + 1
+    rows = []
+    for place, s in enumerate(setups):
+        kind = candidates.kinds[s.kind]
+        for i in s.chosen:
+            row = np.zeros(STATE + count * width)
+            row[:STATE] = kind.slopes[i]
+            own = STATE + place * width
+            row[own : own + width] = [*unknowns[s.kind][i], 1.0]
+            rows.append(row / SIGMA)
+    whole = np.array(rows)
+    known = np.zeros(STATE + count * width)
+    known[STATE:] = 1.0
+    known[STATE + width - 1 :: width] = 1.0 / ZERO**2
+    information = whole.T @ whole + np.diag(known)
+    information[:STATE, :STATE] += prior
+    return np.linalg.inv(information)[:STATE, :STATE]
+
+
+def every_setup(candidates, count):
+    """All setups that can take so many readings, by their first and their others."""
+    for k, kind in enumerate(candidates.kinds):
+        for first in range(len(kind.rows)):
+            others = [i for i in np.flatnonzero(kind.together[first]) if i != first]
+            for rest in combinations(others, count - 1):
+                yield Opened(k, (first, *(int(i) for i in rest)))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_plan_is_nearly_the_best_of_all(seed):
+    rng = np.random.default_rng(seed)
+    candidates, unknowns = draw_candidates(rng)
+    root, prior = rng.normal(size=(STATE, 2)), np.eye(STATE)
+    found = choose_setups(candidates, [3, 2], prior=prior, weigh=lambda _: root, seed=0)
+    best = min(
+        np.sqrt(np.trace(root.T @ posterior(candidates, unknowns, pair, prior) @ root))
+        for pair in ((a, b) for a in every_setup(candidates, 3) for b in every_setup(candidates, 2))
+    )
+    assert best * (1.0 - 1e-9) <= found.left < 1.01 * best
+    # and what it says of itself is what least squares say
+    own = posterior(candidates, unknowns, found.setups, prior)
+    assert found.left == pytest.approx(np.sqrt(np.trace(root.T @ own @ root)), rel=1e-4)
+    assert np.linalg.inv(prior + information_of(candidates, found.setups)) == pytest.approx(
+        own, rel=1e-3, abs=1e-6
+    )
+
+
+def test_every_setup_keeps_what_the_gauge_reaches():
+    rng = np.random.default_rng(3)
+    candidates, _ = draw_candidates(rng, kinds=4, readings=8)
+    root = rng.normal(size=(STATE, STATE))
+    found = choose_setups(candidates, [4, 3, 3], prior=np.eye(STATE), weigh=lambda _: root)
+    for s in found.setups:
+        kind = candidates.kinds[s.kind]
+        assert len(set(s.chosen)) == len(s.chosen)
+        assert kind.together[s.chosen[0], list(s.chosen)].all()
+
+
+def test_the_same_seed_gives_the_same_plan():
+    rng = np.random.default_rng(5)
+    candidates, _ = draw_candidates(rng, kinds=6, readings=8)
+    root = rng.normal(size=(STATE, STATE))
+    first, second = (
+        choose_setups(candidates, [3, 3], prior=np.eye(STATE), weigh=lambda _: root, seed=7)
+        for _ in range(2)
+    )
+    assert first.setups == second.setups
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_way_through_postures_is_hardly_longer_than_the_shortest(seed):
+    points = np.random.default_rng(seed).normal(size=(7, 3))
+    way = order_postures(points)
+    assert way[0] == 0
+    assert sorted(way) == list(range(7))
+
+    def length(order):
+        closed = points[[*order, order[0]]]
+        return np.linalg.norm(np.diff(closed, axis=0), axis=1).sum()
+
+    shortest = min(length((0, *rest)) for rest in permutations(range(1, 7)))
+    assert length(way) < 1.1 * shortest

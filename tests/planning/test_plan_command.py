@@ -1,0 +1,168 @@
+"""orthocal plan: what it prints and writes, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from orthocal import MeasuringPlan, load_plan, plan_readings, summarize
+from orthocal.cli.run import main
+from orthocal.planning.means import Means
+
+QUICK = ["--along", "3", "--across-mm", "0", "--sections", "0.5", "--starts", "1"]
+DIAL = """sigma_mm: 0.002
+resolution_mm: 0.001
+range_mm: [-1, 1]
+tip: {blade: {width_mm: 20}}
+direction_tolerance_mrad: 5
+"""
+
+
+def run(monkeypatch, capsys, *words):
+    monkeypatch.setattr("sys.argv", ["orthocal", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    out, err = capsys.readouterr()
+    return ended.value.code or 0, out, err
+
+
+def test_a_plan_is_written_ready_to_measure(monkeypatch, capsys, tmp_path):
+    dial = tmp_path / "dial.yaml"
+    dial.write_text(DIAL)
+    out = tmp_path / "monday"
+    entered = ["--tolerance", "*.offset_mm=0.5"]
+    words = ["plan", "orthoglide", *QUICK, *entered, "--gauge", dial, "--out", out]
+    code, text, err = run(monkeypatch, capsys, *words)
+    assert code == 0
+    assert "18 readings in 6 setups, about 72 min" in text
+    assert len(text.splitlines()) <= 45
+    assert {p.name for p in out.iterdir()} == {
+        *("session.yaml", "readings.csv", "plan.json", "plan.svg")
+    }
+    comment = (out / "session.yaml").read_text().splitlines()[1]
+    assert comment == "# orthocal calibrate . --model full --tolerance '*.offset_mm=0.5'"
+    session = load_plan(out)
+    assert session.gauge.range == (-1e-3, 1e-3)
+    assert {s.sensor.tip.form for s in session.setups.values()} == {"blade"}
+    assert {s.sensor.standing.direction for s in session.setups.values()} == {5e-3}
+    rows = (out / "readings.csv").read_text().splitlines()
+    assert rows[0] == "setup,posture,cycle,reading_mm"
+    assert all(row.endswith(",") for row in rows[1:])
+    assert len(rows) == 1 + 24
+    assert "readings.csv to fill in" in err
+    document = json.loads((out / "plan.json").read_text())
+    assert document["readings"] + document["closing_readings"] == 24
+    assert (out / "plan.svg").read_text().startswith('<?xml version="1.0"')
+    # what is there is not written over
+    code, _, err = run(monkeypatch, capsys, *words)
+    assert code == 2
+    assert f"orthocal: {out / 'session.yaml'}: is there already; --force writes over it" in err
+
+
+def test_a_dial_without_a_tip_is_told(monkeypatch, capsys, tmp_path):
+    dial = tmp_path / "dial.yaml"
+    dial.write_text("sigma_mm: 0.005\nrange_mm: [-5, 5]\n")
+    code, _, err = run(monkeypatch, capsys, "plan", "orthoglide", *QUICK, "--gauge", dial)
+    assert code == 0
+    assert (
+        f"orthocal: {dial} names no tip: readings are planned of the line between the rods" in err
+    )
+
+
+def test_further_setups_of_a_session_are_planned(monkeypatch, capsys, root):
+    session = root / "examples/workshop"
+    code, text, _ = run(monkeypatch, capsys, "plan", session, "--add", 2, "--json", *QUICK)
+    assert code == 0
+    found = json.loads(text)
+    assert found["setups"] == 2
+    assert found["expected"]["aligned_um"] < found["before"]["aligned_um"]
+
+
+def test_in_python_it_is_the_same(orthoglide):
+    means = Means(along=3, across=0.0, sections=(0.5,))
+    plan = plan_readings(orthoglide, "full", means=means, starts=1, seed=3)
+    again = plan_readings(orthoglide, "full", means=means, starts=1, seed=3)
+    assert isinstance(plan, MeasuringPlan)
+    assert "at the tool are to be expected" in summarize(plan)
+    assert "What it still cannot tell apart" in summarize(plan, details=True)
+    assert [r.posture for r in plan.session.readings] == [r.posture for r in again.session.readings]
+
+
+def plan_for(robot, criterion):
+    means = Means(along=4, across=0.01, sections=(0.5,))
+    return plan_readings(robot, "full", setups=3, means=means, criterion=criterion, starts=1)
+
+
+@pytest.fixture(scope="module")
+def for_the_headline(orthoglide):
+    return plan_for(orthoglide, "aligned")
+
+
+@pytest.mark.parametrize("criterion", ["relative", "absolute", "worst", "A", "D", "E"])
+def test_each_criterion_is_better_met_by_its_own_plan(orthoglide, for_the_headline, criterion):
+    """Than by the plan for the headline, which is not made for it."""
+    own, other = plan_for(orthoglide, criterion), for_the_headline
+    assert own.criterion == criterion
+    stage = len(own.session.setups)
+    found = own.forecast.weigh(criterion, len(own.forecast.selection.names))
+    for plan in (own, other):
+        assert plan.curve[stage].error > 0.0
+    n = len(own.forecast.selection.names)
+    scale = own.forecast.tolerances[:n]
+
+    def size(plan):
+        covariance = plan.forecast.about_nominal(plan.session).covariance[:n, :n]
+        scaled = covariance / scale[:, None] / scale
+        root = found(scaled)
+        return float((root * (scaled @ root)).sum()) ** 0.5
+
+    assert size(own) < 1.03 * size(other)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nowhere"], "nowhere: there is no such file or folder"),
+        (["orthoglide", "--add", 2], "--add: is of a session; this is a robot"),
+        (["orthoglide", "--criterion", "F"], "--criterion: found 'F'; expected one of aligned,"),
+        (["orthoglide", "--box", "10"], "--box: found '10'; expected LOW:HIGH, in mm"),
+        (["orthoglide", "--box", "5:1"], "--box: found '5:1'; expected LOW:HIGH, in mm"),
+        (["orthoglide", "--box", "-5:1,-5:1"], "--box: has 2 coordinates; expected 1 for all, or"),
+        (["orthoglide", "--sections", "0.5,1.5"], "--sections: found 1.5; expected 0 (root) to 1"),
+        (["orthoglide", "--sections", "half"], "--sections: part is 'half'; expected a number"),
+        (["orthoglide", "--touches", "c"], "touches: 'c' is not a rod of leg x; rods: a, b"),
+        (["orthoglide", "--model", "all"], "'all' is not a model of this robot; models: offsets"),
+        (
+            ["orthoglide", *QUICK, "--tolerance", "*.offset_mm=40"],
+            "plan: no setup can take 3 readings within the gauge's range, of which machines within "
+            "their tolerances may take",
+        ),
+        (
+            ["orthoglide", "--minutes-a-setup", 0],
+            "--minutes-a-setup: found 0; expected a number ab",
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_refused(monkeypatch, capsys, words, message):
+    code, out, err = run(monkeypatch, capsys, "plan", *words)
+    assert (code, out) == (2, "")
+    assert message in err
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("range_mm: [-1, 1]\n", "dial.yaml: sigma_mm: is missing: without the scatter"),
+        ("sigma_mm: 0.005\nstand: block\n", "dial.yaml: stand: unknown key"),
+        ("sigma_mm: 0.005\ndirection_tolerance_mrad: -1\n", "direction_tolerance_mrad: found '-1'"),
+        ("- 1\n", "dial.yaml: "),
+    ],
+)
+def test_a_dial_that_makes_no_sense_is_refused(monkeypatch, capsys, tmp_path, text, message):
+    dial = tmp_path / "dial.yaml"
+    dial.write_text(text)
+    code, _, err = run(monkeypatch, capsys, "plan", "orthoglide", "--gauge", dial)
+    assert code == 2
+    assert message in err

@@ -1,0 +1,162 @@
+"""Studies of many machines: against the analytic covariance, and machine by machine."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gauges import exact
+from machines import place
+from tolerances import TRUTH_BACK
+
+from orthocal import Choice, load_plan, load_robot
+from orthocal.errors import ParameterError, SessionError
+from orthocal.kinematics.assembly import Assembly
+from orthocal.kinematics.workspace import cube, gauss_cube
+from orthocal.measurement.session import Gauge
+from orthocal.study.accuracy import GOOD, OUT_OF_RANGE
+from orthocal.study.accuracy_choice import build_accuracy_study
+from orthocal.study.accuracy_summary import summarise_accuracy
+from orthocal.study.paper import Displacements, build_paper_plan
+from orthocal.study.running import StudyTable, run_study
+from orthocal.study.study import run_task
+
+NEAR = {"*.offset_mm": 0.2}
+SIGMA = 5e-6
+
+
+@pytest.fixture(scope="module")
+def workshop(root):
+    return load_plan(root / "examples/workshop/plan.yaml")
+
+
+def summary(study):
+    return summarise_accuracy(study, run_study(study))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["full", "offsets"])
+def test_what_the_covariance_promises_comes(workshop, model):
+    """All errors drawn, whatever is identified of them, gauges as they may stand."""
+    found = summary(build_accuracy_study(workshop, Choice(model, tolerances=NEAR), machines=300))
+    assert found.machines > 290
+    assert abs(found.after - found.foretold.headline.rms) < 3.0 * found.doubt
+    assert found.doubt < 0.05 * found.after
+    for m in found.missed:
+        assert abs(m.rms - m.foretold) < 4.5 * m.doubt + 0.02 * m.foretold
+
+
+def test_standard_errors_of_the_papers_plan_are_those_that_were_computed_independently():
+    """1.942 σ of a single reading, twelve differences weighed by their covariance."""
+    robot = load_robot("orthoglide")
+    plan = build_paper_plan(robot, Displacements(), Gauge(SIGMA, None, None))
+    choice = Choice("offsets", tolerances={"*.offset_mm": 0.05})
+    study = build_accuracy_study(plan, choice, drawn=["*.offset"], machines=2000)
+    columns = run_study(study).columns
+    errors = np.array([columns[f"missed.{a}_slide.offset_mm"] for a in "xyz"])
+    spread = np.sqrt((errors**2).mean(axis=1)) * 1e-3 / SIGMA
+    doubt = 1.942 / np.sqrt(2.0 * 2000)
+    assert np.abs(spread - 1.942).max() < 3.0 * doubt + 0.0005
+
+
+def test_without_noise_the_truth_comes_back(orthoglide):
+    plan = build_paper_plan(orthoglide, Displacements(), Gauge(1e-12, None, None))
+    choice = Choice("offsets", tolerances={"*.offset_mm": 2.0})
+    table = run_study(build_accuracy_study(plan, choice, drawn=["*.offset"], machines=60))
+    for axis in "xyz":
+        missed = np.array(table.columns[f"missed.{axis}_slide.offset_mm"])
+        assert np.abs(missed).max() * 1e-3 < TRUTH_BACK
+        assert np.std(table.columns[f"true.{axis}_slide.offset_mm"]) > 1.0
+    assert max(table.columns["tool_um"]) < 1e-3
+
+
+def test_one_machines_row_is_what_pinocchio_says_of_its_tool(workshop):
+    """Errors at the tool: as drawn and as identified, loops closed by Pinocchio."""
+    choice = Choice("offsets", tolerances=NEAR)
+    study = build_accuracy_study(workshop, choice, machines=4, half_side=0.05)
+    rows = run_task(study, 0)
+    robot, prepared = workshop.robot, study.prepare()
+    space = gauss_cube(robot, half_side=0.05)
+    drives = Assembly(robot).inverse(space.points)
+    drawn, _ = study.draw(prepared, 2)
+    truth = dict(zip(study.drawn, drawn * prepared.truth.theta_scale, strict=False))
+    found = {
+        f"{a}_slide.offset": 1e-3
+        * (rows[f"true.{a}_slide.offset_mm"][2] + rows[f"missed.{a}_slide.offset_mm"][2])
+        for a in "xyz"
+    }
+    real, known, nominal = (
+        np.array([place(robot.with_errors(e), d, "tcp") for d in drives])
+        for e in (truth, found, {})
+    )
+    for column, field in (("tool_um", real - known), ("before_um", real - nominal)):
+        aligned = space.remove_motion(field, nominal)
+        rms = np.sqrt(space.weights @ (aligned**2).sum(axis=1))
+        assert rows[column][2] == pytest.approx(rms * 1e6, rel=1e-6)
+
+
+def test_gauss_points_give_the_mean_square_of_a_fine_grid(orthoglide):
+    few, many = gauss_cube(orthoglide, half_side=0.06), cube(orthoglide, points_a_side=21)
+
+    def square(space):
+        x, y, z = space.points.T
+        return space.weights @ (x * y + 0.3 * z**2 - 1e-3) ** 2
+
+    assert square(few) == pytest.approx(square(many), rel=1e-3)
+
+
+def test_errors_may_be_given_instead(workshop):
+    study = build_accuracy_study(
+        exact(workshop), Choice("offsets"), given={"x_slide.offset": 1e-3}, machines=3
+    )
+    rows = run_task(study, 0)
+    assert rows["true.x_slide.offset_mm"] == [1.0] * 3
+    assert rows["true.y_slide.offset_mm"] == [0.0] * 3
+    assert np.abs(rows["missed.x_slide.offset_mm"]).max() < 0.05
+    assert len(set(rows["missed.x_slide.offset_mm"])) == 3
+    assert len(set(rows["before_um"])) == 1
+
+
+def test_readings_beyond_the_gauge_are_told_not_counted(workshop):
+    from dataclasses import replace
+
+    narrow = replace(workshop, gauges={"": Gauge(SIGMA, 1e-5, (-0.5e-3, 0.5e-3))})
+    study = build_accuracy_study(narrow, "offsets", drawn=["*.offset"], machines=100)
+    table = run_study(study)
+    status = table.columns["status"]
+    found = summarise_accuracy(study, table)
+    assert found.failed[OUT_OF_RANGE] == status.count(OUT_OF_RANGE) > 50
+    assert found.machines == status.count(GOOD)
+    bad = status.index(OUT_OF_RANGE)
+    assert table.columns["tool_um"][bad] is None
+
+
+def test_a_table_of_no_good_machine_says_so(workshop):
+    from orthocal.show.study.views import study_json, summarise_study
+
+    study = build_accuracy_study(workshop, "offsets", machines=2)
+    rows = run_task(study, 0)
+    for name in rows:
+        rows[name] = [OUT_OF_RANGE] * 2 if name == "status" else [None] * 2
+    table = StudyTable(study, rows)
+    assert "None of the machines could be calibrated" in study_json(table, summarise_study(table))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"choice": "all"}, ParameterError, "'all' is not a model"),
+        ({"drawn": ["nothing.*"]}, ParameterError, "nothing"),
+        ({"given": {"x_slide.offset_mm": 1.0}}, ParameterError, "not an error parameter"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(workshop, arguments, error, message):
+    with pytest.raises(error, match=message):
+        build_accuracy_study(workshop, **arguments)
+
+
+def test_unknown_noise_is_refused(workshop):
+    from dataclasses import replace
+
+    silent = replace(workshop, gauges={"": Gauge(None, 1e-5, None)})
+    with pytest.raises(SessionError, match=r"gauge.sigma_mm: is missing"):
+        build_accuracy_study(silent)

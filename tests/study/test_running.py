@@ -1,0 +1,282 @@
+"""Studies that are stopped, killed, shared out: the same table, byte by byte."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from gauges import exact
+
+from orthocal import load_session
+from orthocal.errors import OrthocalError
+from orthocal.show.study.views import study_json, summarise_study
+from orthocal.study.bootstrap import build_bootstrap_study
+from orthocal.study.journal import open_journal
+from orthocal.study.linearisation import build_linearisation_study
+from orthocal.study.parquet import to_parquet
+from orthocal.study.running import JOURNAL, run_study
+from orthocal.study.study import run_task, tidy_cell
+
+KILLS = 20
+FORK = multiprocessing.get_context("fork")
+
+
+def session_of(root):
+    return exact(load_session(root / "examples/table1/experiment-2"))
+
+
+def results(table):
+    return to_parquet(table), study_json(table, summarise_study(table))
+
+
+@pytest.fixture(scope="module")
+def study(root):
+    """Twelve tasks of a tenth of a second or so."""
+    found = build_bootstrap_study(session_of(root), draws=3000)
+    run_task(found, 0)  # what is prepared is there in every fork
+    return found
+
+
+@pytest.fixture(scope="module")
+def undisturbed(study):
+    return run_study(study)
+
+
+def test_killed_twenty_times_it_is_the_same_byte_by_byte(study, undisturbed, tmp_path):
+    rng = np.random.default_rng(0)
+    began = time.monotonic()
+    run_task(study, 1)
+    a_task = time.monotonic() - began
+    kept, kills = set(), 0
+    while kills < KILLS or not kept:  # where the machine is busy more is needed for a first one
+        kills += 1
+        assert kills < 10 * KILLS
+        child = FORK.Process(target=run_study, args=(study,), kwargs={"folder": tmp_path})
+        child.start()
+        time.sleep(float(rng.uniform(0.0, (2.0 + 0.1 * kills) * a_task)))
+        os.kill(child.pid, signal.SIGKILL)
+        child.join()
+        if (tmp_path / JOURNAL).exists():
+            with open_journal(tmp_path / JOURNAL, study) as journal:
+                assert kept <= set(journal.found)  # what was found stays
+                kept = set(journal.found)
+    again = run_study(study, folder=tmp_path)
+    assert results(again) == results(undisturbed)
+
+
+def test_a_line_without_an_end_is_done_again(study, undisturbed, tmp_path):
+    run_study(study, folder=tmp_path)
+    file = tmp_path / JOURNAL
+    whole = file.read_bytes()
+    for cut in (1, 100, len(whole.splitlines(keepends=True)[-1])):
+        file.write_bytes(whole[:-cut])
+        assert results(run_study(study, folder=tmp_path)) == results(undisturbed)
+        assert file.read_bytes() == whole
+
+
+@pytest.mark.parametrize("workers", [2, 3])
+def test_any_number_of_workers_finds_the_same(study, undisturbed, workers):
+    assert results(run_study(study, workers=workers)) == results(undisturbed)
+
+
+def test_what_is_there_is_not_done_again(study, tmp_path, monkeypatch):
+    run_study(study, folder=tmp_path)
+    monkeypatch.setattr("orthocal.study.running.run_task", None)
+    told = []
+    run_study(study, folder=tmp_path, report=told.append)
+    assert [(p.done, p.kept) for p in told] == [(3000, 3000)]
+
+
+def test_progress_and_time_left_are_told(study):
+    told = []
+    run_study(study, report=told.append)
+    assert [p.done for p in told] == [250 * i for i in range(13)]
+    assert told[0].seconds_left is None
+    assert told[1].seconds_left > 0.0
+    assert told[-1].seconds_left == 0.0
+
+
+def test_another_studys_folder_is_refused(study, root, tmp_path):
+    run_study(study, folder=tmp_path)
+    other = build_bootstrap_study(session_of(root), draws=3000, seed=1)
+    with pytest.raises(OrthocalError, match=r"results\.jsonl: is of another study.* seed;"):
+        run_study(other, folder=tmp_path)
+    found = run_study(other, folder=tmp_path, anew=True)
+    assert results(found) == results(run_study(other))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda lines: [b"nothing\n", *lines], r"results\.jsonl:1: is no line of a study"),
+        (lambda lines: [lines[0], b"[1]\n", *lines[1:]], r"jsonl:2: is no line of a study"),
+        (lambda lines: [lines[0], b'{"task": 99, "columns": {"a": [1]}}\n'], "jsonl:2: is damaged"),
+        (lambda lines: [lines[0], b'{"task": 0, "columns": {"a": [1], "b": []}}\n'], "is damaged"),
+        (lambda lines: [b"{}\n", *lines[1:]], r"jsonl: is no study's; --force writes over it"),
+        (lambda lines: [b"[" * 100_000 + b"\n"], "is no line of a study"),
+    ],
+)
+def test_a_damaged_journal_is_refused(study, tmp_path, spoil, message):
+    with open_journal(tmp_path / JOURNAL, study) as journal:
+        journal.add(0, {"draw": [0]})
+    file = tmp_path / JOURNAL
+    spoilt = b"".join(spoil(file.read_bytes().splitlines(keepends=True)))
+    file.write_bytes(spoilt)
+    with pytest.raises(OrthocalError, match=message):
+        run_study(study, folder=tmp_path)
+    assert file.read_bytes() == spoilt
+
+
+def test_two_processes_do_not_write_one_journal(study, tmp_path):
+    with (
+        open_journal(tmp_path / JOURNAL, study),
+        pytest.raises(OrthocalError, match="is being written by another process"),
+    ):
+        run_study(study, folder=tmp_path)
+
+
+def test_pandas_and_polars_open_the_table(undisturbed, tmp_path):
+    import pandas as pd
+    import polars as pl
+
+    file = tmp_path / "results.parquet"
+    file.write_bytes(to_parquet(undisturbed))
+    for frame in (pd.read_parquet(file), pl.read_parquet(file)):
+        assert list(frame.columns) == list(undisturbed.columns)
+        for name, cells in undisturbed.columns.items():
+            assert list(frame[name]) == cells
+
+
+def test_cells_are_plain_and_short():
+    assert tidy_cell(np.float64(1 / 3)) == 0.333333333
+    assert tidy_cell(np.nan) is None
+    assert tidy_cell(-1e-300 * 1e-300) == 0.0
+    assert (tidy_cell(np.int64(3)), tidy_cell(np.bool_(1)), tidy_cell("a")) == (3, True, "a")
+
+
+@pytest.fixture
+def cluster():
+    """A real scheduler and two workers, each a process of its own, on this machine alone."""
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    common = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "env": environment}
+    words = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    scheduler = subprocess.Popen(
+        [*words, "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-jupyter"],
+        text=True,
+        **common,
+    )
+    address = None
+    for line in scheduler.stderr:
+        if "tcp://" in line:
+            address = "tcp://" + line.split("tcp://")[1].strip()
+            break
+    assert address is not None
+    words = [sys.executable, "-m", "distributed.cli.dask_worker", address]
+    workers = [
+        subprocess.Popen(
+            [*words, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1"],
+            **{**common, "stderr": subprocess.DEVNULL},
+        )
+        for _ in range(2)
+    ]
+    yield address, workers
+    for process in (*workers, scheduler):
+        process.kill()
+        process.wait()
+    scheduler.stderr.close()
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+def test_a_cluster_one_of_whose_workers_is_killed_finds_the_same(cluster, study, undisturbed):
+    address, workers = cluster
+    killed = []
+
+    def kill_one(progress):
+        if progress.done > 250 and not killed:
+            workers[0].send_signal(signal.SIGKILL)
+            killed.append(progress.done)
+
+    found = run_study(study, dask=address, report=kill_one)
+    assert killed
+    assert workers[0].wait() == -signal.SIGKILL
+    assert results(found) == results(undisturbed)
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere", "", "tcp://["])
+def test_a_cluster_that_does_not_answer_is_told(study, monkeypatch, address):
+    monkeypatch.setattr("orthocal.study.running.CONNECTING", 1.0)
+    with pytest.raises(OrthocalError, match="--dask: no Dask scheduler answers at"):
+        run_study(study, dask=address)
+
+
+def test_workers_end_when_nobody_wants_them_any_more(root, tmp_path):
+    words = ["study", "bootstrap", str(root / "examples/raw-cycles"), "--draws", "100000"]
+    words += ["--workers", "2", "--out", str(tmp_path)]
+    run = subprocess.Popen(
+        [sys.executable, "-m", "orthocal", *words],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    journal = tmp_path / JOURNAL
+    until(lambda: journal.exists() and journal.read_bytes().count(b"\n") > 1)
+    children = [int(p) for p in children_of(run.pid)]
+    assert children
+    run.kill()
+    run.wait()
+    until(lambda: not any(is_running(p) for p in children))
+
+
+def children_of(pid):
+    with open(f"/proc/{pid}/task/{pid}/children") as stream:
+        return stream.read().split()
+
+
+def is_running(pid):
+    try:
+        with open(f"/proc/{pid}/stat") as stream:
+            return stream.read().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def until(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not come to that"
+        time.sleep(0.05)
+
+
+def test_a_robot_that_is_not_there_any_more_is_made_of_its_files(orthoglide, tmp_path):
+    """As on another machine, or where its files were changed meanwhile."""
+    from orthocal.robot.making import Sizes, make_robot
+
+    sizes = Sizes(leg=0.25, lower=0.1, upper=0.32)
+    robot = make_robot(sizes, tmp_path / "mine")
+    study = build_linearisation_study(robot, sizes=[1.0], along=[1, -0.6, 0.3])
+    expected = run_study(study).columns
+    for file in (tmp_path / "mine").iterdir():
+        file.write_text("something else")
+    from orthocal.study import shipping
+
+    shipping._unpack.cache_clear()
+    from orthocal.study.study import prepare_once
+
+    prepare_once.cache_clear()
+    with pytest.raises(OrthocalError):
+        run_study(study)  # what is there does not load, and is not passed over
+    for file in (tmp_path / "mine").iterdir():
+        file.unlink()
+    (tmp_path / "mine").rmdir()
+    prepare_once.cache_clear()
+    assert run_study(study).columns == expected
+    own = build_linearisation_study(orthoglide, sizes=[1.0], along=[1, -0.6, 0.3])
+    assert run_study(own).columns["six"] != expected["six"]
+    assert json.dumps(study.document) != json.dumps(own.document)

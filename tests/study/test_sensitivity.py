@@ -1,0 +1,84 @@
+"""What readings answer to errors: the paper's factors, and central differences of rigid bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from machines import place
+
+from orthocal import load_plan
+from orthocal.errors import ClosureError, ParameterError
+from orthocal.study.paper import Displacements
+from orthocal.study.running import run_study
+from orthocal.study.sensitivity import build_sensitivity_study, summarise_sensitivity
+
+LENGTH = 0.31025
+
+
+@pytest.fixture(scope="module")
+def offsets(orthoglide):
+    study = build_sensitivity_study(orthoglide, ["*.offset"])
+    return summarise_sensitivity(study, run_study(study))
+
+
+def row(summary, posture, reads):
+    return summary.slopes[summary.rows.index((posture, reads))]
+
+
+@pytest.mark.parametrize(("posture", "moved"), [("x_max", 60.0), ("x_min", -100.0)])
+def test_the_papers_factors_come_out(offsets, posture, moved):
+    """Equation (6) at the tool: 1 and tan α; equation (7) in readings."""
+    alpha = np.arcsin(moved * 1e-3 / LENGTH)
+    t, s = np.tan(alpha), np.sin(alpha)
+    expected = np.array([[1, 0, 0], [t, 1, 0], [t, 0, 1]])
+    tool = np.array([row(offsets, posture, f"tool {a}") for a in "xyz"])
+    assert np.abs(tool - expected).max() < 1e-8
+    less_zero = row(offsets, posture, "yx") - row(offsets, "zero", "yx")
+    assert np.abs(less_zero - [(0.5 + s) * t, s, 0.0]).max() < 1e-8
+    assert set(offsets.units) == {"mm/mm"}
+
+
+def test_the_tools_slopes_are_those_of_rigid_bodies(orthoglide):
+    """Any errors, any place: central differences, loops closed by Pinocchio."""
+    names = ["x_swivel.rz", "y_coupler.x", "z_slide.scale", "frame.y_foot_end.ry"]
+    point = [0.02, -0.03, 0.04]
+    study = build_sensitivity_study(orthoglide, names, points=[point])
+    found = summarise_sensitivity(study, run_study(study))
+    posture = study.session.unpack().postures["point_1"]
+    assert set(found.parameters) == set(names)
+    for i, name in enumerate(found.parameters):
+        parameter = orthoglide.parameters[name]
+        step = 0.1 * parameter.tolerance
+        ends = [
+            place(orthoglide.with_errors({name: s * step}), posture.drives, "tcp") for s in (1, -1)
+        ]
+        expected = (ends[0] - ends[1]) / (2 * step)
+        edge = expected / 1e-3 / parameter.edge_factor
+        own = [row(found, "point_1", f"tool {a}")[i] for a in "xyz"]
+        assert np.abs(np.array(own) - edge).max() < 1e-6 * max(1.0, np.abs(edge).max())
+        assert found.units[i] == f"mm/{parameter.edge_unit}"
+        along_x = found.rows.index(("point_1", "tool x"))
+        expected_um = expected[0] * parameter.tolerance
+        assert found.per_tolerance[along_x, i] == pytest.approx(expected_um, abs=1e-10)
+
+
+def test_a_sessions_own_readings_are_in_it(root):
+    plan = load_plan(root / "examples/workshop/plan.yaml")
+    study = build_sensitivity_study(plan)
+    table = run_study(study)
+    found = summarise_sensitivity(study, table)
+    assert len(found.parameters) == 129
+    assert sum(reads in plan.setups for _, reads in found.rows) == 18
+    assert len(table) == len(found.rows) * 129
+
+
+def test_out_of_reach_is_told(orthoglide):
+    with pytest.raises(ClosureError, match="point_1"):
+        build_sensitivity_study(orthoglide, points=[[0.5, 0.0, 0.0]])
+    with pytest.raises(ClosureError, match="x_max"):
+        build_sensitivity_study(orthoglide, displacements=Displacements(0.5, -0.1))
+
+
+def test_unknown_names_are_told(orthoglide):
+    with pytest.raises(ParameterError, match="nothing"):
+        build_sensitivity_study(orthoglide, ["nothing"])
