@@ -45,10 +45,16 @@ class Visit:
                 pytest.fail(f"not in {PATIENCE} s: {expression}")
             time.sleep(0.02)
 
-    def wait_until_drawn(self, *, frame=None, times=1):
-        self.wait_for(
-            f"Number(document.documentElement.dataset.rendered || 0) > {times}", frame=frame
-        )
+    def wait_until_drawn(self, *, frame=None):
+        """Until all that the page was given is drawn.
+
+        The viewer draws where something has changed, so a page may well be drawn once and rest: it
+        is asked to draw once more after it was loaded, and that is waited for.
+        """
+        self.wait_for("document.readyState === 'complete' && 'viewer' in window", frame=frame)
+        drawn = "Number(document.documentElement.dataset.rendered || 0)"
+        seen = (frame or self.page).evaluate(f"(viewer.set_dirty(), {drawn})")
+        self.wait_for(f"{drawn} > {seen}", frame=frame)
 
     def picture(self):
         """What is to be seen, shape (height, width, 3)."""

@@ -97,9 +97,7 @@ def seek(found, time):
            }""",
         time,
     )
-    seen = found.page.evaluate("Number(document.documentElement.dataset.rendered)")
-    found.page.evaluate("viewer.set_dirty()")
-    found.wait_until_drawn(times=seen)
+    found.wait_until_drawn()
 
 
 @pytest.mark.parametrize("name", ["constructor", "__proto__", "<object>"])
