@@ -46,6 +46,18 @@ class ClosureKeys(_Keys):
     """Rows that count, in the axes of the pair's first frame; all by default."""
 
 
+class JointKeys(_Keys):
+    """A controller's joint, where it counts otherwise than the drive."""
+
+    counts: Literal["up", "down"] = "up"
+    """Whether the joint grows with the drive's coordinate, or against it."""
+    at_zero_mm: Number | None = None
+    """What the joint shows in the mechanical zero, of a prismatic drive; the drive's own
+    coordinate where it is not said."""
+    at_zero_deg: Number | None = None
+    """The same for a revolute drive."""
+
+
 class DriveKeys(_Keys):
     """What orthocal adds to one motor."""
 
@@ -53,6 +65,8 @@ class DriveKeys(_Keys):
     """Commanded coordinate of the mechanical zero, for a prismatic drive."""
     zero_deg: Number | None = None
     """The same for a revolute drive."""
+    joint: JointKeys | None = None
+    """How the controller counts; as the drive where it is not said."""
 
 
 class RodKeys(_Keys):

@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 from orthocal.errors import ParameterError, RobotError
 from orthocal.fields import read_only
 from orthocal.files import is_folder, read_file, require_plain_name
-from orthocal.robot.description import LegKeys, RobotKeys, RodKeys, load_description
+from orthocal.robot.description import (
+    DriveKeys,
+    JointKeys,
+    LegKeys,
+    RobotKeys,
+    RodKeys,
+    load_description,
+)
 from orthocal.robot.frames import find_frame, hangs_on
 from orthocal.robot.idle import find_idle_errors
 from orthocal.robot.model import (
@@ -160,16 +167,13 @@ def _build_drives(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Drive,
             )
         prismatic = not np.any(joint_axis(model, joint.id)[3:])
         entry = keys.orthocal.drives.get(motor)
-        zero = 0.0
+        entry_where = f"{where}: orthocal.drives.{motor}"
+        zero, direction, shown = 0.0, 1, None
         if entry is not None:
-            wrong = "zero_deg" if prismatic else "zero_mm"
-            if getattr(entry, wrong) is not None:
-                kind, right = ("prismatic", "zero_mm") if prismatic else ("revolute", "zero_deg")
-                raise RobotError(
-                    f"the drive is {kind}; expected {right}",
-                    where=f"{where}: orthocal.drives.{motor}.{wrong}",
-                )
-            zero = (entry.zero_mm or 0.0) * MM if prismatic else (entry.zero_deg or 0.0) * DEG
+            zero = _in_drive_unit(entry, "zero", prismatic, entry_where) or 0.0
+            if entry.joint is not None:
+                direction = 1 if entry.joint.counts == "up" else -1
+                shown = _in_drive_unit(entry.joint, "at_zero", prismatic, f"{entry_where}.joint")
         bounded = joint.nq == 1
         lower = float(model.lowerPositionLimit[joint.idx_q]) if bounded else -np.inf
         upper = float(model.upperPositionLimit[joint.idx_q]) if bounded else np.inf
@@ -178,10 +182,34 @@ def _build_drives(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Drive,
             raise RobotError(
                 f"the zero, {zero / size:g} {unit}, is outside the joint's limits "
                 f"{lower / size:g} ... {upper / size:g} {unit}",
-                where=f"{where}: orthocal.drives.{motor}",
+                where=entry_where,
             )
-        drives.append(Drive(motor, "m" if prismatic else "rad", float(zero), lower, upper))
+        drives.append(
+            Drive(
+                motor,
+                "m" if prismatic else "rad",
+                zero,
+                lower,
+                upper,
+                direction=direction,
+                joint_zero=shown,
+            )
+        )
     return tuple(drives)
+
+
+def _in_drive_unit(
+    keys: DriveKeys | JointKeys, key: str, prismatic: bool, where: str
+) -> float | None:
+    """A length or an angle, whichever the drive has, [m, rad]; None where it is not said."""
+    wrong, right = (f"{key}_deg", f"{key}_mm") if prismatic else (f"{key}_mm", f"{key}_deg")
+    if getattr(keys, wrong) is not None:
+        raise RobotError(
+            f"the drive is {'prismatic' if prismatic else 'revolute'}; expected {right}",
+            where=f"{where}.{wrong}",
+        )
+    value = getattr(keys, right)
+    return None if value is None else float(value * (MM if prismatic else DEG))
 
 
 def _build_closures(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Closure, ...]:

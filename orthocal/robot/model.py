@@ -37,6 +37,26 @@ class Drive(InUnit):
     """Largest coordinate, [unit]; inf where the URDF gives none."""
     zero_found: bool = False
     """Whether the zero was found by closing the loops, and is not the one that was given."""
+    direction: int = 1
+    """1 where the controller's joint grows with the coordinate, -1 where it falls."""
+    joint_zero: float | None = None
+    """What the controller's joint shows in the mechanical zero, [unit]; None: the coordinate."""
+
+    def to_joint(self, coordinate: ArrayLike) -> Array:
+        """What the controller's joint shows at coordinates, of any shape, [unit]."""
+        shown = self.zero if self.joint_zero is None else self.joint_zero
+        return shown + self.direction * (np.asarray(coordinate, dtype=np.float64) - self.zero)
+
+    def from_joint(self, joint: ArrayLike) -> Array:
+        """Coordinates at which the controller's joint shows this, of any shape, [unit]."""
+        shown = self.zero if self.joint_zero is None else self.joint_zero
+        return self.zero + self.direction * (np.asarray(joint, dtype=np.float64) - shown)
+
+    @property
+    def joint_limits(self) -> tuple[float, float]:
+        """Least and largest that the joint may show, [unit]."""
+        ends = (float(self.to_joint(self.lower)), float(self.to_joint(self.upper)))
+        return min(ends), max(ends)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
