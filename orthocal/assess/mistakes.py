@@ -16,6 +16,10 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
+
+from orthocal.statistics.chance import BY_CHANCE
+from orthocal.statistics.whitening import whiten
 
 Array = NDArray[np.float64]
 Mistake = Literal[
@@ -24,7 +28,11 @@ Mistake = Literal[
 
 EXPLAINED = 0.2
 """Part of what offsets can explain that a mistake may leave of it at most, r.m.s., to be taken for
-the reason; or what the noise leaves, if that is more."""
+the reason; or what chance leaves, if that is more."""
+
+KNOWN_LEAVES = 2.0
+"""Times what is expected of deviations that a known mistake may leave at most, to be the reason;
+readings answer in proportion to small changes only."""
 
 AS_GOOD = 1.05
 """Times what the best of the mistakes leaves up to which the simpler one is held to be it: what
@@ -50,7 +58,7 @@ class EnteringMistake:
     by: tuple[float, ...]
     """What is in the controller less what was to be entered, for each of the drives, [m, rad]."""
     rms: float
-    """What it leaves of the deviations, [m]."""
+    """What it leaves of the deviations, and neither machine nor gauges explain, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,48 +67,70 @@ class _Guess:
     drives: tuple[int, ...]
     active: Array
     left: float
-    """What it leaves of what offsets can explain, r.m.s., [m]."""
+    """What it leaves of what offsets can explain, r.m.s., [σ]."""
 
 
 def find_mistake(
     deviations: Array,
     slopes: Array,
     *,
+    spread: Array,
+    sigma: float,
+    model_sigma: float,
+    model_dof: float,
+    dof: float,
     before: Array,
     identified: Array,
     entered: Array,
     names: tuple[str, ...],
     rounding: Array,
-    noise: float = 0.0,
 ) -> EnteringMistake | None:
     """The mistake that explains deviations best, if one does.
+
+    All are held against what deviations are where there is no mistake: noise, and what was not
+    known of machine and gauges.
 
     Args:
         deviations: New readings less those of the calibrated machine, zeros eliminated, (n,), [m].
         slopes: How the readings answer to the offsets of the drives, zeros eliminated, shape
             (n, n_drives), [m per m or rad].
+        spread: Root of the covariance that deviations have of what is not known, shape (n, m), [m].
+        sigma: Standard deviation of what is each reading's own, and new, [m].
+        model_sigma: The same with error of the model, which repeats, [m].
+        model_dof: Degrees of freedom of that.
+        dof: Degrees of freedom of the deviations.
         before: Offsets that were active while the calibration was measured, A, [m, rad].
         identified: Offsets of the identified machine, I, shape (n_drives,), [m, rad].
         entered: Offsets that are taken to be active, E, shape (n_drives,), [m, rad].
         names: Of the drives.
         rounding: Differences that are none, shape (n_drives,), [m, rad].
-        noise: What the noise leaves of what offsets can explain, r.m.s., [m].
     """
+    weighed = whiten(np.column_stack([deviations, slopes]), spread, sigma=sigma)
+    own, answers = weighed[:, 0], weighed[:, 1:]
     # what offsets have no part in is error of the model, and stays whatever is entered
-    solution = np.linalg.lstsq(slopes, deviations, rcond=None)[0]
-    shown = slopes @ solution
-    allowed = max(EXPLAINED * _rms(shown), noise)
+    solution, _, rank, _ = np.linalg.lstsq(answers, own, rcond=None)
+    shown = answers @ solution
+    chance = math.sqrt(float(special.chdtri(max(rank, 1), BY_CHANCE)) / own.size)
+    allowed = max(EXPLAINED * _rms(shown), chance)
     guesses = [
-        _Guess(kind, drives, active, _rms(shown - slopes @ (entered - active)))
+        _Guess(kind, drives, active, _rms(shown - answers @ (entered - active)))
         for kind, drives, active in _guesses(before, identified, entered, rounding)
     ]
     known = [g for g in guesses if g.left <= allowed]
     if not known:
-        known = [g for g in _single(shown, slopes, entered, rounding) if g.left <= allowed]
+        known = [g for g in _single(shown, answers, entered, rounding) if g.left <= allowed]
     if not known:
         return None
-    least = max(min(g.left for g in known) * AS_GOOD, noise)
+    least = max(min(g.left for g in known) * AS_GOOD, chance)
     best = min((g for g in known if g.left <= least), key=lambda g: (len(g.drives), g.left))
+    missing = entered - best.active
+    left = whiten(deviations - slopes @ missing, spread, sigma=model_sigma)
+    excess = float(left @ left) / dof
+    if best.kind == "one differs":  # any offset of one drive: it must explain all but chance
+        if special.fdtrc(dof, model_dof, excess) < BY_CHANCE:
+            return None
+    elif excess > KNOWN_LEAVES**2:
+        return None
     moved = int((np.abs(entered - before) > rounding).sum())
     return EnteringMistake(
         kind=best.kind,
@@ -108,7 +138,8 @@ def find_mistake(
         all_drives=best.kind != "one differs" and len(best.drives) >= max(moved, 1),
         active=best.active,
         by=tuple((best.active - entered)[list(best.drives)].tolist()),
-        rms=_rms(deviations - slopes @ (entered - best.active)),
+        # of what is left what neither machine nor gauges explain: σ² V⁻¹ times it
+        rms=model_sigma**2 * _rms(whiten(left, spread, sigma=model_sigma)),
     )
 
 

@@ -26,6 +26,7 @@ from orthocal.calibration.repeating import repeat_fit, restore_gauge_covariance
 from orthocal.diagnosis.rows import ResidualRow
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import Fit
+from orthocal.estimation.problem import CalibrationProblem
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.measurement.session import Session
 from orthocal.statistics.chance import BY_CHANCE, confidence_factor
@@ -33,12 +34,6 @@ from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import InUnit, Unit
 
 Array = NDArray[np.float64]
-
-KNOWN_LEAVES = 2.0
-"""Times the expected deviations that a known mistake may leave at most, to be the reason."""
-
-LEAVES = 1.4
-"""The same where it is no known one, but any offset of one drive."""
 
 FEWEST = 5.0
 """Degrees of freedom below which what does not repeat of two sessions is not known."""
@@ -198,11 +193,7 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
     )
     if found.confirmed is not False:
         return found
-    mistake = _find_mistake(calibration, fit, session)
-    if mistake is not None:  # what it leaves must be what was expected
-        times = LEAVES if mistake.kind == "one differs" else KNOWN_LEAVES
-        if mistake.rms > times * calibration.rms_after / calibration.row_factor:
-            mistake = None
+    mistake = _find_mistake(calibration, fit, session, repetition, stood)
     slip = mistake is not None and mistake.kind != "one differs"
     enter = entries if slip else find_entries(refit)
     return replace(found, mistake=mistake, enter=enter)
@@ -226,35 +217,91 @@ def _entered(calibration: Calibration, session: Session) -> Session:
     return session.with_controller(np.array(offsets))
 
 
-def _find_mistake(calibration: Calibration, fit: Fit, session: Session) -> EnteringMistake | None:
-    """The mistake in entering offsets that explains a session, if one does."""
+def _find_mistake(
+    calibration: Calibration,
+    fit: Fit,
+    session: Session,
+    repetition: Repetition,
+    stood: Sequence[Array],
+) -> EnteringMistake | None:
+    """The mistake in entering offsets that explains a session, if one does.
+
+    Deviations are held against all that they may be without a mistake: noise, what the calibration
+    does not know of its parameters, and how the gauges stand, this time.
+    """
     drives, o, problem = session.robot.drives, fit.problem.observations, fit.problem
-    stood = fit.solution.theta[problem.n_machine :]
-    theta = np.append([p.value for p in calibration.free], stood)
+    known = problem.prior_mean[problem.n_machine :] * problem.theta_scale[problem.n_machine :]
+    theta = np.append([p.value for p in calibration.free], known)
     deviations = project_out_zeros(problem.values - problem.predict(theta), o)
+    scaled = project_out_zeros(fit.jacobian, o)
     slopes = np.zeros((o.size, len(drives)))
     for i, drive in enumerate(drives):
         name = f"{drive.name}.offset"
         if name in problem.free:
             k = problem.free.index(name)
-            slopes[:, i] = fit.jacobian[:, k] / problem.theta_scale[k]
+            slopes[:, i] = scaled[:, k] / problem.theta_scale[k]
     entries = {e.drive: e for e in find_entries(calibration)}
     identified, scatter = (
         np.array([getattr(entries[d.name], key) if d.name in entries else 0.0 for d in drives])
         for key in ("identified", "scatter")
     )
-    zeros = project_out_zeros(slopes, o)
-    told = np.linalg.matrix_rank(zeros) / max(o.size, 1)
+    noise = calibration.noise
+    model = max(noise.sigma, noise.residual_sigma)
+    share = _share_that_is_new(calibration, repetition, model)
     return find_mistake(
         deviations,
-        zeros,
+        slopes,
+        spread=scaled @ _root(_known_beforehand(calibration, problem, stood[0], share)),
+        sigma=share * model,
+        model_sigma=model,
+        model_dof=noise.residual_dof,
+        dof=o.size - o.n_zeros,
         before=calibration.active_offsets,
         identified=identified,
         entered=session.active_offsets,
         names=tuple(d.name for d in drives),
         rounding=np.nan_to_num(scatter),
-        noise=calibration.rms_after / calibration.row_factor * math.sqrt(told),
     )
+
+
+def _share_that_is_new(calibration: Calibration, repetition: Repetition, sigma: float) -> float:
+    """Part of σ that differs from session to session: errors of the model repeat.
+
+    1 where the readings do not tell.
+    """
+    if calibration.prior or not repetition.scatter_dof >= FEWEST:
+        return 1.0
+    return min(repetition.scatter / sigma, 1.0)
+
+
+def _known_beforehand(
+    calibration: Calibration, problem: CalibrationProblem, stood: Array, share: float
+) -> Array:
+    """Covariance of the parameters before a new session is read, scaled as the problem's.
+
+    Of the machine what the calibration left, of gauges that stand anew their tolerances.
+
+    Args:
+        calibration: The calibration.
+        problem: Of the new session.
+        stood: What of the calibration's covariance is from how its gauges stood, [SI].
+        share: Part of σ that is new each time.
+
+    Returns:
+        Shape (n_free, n_free).
+    """
+    n = problem.n_machine
+    found = np.zeros((problem.n_free, problem.n_free))
+    of_machine = share**2 * (np.nan_to_num(calibration.covariance) - stood) + stood
+    found[:n, :n] = of_machine / np.outer(*[problem.theta_scale[:n]] * 2)
+    found[n:, n:] = np.diag(1.0 / problem.prior_precision[n:])
+    return found
+
+
+def _root(covariance: Array) -> Array:
+    """R with R Rᵀ a covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _further_changes(

@@ -149,6 +149,11 @@ def test_a_mistake_solved_by_hand():
     slopes = np.array([[1.0, 0.0], [0.0, 2.0], [0.0, -2.0]])
     change = np.array([1.0, 3.0])
     known = {
+        "spread": np.zeros((3, 1)),
+        "sigma": 0.01,
+        "model_sigma": 0.01,
+        "model_dof": 1e6,
+        "dof": 3,
         "before": np.zeros(2),
         "identified": change,
         "entered": change,
