@@ -9,8 +9,8 @@ the change), take the column beside it (I), or take another drive's.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from itertools import combinations, permutations
 from typing import Literal
 
@@ -31,8 +31,16 @@ EXPLAINED = 0.2
 the reason; or what chance leaves, if that is more."""
 
 KNOWN_LEAVES = 2.0
-"""Times what is expected of deviations that a known mistake may leave at most, to be the reason;
-readings answer in proportion to small changes only."""
+"""Times what is expected of deviations that a known mistake may leave at most, to be the reason."""
+
+MOST_TRIED = 12
+"""Guesses whose readings are computed."""
+
+STEPS = 2
+"""Towards the offset of one drive that explains most."""
+
+NOTHING = 1e-9
+"""Part of the largest singular value below which one is nothing."""
 
 AS_GOOD = 1.05
 """Times what the best of the mistakes leaves up to which the simpler one is held to be it: what
@@ -66,12 +74,12 @@ class _Guess:
     kind: Mistake
     drives: tuple[int, ...]
     active: Array
-    left: float
+    left: float = math.nan
     """What it leaves of what offsets can explain, r.m.s., [σ]."""
 
 
 def find_mistake(
-    deviations: Array,
+    deviate: Callable[[Array], Array],
     slopes: Array,
     *,
     spread: Array,
@@ -91,7 +99,8 @@ def find_mistake(
     known of machine and gauges.
 
     Args:
-        deviations: New readings less those of the calibrated machine, zeros eliminated, (n,), [m].
+        deviate: New readings less those of the calibrated machine with some offsets in the
+            controller, shape (n_drives,), [m, rad]; zeros eliminated, shape (n,), [m].
         slopes: How the readings answer to the offsets of the drives, zeros eliminated, shape
             (n, n_drives), [m per m or rad].
         spread: Root of the covariance that deviations have of what is not known, shape (n, m), [m].
@@ -105,26 +114,24 @@ def find_mistake(
         names: Of the drives.
         rounding: Differences that are none, shape (n_drives,), [m, rad].
     """
-    weighed = whiten(np.column_stack([deviations, slopes]), spread, sigma=sigma)
-    own, answers = weighed[:, 0], weighed[:, 1:]
-    # what offsets have no part in is error of the model, and stays whatever is entered
-    solution, _, rank, _ = np.linalg.lstsq(answers, own, rcond=None)
-    shown = answers @ solution
-    chance = math.sqrt(float(special.chdtri(max(rank, 1), BY_CHANCE)) / own.size)
+    seen = _Seen.of(deviate, whiten(slopes, spread, sigma=sigma), spread, sigma)
+    shown = seen.shown(entered)
+    chance = math.sqrt(float(special.chdtri(max(seen.rank, 1), BY_CHANCE)) / len(shown))
     allowed = max(EXPLAINED * _rms(shown), chance)
-    guesses = [
-        _Guess(kind, drives, active, _rms(shown - answers @ (entered - active)))
-        for kind, drives, active in _guesses(before, identified, entered, rounding)
-    ]
-    known = [g for g in guesses if g.left <= allowed]
+    # readings answer in proportion to small changes only: those that come near are looked at
+    likely = sorted(
+        _guesses(before, identified, entered, rounding),
+        key=lambda g: _rms(shown - seen.answers @ (entered - g.active)),
+    )[:MOST_TRIED]
+    known = [g for g in map(seen.judge, likely) if g.left <= allowed]
     if not known:
-        known = [g for g in _single(shown, answers, entered, rounding) if g.left <= allowed]
+        single = map(seen.judge, _single(seen, entered, rounding))
+        known = [g for g in single if g.left <= allowed]
     if not known:
         return None
     least = max(min(g.left for g in known) * AS_GOOD, chance)
     best = min((g for g in known if g.left <= least), key=lambda g: (len(g.drives), g.left))
-    missing = entered - best.active
-    left = whiten(deviations - slopes @ missing, spread, sigma=model_sigma)
+    left = whiten(deviate(best.active), spread, sigma=model_sigma)
     excess = float(left @ left) / dof
     if best.kind == "one differs":  # any offset of one drive: it must explain all but chance
         if special.fdtrc(dof, model_dof, excess) < BY_CHANCE:
@@ -143,10 +150,44 @@ def find_mistake(
     )
 
 
-def _guesses(
-    before: Array, identified: Array, entered: Array, rounding: Array
-) -> Iterator[tuple[Mistake, tuple[int, ...], Array]]:
-    """Known mistakes: their kind, the drives and what is in the controller then."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """Deviations by their likelihood, [σ]."""
+
+    deviate: Callable[[Array], Array]
+    answers: Array
+    """To the offsets, shape (n, n_drives), [per m or rad]."""
+    directions: Array
+    """An orthonormal basis of what offsets can explain, shape (n, rank)."""
+    spread: Array
+    sigma: float
+
+    @staticmethod
+    def of(deviate: Callable[[Array], Array], answers: Array, spread: Array, sigma: float) -> _Seen:
+        left, sizes, _ = np.linalg.svd(answers, full_matrices=False)
+        kept = sizes > NOTHING * sizes.max(initial=0.0)
+        return _Seen(deviate, answers, left[:, kept], spread, sigma)
+
+    @property
+    def rank(self) -> int:
+        """How many sums of offsets the readings tell."""
+        return int(self.directions.shape[1])
+
+    def shown(self, active: Array) -> Array:
+        """What offsets can explain of the deviations with some active, shape (n,), [σ].
+
+        What they have no part in is error of the model, and stays whatever is entered.
+        """
+        own = whiten(self.deviate(active), self.spread, sigma=self.sigma)
+        return np.asarray(self.directions @ (self.directions.T @ own))
+
+    def judge(self, guess: _Guess) -> _Guess:
+        """A guess with what it leaves."""
+        return replace(guess, left=_rms(self.shown(guess.active)))
+
+
+def _guesses(before: Array, identified: Array, entered: Array, rounding: Array) -> Iterator[_Guess]:
+    """Known mistakes, not yet judged."""
     change = entered - before
     kinds: tuple[tuple[Mistake, Array], ...] = (
         ("not entered", before),
@@ -165,25 +206,28 @@ def _guesses(
             for drives in combinations(other, count):
                 active = np.array(entered)
                 active[list(drives)] = values[list(drives)]
-                yield kind, drives, active
+                yield _Guess(kind, drives, active)
     if entered.size > MOST_DRIVES:
         return
     for order in permutations(range(entered.size)):
         active = entered[list(order)]
         drives = tuple(i for i in range(entered.size) if order[i] != i)
         if any(abs(active[i] - entered[i]) > rounding[i] for i in drives):
-            yield "interchanged", drives, active
+            yield _Guess("interchanged", drives, active)
 
 
-def _single(shown: Array, slopes: Array, entered: Array, rounding: Array) -> Iterator[_Guess]:
+def _single(seen: _Seen, entered: Array, rounding: Array) -> Iterator[_Guess]:
     """For each drive the offset that explains most by itself."""
     for i in range(entered.size):
-        square = float(slopes[:, i] @ slopes[:, i])
-        missing = float(slopes[:, i] @ shown) / square if square > 0.0 else 0.0
-        if abs(missing) > rounding[i]:
-            active = np.array(entered)
-            active[i] -= missing
-            yield _Guess("one differs", (i,), active, _rms(shown - slopes[:, i] * missing))
+        answer = seen.answers[:, i]
+        square = float(answer @ answer)
+        if square == 0.0:
+            continue
+        active = np.array(entered)
+        for _ in range(STEPS):
+            active[i] -= float(answer @ seen.shown(active)) / square
+        if abs(active[i] - entered[i]) > rounding[i]:
+            yield _Guess("one differs", (i,), active)
 
 
 def _rms(values: Array) -> float:

@@ -18,6 +18,7 @@ from scipy import special
 
 from orthocal.arguments import require_kind
 from orthocal.assess.entering import ControllerEntry, find_entries
+from orthocal.assess.expectation import Expectation, expect
 from orthocal.assess.mistakes import EnteringMistake, find_mistake
 from orthocal.assess.repetition import Repetition, measure_repetition
 from orthocal.calibration.calibration import Calibration
@@ -26,7 +27,6 @@ from orthocal.calibration.repeating import repeat_fit, restore_gauge_covariance
 from orthocal.diagnosis.rows import ResidualRow
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import Fit
-from orthocal.estimation.problem import CalibrationProblem
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.measurement.session import Session
 from orthocal.statistics.chance import BY_CHANCE, confidence_factor
@@ -175,6 +175,11 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
     differ = _gauges_differ(fit, refit, stood)
     more = math.hypot(calibration.rms_after, differ) / (calibration.rms_after or math.nan)
     repetition = measure_repetition(calibration, refit)
+    expected = expect(calibration, fit, stood=stood[0])
+    if calibration.prior:  # residuals beside a prior are few, and expect nothing
+        excess = expected.chance(sigma_dof=calibration.noise.dof)
+    else:
+        excess = _excess_probability(calibration, fit, refit, stood)
     found = Validation(
         title=session.title,
         offsets_stated=all(one.controller_offsets is not None for one in given),
@@ -184,7 +189,7 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
         achieved_largest=refit.largest_before,
         refit_rms=refit.rms_after,
         refit_largest=refit.largest_after,
-        excess_probability=_excess_probability(calibration, fit, refit, stood),
+        excess_probability=excess,
         changes=_further_changes(calibration, refit, repetition, stood),
         mistake=None,
         enter=entries,
@@ -193,7 +198,7 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
     )
     if found.confirmed is not False:
         return found
-    mistake = _find_mistake(calibration, fit, session, repetition, stood)
+    mistake = _find_mistake(calibration, expected, repetition)
     slip = mistake is not None and mistake.kind != "one differs"
     enter = entries if slip else find_entries(refit)
     return replace(found, mistake=mistake, enter=enter)
@@ -218,44 +223,38 @@ def _entered(calibration: Calibration, session: Session) -> Session:
 
 
 def _find_mistake(
-    calibration: Calibration,
-    fit: Fit,
-    session: Session,
-    repetition: Repetition,
-    stood: Sequence[Array],
+    calibration: Calibration, expected: Expectation, repetition: Repetition
 ) -> EnteringMistake | None:
-    """The mistake in entering offsets that explains a session, if one does.
-
-    Deviations are held against all that they may be without a mistake: noise, what the calibration
-    does not know of its parameters, and how the gauges stand, this time.
-    """
-    drives, o, problem = session.robot.drives, fit.problem.observations, fit.problem
-    known = problem.prior_mean[problem.n_machine :] * problem.theta_scale[problem.n_machine :]
-    theta = np.append([p.value for p in calibration.free], known)
-    deviations = project_out_zeros(problem.values - problem.predict(theta), o)
-    scaled = project_out_zeros(fit.jacobian, o)
-    slopes = np.zeros((o.size, len(drives)))
-    for i, drive in enumerate(drives):
-        name = f"{drive.name}.offset"
-        if name in problem.free:
-            k = problem.free.index(name)
-            slopes[:, i] = scaled[:, k] / problem.theta_scale[k]
+    """The mistake in entering offsets that explains a session, if one does."""
+    if not expected.sigma > 0.0:
+        return None
+    problem = expected.fit.problem
+    session, drives = problem.session, problem.robot.drives
+    offsets = {i: f"{d.name}.offset" for i, d in enumerate(drives)}
+    told = {i: name for i, name in offsets.items() if name in problem.free}
+    slopes = np.zeros((problem.observations.size, len(drives)))
+    for i, name in told.items():
+        k = problem.free.index(name)
+        slopes[:, i] = expected.slopes[:, k] / problem.theta_scale[k]
     entries = {e.drive: e for e in find_entries(calibration)}
     identified, scatter = (
         np.array([getattr(entries[d.name], key) if d.name in entries else 0.0 for d in drives])
         for key in ("identified", "scatter")
     )
-    noise = calibration.noise
-    model = max(noise.sigma, noise.residual_sigma)
-    share = _share_that_is_new(calibration, repetition, model)
+    share = _share_that_is_new(calibration, repetition, expected.sigma)
+
+    def deviate(active: Array) -> Array:
+        missing = session.active_offsets - active
+        return expected.deviations(more={name: missing[i] for i, name in told.items()})
+
     return find_mistake(
-        deviations,
+        deviate,
         slopes,
-        spread=scaled @ _root(_known_beforehand(calibration, problem, stood[0], share)),
-        sigma=share * model,
-        model_sigma=model,
-        model_dof=noise.residual_dof,
-        dof=o.size - o.n_zeros,
+        spread=expected.spread(share=share),
+        sigma=share * expected.sigma,
+        model_sigma=expected.sigma,
+        model_dof=calibration.noise.residual_dof,
+        dof=expected.dof,
         before=calibration.active_offsets,
         identified=identified,
         entered=session.active_offsets,
@@ -272,36 +271,6 @@ def _share_that_is_new(calibration: Calibration, repetition: Repetition, sigma: 
     if calibration.prior or not repetition.scatter_dof >= FEWEST:
         return 1.0
     return min(repetition.scatter / sigma, 1.0)
-
-
-def _known_beforehand(
-    calibration: Calibration, problem: CalibrationProblem, stood: Array, share: float
-) -> Array:
-    """Covariance of the parameters before a new session is read, scaled as the problem's.
-
-    Of the machine what the calibration left, of gauges that stand anew their tolerances.
-
-    Args:
-        calibration: The calibration.
-        problem: Of the new session.
-        stood: What of the calibration's covariance is from how its gauges stood, [SI].
-        share: Part of σ that is new each time.
-
-    Returns:
-        Shape (n_free, n_free).
-    """
-    n = problem.n_machine
-    found = np.zeros((problem.n_free, problem.n_free))
-    of_machine = share**2 * (np.nan_to_num(calibration.covariance) - stood) + stood
-    found[:n, :n] = of_machine / np.outer(*[problem.theta_scale[:n]] * 2)
-    found[n:, n:] = np.diag(1.0 / problem.prior_precision[n:])
-    return found
-
-
-def _root(covariance: Array) -> Array:
-    """R with R Rᵀ a covariance."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _further_changes(

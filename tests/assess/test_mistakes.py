@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from fleets import Fleet
 
-from orthocal import calibrate, load_plan, simulate_session, summarize, validate_calibration
+from orthocal import (
+    Choice,
+    calibrate,
+    draw_errors,
+    load_plan,
+    simulate_session,
+    summarize,
+    validate_calibration,
+)
 from orthocal.assess.entering import entered_offsets, find_entries
 from orthocal.assess.mistakes import find_mistake
 
@@ -111,6 +119,27 @@ def _is_alike(right, before, active, kind):
     )
 
 
+@pytest.mark.slow
+def test_of_readings_of_rods_too(root):
+    """Eighteen readings by a ball, all errors identified: few, yet each mistake is named."""
+    plan = load_plan(root / "examples/workshop/plan.yaml")
+    tolerances = {"*.offset_mm": 2.0}
+    for seed in (0, 1, 5):
+        errors = draw_errors(plan.robot, ["*"], seed=seed, tolerances=tolerances)
+        session = simulate_session(plan, errors, seed=seed).session
+        choice = Choice("full", tolerances=tolerances)
+        calibration = calibrate(session, choice, solver="eliminated")
+        right = entered_offsets(calibration)
+        for slip in ("right", "left as it was", "sign", "twice"):
+            kind, enter = SLIPS[slip]
+            entered = plan.with_controller(enter(right, np.zeros(3)))
+            measured = simulate_session(entered, errors, seed=1000 + seed).session
+            claimed = plan.with_controller(right).with_values(measured.values)
+            found = validate_calibration(calibration, claimed)
+            assert found.confirmed is (slip == "right"), (seed, slip)
+            assert (found.mistake and found.mistake.kind) == kind, (seed, slip)
+
+
 def test_the_column_beside_it(plan, machines):
     """The identified offsets of a full model, entered instead of those that belong there."""
     errors, _ = machines[0]
@@ -160,13 +189,17 @@ def test_a_mistake_solved_by_hand():
         "names": ("a", "b"),
         "rounding": np.full(2, 1e-9),
     }
-    found = find_mistake(slopes @ [0.0, 6.0], slopes, **known)
+
+    def find(missing):
+        return find_mistake(lambda c: slopes @ (missing - (change - c)), slopes, **known)
+
+    found = find([0.0, 6.0])
     assert (found.kind, found.drives, found.all_drives) == ("wrong sign", ("b",), False)
     assert found.active == pytest.approx([1.0, -3.0])
     assert found.by == pytest.approx([-6.0])
     assert found.rms == pytest.approx(0.0, abs=1e-12)
     # one drive by itself, and two at once that no slip explains
-    found = find_mistake(slopes @ [0.4, 0.0], slopes, **known)
+    found = find([0.4, 0.0])
     assert (found.kind, found.drives) == ("one differs", ("a",))
     assert found.by == pytest.approx([-0.4])
-    assert find_mistake(slopes @ [1.7, -1.1], slopes, **known) is None
+    assert find([1.7, -1.1]) is None
