@@ -117,6 +117,8 @@ def find_mistake(
     seen = _Seen.of(deviate, whiten(slopes, spread, sigma=sigma), spread, sigma)
     shown = seen.shown(entered)
     chance = math.sqrt(float(special.chdtri(max(seen.rank, 1), BY_CHANCE)) / len(shown))
+    if _rms(shown) <= chance:  # other offsets would not help
+        return None
     allowed = max(EXPLAINED * _rms(shown), chance)
     # readings answer in proportion to small changes only: those that come near are looked at
     likely = sorted(
