@@ -1,6 +1,7 @@
 # Everything a fresh machine with Python 3.11 or newer and make needs.
 #   make calibrate   set up, and calibrate the paper's Experiment 2
 #   make test        set up with the test tools, and run all checks
+#   make docs        set up with the tools for pages, and write them to out/docs
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -10,8 +11,9 @@ WORKERS ?= $(shell expr 1 + `getconf _NPROCESSORS_ONLN`)
 
 INSTALLED = $(VENV)/.installed
 TESTED = $(VENV)/.installed-test
+DOCUMENTED = $(VENV)/.installed-docs
 
-.PHONY: calibrate test check clean
+.PHONY: calibrate test check docs clean
 
 calibrate: $(INSTALLED)
 	$(VENV)/bin/orthocal calibrate $(SESSION) --out out/$(notdir $(SESSION))
@@ -24,6 +26,10 @@ check: $(TESTED)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+
+docs: $(DOCUMENTED)
+	$(VENV)/bin/python -m sphinx -E -W -q --keep-going -b html docs out/docs
+	@echo "Wrote out/docs/index.html"
 
 clean:
 	rm -rf $(VENV) out build dist
@@ -38,3 +44,7 @@ $(INSTALLED): pyproject.toml | $(VENV)/bin/python
 $(TESTED): pyproject.toml | $(VENV)/bin/python
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable ".[test]"
 	touch $@ $(INSTALLED)
+
+$(DOCUMENTED): pyproject.toml | $(VENV)/bin/python
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable ".[docs]"
+	touch $@

@@ -1,8 +1,9 @@
-"""Examples run headless and stay short; the README's commands and Python run as they stand."""
+"""Examples run headless and stay short; commands and Python of all pages run as they stand."""
 
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -38,49 +39,76 @@ def test_an_example_runs_from_anywhere(script):
     assert len(script.read_text().splitlines()) <= 80
 
 
-def blocks(language):
-    text = (ROOT / "README.md").read_text()
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def blocks(language, page):
+    """What a page shows of a language."""
+    text = (ROOT / page).read_text()
     return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
 
 
-def test_the_readmes_python_runs(root):
-    for code in blocks("python"):
+def commands(page):
+    """Those of a page's shell blocks that are orthocal's, or make files for it; `make` runs these
+    tests. Where one ends otherwise than well, a comment behind it says so."""
+    found = []
+    for block in blocks("sh", page):
+        for line in block.replace("\\\n", " ").splitlines():
+            command, _, comment = line.partition("  # ")
+            if command.startswith(("orthocal ", "printf ", "cp ", "cat ", "mkdir ")):
+                code = re.search(r"exit code (\d+)", comment)
+                found.append((command, int(code[1]) if code else 0))
+    return found
+
+
+def with_code(language):
+    return [p.relative_to(ROOT).as_posix() for p in PAGES if blocks(language, p)]
+
+
+@pytest.mark.parametrize("page", with_code("python"))
+def test_the_python_of_a_page_runs(root, page):
+    for code in blocks("python", page):
         done = subprocess.run(
             [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True
         )
         assert done.stderr == ""
 
 
-def test_the_readmes_commands_run(root, tmp_path):
-    """Those of orthocal itself, in a copy of the examples; `make` is what runs these tests."""
-    (tmp_path / "examples").symlink_to(root / "examples")
-    commands = [
-        line
-        for block in blocks("sh")
-        for line in block.splitlines()
-        if line.startswith(("orthocal ", "printf "))
-    ]
-    assert len(commands) >= 5
-    for command in commands:
-        words = command.replace("orthocal ", f"{sys.executable} -m orthocal.cli ", 1)
-        done = subprocess.run(words, shell=True, cwd=tmp_path, capture_output=True, text=True)
-        # a comparison that finds error of the model says so by its exit code
-        expected = 3 if "compare examples/table1" in command else 0
+@pytest.mark.parametrize("page", with_code("sh"))
+def test_the_commands_of_a_page_run(root, page, tmp_path):
+    """One after the other, as they stand, in a folder with a copy of the examples."""
+    shutil.copytree(root / "examples", tmp_path / "examples")
+    (tmp_path / "out").mkdir()
+    assert commands(page)
+    for command, expected in commands(page):
+        words = re.sub(r"\borthocal (?=[a-z])", f"{sys.executable} -m orthocal.cli ", command)
+        done = subprocess.run(
+            words,
+            shell=True,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            stdin=subprocess.DEVNULL,
+        )
         assert done.returncode == expected, f"{command}: {done.stderr}"
 
 
+EXPERIMENT = "examples/table1/experiment-2"
+
+
 @pytest.mark.parametrize(
-    ("title", "command"),
+    ("page", "title", "command"),
     [
-        ("Calibration of orthoglide", "calibrate examples/table1/experiment-2"),
-        ("What was identified\n", "calibrate examples/table1/experiment-2 --details"),
-        ("At the tool\n", "calibrate examples/table1/experiment-2 --details"),
-        ("Verdict", "compare examples/table1/experiment-2"),
-        ("The paper's six equations miss", "study linearisation orthoglide"),
+        ("README.md", "Calibration of orthoglide", f"calibrate {EXPERIMENT}"),
+        ("docs/results.md", "Calibration of orthoglide", f"calibrate {EXPERIMENT}"),
+        ("docs/results.md", "What was identified\n", f"calibrate {EXPERIMENT} --details"),
+        ("docs/results.md", "At the tool\n", f"calibrate {EXPERIMENT} --details"),
+        ("docs/results.md", "Verdict", f"compare {EXPERIMENT}"),
+        ("docs/planning.md", "The paper's six equations", "study linearisation orthoglide"),
     ],
 )
-def test_the_readmes_printed_results_are_the_real_ones(title, command):
-    shown = next(b for b in blocks("text") if title in b)
+def test_printed_results_on_a_page_are_the_real_ones(page, title, command):
+    shown = next(b for b in blocks("text", page) if title in b)
     done = run(*command.split())
     printed = [line.rstrip() for line in done.stdout.splitlines()]
     for line in shown.splitlines():
@@ -89,8 +117,8 @@ def test_the_readmes_printed_results_are_the_real_ones(title, command):
         assert [line.rstrip() for line in shown.splitlines()] == printed
 
 
-def test_what_the_readme_says_of_the_papers_readings_is_what_the_example_prints():
-    text = " ".join((ROOT / "README.md").read_text().split())
+def test_what_is_said_of_the_papers_readings_is_what_the_example_prints():
+    text = " ".join((ROOT / "docs/results.md").read_text().split())
     script = ROOT / "examples/02_what_readings_are_worth.py"
     done = run(str(script))
     rows = {}
@@ -115,16 +143,18 @@ def test_what_the_readme_says_of_the_papers_readings_is_what_the_example_prints(
 
 def test_what_the_readme_says_of_its_picture_and_of_what_remains_is_so(root):
     text = " ".join((ROOT / "README.md").read_text().split())
+    said = " ".join((ROOT / "docs/results.md").read_text().split())
     calibration = calibrate(root / "examples/table1/experiment-2")
     assert "drawn twelve times its size" in text
     assert draw_scene(calibration).exaggeration == 12.0
-    assert "what remains is ten times what the gauge itself would leave" in text
+    assert "what remains is ten times what the gauge itself would leave" in said
     noise, gauge = calibration.noise, calibration.session.gauge_sigma
     assert noise.residual_sigma / gauge == pytest.approx(10.0, abs=0.5)
 
 
-def test_the_session_that_the_readme_shows_can_be_read(tmp_path):
-    (session,), (readings,) = blocks("yaml"), blocks("csv")
+def test_the_session_that_a_page_shows_can_be_read(tmp_path):
+    (session,) = blocks("yaml", "docs/sessions.md")
+    readings = next(b for b in blocks("text", "docs/sessions.md") if "reading_mm" in b)
     (tmp_path / "session.yaml").write_text(session)
     (tmp_path / "readings.csv").write_text(readings)
     loaded = load_session(tmp_path)

@@ -55,7 +55,7 @@ def draw_errors(
         patterns: Names or globs of the parameters to draw; '!' takes out. Of a sum and the errors
             that it is made of only these are drawn.
         seed: Of the random numbers.
-        tolerances: Name or glob with its unit, such as *.offset_mm, to another standard deviation
+        tolerances: Name or glob with its unit, such as `*.offset_mm`, to another standard deviation
             than the robot's.
 
     Raises:
