@@ -71,7 +71,9 @@ def fit_changed_machine(
     whiten = np.sqrt(fit.weights) / sigma
     for _ in range(MOST_ITERATIONS):
         try:
-            prediction, slopes = _linearise(problem, beta, directions, size, after, session)
+            prediction, slopes = _linearise(
+                problem, beta, directions @ (size * after).T, session, fit.solution.passive
+            )
         except ClosureError:
             break
         changing = np.where(after[session], 1.0, 0.0) * (slopes @ directions) / units
@@ -93,18 +95,26 @@ def fit_changed_machine(
 def _linearise(
     problem: CalibrationProblem,
     beta: Array,
-    directions: Array,
-    size: Array,
-    after: NDArray[np.bool_],
+    changed: Array,
     session: Indices,
+    passive: Array,
 ) -> tuple[Array, Array]:
-    """Readings of each session's own machine, and their slopes there."""
+    """Readings of each session's own machine, and their slopes there.
+
+    Args:
+        problem: All errors of the machine.
+        beta: What is common to all sessions, shape (n,), [tolerances].
+        changed: What has changed by each session, shape (n, n_sessions), [tolerances].
+        session: Of each entry, shape (n_entries,).
+        passive: Passive coordinates near by, shape (n_postures, n_passive).
+    """
     prediction = np.zeros(session.size)
     slopes = np.zeros((session.size, beta.size))
-    for changed in np.unique(after, axis=0):
-        of = (after[session] == changed).all(axis=1)
-        theta = beta + directions @ (size * changed)
-        h, jacobian = problem.linearise(theta * problem.theta_scale)
+    machines, which = np.unique(changed, axis=1, return_inverse=True)
+    for i in range(machines.shape[1]):
+        of = which.ravel()[session] == i
+        theta = (beta + machines[:, i]) * problem.theta_scale
+        h, jacobian = problem.linearise(theta, problem.close(theta, start=passive))
         prediction[of], slopes[of] = h[of], jacobian[of]
     return prediction, slopes
 
