@@ -224,6 +224,16 @@ def test_a_wrong_reading_is_no_change(pairs):
     assert pairs.find_near(values).none_found
 
 
+def test_offsets_that_were_entered_and_not_stated_are_asked_for(root):
+    """The paper's third experiment had those of the second in the controller, without a word."""
+    table1 = [root / f"examples/table1/experiment-{n}" for n in (2, 3)]
+    together, first = calibrate(table1), calibrate(table1[0])
+    assert {c.of for c in together.changes.found} == {"x_slide", "y_slide", "z_slide"}
+    for change in together.changes.found:
+        assert change.size == pytest.approx(-first[change.name].value, abs=0.15e-3)
+    assert "(`controller.offsets_mm`) in experiment-3: if others" in decide(together).action
+
+
 def test_nothing_is_told_where_nothing_tells_the_noise(root):
     """Differences without a σ, as many as there are parameters: no change is claimed."""
     silent = load_session(root / "examples/table1/experiment-2")

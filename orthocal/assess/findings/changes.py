@@ -45,11 +45,18 @@ def _moved(calibration: Calibration, changes: Changes) -> Finding:
         numbers[f"{c.name}_std_{c.edge_unit}"] = c.std * c.edge_factor
     last = max((c.since for c in changes.found), key=changes.sessions.index)
     file = _file_of(calibration, changes, last)
+    action = _apart(changes, last)
+    unstated = _unstated(calibration, changes)
+    if unstated and all(c.part == "drive" for c in changes.found):
+        action = (
+            f"Say which offsets were active (`controller.offsets_mm`) in {joined(unstated)}: if "
+            f"others had been entered, it is that. Else: {action[0].lower()}{action[1:]}"
+        )
     return Finding(
         "machine changed",
         "stops",
         text,
-        _apart(changes, last),
+        action,
         numbers,
         tuple(Place(file=file, parameter=c.name) for c in changes.found),
     )
@@ -142,6 +149,18 @@ def _largest(changes: Changes, tested: Sequence[TestedChange]) -> dict[str, floa
         size = changes.seen_from(t) * t.edge_factor
         sizes[t.edge_unit] = max(sizes.get(t.edge_unit, 0.0), size)
     return sizes
+
+
+def _unstated(calibration: Calibration, changes: Changes) -> list[str]:
+    """Sessions that do not say which offsets were active in the controller."""
+    parts = calibration.session.parts
+    if len(parts) != len(changes.sessions):
+        return []
+    return [
+        label
+        for label, part in zip(changes.sessions, parts, strict=True)
+        if part.controller_offsets is None
+    ]
 
 
 def _file_of(calibration: Calibration, changes: Changes, label: str) -> str | None:
