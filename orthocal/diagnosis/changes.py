@@ -49,6 +49,13 @@ ANYTHING = 0.003
 NEARLY = 6.0
 """χ² by which another explanation may be worse and still be as good."""
 
+CLEARLY = 12.0
+"""χ² by which an error of another part must explain more than drives and legs to be preferred:
+there are some hundred of them, and zeros are lost sooner than a part bends."""
+
+BENT = 0.1
+"""Part of a χ² that it may be off by, for what bends in the machine and how gauges stand."""
+
 MOST_CHANGES = 6
 """That are told of one machine."""
 
@@ -255,7 +262,8 @@ def _better_elsewhere(
     best = max(squares, key=lambda s: s.square)
     least = common.square - _take_out(columns, common, steps).square
     margin = NEARLY * noise.scale**2
-    if best.square <= least + margin * (2 - len(steps)):
+    clearly = CLEARLY * noise.scale**2 * (2 - len(steps))
+    if best.square <= (1.0 + BENT) * least + clearly:
         return None
     parts = dict.fromkeys(
         columns.suspects[s.suspect].words for s in squares if s.square > best.square - margin
