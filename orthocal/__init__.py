@@ -68,6 +68,7 @@ _HOMES = {
     "draw_errors": "orthocal.measurement.synthetic",
     "draw_scene": "orthocal.show.scene.drawing",
     "export_calibration": "orthocal.export.formats",
+    "find_changes": "orthocal.calibration.repeating",
     "join_sessions": "orthocal.measurement.joining",
     "load_calibration": "orthocal.calibration.file",
     "load_plan": "orthocal.measurement.session_file",
@@ -141,6 +142,7 @@ __all__ = [
     "draw_errors",
     "draw_scene",
     "export_calibration",
+    "find_changes",
     "join_sessions",
     "load_calibration",
     "load_plan",
@@ -175,7 +177,7 @@ if TYPE_CHECKING:
     from orthocal.calibration.calibration import Calibration
     from orthocal.calibration.file import load_calibration, write_calibration
     from orthocal.calibration.machine import Machine
-    from orthocal.calibration.repeating import repeat_calibration, restore_session
+    from orthocal.calibration.repeating import find_changes, repeat_calibration, restore_session
     from orthocal.calibration.tables import parameter_table, reading_table
     from orthocal.errors import (
         CalibrationFileError,

@@ -124,6 +124,7 @@ def _read_document(data: Any, file: str, *, path: Path | None = None) -> Calibra
             where=f"{file}: sensor_bias",
         )
     _check_singular_values(record.identifiability, file)
+    _check_changes(record, file)
     calibration = Calibration(
         **{name: getattr(record, name) for name in CalibrationRecord.__slots__}, path=path
     )
@@ -256,6 +257,38 @@ def _check_unmodelled(record: CalibrationRecord, file: str) -> None:
             f"expected {n_free} × {count} numbers, free parameters by names",
             where=f"{file}: unmodelled.leakage",
         )
+
+
+def _check_changes(record: CalibrationRecord, file: str) -> None:
+    """Refuse changes of what was not tested, or between sessions that are none."""
+    found = record.changes
+    if found is None:
+        return
+    where = f"{file}: changes"
+    read = list(dict.fromkeys(r.setup.partition("/")[0] for r in record.residuals))
+    if sorted(found.sessions) != sorted(read):
+        raise CalibrationFileError(
+            f"found {', '.join(map(shorten, found.sessions)) or 'none'}; the readings are of "
+            f"{', '.join(map(shorten, read))}",
+            where=f"{where}.sessions",
+        )
+    later = found.sessions[1:]
+    tested = {(t.name, t.unit) for t in found.tested}
+    since = [(f"tested[{i}]", t.since) for i, t in enumerate(found.tested)]
+    since += [(f"found[{i}]", c.since) for i, c in enumerate(found.found)]
+    since += [] if found.other is None else [("other", found.other.since)]
+    for key, label in since:
+        if label not in later:
+            raise CalibrationFileError(
+                f"found '{shorten(label)}'; expected one of {', '.join(later) or 'none'}",
+                where=f"{where}.{key}.since",
+            )
+    for i, change in enumerate(found.found):
+        if (change.name, change.unit) not in tested:
+            raise CalibrationFileError(
+                f"'{shorten(change.name)}' in '{change.unit}' is not among what was tested",
+                where=f"{where}.found[{i}].name",
+            )
 
 
 def _number(value: float) -> float | None:

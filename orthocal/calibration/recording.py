@@ -22,6 +22,7 @@ from orthocal.calibration.records import (
     SetupRecord,
     SolverRecord,
 )
+from orthocal.diagnosis.changes import find_session_changes
 from orthocal.diagnosis.cross_validation import predict_unseen
 from orthocal.diagnosis.rows import ResidualRow
 from orthocal.diagnosis.single_readings import Diagnostics, diagnose_readings
@@ -116,6 +117,7 @@ def assemble_calibration(
         ),
         setups=_setup_records(fit),
         gauges=_gauge_records(fit),
+        changes=find_session_changes(fit, others),
         version=__version__,
     )
     require_loadable(calibration)

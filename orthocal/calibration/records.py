@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from orthocal.diagnosis.change_records import Changes
 from orthocal.diagnosis.rows import ResidualRow
 from orthocal.diagnosis.turned import TurnedSetup
 from orthocal.diagnosis.unmodelled import Unmodelled
@@ -227,3 +228,5 @@ class CalibrationRecord:
     postures: Many[PostureRecord]
     setups: Many[SetupRecord]
     gauges: Many[GaugeRecord]
+    changes: Changes | None = None
+    """What has changed between the sessions; None for a single one."""

@@ -11,8 +11,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arguments import require_kind
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.recording import assemble_calibration
+from orthocal.diagnosis.change_records import Changes
 from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.gauges import find_gauge_covariance
 from orthocal.estimation.loss import Loss
@@ -44,6 +46,27 @@ def repeat_calibration(calibration: Calibration, sessions: Given | Sequence[Give
     session = join_sessions(gather_sessions(sessions))
     nominal = np.array([p.value for p in calibration.free])
     return assemble_calibration(repeat_fit(calibration, session), nominal=nominal)
+
+
+def find_changes(calibration: Calibration) -> Changes | None:
+    """Whether the machine has changed between the sessions of a calibration, and what of it.
+
+    Args:
+        calibration: Of several sessions, in the order in which they were given.
+
+    Returns:
+        What was tested, from which size on it would have been seen, and what was found; None for
+        a calibration of a single session.
+
+    Raises:
+        RobotError, CalibrationFileError: If its file does not say and the robot cannot be loaded.
+        NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
+    """
+    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    if calibration.changes is not None or not calibration.session.parts:
+        return calibration.changes
+    again = repeat_calibration(calibration, restore_session(calibration))
+    return calibration.remember("changes", lambda: again.changes)
 
 
 def repeat_fit(calibration: Calibration, session: Session) -> Fit:

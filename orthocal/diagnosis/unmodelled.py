@@ -10,7 +10,7 @@ and with θᵤ within the tolerances this is known as a spread. It belongs into 
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,7 +105,19 @@ def find_other_errors(fit: Fit, *, spoken_for: Collection[str] = ()) -> OtherErr
     o = problem.observations
     if not names:
         return OtherErrors((), read_only([]), read_only(np.zeros((o.size, 0))))
-    chosen = tuple(parameters[n] for n in names)
+    tolerances = read_only([parameters[n].tolerance for n in names])
+    return OtherErrors(tuple(names), tolerances, read_only(error_slopes(fit, names)))
+
+
+def error_slopes(fit: Fit, names: Sequence[str]) -> Array:
+    """How errors of the machine move the readings at the solution of a fit that has them not free.
+
+    Returns:
+        ∂h of one tolerance of each, gauge zeros eliminated, shape (n_entries, n_names), [m].
+    """
+    problem = fit.problem
+    chosen = tuple(problem.robot.parameters[n] for n in names)
+    values = problem.split_errors(fit.solution.theta)
     selection = Selection(
         label="",
         parameters=chosen,
@@ -113,13 +125,12 @@ def find_other_errors(fit: Fit, *, spoken_for: Collection[str] = ()) -> OtherErr
         mean=read_only(np.zeros(len(names))),
         lower=read_only(np.full(len(names), -np.inf)),
         upper=read_only(np.full(len(names), np.inf)),
-        fixed=problem.split_errors(fit.solution.theta),
+        fixed={n: v for n, v in values.items() if n not in names},
     )
     others = CalibrationProblem(problem.session, selection, noise=problem.noise)
-    at = np.append(np.zeros(len(names)), fit.solution.theta[problem.n_machine :])
+    at = np.append([values.get(n, 0.0) for n in names], fit.solution.theta[problem.n_machine :])
     _, jacobian = others.linearise(at, fit.solution.passive)
-    slopes = project_out_zeros(jacobian[:, : len(names)], o)
-    return OtherErrors(tuple(names), read_only(selection.tolerances), read_only(slopes))
+    return project_out_zeros(jacobian[:, : len(names)], problem.observations)
 
 
 def measure_unmodelled(fit: Fit, others: OtherErrors) -> tuple[Unmodelled, Array]:

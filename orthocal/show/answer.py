@@ -28,6 +28,8 @@ LONGEST_LABEL = 24
 """Characters of a setup and a posture that leave a suspicious reading on one line."""
 
 FURTHER: tuple[Kind, ...] = (
+    "nothing changed",
+    "change not known",
     "suspicious setup",
     "many contradicted",
     "nothing to check by",

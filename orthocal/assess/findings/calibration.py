@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from orthocal.arguments import require_kind
 from orthocal.assess.entering import find_entries
+from orthocal.assess.findings.changes import find_machine_changes
 from orthocal.assess.findings.decision import Answer, Decision, first_of
 from orthocal.assess.findings.finding import Finding, Severity
 from orthocal.assess.findings.parameters import (
@@ -51,6 +52,7 @@ def find_findings(calibration: Calibration) -> tuple[Finding, ...]:
     promised = [f for f in at_tool if f.kind == "at the tool"]
     found = [
         *find_turned(calibration),
+        *find_machine_changes(calibration),
         *find_tolerances(calibration),
         *find_doubts(calibration),
         *find_suspicious(calibration),

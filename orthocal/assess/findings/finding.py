@@ -36,6 +36,9 @@ Kind = Literal[
     "gauge overstated",
     "fits",
     "line in the air",
+    "machine changed",
+    "nothing changed",
+    "change not known",
     # of what is entered, and of single parameters
     "no offset",
     "nothing moved",
