@@ -10,12 +10,12 @@ import fcntl
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from orthocal.errors import OrthocalError, OutputError
-from orthocal.files import require_writable_file
+from orthocal.files import require_writable_file, sync_folder
 
 LONGEST_LINE = 2**26
 """[bytes]"""
@@ -50,6 +50,8 @@ class Journal:
             while line := stream.readline(self._longest):
                 number += 1
                 if not line.endswith(b"\n"):
+                    if len(line) >= self._longest:
+                        yield f"{self.path}:{number}", None
                     break
                 yield f"{self.path}:{number}", _parse(line)
                 end = stream.tell()
@@ -102,7 +104,7 @@ def open_journal_file(
         if anew:
             os.ftruncate(descriptor, 0)
         if made:
-            _keep_name(path.parent)
+            sync_folder(path.parent)
         yield Journal(path, descriptor, longest=longest)
     finally:
         os.close(descriptor)
@@ -113,16 +115,6 @@ def _lock(descriptor: int, path: Path, busy: str) -> None:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         raise OrthocalError(busy, where=str(path)) from None
-
-
-def _keep_name(folder: Path) -> None:
-    """Let the name of a new file survive a power cut, where the file system can do that."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def _parse(line: bytes) -> dict[str, Any] | None:
