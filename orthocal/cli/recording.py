@@ -148,6 +148,8 @@ class _Dialogue:
             prompt = named if len(named) <= self._width // 2 else f"row {at + 1} [mm]> "
         if sys.stdin is None:
             raise _Leave
+        if isinstance(sys.stdin, io.TextIOWrapper) and sys.stdin.errors != "replace":
+            sys.stdin.reconfigure(errors="replace")  # what is no text is no number either
         if sys.stdin.isatty() and sys.stdout.isatty():
             with suppress(ImportError):
                 import readline  # noqa: F401 - lines can be edited
@@ -331,8 +333,6 @@ class _Dialogue:
 
 def _read_line() -> str:
     """A line of the standard input that is no terminal; empty at its end."""
-    if isinstance(sys.stdin, io.TextIOWrapper) and sys.stdin.errors != "replace":
-        sys.stdin.reconfigure(errors="replace")
     line = sys.stdin.readline(LONGEST_LINE)
     while line and not line.endswith("\n"):
         more = sys.stdin.readline(LONGEST_LINE)

@@ -269,7 +269,8 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
         lines = _read_lines(journal)
         if session.readings_path is None:
             write_rows_of_plan(session, csv, _table(_rows(session.readings, unread)))
-        session, unread = load_rows(path)  # as nobody else changes it any more
+        if _changed(session):  # before nobody else could any more
+            session, unread = load_rows(path)
         rows = _rows(session.readings, unread)
         content = read_file(csv, error=SessionError)
         done, edited = _done_since(lines, _digest(content))
@@ -289,6 +290,14 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
             yield found
         finally:
             found.close()
+
+
+def _changed(session: Session) -> bool:
+    """Whether the files of a session are others than those that were loaded."""
+    if session.path is None or session.readings_path is None:
+        return True
+    parts = (read_file(f, error=SessionError) for f in (session.path, session.readings_path))
+    return _digest(b"\0".join(parts)) != session.sha256
 
 
 def _write(csv: Path, content: bytes) -> None:
