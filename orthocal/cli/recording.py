@@ -93,11 +93,7 @@ class _Dialogue:
         from orthocal.show.recording import describe_session
 
         recording = self._recording
-        self._say(
-            describe_session(
-                recording.session, recording.rows, redone=recording.redone, width=self._width
-            )
-        )
+        self._say(describe_session(recording, width=self._width))
         self._go_on()
         self._foresight = build_foresight(recording.session)  # while the first posture is read
         with raised_interrupt(), suppress(_Leave):

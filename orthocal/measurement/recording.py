@@ -28,7 +28,7 @@ from orthocal.measurement.schema import LARGEST_READING_MM, MOST_READINGS
 from orthocal.measurement.session import Reading, Session
 from orthocal.measurement.session_file import check_range, load_rows
 from orthocal.measurement.session_output import readings_table
-from orthocal.measurement.table_of_plan import write_rows_of_plan
+from orthocal.measurement.table_of_plan import add_name_of_rows
 from orthocal.units import MM, to_mm
 
 FORMAT = "orthocal/recording/1"
@@ -263,13 +263,16 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
     """
     session, unread = load_rows(path)
     csv = _csv_of(session)
+    _find_names(session, unread)  # refused before anything is written
     with open_journal_file(
         csv.with_name(csv.name + SUFFIX), busy=BUSY, longest=LONGEST_LINE
     ) as journal:
         lines = _read_lines(journal)
-        if session.readings_path is None:
-            write_rows_of_plan(session, csv, _table(_rows(session.readings, unread)))
         if _changed(session):  # before nobody else could any more
+            session, unread = load_rows(path)
+        for file, text in _find_names(session, unread).items():
+            write_file(file, text)
+        if session.readings_path is None:
             session, unread = load_rows(path)
         rows = _rows(session.readings, unread)
         content = read_file(csv, error=SessionError)
@@ -290,6 +293,14 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
             yield found
         finally:
             found.close()
+
+
+def _find_names(session: Session, unread: frozenset[int]) -> dict[Path, str | bytes]:
+    """Files that make a plan a session: its rows, then the YAML that names them."""
+    if session.readings_path is not None or session.path is None:
+        return {}
+    csv, rows = _csv_of(session), _table(_rows(session.readings, unread))
+    return {csv: rows, session.path: add_name_of_rows(session, csv, rows)}
 
 
 def _changed(session: Session) -> bool:

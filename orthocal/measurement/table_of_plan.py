@@ -6,23 +6,22 @@ from pathlib import Path
 
 from orthocal.documents import read_yaml
 from orthocal.errors import SessionError
-from orthocal.files import exists, read_file, write_file
+from orthocal.files import exists, read_file
 from orthocal.measurement.session import Session
 
 
-def write_rows_of_plan(session: Session, csv: Path, text: str) -> None:
-    """Write the rows of a plan without readings, and then their name into its YAML.
+def add_name_of_rows(session: Session, csv: Path, text: str) -> bytes:
+    """The YAML of a plan without readings, with the name of its rows; nothing is written.
 
-    Nothing else changes in the YAML: comments stay. Killed between, it does the same once more.
+    Nothing else changes in it: comments stay.
 
     Args:
         session: The plan.
-        csv: Beside its YAML.
+        csv: Beside its YAML, to be written.
         text: Of the CSV.
 
     Raises:
         SessionError: If there is such a file with other rows, or the YAML cannot be added to.
-        OutputError: If it cannot be written.
     """
     file = session.path
     if file is None:
@@ -44,6 +43,4 @@ def write_rows_of_plan(session: Session, csv: Path, text: str) -> None:
         raise SessionError(
             f"is missing; add `readings: {csv.name}` to it", where=f"{file}: readings"
         )
-    if not exists(csv):
-        write_file(csv, text)
-    write_file(file, added)
+    return added

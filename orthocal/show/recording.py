@@ -13,7 +13,7 @@ from orthocal.assess.wording import counted, joined
 from orthocal.characters import printable
 from orthocal.measurement.guidance import Guidance
 from orthocal.measurement.oddities import Oddity, Slip
-from orthocal.measurement.recording import Row
+from orthocal.measurement.recording import Recording, Row
 from orthocal.measurement.session import Session, Setup
 from orthocal.units import DRIVE_UNITS, MM, to_mm
 
@@ -65,8 +65,9 @@ def _decimal(value: float, decimals: int = 3) -> str:
     return f"{round(float(value), decimals) + 0.0:.{decimals}f}"
 
 
-def describe_session(session: Session, rows: Sequence[Row], *, redone: int, width: int) -> str:
+def describe_session(recording: Recording, *, width: int) -> str:
     """What there is to measure."""
+    session, rows, redone = recording.session, recording.rows, recording.redone
     done = sum(row.value is not None for row in rows)
     title = f"{session.title}: " if session.title else ""
     count = counted(len({r.setup for r in rows}), "setup")
@@ -76,6 +77,11 @@ def describe_session(session: Session, rows: Sequence[Row], *, redone: int, widt
         parts.append(
             f"The last recording was cut off; {counted(redone, 'change')} of it "
             f"{'was' if redone == 1 else 'were'} restored."
+        )
+    if recording.edited:
+        parts.append(
+            f"{recording.path.name} was changed since the last recording was cut off; it counts as "
+            "it is."
         )
     parts.append(
         "Type what the dial shows, in mm; it is on disk before the next question. `help` lists "
@@ -255,9 +261,9 @@ def list_commands(*, width: int) -> str:
 
 
 def conclude(session: Session, rows: Sequence[Row], path: str, *, width: int) -> str:
-    """What is missing, and what comes next."""
+    """What is missing, and what comes next: a command on a line of its own, however long it is."""
     missing = [(i, r) for i, r in enumerate(rows) if r.value is None]
-    own = shlex.quote(path)
+    own = printable(shlex.quote(path))
     if missing:
         parts = []
         for setup in dict.fromkeys(r.setup for _, r in missing):
@@ -265,12 +271,11 @@ def conclude(session: Session, rows: Sequence[Row], path: str, *, width: int) ->
             every = len(of_setup) == sum(r.setup == setup for r in rows)
             places = "all" if every else _spans(of_setup)
             parts.append(f"{setup} {places}")
-        lines = [
+        state = (
             f"{len(missing)} of {counted(len(rows), 'reading')} "
-            f"{'is' if len(missing) == 1 else 'are'} missing: {joined(parts)}.",
-            f"Go on with: orthocal record {own}",
-        ]
-        return "\n".join(wrap(line, width) for line in lines)
+            f"{'is' if len(missing) == 1 else 'are'} missing: {joined(parts)}."
+        )
+        return f"{wrap(state, width)}\nGo on with:\n  orthocal record {own}"
     lines = [f"All {counted(len(rows), 'reading')} are there."]
     if session.controller_offsets is None:
         keys = "offsets_mm" if session.robot.drives[0].unit == "m" else "offsets_deg"
@@ -280,8 +285,8 @@ def conclude(session: Session, rows: Sequence[Row], path: str, *, width: int) ->
             f"`controller: {{{keys}: [{zeros}]}}`, one number a drive: without it only changes of "
             "them can be told."
         )
-    lines.append(f"Next: orthocal calibrate {own}")
-    return "\n".join(wrap(line, width) for line in lines)
+    told = "\n".join(wrap(line, width) for line in lines)
+    return f"{told}\nNext:\n  orthocal calibrate {own}"
 
 
 def _spans(numbers: Sequence[int]) -> str:
