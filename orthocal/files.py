@@ -233,6 +233,16 @@ def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
         raise _refusal(e, folder) from None
 
 
+def sync_folder(folder: Path) -> None:
+    """Let names of files that were made or replaced survive a power cut, where that can be done."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
 def _write(folder: Path, files: Mapping[str, str | bytes]) -> None:
     """Stage all files, and put them in place; what was staged is taken away whatever happens."""
     staged: dict[Path, Path] = {}

@@ -34,6 +34,11 @@ class _Guarded(io.TextIOBase):
         """Of the stream."""
         return "utf-8" if self._stream is None else self._stream.encoding
 
+    @property
+    def errors(self) -> str:  # type: ignore[override] # likewise
+        """What it does with characters that it does not have."""
+        return "strict" if self._stream is None else self._stream.errors or "strict"
+
     def isatty(self) -> bool:
         """Whether it is a terminal."""
         return self._stream is not None and self._stream.isatty()

@@ -12,7 +12,8 @@ from conftest import ROOT
 import orthocal
 
 EDGES = (
-    "characters arguments errors units interrupts streams files cache strict_yaml documents fields"
+    "characters arguments errors units interrupts streams files journal cache strict_yaml "
+    "documents fields"
 )
 
 ALLOWED = {
@@ -26,6 +27,7 @@ ALLOWED = {
     "markup": "characters",
     "streams": "characters errors",
     "files": "characters errors interrupts",
+    "journal": "errors files",
     "documents": "characters errors files strict_yaml",
     "fields": "documents",
     "robot": EDGES,

@@ -158,7 +158,7 @@ def plan(
     if out is not None:
         options = "".join(f" --tolerance '{t}'" for t in tolerance or [])
         comment = (
-            "A plan: fill in readings.csv in its order, then, in this folder,\n"
+            "A plan: here `orthocal record .` leads through it, or fill in readings.csv; then\n"
             f"orthocal calibrate . --model {model}{options}\n"
             "State the offsets that are active in the controller meanwhile, such as\n"
             "controller: {offsets_mm: [0, 0, 0]}, one number a drive.\n"

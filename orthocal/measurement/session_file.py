@@ -57,8 +57,9 @@ def load_session(path: str | Path) -> Session:
 
 
 def _load_session(
-    file: Path, content: bytes, keys: SessionKeys, *, planned: bool = False
+    file: Path, content: bytes, keys: SessionKeys, *, unread: set[int] | None = None
 ) -> Session:
+    """A session with readings; where `unread` is given cells may be empty, and it tells which."""
     if keys.readings is None:
         raise SessionError("is missing; expected the name of a CSV file", where=f"{file}: readings")
     require_plain_name(file, error=SessionError)
@@ -69,7 +70,7 @@ def _load_session(
         )
     readings_path = file.parent / keys.readings
     table = read_file(readings_path, error=SessionError)
-    readings = _read_readings(readings_path, table, plan, planned=planned)
+    readings = _read_readings(readings_path, table, plan, unread=unread)
     digest = hashlib.sha256(content + b"\0" + table).hexdigest()
     session = replace(plan, readings=readings, readings_path=readings_path, sha256=digest)
     check_contacts(session)
@@ -86,9 +87,26 @@ def load_plan(path: str | Path) -> Session:
         SessionError: Naming file and key.
         RobotError: If the robot does not load.
     """
+    session, _ = load_rows(path)
+    return session
+
+
+def load_rows(path: str | Path) -> tuple[Session, frozenset[int]]:
+    """Read a plan, as `load_plan` does, and which of its readings are not there yet.
+
+    Returns:
+        The plan, and indices of its readings that are 0 because nothing was read: of a session with
+        readings its empty cells; else all of them, and it has no `readings_path`.
+
+    Raises:
+        SessionError: Naming file and key.
+        RobotError: If the robot does not load.
+    """
     file, content, keys = _read_keys(Path(path))
     if keys.readings is not None:
-        return _load_session(file, content, keys, planned=True)
+        unread: set[int] = set()
+        session = _load_session(file, content, keys, unread=unread)
+        return session, frozenset(unread)
     read = _read_setups(file, keys)
     count = keys.cycles * sum(len(s.postures or keys.postures) for s, _ in read.values())
     if count > MOST_READINGS:
@@ -107,7 +125,7 @@ def load_plan(path: str | Path) -> Session:
         ]
     session = replace(plan, readings=tuple(readings))
     check_contacts(session)
-    return session
+    return session, frozenset(range(len(readings)))
 
 
 def check_contacts(session: Session) -> None:
@@ -339,7 +357,7 @@ def _check_travel(robot: Robot, drives: Array, *, where: str, joiner: str = ": "
 
 
 def _read_readings(
-    path: Path, content: bytes, plan: Session, *, planned: bool
+    path: Path, content: bytes, plan: Session, *, unread: set[int] | None
 ) -> tuple[Reading, ...]:
     readings: list[Reading] = []
     seen: dict[tuple[Any, ...], int] = {}
@@ -367,12 +385,14 @@ def _read_readings(
         if minus == posture:
             raise SessionError(f"takes posture '{posture}' off itself", where=where)
         cycle = _parse_cycle(row.get("cycle", ""), where)
-        if not row["reading_mm"] and not planned:
-            raise SessionError(
-                "reading_mm is empty; expected what the gauge showed, or no row where nothing was "
-                "read",
-                where=where,
-            )
+        if not row["reading_mm"]:
+            if unread is None:
+                raise SessionError(
+                    "reading_mm is empty; expected what the gauge showed, or no row where nothing "
+                    "was read",
+                    where=where,
+                )
+            unread.add(len(readings))
         text = row["reading_mm"] or "0"
         value = parse_number(text, where=where, name="reading_mm", error=SessionError)
         reading = Reading(setup, posture, minus or None, cycle, value * MM, line)
@@ -386,7 +406,7 @@ def _read_readings(
         seen[key] = line
         if len(readings) >= MOST_READINGS:
             raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(path))
-        _check_range(value, plan.gauges[plan.setups[setup].gauge], bool(minus), where)
+        check_range(value, plan.gauges[plan.setups[setup].gauge], bool(minus), where)
         _check_form(reading, raw, joined, where)
         readings.append(reading)
     if not readings:
@@ -402,7 +422,12 @@ def _parse_cycle(text: str, where: str) -> int:
     return int(text)
 
 
-def _check_range(value_mm: float, gauge: Gauge, difference: bool, where: str) -> None:
+def check_range(value_mm: float, gauge: Gauge, difference: bool, where: str) -> None:
+    """Refuse a reading that no indicator shows, or not this one.
+
+    Raises:
+        SessionError: At `where`.
+    """
     if abs(value_mm) > LARGEST_READING_MM:
         raise SessionError(
             f"reading_mm is {value_mm:g}; expected a number within ±{LARGEST_READING_MM:g}: no "

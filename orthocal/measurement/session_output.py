@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from orthocal.files import write_files
-from orthocal.measurement.session import Gauge, Session
+from orthocal.measurement.session import Gauge, Reading, Session
 from orthocal.robot.loading import packaged_robots
 from orthocal.sensors.registry import write_sensor
 from orthocal.units import MM, tidy, to_mm
@@ -100,23 +100,39 @@ def write_session(
     text = head + yaml.safe_dump(
         document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
     )
+    table = readings_table(
+        session.readings, [None if blank else r.value for r in session.readings], decimals=decimals
+    )
+    files = {"session.yaml": text, "readings.csv": table, **(extra or {})}
+    write_files(folder, files)
+    return folder / "session.yaml"
+
+
+def readings_table(
+    rows: Sequence[Reading], values: Sequence[float | None], *, decimals: int = 6
+) -> str:
+    """Text of a readings.csv.
+
+    Args:
+        rows: What is read where.
+        values: Their readings, [m]; None for a cell that stays empty.
+        decimals: Decimals of a reading in mm.
+    """
     table = io.StringIO()
-    with_minus = any(r.minus for r in session.readings)
-    with_cycle = any(r.cycle != 1 for r in session.readings)
+    with_minus = any(r.minus for r in rows)
+    with_cycle = any(r.cycle != 1 for r in rows)
     columns = [c for c in COLUMNS if (c != "minus" or with_minus) and (c != "cycle" or with_cycle)]
     table.write(",".join(columns) + "\n")
-    for r in session.readings:
+    for r, value in zip(rows, values, strict=True):
         fields = {
             "setup": r.setup,
             "posture": r.posture,
             "minus": r.minus or "",
             "cycle": str(r.cycle),
-            "reading_mm": "" if blank else _trim(f"{r.value / MM:.{decimals}f}"),
+            "reading_mm": "" if value is None else _trim(f"{value / MM:.{decimals}f}"),
         }
         table.write(",".join(fields[c] for c in columns) + "\n")
-    files = {"session.yaml": text, "readings.csv": table.getvalue(), **(extra or {})}
-    write_files(folder, files)
-    return folder / "session.yaml"
+    return table.getvalue()
 
 
 def _trim(number: str) -> str:

@@ -1,37 +1,30 @@
 """What a study has found so far, on disk: a line a task, each written before it counts.
 
-The first line says which study it is. A process that is killed leaves at most a line without an
-end, which the next one takes away; what was found before stays.
+The first line says which study it is.
 """
 
 from __future__ import annotations
 
-import fcntl
-import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from orthocal.errors import OrthocalError, OutputError
-from orthocal.files import require_writable_file
+from orthocal.errors import OrthocalError
+from orthocal.journal import Journal, open_journal_file
 from orthocal.study.study import Cell, Study
 
 FORMAT = "orthocal/study/1"
 
-LONGEST_LINE = 2**26
-"""[bytes]"""
-
 Found = dict[int, dict[str, list[Cell]]]
 
 
-class Journal:
+class StudyJournal:
     """Results of a study's tasks, by their numbers."""
 
-    def __init__(self, found: Found, descriptor: int | None = None) -> None:
+    def __init__(self, found: Found, journal: Journal | None = None) -> None:
         self.found = found
-        self._descriptor = descriptor
+        self._journal = journal
 
     def add(self, task: int, columns: dict[str, list[Cell]]) -> None:
         """Keep the rows of a task; on disk when this returns.
@@ -39,14 +32,13 @@ class Journal:
         Raises:
             OutputError: If they cannot be written.
         """
-        if self._descriptor is not None:
-            line = json.dumps({"task": task, "columns": columns}, allow_nan=False) + "\n"
-            _append(self._descriptor, line.encode())
+        if self._journal is not None:
+            self._journal.append({"task": task, "columns": columns})
         self.found[task] = columns
 
 
 @contextmanager
-def open_journal(path: Path | None, study: Study, *, anew: bool = False) -> Iterator[Journal]:
+def open_journal(path: Path | None, study: Study, *, anew: bool = False) -> Iterator[StudyJournal]:
     """The journal of a study: what is there of it, and room for more.
 
     Args:
@@ -59,74 +51,32 @@ def open_journal(path: Path | None, study: Study, *, anew: bool = False) -> Iter
         OutputError: If it cannot be written.
     """
     if path is None:
-        yield Journal({})
+        yield StudyJournal({})
         return
-    require_writable_file(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_CLOEXEC", 0)
-        descriptor = os.open(path, flags, 0o666)
-    except OSError as e:
-        raise OutputError(f"cannot be written: {e.strerror}", where=str(path)) from None
-    try:
-        _lock(descriptor, path)
-        if anew:
-            os.ftruncate(descriptor, 0)
-        yield Journal(_resume(descriptor, path, study), descriptor)
-    finally:
-        os.close(descriptor)
+    busy = "is being written by another process; wait for it, or name another folder"
+    with open_journal_file(path, busy=busy, anew=anew) as journal:
+        yield StudyJournal(_resume(journal, study), journal)
 
 
-def _lock(descriptor: int, path: Path) -> None:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        raise OrthocalError(
-            "is being written by another process; wait for it, or name another folder",
-            where=str(path),
-        ) from None
-
-
-def _resume(descriptor: int, path: Path, study: Study) -> Found:
-    """What is there; the beginning of the file where nothing is, its torn end taken away."""
+def _resume(journal: Journal, study: Study) -> Found:
+    """What is there; the beginning of the file where nothing is."""
     found: Found = {}
-    head, end = False, 0
-    with os.fdopen(os.dup(descriptor), "rb") as stream:
-        stream.seek(0)
-        number = 0
-        while line := stream.readline(LONGEST_LINE):
-            number += 1
-            if not line.endswith(b"\n"):
-                break
-            data = _parse(line, f"{path}:{number}")
-            if not head:
-                _require_same(data, study, path)
-                head = True
-            else:
-                task, columns = _entry(data, study, f"{path}:{number}")
-                found[task] = columns
-            end = stream.tell()
-    try:
-        os.ftruncate(descriptor, end)
-    except OSError as e:
-        raise OutputError(f"cannot be written: {e.strerror}", where=str(path)) from None
+    head = False
+    for where, data in journal.entries():
+        if data is None:
+            raise OrthocalError(
+                "is no line of a study: it is damaged, or another file; --force begins anew",
+                where=where,
+            )
+        if not head:
+            _require_same(data, study, journal.path)
+            head = True
+        else:
+            task, columns = _entry(data, study, where)
+            found[task] = columns
     if not head:
-        first = {"format": FORMAT, "study": study.document, "digest": study.digest}
-        _append(descriptor, (json.dumps(first, allow_nan=False) + "\n").encode())
+        journal.append({"format": FORMAT, "study": study.document, "digest": study.digest})
     return found
-
-
-def _parse(line: bytes, where: str) -> dict[str, Any]:
-    try:
-        data = json.loads(line)
-    except (ValueError, RecursionError):
-        data = None
-    if not isinstance(data, dict):
-        raise OrthocalError(
-            "is no line of a study: it is damaged, or another file; --force begins anew",
-            where=where,
-        )
-    return data
 
 
 def _require_same(data: dict[str, Any], study: Study, path: Path) -> None:
@@ -151,12 +101,3 @@ def _entry(data: dict[str, Any], study: Study, where: str) -> tuple[int, dict[st
         if cells and all(isinstance(c, list) and len(c) == len(cells[0]) for c in cells):
             return task, columns
     raise OrthocalError("is damaged; --force begins anew", where=where)
-
-
-def _append(descriptor: int, data: bytes) -> None:
-    try:
-        while data:
-            data = data[os.write(descriptor, data) :]
-        os.fsync(descriptor)
-    except OSError as e:
-        raise OutputError(f"cannot be written: {e.strerror}", where="the study's journal") from None

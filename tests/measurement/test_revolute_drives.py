@@ -12,7 +12,10 @@ from orthocal import calibrate, load_plan, load_session, write_session
 from orthocal.assess.entering import find_entries
 from orthocal.assess.validation import CHANGE_CHANCE, validate_calibration
 from orthocal.errors import SessionError
+from orthocal.measurement.guidance import guide
+from orthocal.measurement.recording import open_recording
 from orthocal.measurement.synthetic import simulate_session
+from orthocal.show.recording import describe_row
 from orthocal.statistics.chance import BY_CHANCE
 
 OFFSETS = {"motor_a.offset": 8e-3, "motor_b.offset": -5e-3}
@@ -234,3 +237,16 @@ def test_square_means_within_a_degree(root, tmp_path, degrees, good):
     else:
         with pytest.raises(SessionError, match=r"'y' is at 88\.9° to leg a"):
             load_plan(plan)
+
+
+def test_somebody_who_records_is_shown_degrees_as_the_controller_has_them(root, tmp_path):
+    robot = write_fivebar(root, tmp_path / "rails")
+    folder = write_plan(tmp_path / "s", robot, "{offsets_mrad: [6, -2]}")
+    with open_recording(folder) as recording:
+        shown = describe_row(
+            recording.session, guide(recording.session), recording.rows, 1, width=100
+        )
+    assert shown.splitlines()[:2] == [
+        "2 of 18: ya p-10",
+        "  joints motor_a -6.000 deg, motor_b 0.000 deg",
+    ]

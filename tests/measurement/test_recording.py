@@ -1,0 +1,395 @@
+"""Readings as they are taken: nothing accepted is ever lost, and the session always loads."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import re
+import shutil
+import signal
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from orthocal import load_session
+from orthocal.assess import foresight
+from orthocal.cli.recording import record
+from orthocal.errors import OrthocalError, OutputError, SessionError
+from orthocal.interrupts import ending_at_interrupt
+from orthocal.measurement import recording as module
+from orthocal.measurement import session_file
+from orthocal.measurement.recording import SUFFIX, open_recording
+from orthocal.measurement.session_file import load_plan, load_rows
+from orthocal.measurement.typed_numbers import read_typed
+from orthocal.units import MM
+
+KILLS = 100
+FORK = multiprocessing.get_context("fork")
+
+PLAN = """# a comment that stays
+robot: orthoglide
+gauge: {sigma_mm: 0.005, resolution_mm: 0.01, range_mm: [-5, 5]}
+postures:
+  zero: {tcp_mm: [0, 0, 0]}
+  x_max: {tcp_mm: [60, 0, 0]}
+  x_min: {tcp_mm: [-100, 0, 0]}
+setups:
+  yx: {leg: x, direction: y, section: {fraction: 0.5}}
+  zx: {leg: x, direction: z, section: {fraction: 0.5}}
+cycles: CYCLES
+"""
+
+
+def make_plan(folder, *, cycles=2):
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "session.yaml").write_text(PLAN.replace("CYCLES", str(cycles)))
+    return folder
+
+
+@pytest.fixture
+def plan(tmp_path):
+    return make_plan(tmp_path / "session")
+
+
+def values(folder):
+    """Readings by their rows, [mm]; None where there is none."""
+    session, unread = load_rows(folder)
+    return {
+        (r.setup, r.posture, r.cycle): None if i in unread else round(r.value / MM, 9)
+        for i, r in enumerate(session.readings)
+    }
+
+
+def test_a_plan_without_readings_gets_its_rows_and_keeps_its_words(plan):
+    with open_recording(plan) as r:
+        assert [row.label for row in r.rows][:4] == [
+            *("yx zero", "yx x_max", "yx x_min"),
+            "yx zero, cycle 2",
+        ]
+        assert r.missing == tuple(range(12))
+    text = (plan / "session.yaml").read_text()
+    assert text == PLAN.replace("CYCLES", "2") + "readings: readings.csv\n"
+    assert set(values(plan).values()) == {None}
+    with open_recording(plan) as r:
+        assert len(r.rows) == 12
+
+
+def test_killed_between_rows_and_their_name_a_plan_is_made_a_session_all_the_same(plan):
+    with open_recording(plan):
+        pass
+    (plan / "session.yaml").write_text(PLAN.replace("CYCLES", "2"))
+    with open_recording(plan) as r:
+        assert len(r.rows) == 12
+
+
+def test_a_plan_writes_over_no_other_readings(plan):
+    (plan / "readings.csv").write_text("setup,posture,reading_mm\nyx,zero,0.1\n")
+    with (
+        pytest.raises(SessionError, match=r"readings\.csv: holds other rows than session\.yaml"),
+        open_recording(plan),
+    ):
+        pass
+    assert (plan / "readings.csv").read_text().endswith("yx,zero,0.1\n")
+
+
+def test_what_is_read_is_on_disk_at_once_and_all_of_it_makes_a_session(plan):
+    with open_recording(plan) as r:
+        for i in range(12):
+            assert r.next_empty() == i
+            r.read(i, (0.01 * i - 0.05) * MM)
+            assert values(plan)[r.rows[i].key[0], r.rows[i].posture, r.rows[i].cycle] == round(
+                0.01 * i - 0.05, 9
+            )
+        assert r.next_empty() is None
+    session = load_session(plan)
+    assert [v / MM for v in session.values] == pytest.approx(0.01 * np.arange(12) - 0.05)
+
+
+def test_what_nobody_touched_stays_byte_by_byte(root, tmp_path):
+    folder = shutil.copytree(root / "examples/table1/experiment-2", tmp_path / "s")
+    before = (folder / "readings.csv").read_bytes()
+    with open_recording(folder) as r:
+        assert r.missing == ()
+    assert (folder / "readings.csv").read_bytes() == before
+    with open_recording(folder) as r:
+        r.read(0, 0.1 * MM)
+        one = r.repeat(0)
+        r.read(one, 0.2 * MM)
+    assert [x.cycle for x in load_session(folder).readings][:2] == [1, 2]
+
+
+def test_repeating_dropping_emptying_and_correcting(plan):
+    with open_recording(plan) as r:
+        r.read(0, 0.1 * MM)
+        assert r.repeat(0) == 1
+        assert r.rows[1].label == "yx zero, cycle 3"
+        r.read(1, 0.11 * MM)
+        r.read(0, 0.2 * MM)
+        r.drop(2)
+        r.read(7, -0.3 * MM)
+        assert [i for i, row in enumerate(r.rows) if row.value is not None] == [0, 1, 7]
+        r.empty(0)
+        assert [i for i, row in enumerate(r.rows) if row.value is not None] == [7]
+    found = values(plan)
+    assert len(found) == 12
+    assert ("yx", "x_max", 1) not in found
+    lines = (plan / f"readings.csv{SUFFIX}").read_text().splitlines()
+    said = [json.loads(line).get("done") for line in lines]
+    assert said == [
+        *(None, "read", "added", "read", "read", "dropped", "read", "emptied", None),
+    ]
+
+
+def test_a_repeated_difference_gets_a_cycle_that_holds_no_readings_of_another_form(plan):
+    text = "setup,posture,minus,cycle,reading_mm\nyx,x_max,zero,1,\nyx,x_min,,2,\n"
+    (plan / "readings.csv").write_text(text)
+    with (plan / "session.yaml").open("a") as stream:
+        stream.write("readings: readings.csv\n")
+    with open_recording(plan) as r:
+        r.repeat(0)
+        r.repeat(2)
+    assert [r.cycle for r in load_plan(plan).readings] == [1, 3, 2, 3] or [
+        r.cycle for r in load_plan(plan).readings
+    ] == [1, 3, 2, 4]
+
+
+@pytest.mark.parametrize("value", [5.01, -7.0, 1234.0])
+def test_what_the_gauge_cannot_show_is_not_taken(plan, value):
+    with open_recording(plan) as r:
+        with pytest.raises(SessionError, match=r"yx zero: reading_mm is"):
+            r.read(0, value * MM)
+        assert r.missing[0] == 0
+    load_plan(plan)
+
+
+def test_the_only_row_stays(plan):
+    (plan / "readings.csv").write_text("setup,posture,reading_mm\nyx,zero,\n")
+    with (plan / "session.yaml").open("a") as stream:
+        stream.write("readings: readings.csv\n")
+    with open_recording(plan) as r, pytest.raises(SessionError, match="it is the only row"):
+        r.drop(0)
+
+
+def test_two_people_do_not_record_one_session(plan):
+    with (
+        open_recording(plan),
+        pytest.raises(OrthocalError, match=r"journal: .* recorded by somebody else; one at a time"),
+        open_recording(plan),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("when", ["after the journal", "before the CSV's name"])
+def test_cut_off_between_journal_and_table_a_reading_is_there_all_the_same(plan, monkeypatch, when):
+    def fail(*_):
+        raise OutputError("cannot be written: no room", where="readings.csv")
+
+    with open_recording(plan) as r:
+        r.read(0, 0.1 * MM)
+        monkeypatch.setattr(module, "_write" if when.startswith("after") else "write_file", fail)
+        monkeypatch.setattr(module.Recording, "close", lambda self: None)
+        with pytest.raises(OutputError):
+            r.read(1, 0.2 * MM)
+    monkeypatch.undo()
+    assert list(values(plan).values())[:2] == [0.1, None]
+    with open_recording(plan) as r:
+        assert (r.redone, r.edited) == (1, False)
+        assert r.missing[0] == 2
+    assert list(values(plan).values())[:3] == [0.1, 0.2, None]
+
+
+def test_after_a_power_cut_several_changes_are_done_again(plan, monkeypatch):
+    monkeypatch.setattr(module.Recording, "close", lambda self: None)
+    with open_recording(plan) as r:
+        r.read(0, 0.1 * MM)
+        old = (plan / "readings.csv").read_bytes()
+        r.read(1, 0.2 * MM)
+        r.repeat(1)
+        r.read(2, 0.3 * MM)
+        r.drop(4)
+        new = (plan / "readings.csv").read_bytes()
+    (plan / "readings.csv").write_bytes(old)
+    with open_recording(plan) as r:
+        assert r.redone == 4
+    assert (plan / "readings.csv").read_bytes() == new
+
+
+def test_a_table_edited_by_hand_counts(plan, monkeypatch):
+    with open_recording(plan) as r:
+        blank = (plan / "readings.csv").read_bytes()
+        r.read(0, 0.1 * MM)
+    (plan / "readings.csv").write_bytes(blank)  # as it was once: left in order, nothing is redone
+    with open_recording(plan) as r:
+        assert (r.redone, r.missing[0]) == (0, 0)
+        monkeypatch.setattr(module.Recording, "close", lambda self: None)
+        r.read(0, 0.3 * MM)
+    edited = (plan / "readings.csv").read_text().replace("0.30", "0.35")
+    (plan / "readings.csv").write_text(edited)
+    with open_recording(plan) as r:
+        assert (r.redone, r.edited) == (0, True)
+    assert values(plan)["yx", "zero", 1] == 0.35
+
+
+def test_a_line_without_an_end_was_never_accepted(plan, monkeypatch):
+    monkeypatch.setattr(module.Recording, "close", lambda self: None)
+    with open_recording(plan) as r:
+        r.read(0, 0.1 * MM)
+    journal = plan / f"readings.csv{SUFFIX}"
+    with journal.open("a") as stream:
+        stream.write('{"done": "read", "rows": [["yx", "x_max", null, 1]], "read')
+    with open_recording(plan) as r:
+        assert r.missing[0] == 1
+        r.read(1, 0.2 * MM)
+    assert all(json.loads(line) for line in journal.read_text().splitlines())
+
+
+READ = '{"done": "read", "rows": [["yx", "zero", null, 1]], "reading_mm": 0.1, "at": "", '
+DIGESTS = '"before": "BEFORE", "after": ""}'
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("nonsense\n", "is no recording's journal; move it away"),
+        ('{"format": "orthocal/study/1"}\n', "is no recording's journal"),
+        ("HEAD" + "[1]\n", r"journal:2: is no line of a recording: it is damaged"),
+        ("HEAD" + READ.replace("0.1", "NaN") + DIGESTS + "\n", ":2: is no line of a recording"),
+        ("HEAD" + READ.replace("0.1", "1e9") + DIGESTS + "\n", ":2: is no line of a recording"),
+        ("HEAD" + READ.replace("read", "burnt", 1) + DIGESTS + "\n", "is no line of a recording"),
+        ("HEAD" + "[" * 70_000 + "\n", "is no line of a recording"),
+        ("HEAD" + "x" * 70_000, "is no line of a recording"),
+        ("HEAD" + READ.replace("yx", "no") + DIGESTS + "\n", r":2: does not fit readings\.csv"),
+    ],
+)
+def test_a_damaged_journal_is_refused_and_nothing_changes(plan, content, message):
+    with open_recording(plan):
+        pass
+    csv = (plan / "readings.csv").read_bytes()
+    content = content.replace("HEAD", '{"format": "orthocal/recording/1"}\n')
+    content = content.replace("BEFORE", module._digest(csv))
+    journal = plan / f"readings.csv{SUFFIX}"
+    journal.write_text(content)
+    with pytest.raises(OrthocalError, match=message), open_recording(plan):
+        pass
+    assert journal.read_text() == content
+    assert (plan / "readings.csv").read_bytes() == csv
+
+
+def talk(folder, lines, said):
+    """In a child: record with what comes from a pipe, and answer into another."""
+    os.dup2(lines, 0)
+    os.dup2(said, 1)
+    sys.stdin = os.fdopen(0, "r", encoding="utf-8", closefd=False)
+    sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
+    with ending_at_interrupt():
+        record(folder)
+
+
+KEPT = re.compile(r"Kept: row \d+, (\S+) (\S+?)(?:, cycle (\d+))?: (-?[0-9.]+) mm\n")
+
+
+def test_killed_a_hundred_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
+    """Killed while lines come in as fast as they are taken, among them corrections and repeats."""
+    monkeypatch.setenv("COLUMNS", "100")
+    folder = make_plan(tmp_path / "session", cycles=60)
+    monkeypatch.setattr(foresight, "build_foresight", lambda session: None)
+    robot = load_plan(folder).robot
+    monkeypatch.setattr(session_file, "load_robot", lambda *_, **__: robot)
+    rng = np.random.default_rng(0)
+    accepted, redone, unsaid, busy = {}, 0, 0, 0
+    for _ in range(KILLS):
+        lines_out, lines_in = os.pipe()
+        said_out, said_in = os.pipe()
+        child = FORK.Process(target=talk, args=(folder, lines_out, said_in))
+        child.start()
+        os.close(lines_out)
+        os.close(said_in)
+        text = []
+        for value in rng.integers(-400, 400, size=1500):
+            text.append(f"{value / 100:.2f}")
+            if value % 7 == 0:
+                text += ["again", f"{value / 100 + 0.01:.2f}"]
+            if value % 11 == 0:
+                text += ["back", f"{value / 100 - 0.01:.2f}"]
+        os.write(lines_in, ("\n".join(text) + "\n").encode()[:60_000])
+        answer = b""
+        while b"Kept" not in answer:  # what comes before is the same every time
+            answer += os.read(said_out, 65536)
+        time.sleep(float(rng.uniform(0.0, 0.05)))
+        os.kill(child.pid, signal.SIGKILL)
+        child.join()
+        os.close(lines_in)
+        while more := os.read(said_out, 65536):
+            answer += more
+        os.close(said_out)
+        found = KEPT.findall(answer.decode())
+        busy += bool(found)
+        numbers = [float(line) for line in text if line[-1].isdigit()]
+        assert [float(value) for *_, value in found] == numbers[: len(found)]
+        accepted |= {(s, p, int(c or 1)): float(v) for s, p, c, v in found}
+        with open_recording(folder) as r:  # it loads as it lies there, whenever it was
+            redone += r.redone
+            there = {
+                row.key[:2] + row.key[3:]: round(row.value / MM, 9)
+                for row in r.rows
+                if row.value is not None
+            }
+        other = {key: v for key, v in there.items() if accepted.get(key) != v}
+        assert accepted.keys() <= there.keys()
+        # one more may be there, of which nothing could be said any more: what was typed next
+        assert list(other.values()) in ([], [numbers[len(found)]])
+        unsaid += len(other)
+        accepted = there
+    assert busy == KILLS
+    assert len(accepted) > KILLS // 2
+    assert 0 < redone <= unsaid
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("0.12", 0.12),
+        (" -0,35 ", -0.35),
+        ("−0.35", -0.35),
+        ("– 1,5", -1.5),
+        ("+.5", 0.5),
+        ("5.", 5.0),
+        ("0,123", 0.123),
+        ("1.234", 1.234),
+        ("1,23", 1.23),
+        ("1,2345", 1.2345),
+        ("0.12 mm", 0.12),
+        ("0,12MM", 0.12),
+        ("-0", 0.0),
+    ],
+)
+def test_numbers_as_people_type_them(text, value):
+    assert read_typed(text) / MM == pytest.approx(value, abs=1e-15)
+    assert not np.signbit(read_typed("-0"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1,234", "'1,234' may be 1.234 or 1234; write 1.234 with a point, or 1234 without"),
+        ("-12,345", "may be -12.345 or -12345"),
+        ("1.234,5", "more than one separator"),
+        ("1'234.5", "more than one separator"),
+        ("1 234", "more than one separator"),
+        ("120 µm", "'120 µm' is in µm; readings are in mm"),
+        ("0.1 in", "is in in; readings are in mm"),
+        ("1e3", "is neither a number nor a command"),
+        ("0.1.", "is neither"),
+        ("--1", "is neither"),
+        ("٣", "is neither"),
+        ("nan", "is neither"),
+        ("1" * 5000, "is neither"),
+        (",", "is neither"),
+    ],
+)
+def test_what_may_be_meant_otherwise_is_asked_back(text, message):
+    with pytest.raises(SessionError, match=re.escape(message)):
+        read_typed(text)

@@ -1,0 +1,358 @@
+"""orthocal record: the dialogue over a pipe, on a narrow terminal, and what it refuses."""
+
+from __future__ import annotations
+
+import io
+import os
+import pty
+import re
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from orthocal import load_session
+from orthocal.assess import foresight
+from orthocal.cli.run import main
+from orthocal.measurement.guidance import guide
+from orthocal.measurement.recording import SUFFIX, open_recording
+from orthocal.measurement.session_file import load_plan
+from orthocal.robot.loading import packaged_robots
+from orthocal.units import MM
+
+PLAN = """robot: orthoglide
+title: Monday
+gauge: {sigma_mm: 0.005, resolution_mm: 0.01, range_mm: [-5, 5], tip: {ball: {radius_mm: 1.5}}}
+postures:
+  zero: {tcp_mm: [0, 0, 0]}
+  x_max: {tcp_mm: [60, 0, 0]}
+  x_min: {tcp_mm: [-100, 0, 0]}
+setups:
+  yx: {leg: x, touches: a, direction: y, section: {fraction: 0.5}}
+  zx: {leg: x, touches: a, direction: -z, section: {fraction: 0.5}}
+"""
+
+PATIENCE = 60.0
+
+
+@pytest.fixture
+def folder(tmp_path):
+    made = tmp_path / "monday"
+    made.mkdir()
+    (made / "session.yaml").write_text(PLAN)
+    return made
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    def record(folder, *lines, columns=100):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        monkeypatch.setattr("sys.argv", ["orthocal", "record", str(folder)])
+        monkeypatch.setattr("sys.stdin", io.StringIO("".join(f"{line}\n" for line in lines)))
+        with pytest.raises(SystemExit) as ended:
+            main()
+        out, err = capsys.readouterr()
+        assert "Traceback" not in out + err
+        return ended.value.code or 0, out, err
+
+    return record
+
+
+def cells(folder):
+    rows = (folder / "readings.csv").read_text().splitlines()[1:]
+    return [row.split(",")[-1] for row in rows]
+
+
+def test_the_examples_readings_typed_over_a_pipe_calibrate_as_they_do(root, run, tmp_path):
+    example = root / "examples/raw-cycles"
+    folder = shutil.copytree(example, tmp_path / "typed")
+    rows = (example / "readings.csv").read_text().splitlines()
+    blank = [row.rpartition(",")[0] + "," for row in rows[1:]]
+    (folder / "readings.csv").write_text("\n".join([rows[0], *blank]) + "\n")
+    typed = [row.rpartition(",")[2].replace(".", ",").replace("-", "−") for row in rows[1:]]
+    code, out, err = run(folder, *typed)
+    assert (code, err) == (0, "")
+    assert "All readings are there. Enter ends; `back` corrects." in out
+    assert out.rstrip().endswith(f"Next:\n  orthocal calibrate {folder}")
+    assert "\n! " not in out
+    values = [r.value for r in load_session(folder).readings]
+    assert values == pytest.approx([r.value for r in load_session(example).readings], abs=1e-12)
+
+
+def test_what_is_shown_of_a_setup_and_a_posture(folder, run):
+    _, out, _ = run(folder)
+    text = " ".join(out.split())
+    # the middle of the leg is at 310.25 + 40 − 310.25/2 mm; rod a 40 mm above it, of 5.5 mm radius
+    for words in (
+        "Monday: 6 readings in 2 setups on orthoglide; nothing is read yet.",
+        "Setup yx, 1 of 2: 3 readings Read: leg x, y, fraction 0.5, ball on rod a",
+        "Stand: on the +y side, so that the tip touches at (195.1, 5.5, 40.0) mm in zero.",
+        "Push the plunger in by hand: the dial has to grow",
+        "Dial: -5 to 5 mm, resolution 0.01 mm",
+        "Go to zero and set the dial to about 0 mm, the middle of its range, there.",
+        "1 of 6: yx zero joints x_slide 310.250 mm, y_slide 310.250 mm, z_slide 310.250 mm",
+        "tool x 0.000, y 0.000, z 0.000 mm",
+        "6 of 6 readings are missing: yx all and zx all.",
+        f"Go on with: orthocal record {folder}",
+    ):
+        assert words in text
+
+
+def test_joints_are_shown_as_the_controller_shows_them(tmp_path):
+    """Counting down from 0 at the mechanical zero; active offsets come on top and are not seen."""
+    machine = shutil.copytree(packaged_robots()["orthoglide"], tmp_path / "orthoglide")
+    file = machine / "orthoglide.yaml"
+    joint = "{zero_mm: 310.25, joint: {counts: down, at_zero_mm: 5}}"
+    file.write_text(file.read_text().replace("x_slide: {zero_mm: 310.25}", f"x_slide: {joint}"))
+    plan = PLAN.replace("robot: orthoglide", f"robot: {machine}")
+    plan += "controller: {offsets_mm: [1.5, -0.5, 0.25]}\n"
+    (tmp_path / "session.yaml").write_text(plan)
+    session = load_plan(tmp_path)
+    shown = guide(session)
+    length = 310.25
+    for name, x in (("zero", 0.0), ("x_max", 60.0), ("x_min", -100.0)):
+        others = np.sqrt(length**2 - x**2)  # equation (2): what a nominal controller commands
+        assert shown.joints[name] / MM == pytest.approx([5.0 - x, others, others])
+        assert shown.tool[name] / MM == pytest.approx([x, 0.0, 0.0], abs=1e-9)
+
+
+def test_tools_of_postures_that_are_given_by_joints(tmp_path):
+    text = PLAN.replace("{tcp_mm: [60, 0, 0]}", "{joints_mm: [370, 305, 305]}")
+    (tmp_path / "session.yaml").write_text(text)
+    shown = guide(load_plan(tmp_path))
+    assert shown.joints["x_max"] / MM == pytest.approx([370.0, 305.0, 305.0])
+    tool = shown.tool["x_max"] / MM
+    back = tool + np.sqrt(310.25**2 - (tool @ tool - tool**2))  # equation (2)
+    assert back == pytest.approx([370.0, 305.0, 305.0])
+
+
+TURNS = {
+    "nothing": (["", "0.1"], ["0.10"], "Not taken: type what the dial shows, or `skip`"),
+    "back": (["0.1", "back", "0,2"], ["0.20"], "It is 0.10 mm; Enter keeps it."),
+    "back and keep": (["0.1", "b", ""], ["0.10"], "2 of 6: yx x_max"),
+    "back to a row": (["0.1", "0.2", "back 1", "0.3"], ["0.30", "0.20"], "1 of 6: yx zero"),
+    "back beyond": (["back"], [], "Not taken: this is the first row."),
+    "back to none": (["back 7"], [], "Not taken: '7' is no row; expected 1 to 6."),
+    "back to a word": (["back to"], [], "Not taken: 'to' is no row; expected 1 to 6."),
+    "again": (["0.1", "again", "0.11"], ["0.10", "0.11"], "2 of 7: yx zero, cycle 2"),
+    "again of a row": (["0.1", "0.2", "again 1", "0.11"], ["0.10", "0.11", "0.20"], "cycle 2"),
+    "again of nothing": (["again"], [], "Not taken: nothing was read yet."),
+    "again of an empty row": (["again 2"], [], "Not taken: row 2 was not read yet."),
+    "skip": (["skip", "0.2"], ["", "0.20"], "Left empty: row 1"),
+    "drop": (["0.1", "drop", "0.3"], ["0.10", "0.30"], "Taken out: row 2, yx x_max"),
+    "drop a row": (["0.1", "drop 1", "0.3"], ["0.30"], "Taken out: row 1, yx zero"),
+    "restart": (["0.1", "0.2", "restart", "0.3"], ["0.30"], "Emptied: all readings of yx"),
+    "list": (["0.1", "list"], ["0.10"], "2 yx x_max: not read"),
+    "show": (["show"], [], "Setup yx, 1 of 2"),
+    "help": (["help"], [], "again: read the last row once more, as another cycle"),
+    "?": (["?"], [], "Ctrl-D and Ctrl-C leave, too."),
+    "quit": (["quit", "0.1"], [], "6 of 6 readings are missing"),
+    "exit": (["exit", "0.1"], [], "6 of 6 readings are missing"),
+    "q": (["0.1", "Q", "0.2"], ["0.10"], "5 of 6 readings are missing: yx rows 2 to 3 and zx all"),
+    "two of them": (["s"], [], "Not taken: 's' is no command (skip or show?); `help` lists them."),
+    "none": (["burn"], [], "Not taken: 'burn' is no command; `help` lists them."),
+    "too much": (["skip 3"], [], "Not taken: `skip` takes nothing after it that begins '3'."),
+    "two ways": (["1,234", "1.234"], ["1.234"], "'1,234' may be 1.234 or 1234; write 1.234"),
+    "range": (["5.5"], [], "yx zero: reading_mm is 5.5; the gauge's range allows a reading from"),
+    "resolution": (["0.123"], ["0.123"], "! 0.123 mm is no multiple of the dial's resolution"),
+    "no text": (["\ufffd\x1b[2J"], [], r"is neither a number nor a command"),
+}
+
+
+@pytest.mark.parametrize("name", TURNS)
+def test_what_can_be_typed_on_a_narrow_terminal(folder, run, monkeypatch, name):
+    monkeypatch.setattr(foresight, "build_foresight", lambda session: None)  # it takes its time
+    typed, read, words = TURNS[name]
+    code, out, err = run(folder, *typed, columns=40)
+    assert (code, err) == (0, "")
+    assert words in " ".join(out.split())
+    expected = (read + [""] * 7)[: len(cells(folder))]
+    assert cells(folder) == expected
+    assert "\x1b" not in out
+    *narrow, command = out.splitlines()
+    assert max(map(len, narrow)) <= 40
+    assert command == f"  orthocal record {folder}"  # to be copied
+
+
+def test_what_is_odd_is_said_at_once(folder, run):
+    typed = ["0.1", "0.5", "0.3", "again 1", "0.2", "again 3", "0.58"]
+    _, out, _ = run(folder, *typed)
+    text = " ".join(out.split())
+    assert "! It is 0.100 mm from what yx showed here at first (0.100 mm): stand or dial" in text
+    assert "! It is 0.080 mm from its other cycles (0.500 mm): more than the dial's noise" in text
+    assert cells(folder) == ["0.10", "0.20", "0.50", "0.58", "0.30", "", "", ""]
+
+
+def test_a_dial_that_is_turned_round_is_said_once(root, run, tmp_path):
+    example = root / "examples/raw-cycles"
+    folder = shutil.copytree(example, tmp_path / "turned")
+    rows = [row.split(",") for row in (example / "readings.csv").read_text().splitlines()]
+    turned = [str(-float(r[3])) if r[0] == "xz" else r[3] for r in rows[1:]]
+    text = "\n".join(",".join([*r[:3], ""]) for r in rows[1:])
+    (folder / "readings.csv").write_text(f"{','.join(rows[0])}\n{text}\n")
+    _, out, _ = run(folder, *turned)
+    said = " ".join(out.split())
+    assert said.count("readings of xz fit far better with the other sign") == 1
+    assert "It belongs on the +x side" in said
+
+
+def test_it_goes_on_where_it_was_left(folder, run):
+    run(folder, "0.1", "skip", "0.3", "0.4", "quit")
+    code, out, _ = run(folder, "0.2", "0.5", "0.6", "")
+    assert code == 0
+    text = " ".join(out.split())
+    assert "3 of them are there" in text
+    assert "There are readings of this setup: neither stand nor dial may have moved since." in text
+    assert cells(folder) == ["0.10", "0.20", "0.30", "0.40", "0.50", "0.60"]
+    assert "Say in session.yaml which offsets are active in the controller" in text
+    load_session(folder)
+
+
+def test_the_next_command_has_the_model_that_was_planned_for(folder, run):
+    (folder / "plan.json").write_text('{"model": "lengths"}')
+    _, out, _ = run(folder, *["0.1"] * 6)
+    assert out.endswith(f"Next:\n  orthocal calibrate {folder} --model lengths\n")
+    for other in ('{"model": "; rm"}', '{"model": ["full"]}', "[]", "not a plan"):
+        (folder / "plan.json").write_text(other)
+        _, out, _ = run(folder)
+        assert out.endswith(f"Next:\n  orthocal calibrate {folder}\n")
+
+
+def test_at_the_end_the_last_reading_can_be_corrected(folder, run):
+    _, out, _ = run(folder, *["0.1"] * 6, "0.3", "back", "0.2", "", "0.9")
+    assert cells(folder) == [*["0.10"] * 5, "0.20"]
+    assert "no row is asked for; `back 3` goes to row 3" in " ".join(out.split())
+
+
+def test_a_stand_that_was_elsewhere_is_recalled(folder, run):
+    _, out, _ = run(folder, *["0.1"] * 4, "back 1", "0.2")
+    assert "The stand has been elsewhere since yx was read" in " ".join(out.split())
+    assert cells(folder)[0] == "0.20"
+
+
+def test_half_a_line_at_the_end_of_a_pipe_is_no_reading(folder, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["orthocal", "record", str(folder)])
+    monkeypatch.setattr("sys.stdin", io.StringIO("0.1\n0.2"))
+    with pytest.raises(SystemExit):
+        main()
+    assert "Not taken: '0.2', a line without an end." in capsys.readouterr().out
+    assert cells(folder)[:2] == ["0.10", ""]
+
+
+def test_a_process_with_a_pipe_takes_bytes_that_are_no_text(folder):
+    command = [sys.executable, "-m", "orthocal", "record", str(folder)]
+    lines = b"\xff\xfe\n" + b"9" * 30_000 + b"\n0,12\n"
+    done = subprocess.run(command, input=lines, capture_output=True, timeout=PATIENCE, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert " ".join(done.stdout.decode().split()).count("neither a number nor a command") == 2
+    assert cells(folder)[0] == "0.12"
+
+
+def test_a_terminal_can_be_left_by_ctrl_c(folder):
+    """Lines can be edited there; what was accepted is kept."""
+    child, terminal = pty.fork()
+    if child == 0:
+        os.environ.update(COLUMNS="60", TERM="dumb")
+        os.execv(sys.executable, [sys.executable, "-m", "orthocal", "record", str(folder)])
+    said = b""
+
+    def until(words):
+        nonlocal said
+        end, start = time.monotonic() + PATIENCE, len(said)
+        while words not in said[start:] and time.monotonic() < end:
+            if select.select([terminal], [], [], 0.1)[0]:
+                try:
+                    said += os.read(terminal, 65536)
+                except OSError:
+                    return
+
+    until(b"yx zero [mm]> ")
+    os.write(terminal, "−0,1X\x7f2\n".encode())
+    until(b"yx x_max [mm]> ")
+    os.kill(child, signal.SIGINT)
+    until(b"orthocal record")
+    _, status = os.waitpid(child, 0)
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(status) == 130
+    assert b"5 of 6 readings are missing" in said
+    assert cells(folder)[:2] == ["-0.12", ""]
+    with open_recording(folder) as recording:
+        assert recording.redone == 0
+
+
+def files_of(folder):
+    return {p: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+BAD = {
+    "no session": (lambda f: (f / "session.yaml").unlink(), "/session.yaml: there is no such file"),
+    "no plan": (
+        lambda f: (f / "session.yaml").write_text(PLAN.replace("leg: x", "leg: w")),
+        "/session.yaml: setups.yx.leg: 'w' is not a leg of orthoglide; legs: x, y, z",
+    ),
+    "no table": (
+        lambda f: (f / "session.yaml").write_text(PLAN + "readings: readings.csv\n"),
+        "/readings.csv: there is no such file",
+    ),
+    "no reading": (
+        lambda f: (
+            (f / "session.yaml").write_text(PLAN + "readings: readings.csv\n"),
+            (f / "readings.csv").write_text("setup,posture,reading_mm\nyx,zero,a lot\n"),
+        ),
+        "/readings.csv:2: reading_mm is 'a lot'; expected a number",
+    ),
+    "other rows": (
+        lambda f: (f / "readings.csv").write_text("setup,posture,reading_mm\nyx,zero,0.1\n"),
+        "/readings.csv: holds other rows than session.yaml plans, and would be written over; move "
+        "it away, or name it in session.yaml by `readings: readings.csv`",
+    ),
+    "a YAML that cannot be added to": (
+        lambda f: (f / "session.yaml").write_text(
+            "{robot: orthoglide, postures: {zero: {tcp_mm: [0, 0, 0]}}, "
+            "setups: {yx: {leg: x, direction: y, section: {fraction: 0.5}}}}\n"
+        ),
+        "/session.yaml: readings: is missing; add `readings: readings.csv` to it",
+    ),
+    "a folder for a journal": (
+        lambda f: (f / f"readings.csv{SUFFIX}").mkdir(),
+        "/readings.csv.journal: is a folder; expected a file",
+    ),
+    "a journal of something else": (
+        lambda f: (f / f"readings.csv{SUFFIX}").write_text("Dear diary\n"),
+        "/readings.csv.journal: is no recording's journal; move it away, and the readings count as "
+        "they are",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_recorded_is_refused_and_nothing_is_written(folder, run, name):
+    spoil, message = BAD[name]
+    spoil(folder)
+    before = files_of(folder)
+    code, out, err = run(folder, "0.1")
+    assert err == f"orthocal: {folder}{message}\n"
+    assert (code, out) == (2, "")
+    assert files_of(folder) == before
+
+
+def test_a_session_that_somebody_records_is_refused(folder, run):
+    with open_recording(folder):
+        code, out, err = run(folder, "0.1")
+    assert (code, out) == (2, "")
+    assert err == (
+        f"orthocal: {folder}/readings.csv{SUFFIX}: these readings are being recorded by somebody "
+        "else; one at a time\n"
+    )
+
+
+def test_help_says_what_it_does(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["orthocal", "record", "--help"])
+    with pytest.raises(SystemExit):
+        main()
+    assert re.search(r"Every reading is on disk before the next", capsys.readouterr().out)
