@@ -188,19 +188,21 @@ def _go(session: Session, setup: str, stops: list[Stop]) -> list[Stop]:
         return stops
     zero = tool_at_zero(robot)
     gone: list[Stop] = []
-    ways: list[Array] = []
+    ways: list[_Gone] = []
     for stop in stops:
         start = gone[-1].point if gone else zero
-        direct, over = _way(start, stop), _way(start, stop, zero)
-        over_zero = not _reaches(robot, direct)
-        if over_zero and not _reaches(robot, over):
+        way = _follow(robot, _way(start, stop))
+        over_zero = way is None
+        if way is None:
+            way = _follow(robot, _way(start, stop, zero))
+        if way is None:
             raise SessionError(
                 f"the way to posture '{stop.posture}' of setup '{setup}' leaves what the machine "
                 "reaches, straight and over the mechanical zero; put a posture between",
                 where=str(session.path or "session"),
             )
         gone.append(replace(stop, over_zero=over_zero))
-        ways.append(over if over_zero else direct)
+        ways.append(way)
     return _touch(session, setup, gone, ways)
 
 
@@ -216,20 +218,24 @@ def _way(start: Array | None, stop: Stop, over: Array | None = None) -> Array:
     return np.concatenate(places)
 
 
-def _reaches(robot: Robot, way: Array) -> bool:
-    names = [""] * len(way)
+_Gone = tuple[Array, Array, Array]
+"""Places on a way with the drives and passive coordinates there."""
+
+
+def _follow(robot: Robot, way: Array) -> _Gone | None:
+    """A way as the machine goes it; None where it does not reach."""
     try:
-        drives = nominal_assembly(robot).inverse(way)
+        drives, passive = nominal_assembly(robot).reach(way)
     except ClosureError:
-        return False
-    return not find_beyond_travel(robot, drives, names)
+        return None
+    if find_beyond_travel(robot, drives, [""] * len(way)):
+        return None
+    return way, drives, passive
 
 
-def _touch(session: Session, setup: str, stops: list[Stop], ways: Sequence[Array]) -> list[Stop]:
+def _touch(session: Session, setup: str, stops: list[Stop], ways: Sequence[_Gone]) -> list[Stop]:
     """The same stops, with what a perfect machine shows, and where the plunger is to be lifted."""
-    robot = session.robot
-    places = np.concatenate(ways)
-    drives, passive = nominal_assembly(robot).reach(places)
+    places, drives, passive = (np.concatenate(part) for part in zip(*ways, strict=True))
     names = [str(i) for i in range(len(places))]
     along = replace(
         session,
@@ -243,13 +249,13 @@ def _touch(session: Session, setup: str, stops: list[Stop], ways: Sequence[Array
     observations = build_observations(along)
     shown = observations.rows(predict_entries(along, observations, passive=passive))
     _, contact = locate_contacts(along)[setup]
-    ends = np.cumsum([len(way) for way in ways])
+    ends = np.cumsum([len(way) for way, _, _ in ways])
     zero = shown[ends[0] - 1]
     gauge = session.gauges[session.setups[setup].gauge]
     room = np.inf if gauge.range is None else 0.5 * (gauge.range[1] - gauge.range[0])
     found = []
     for i, (stop, end) in enumerate(zip(stops, ends.tolist(), strict=True)):
-        own = range(end - len(ways[i]), end)
+        own = range(end - len(ways[i][0]), end)
         lift = ""
         if i > 0:  # before the first stop no gauge stands there
             off = shown[own.start : own.stop] - zero

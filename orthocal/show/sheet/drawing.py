@@ -227,6 +227,9 @@ def draw_cut(standing: Standing) -> str:
     far = 0.75 * max([0.02, *[2.0 * float(v) for v in spread]])
     dial = standing.point + far * direction
     around = [line, standing.point, dial + 0.25 * far * direction, *cuts.values()]
+    if standing.tip is not None and standing.tip.edge is not None:
+        edge = 0.5 * standing.tip.width * standing.tip.edge
+        around += [standing.point - edge, standing.point + edge]
     radius = max([0.0, *[r.radius for r in leg.rods.values()]])
     every = np.array([p + s * radius * e for p in around for e in np.eye(3) for s in (-1, 1)])
     up = np.eye(3)[2] if abs(axis[2]) < 0.9 else np.eye(3)[1]

@@ -18,6 +18,7 @@ from orthocal.show.sheet.drawing import draw_cut, draw_machine
 from orthocal.show.sheet.standing import Standing, direction_words, find_standing, tip_words
 from orthocal.show.sheet.words import (
     active_words,
+    approach_words,
     counting_words,
     gauge_words,
     joint_list,
@@ -116,17 +117,17 @@ def _front(
     limits = "; ".join(limit_words(robot))
     before = [
         "Let the machine run until it is warm. Then home it once, and not again until all is read.",
-        f"In the mechanical zero (legs parallel to their axes) the controller must show {zero}. "
-        f"Its joints may go: {limits}. If it shows something else, mend the robot's YAML first.",
+        "In the mechanical zero (legs parallel to their axes, by eye) the controller must show "
+        f"about {zero}. Its joints may go: {limits}. If it shows something else, mend the robot's "
+        "files first.",
         "Move each slider by hand a little outwards, away from the middle: its number must "
         f"{counting_words(robot)}.",
         active_words(session),
         "Lay a hand on each rod and turn each hinge: play that you feel is not calibrated away.",
     ]
     rules = [
-        "Every posture is approached from the same side: the last move of each drive is towards "
-        f"{'larger' if motions[0].side < 0 else 'smaller'} coordinates. The programs do it; by "
-        "hand do it, too.",
+        "Every posture is approached from the same side: the last millimetres are towards "
+        f"{approach_words(robot, motions[0].side)}. The programs do it; by hand do it, too.",
         "The dial stays on its rod from the first reading of a setup to the last, except where "
         "the sheet says to hold the plunger up.",
         "Once the first reading is set, touch nothing of the gauge: not its bezel, not its stand, "

@@ -54,6 +54,16 @@ def counting_words(robot: Robot) -> str:
     return ", ".join(f"{words[d.direction]} for {d.name}" for d in robot.drives)
 
 
+def approach_words(robot: Robot, side: int) -> str:
+    """Which way the last move of each drive goes, by what its joint shows."""
+    ways = ["larger" if -side * d.direction > 0 else "smaller" for d in robot.drives]
+    if len(set(ways)) == 1:
+        return f"{ways[0]} numbers of all joints"
+    return ", ".join(
+        f"{way} numbers of {d.name}" for way, d in zip(ways, robot.drives, strict=True)
+    )
+
+
 def limit_words(robot: Robot) -> list[str]:
     """From where to where joints may go."""
     found = []
