@@ -263,6 +263,7 @@ def _touch(session: Session, setup: str, stops: list[Stop], ways: Sequence[_Gone
             if problems or not np.isfinite(off).all():
                 lift = "the tip would leave the rod" if not problems else problems[0]
             elif np.abs(off).max() > room:
-                lift = f"the dial would go {off[np.abs(off).argmax()] / MM:+.1f} mm"
+                far = f"{off[np.abs(off).argmax()] / MM:+.1f}".replace("-", "−")
+                lift = f"the dial would go {far} mm"
         found.append(replace(stop, lift=lift, expected=float(shown[end - 1] - zero)))
     return found

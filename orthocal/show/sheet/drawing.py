@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.robot.model import Robot
-from orthocal.show.sheet.standing import Standing, direction_words
+from orthocal.show.sheet.standing import Standing, axis_name, direction_words
 from orthocal.show.sheet.strokes import Drawing, circle_points, outline
 from orthocal.units import MM
 from orthocal.viewer.stage import VIEW
@@ -90,8 +90,8 @@ def draw_machine(robot: Robot, visuals: Sequence[Visual], standing: Standing) ->
             fill, stroke = "#d6dde5", "#4d5661"
         drawing.polygon(outline(view.flat(points)), fill=fill, stroke=stroke)
     _draw_legs(drawing, view, robot, standing)
-    _draw_tool(drawing, view, standing)
     _draw_gauge(drawing, view, standing, reach)
+    _draw_tool(drawing, view, standing, reach)
     _draw_axes(drawing, view, np.array([14.0, 18.0]))
     words = f"Setup {standing.setup.name}: where the gauge stands on the machine"
     return drawing.to_svg(words)
@@ -156,7 +156,7 @@ def _draw_legs(drawing: Drawing, view: _View, robot: Robot, standing: Standing) 
         drawing.text(view.flat(at) + shift, rod.name, colour=colour, bold=True, size=4.0)
 
 
-def _draw_tool(drawing: Drawing, view: _View, standing: Standing) -> None:
+def _draw_tool(drawing: Drawing, view: _View, standing: Standing, reach: float) -> None:
     """The tool's way through the postures, and the first of them."""
     if not len(standing.tool_points):
         return
@@ -166,7 +166,9 @@ def _draw_tool(drawing: Drawing, view: _View, standing: Standing) -> None:
     drawing.line(points, stroke=GREEN, width=0.35)
     drawing.arrow(ends[0], ends[1], stroke=GREEN, width=0.7, both=True)
     drawing.circle(points[0], 1.2, fill=GREEN, stroke="#fff")
-    drawing.text(ends[1] + np.array([0.0, 4.0]), "tool", colour=GREEN, bold=True)
+    busy = view.flat(standing.point + reach * standing.contact.direction)
+    free = max(ends, key=lambda end: float(np.linalg.norm(end - busy)))
+    drawing.text(free + np.array([0.0, 4.0]), "tool", colour=GREEN, bold=True)
 
 
 def _main_way(points: Array) -> Array:
@@ -186,7 +188,7 @@ def _draw_gauge(drawing: Drawing, view: _View, standing: Standing, reach: float)
     drawing.circle(foot, 1.1, fill="#222", stroke="#fff")
     way = view.way(direction)
     length = float(np.linalg.norm(way))
-    words = f"dial grows: {direction_words(direction)}"
+    words = f"dial grows {axis_name(direction)}".strip()
     # beyond the dial, where the plunger is not
     below = 8.0 if way[1] > -0.05 else -8.0
     drawing.text(dial + np.array([0.0, below]), words, colour=ORANGE, bold=True)
@@ -204,7 +206,7 @@ def _draw_axes(drawing: Drawing, view: _View, origin: Array) -> None:
     """The world's axes; those that are seen from their ends are left out."""
     for name, axis in zip("xyz", np.eye(3), strict=True):
         way = view.way(axis)
-        if np.linalg.norm(way) < 0.2:
+        if np.linalg.norm(way) < 0.35:
             continue
         drawing.arrow(origin, origin + 9.0 * way, stroke=GREY, width=0.5)
         drawing.text(origin + 11.5 * way, name, colour="#444", size=3.4)
@@ -312,7 +314,7 @@ def _draw_plunger(drawing: Drawing, view: _View, standing: Standing, dial: Array
     drawing.arrow(
         top + side + 0.1 * span * way, top + side + 0.95 * span * way, stroke=ORANGE, width=0.9
     )
-    words = f"grows {direction_words(direction)}"
+    words = f"grows {axis_name(direction)}".strip()
     room = 3.0 + 0.28 * 3.1 * len(words) * abs(float(across[0]))
     drawing.text(top + 0.5 * span * way + side + room * across, words, colour=ORANGE, bold=True)
     if standing.rod is not None and np.linalg.norm(standing.aside) > 0.05 * MM:

@@ -182,7 +182,7 @@ def _setup(
         f"{paragraph(f'{words}.{program}', kind='lead')}"
         f'<div class="pictures">{pictures}</div>'
         f"{_numbered(_steps(session, motion, standing))}"
-        f"{_warnings(motion, standing)}{_boxes(session, motion)}</section>"
+        f"{_warnings(session, motion, standing)}{_boxes(session, motion)}</section>"
     )
 
 
@@ -191,36 +191,41 @@ def _steps(session: Session, motion: SetupMotion, standing: Standing) -> list[st
     grows = direction_words(standing.contact.direction)
     gauge = session.gauges[session.setups[motion.setup].gauge]
     place = ", ".join(number(v / MM, 1) for v in standing.point)
+    where = f"in the world at ({place}) mm"
     if standing.rod is not None and standing.leg is not None:
         what = f"rod {standing.rod.name} of leg {standing.leg.name}"
         reach = standing.from_root / MM
         where = (
-            f"{reach[standing.first]:.1f} mm from its hinge at the drive "
-            f"({reach.min():.0f} to {reach.max():.0f} mm as the leg moves)"
+            f"its {tip_words(standing.tip)} touches {_beside(standing)}, "
+            f"{reach[standing.first]:.1f} mm from its hinge at the drive ({reach.min():.0f} to "
+            f"{reach.max():.0f} mm as the leg moves); {where}"
         )
     elif standing.leg is not None:
-        what, where = f"leg {standing.leg.name}", "on the line between its rods"
+        what = f"leg {standing.leg.name}"
+        where = f"it touches the line between the rods; {where}"
     else:
-        what, where = " ".join(standing.setup.sensor.place), "where the picture shows it"
-    middle = "over the middle of the rod"
-    if np.linalg.norm(standing.aside) > NOTICED:
-        middle = (
-            f"{np.linalg.norm(standing.aside) / MM:.1f} mm beside the middle of the rod, towards "
-            f"{direction_words(standing.aside)}"
-        )
-    elif standing.rod is None:
-        middle = "at its middle"
+        what = " ".join(standing.setup.sensor.place).strip()
+        where = f"it touches {where}"
     opposite = direction_words(-standing.contact.direction)
     return [
         f"Go to the first posture, {first.posture}: joints {joint_list(robot, first.drives)}.",
         f"Stand the gauge on the base, on the {grows} side of {what}, its plunger pointing to "
-        f"{opposite}. Its {tip_words(standing.tip)} touches {middle}, {where}; in the world at "
-        f"({place}) mm.",
+        f"{opposite}: {where}.",
         f"Push the plunger in by hand, towards {grows}: does the dial grow? If it falls, write "
         "every reading of this setup with the opposite sign.",
         _set_zero(gauge, first),
         "Then read in the order below. Lines are those of readings.csv.",
     ]
+
+
+def _beside(standing: Standing) -> str:
+    """Where across the rod the tip touches in the first posture."""
+    if np.linalg.norm(standing.aside) <= NOTICED:
+        return "over the middle of the rod"
+    return (
+        f"{np.linalg.norm(standing.aside) / MM:.1f} mm beside the middle of the rod, towards "
+        f"{direction_words(standing.aside)}"
+    )
 
 
 def _set_zero(gauge: Gauge, first: Stop) -> str:
@@ -237,7 +242,7 @@ def _set_zero(gauge: Gauge, first: Stop) -> str:
     return f"{how}, here only. Tap the stand: the hand must come back.{again}"
 
 
-def _warnings(motion: SetupMotion, standing: Standing) -> str:
+def _warnings(session: Session, motion: SetupMotion, standing: Standing) -> str:
     found = []
     near = standing.near_hinge
     if near is not None:
@@ -245,6 +250,16 @@ def _warnings(motion: SetupMotion, standing: Standing) -> str:
             f"The tip comes within {near / MM:.1f} mm of the middle of a hinge: look whether it "
             "stays clear of the bearing before you set it."
         )
+    gauge = session.gauges[session.setups[motion.setup].gauge]
+    if gauge.range is not None:
+        half = 0.5 * (gauge.range[1] - gauge.range[0])
+        beyond = [s for s in motion.stops if s.role == "reading" and abs(s.expected) > half]
+        if beyond:
+            found.append(
+                f"Even a perfect machine would show {number(beyond[0].expected / MM, 1, sign=True)}"
+                f" mm in {_name(beyond[0])}, more than the dial has to either side: take another "
+                "posture, or another dial."
+            )
     lifted = [s for s in motion.stops if s.lift]
     if lifted:
         found.append(
@@ -265,7 +280,7 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
         ("posture", ""),
         *([(f"tool {', '.join(letters)} [mm]", "")] if letters else []),
         *((f"{d.name} [{DRIVE_UNITS[d.unit][0]}]", "number") for d in robot.drives),
-        *([("perfect machine [mm]", "number")] if told else []),
+        *([("perfect machine shows [mm]", "number")] if told else []),
         ("reading [mm]", ""),
         ("remarks", ""),
     ]
@@ -281,7 +296,8 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
         body = "".join(f'<td class="{kind}">{escape(text)}</td>' for text, kind in cells)
         read = stop.role != "taken off"
         box = '<td class="box"></td>' if read else "<td>set to 0</td>"
-        rows.append(f'<tr>{body}{box}<td class="note"></td></tr>')
+        asked = "as at first?" if stop.role == "return" else ""
+        rows.append(f'<tr>{body}{box}<td class="note">{asked}</td></tr>')
     return (
         f'<table class="boxes"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
     )
@@ -289,7 +305,7 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
 
 def _posture(stop: Stop) -> str:
     if stop.role == "return":
-        return f"{stop.posture}, again: the same as at first?"
+        return f"{stop.posture}, again"
     if stop.cycle == 1 or stop.role == "taken off":
         return stop.posture
     return f"{stop.posture}, cycle {stop.cycle}"

@@ -144,10 +144,18 @@ def find_standing(
 
 def direction_words(direction: Array) -> str:
     """A direction by an axis of the world, or as a vector."""
+    name = axis_name(direction)
+    if name:
+        return name
+    return "(" + ", ".join(f"{round(v, 2) + 0.0:.2f}".replace("-", "−") for v in direction) + ")"
+
+
+def axis_name(direction: Array) -> str:
+    """The axis of the world that a direction is along, such as −y; empty where it is along none."""
     k = int(np.abs(direction).argmax())
-    if abs(direction[k]) > ALONG_AXIS * np.linalg.norm(direction):
-        return f"{'+' if direction[k] > 0.0 else '−'}{'xyz'[k]}"
-    return "(" + ", ".join(f"{v:.2f}".replace("-", "−") for v in direction) + ")"
+    if abs(direction[k]) <= ALONG_AXIS * np.linalg.norm(direction):
+        return ""
+    return f"{'+' if direction[k] > 0.0 else '−'}{'xyz'[k]}"
 
 
 def tip_words(tip: TouchingTip | None) -> str:

@@ -92,7 +92,7 @@ def test_every_setup_and_row_is_on_it(small, page):
         own = rows(section)
         assert [(r[0], r[1]) for r in own[:-1]] == expected
         # back to the first posture, with a box of its own
-        assert own[-1][:2] == ["", f"{expected[0][1]}, again: the same as at first?"]
+        assert own[-1][:2] == ["", f"{expected[0][1]}, again"]
         assert len(section.xpath(".//td[@class='box']")) == len(own)
 
 
@@ -146,8 +146,12 @@ def test_what_is_done_with_the_gauge_is_said(page):
         assert "half of its travel (5 mm) is taken, and turn the bezel until it shows 0" in text
     assert "blade 20 mm wide" in blade
     assert "on the -x side of rod b of leg y, its plunger pointing to +x" in blade
-    assert "on the line between its rods" in line
+    assert "it touches the line between the rods; in the world at (155.0, 0.0, 0.0) mm" in line
     assert "pin of 4 mm diameter, 60 mm wide" in pin
+    # the leg moves aside by more than this dial has
+    assert "Even a perfect machine would show -32.7 mm in line 6" in blade
+    assert "Hold the plunger up on the way to line 6, in&: the dial would go -32.7 mm" in blade
+    assert "Even a perfect" not in line
     assert "on the (0.71, 0.71, 0.00) side of rod b of leg z" in pin
 
 
