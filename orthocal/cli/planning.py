@@ -32,7 +32,8 @@ def plan(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Folder for session.yaml and an empty readings.csv.")
+        Path | None,
+        typer.Option(help="Folder for session.yaml, an empty readings.csv and a sheet."),
     ] = None,
     model: Annotated[str, typer.Option(help="What will be identified.")] = "full",
     setups: Annotated[int | None, typer.Option(min=1, help="How many; 6 by default.")] = None,
