@@ -257,7 +257,10 @@ def draw_cut(standing: Standing) -> str:
         )
     if standing.rod is None:
         drawing.circle(view.flat(line), 0.8, fill=BLUE, stroke=BLUE)
-        drawing.text(view.flat(line) + np.array([0.0, 4.5]), "the line between", colour=BLUE)
+        # where neither the plunger nor the arrow beside it is
+        way = view.way(direction)
+        shift = -np.array([-way[1], way[0]]) if abs(way[0]) > abs(way[1]) else -way
+        drawing.text(view.flat(line) + 4.5 * shift, "the line between", colour=BLUE)
     _draw_plunger(drawing, view, standing, dial)
     _draw_axes(drawing, view, _free_corner(view.flat(np.array(around))))
     return drawing.to_svg(f"Setup {standing.setup.name}: the rods seen along leg {leg.name}")
