@@ -46,7 +46,7 @@ _HOMES = {
     "Session": "orthocal.measurement.session",
     "SessionError": "orthocal.errors",
     "Setup": "orthocal.measurement.session",
-    "Sizes": "orthocal.robot.making",
+    "Sizes": "orthocal.robot.sizes",
     "SolverError": "orthocal.errors",
     "SolverOptions": "orthocal.estimation.options",
     "Study": "orthocal.study.study",
@@ -207,8 +207,9 @@ if TYPE_CHECKING:
     from orthocal.planning.means import Means
     from orthocal.planning.plan import MeasuringPlan, plan_readings
     from orthocal.robot.loading import load_robot
-    from orthocal.robot.making import Sizes, make_robot
+    from orthocal.robot.making import make_robot
     from orthocal.robot.model import Robot
+    from orthocal.robot.sizes import Sizes
     from orthocal.sensors.protocol import Sensor
     from orthocal.sensors.registry import register_sensor
     from orthocal.show.report.page import write_report

@@ -9,7 +9,7 @@ import typer
 
 from orthocal.cli.options import Json, Tolerances, app, split_globs
 from orthocal.cli.printing import put_note, put_out
-from orthocal.errors import ParameterError, SessionError
+from orthocal.errors import OrthocalError, ParameterError, SessionError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from orthocal.planning.means import Means
     from orthocal.robot.model import Robot
 
-FILES = ("session.yaml", "readings.csv", "plan.json", "plan.svg")
+FILES = ("session.yaml", "readings.csv", "plan.json", "plan.svg", "sheet.html")
 
 
 @app.command()
@@ -32,7 +32,8 @@ def plan(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Folder for session.yaml and an empty readings.csv.")
+        Path | None,
+        typer.Option(help="Folder for session.yaml, an empty readings.csv and a sheet."),
     ] = None,
     model: Annotated[str, typer.Option(help="What will be identified.")] = "full",
     setups: Annotated[int | None, typer.Option(min=1, help="How many; 6 by default.")] = None,
@@ -157,17 +158,31 @@ def plan(
         )
     if out is not None:
         options = "".join(f" --tolerance '{t}'" for t in tolerance or [])
+        command = f"orthocal calibrate . --model {model}{options}"
         comment = (
-            "A plan: here `orthocal record .` leads through it, or fill in readings.csv; then\n"
-            f"orthocal calibrate . --model {model}{options}\n"
+            "A plan: here `orthocal record .` leads through it, or fill in readings.csv in its\n"
+            f"order; then\n{command}\n"
             "State the offsets that are active in the controller meanwhile, such as\n"
             "controller: {offsets_mm: [0, 0, 0]}, one number a drive.\n"
             "Approach every posture from the same side; the last reading of a setup is its first\n"
             "posture again."
         )
         extra = {"plan.json": plan_json(found), "plan.svg": draw_plan(found)}
+        extra |= _sheet(found.session, command)
         path = write_session(found.session, out, comment=comment, extra=extra, blank=True)
-        put_note(f"Wrote {path}, readings.csv to fill in, plan.json and plan.svg")
+        paper = ", sheet.html and its programs" if "sheet.html" in extra else ""
+        put_note(f"Wrote {path}, readings.csv to fill in, plan.json, plan.svg{paper}")
+
+
+def _sheet(session: Session, command: str) -> dict[str, str]:
+    """The measuring sheet and its programs; nothing, and why, where there cannot be one."""
+    from orthocal.show.sheet.page import sheet_files
+
+    try:
+        return sheet_files(session, command=command)
+    except OrthocalError as e:
+        put_note(f"orthocal: no measuring sheet: {e}")
+        return {}
 
 
 def _load(subject: str) -> tuple[Robot, Session | None, str]:

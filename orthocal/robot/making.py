@@ -7,7 +7,8 @@ else, joints, loops, legs, error parameters and models, is as there.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from lxml import etree
@@ -15,19 +16,16 @@ from lxml import etree
 from orthocal.errors import RobotError
 from orthocal.files import read_file, write_files
 from orthocal.robot.loading import load_robot, packaged_robots
+from orthocal.robot.machine_file import MACHINE, drive_text, machine_text, read_machine
 from orthocal.robot.model import Robot
-from orthocal.units import MM
+from orthocal.robot.sizes import AS_DRIVE, Counting, Sizes, find_counting_problem, in_mm
+
+__all__ = ["Counting", "Sizes", "describe_machine", "make_robot", "remake_robot"]
 
 PATTERN = "orthoglide"
 """The packaged robot that others are made from."""
 
 AXES = "xyz"
-
-SHORTEST_LEG, LONGEST_LEG = 0.02, 5.0
-"""[m]"""
-
-STEEPEST = 0.9
-"""Sine of the largest angle that legs turn by at the ends of a drive's travel."""
 
 SLIDER = 0.03
 """From a leg's hinge axis on the slider to the middle of what is drawn of it, less the offset, [m].
@@ -36,89 +34,90 @@ SLIDER = 0.03
 RAIL = 0.09
 """What a rail is longer than the travel, [m]."""
 
-
-@dataclass(frozen=True, slots=True)
-class Sizes:
-    """Of a machine of the Orthoglide's kind, [m]."""
-
-    leg: float = 0.31025
-    """Length of a leg, from hinge to hinge of a rod."""
-    lower: float = 0.12
-    """Least coordinate of a drive: distance of a leg's root from where the axes meet, plus the
-    offset; the leg's own length in the mechanical zero."""
-    upper: float = 0.39
-    attachment: float = 0.04
-    """From slider to hinge, and as much from hinge to tool: cancels out of where the tool is."""
-    rods_apart: float = 0.08
-    """Distance of the two rods of a leg."""
-    rod_radius: float = 0.0055
-
-    def require_machine(self, where: str) -> None:
-        """Refuse sizes that make no machine.
-
-        Raises:
-            RobotError: Naming the size, in mm.
-        """
-        leg = self.leg
-        problem = None
-        if not SHORTEST_LEG <= leg <= LONGEST_LEG:
-            problem = (
-                f"legs of {_mm(leg)} mm; expected {_mm(SHORTEST_LEG)} to {_mm(LONGEST_LEG)} mm"
-            )
-        elif not self.lower < leg < self.upper:
-            problem = (
-                f"travel from {_mm(self.lower)} to {_mm(self.upper)} mm; expected the mechanical "
-                f"zero in it, which is at the leg's length, {_mm(leg)} mm"
-            )
-        elif max(leg - self.lower, self.upper - leg) > STEEPEST * leg:
-            problem = (
-                f"travel from {_mm(self.lower)} to {_mm(self.upper)} mm; legs of {_mm(leg)} mm "
-                f"reach {_mm((1.0 - STEEPEST) * leg)} to {_mm((1.0 + STEEPEST) * leg)} mm"
-            )
-        elif not 0.0 <= self.attachment <= leg:
-            problem = (
-                f"an attachment offset of {_mm(self.attachment)} mm; expected 0 to the leg's "
-                f"length, {_mm(leg)} mm"
-            )
-        elif not self.rod_radius > 0.0 or not 2.0 * self.rod_radius < self.rods_apart <= leg:
-            problem = (
-                f"rods of radius {_mm(self.rod_radius)} mm, {_mm(self.rods_apart)} mm apart; "
-                f"expected them to clear each other, within {_mm(leg)} mm"
-            )
-        if problem:
-            raise RobotError(problem, where=where)
+_HEAD = re.compile(r"\A(?:# (?:A machine of the Orthoglide's kind|Made from).*\n)+")
+_DRIVE = r"(?m)^(?P<name> *{axis}_slide: )\{{[^#\n]*zero_mm: [^#\n]*\}}(?P<rest> *(?:#.*)?)$"
+_RADIUS = re.compile(r"radius_mm: [-+.0-9e]+")
 
 
-def describe_machine(sizes: Sizes, *, name: str, where: str = "sizes") -> dict[str, str]:
+def describe_machine(
+    sizes: Sizes,
+    *,
+    name: str,
+    counting: Sequence[Counting] = (AS_DRIVE,) * 3,
+    where: str = "sizes",
+    description: str | None = None,
+) -> dict[str, str]:
     """The files of a machine: name to text.
 
     Args:
         sizes: Of the machine.
         name: Of its folder and files.
+        counting: How the controller's joints of x, y and z count.
         where: For messages.
+        description: The robot's YAML to put the sizes into; the packaged one's by default.
 
     Raises:
-        RobotError: If the sizes make no machine.
+        RobotError: If the sizes make no machine, or the YAML has no place for them.
     """
     sizes.require_machine(where)
+    problem = find_counting_problem(counting)
+    if problem:
+        raise RobotError(problem, where=where)
     folder = packaged_robots()[PATTERN]
-    urdf, description = (
+    urdf, packaged = (
         read_file(folder / f"{PATTERN}.{kind}", error=RobotError) for kind in ("urdf", "yaml")
     )
+    pattern = packaged.decode() if description is None else description
     return {
-        f"{name}.yaml": _describe(description.decode(), sizes),
+        f"{name}.yaml": _describe(pattern, sizes, counting, f"{name}.yaml"),
         f"{name}.urdf": _draw(urdf, sizes),
+        MACHINE: machine_text(sizes, tuple(counting)),
     }
 
 
-def make_robot(sizes: Sizes, folder: Path) -> Robot:
-    """Write the folder of a machine, and load it.
+def make_robot(
+    sizes: Sizes, folder: Path, *, counting: Sequence[Counting] = (AS_DRIVE,) * 3
+) -> Robot:
+    """Write the folder of a machine, with machine.yaml, and load it.
+
+    Args:
+        sizes: Of the machine.
+        folder: Made if need be.
+        counting: How the controller's joints of x, y and z count.
 
     Raises:
         RobotError: If the sizes make no machine.
         OrthocalError: If the folder cannot be written.
     """
-    write_files(folder, describe_machine(sizes, name=folder.resolve().name))
+    name = folder.resolve().name
+    write_files(folder, describe_machine(sizes, name=name, counting=counting))
+    return load_robot(folder.resolve())
+
+
+def remake_robot(folder: Path) -> Robot:
+    """Make URDF and YAML of a machine again from its machine.yaml, and load it.
+
+    What else was changed in the YAML stays; what does not load is not written.
+
+    Raises:
+        RobotError: If there is no machine.yaml, its sizes make no machine, or the YAML has no
+            place for them.
+        OrthocalError: If the folder cannot be written.
+    """
+    name = folder.resolve().name
+    sizes, counting = read_machine(folder / MACHINE)
+    own = folder / f"{name}.yaml"
+    description = read_file(own, error=RobotError).decode("utf-8", "replace")
+    files = describe_machine(sizes, name=name, counting=counting, description=description)
+    del files[MACHINE]
+    with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
+        write_files(Path(trial) / name, files)
+        try:
+            load_robot(Path(trial) / name)
+        except RobotError as e:
+            where = None if e.where is None else e.where.replace(f"{trial}/{name}", str(folder))
+            raise RobotError(e.problem, where=where) from None
+    write_files(folder, files)
     return load_robot(folder.resolve())
 
 
@@ -172,27 +171,37 @@ def _draw(pattern: bytes, sizes: Sizes) -> str:
         places[i] = _number(middle)
         origin.set("xyz", " ".join(places))
         box = visual("base", i).find("geometry/box")
-        box.set("size", re.sub(r"0\.36\b", _number(rail), box.get("size")))
+        lengths = box.get("size").split()
+        lengths[i] = _number(rail)
+        box.set("size", " ".join(lengths))
     text = str(etree.tostring(root, encoding="unicode"))
     return f'<?xml version="1.0"?>\n<!-- {_words(sizes)} -->\n{text}\n'
 
 
-def _describe(pattern: str, sizes: Sizes) -> str:
-    """The YAML: zeros and radii in mm, and where the sizes stand."""
-    leg, radius = _mm(sizes.leg), _mm(sizes.rod_radius)
-    text = re.sub(r"zero_mm: [0-9.]+", f"zero_mm: {leg}", pattern)
-    text = re.sub(r"radius_mm: [0-9.]+", f"radius_mm: {radius}", text)
-    head = f"# {_words(sizes)}\n# Sizes stand in the URDF, too.\n"
-    return head + text
+def _describe(pattern: str, sizes: Sizes, counting: Sequence[Counting], file: str) -> str:
+    """The YAML: zeros and radii in mm, how joints count, and where the sizes stand.
+
+    Raises:
+        RobotError: If there is no place for one of them.
+    """
+    text, found = _RADIUS.subn(f"radius_mm: {in_mm(sizes.rod_radius)}", _HEAD.sub("", pattern))
+    if not found:
+        raise RobotError("has no rods with a radius_mm any more", where=file)
+    for axis, joint in zip(AXES, counting, strict=True):
+        line = re.compile(_DRIVE.format(axis=axis))
+        drive = f"{{{drive_text(sizes, joint)}}}"
+        text, found = line.subn(rf"\g<name>{drive}\g<rest>", text)
+        if found != 1:
+            raise RobotError(
+                f"has no line '{axis}_slide: {{zero_mm: ...}}' any more, where its zero would "
+                "stand",
+                where=file,
+            )
+    return f"# {_words(sizes)}\n# Made from {MACHINE}: change sizes there.\n{text}"
 
 
 def _words(sizes: Sizes) -> str:
-    return (
-        f"A machine of the Orthoglide's kind: legs of {_mm(sizes.leg)} mm, travel "
-        f"{_mm(sizes.lower)} to {_mm(sizes.upper)} mm, attachment offset "
-        f"{_mm(sizes.attachment)} mm, rods of radius {_mm(sizes.rod_radius)} mm, "
-        f"{_mm(sizes.rods_apart)} mm apart."
-    )
+    return f"A machine of the Orthoglide's kind: {sizes.words}."
 
 
 def _set_cylinder(visual: etree._Element, *, length: float, radius: float | None = None) -> None:
@@ -204,7 +213,3 @@ def _set_cylinder(visual: etree._Element, *, length: float, radius: float | None
 
 def _number(value: float) -> str:
     return f"{round(value, 12) + 0.0:.12g}"
-
-
-def _mm(value: float) -> str:
-    return f"{round(value / MM, 9):.9g}"

@@ -38,7 +38,8 @@ def test_a_plan_is_written_ready_to_measure(monkeypatch, capsys, tmp_path):
     assert "18 readings in 6 setups, about 72 min" in text
     assert len(text.splitlines()) <= 45
     assert {p.name for p in out.iterdir()} == {
-        *("session.yaml", "readings.csv", "plan.json", "plan.svg")
+        *("session.yaml", "readings.csv", "plan.json", "plan.svg", "sheet.html"),
+        *("01-yx.ngc", "02-zx.ngc", "03-xy.ngc", "04-zy.ngc", "05-xz.ngc", "06-yz.ngc"),
     }
     comment = (out / "session.yaml").read_text().splitlines()[1]
     assert comment == "# orthocal calibrate . --model full --tolerance '*.offset_mm=0.5'"

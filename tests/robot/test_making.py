@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lxml import etree
@@ -11,7 +13,9 @@ from orthocal.errors import RobotError
 from orthocal.kinematics import orthoglide as closed_forms
 from orthocal.kinematics.assembly import Assembly
 from orthocal.robot.loading import packaged_robots
-from orthocal.robot.making import Sizes, describe_machine, make_robot
+from orthocal.robot.machine_file import MACHINE, read_machine
+from orthocal.robot.making import describe_machine, make_robot, remake_robot
+from orthocal.robot.sizes import Counting, Sizes
 
 SMALL = Sizes(leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004)
 
@@ -61,3 +65,70 @@ def test_sizes_that_make_no_machine_are_refused(tmp_path, change, message):
         make_robot(Sizes(**change), tmp_path / "mine")
     assert message in str(e.value)
     assert not (tmp_path / "mine").exists()
+
+
+COUNTING = (Counting(True, 0.0), Counting(False, 0.0), Counting(True, None))
+
+
+def test_a_machine_counts_as_it_is_told(tmp_path):
+    """Up or down from what the controller shows in the mechanical zero; 10 mm further out."""
+    robot = make_robot(SMALL, tmp_path / "mine", counting=COUNTING)
+    further = robot.drive_zero + 0.01
+    shown = [float(d.to_joint(v)) for d, v in zip(robot.drives, further, strict=True)]
+    assert shown == pytest.approx([0.01, -0.01, 0.26])
+    assert robot.drives[1].joint_limits == pytest.approx((-0.07, 0.15))
+
+
+def test_a_machine_is_made_again_from_its_sizes_in_one_place(tmp_path):
+    folder = tmp_path / "mine"
+    make_robot(SMALL, folder, counting=COUNTING)
+    file = folder / MACHINE
+    assert read_machine(file) == (SMALL, COUNTING)
+    before = {p.name: p.read_text() for p in folder.iterdir()}
+    remake_robot(folder)
+    assert {p.name: p.read_text() for p in folder.iterdir()} == before
+    file.write_text(file.read_text().replace("leg_mm: 250", "leg_mm: 260"))
+    yaml = folder / "mine.yaml"  # what else was changed there stays
+    yaml.write_text(yaml.read_text().replace("offset_mm: 5,", "offset_mm: 2,"))
+    robot = remake_robot(folder)
+    fresh = make_robot(replace(SMALL, leg=0.26), tmp_path / "mine.fresh", counting=COUNTING)
+    assert (folder / "mine.urdf").read_text() == fresh.urdf.read_text()
+    assert robot.drive_zero == pytest.approx([0.26] * 3)
+    assert robot.parameters["x_slide.offset"].tolerance == pytest.approx(2e-3)
+    assert yaml.read_text().replace("offset_mm: 2,", "offset_mm: 5,").replace(
+        "mine", ""
+    ) == fresh.yaml.read_text().replace("mine.fresh", "")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("leg_mm: 250", "leg_mm: 0.25", "machine.yaml: leg_mm: legs of 0.25 mm; expected 20 to"),
+        ("[100, 320]", "[100, 240]", "machine.yaml: travel_mm: travel from 100 to 240 mm; exp"),
+        ("[100, 320]", "[100]", "machine.yaml: travel_mm"),
+        ("leg_mm: 250", "leg_mm: long", "machine.yaml: leg_mm"),
+        ("counts: down", "counts: left", "machine.yaml: joints.y_slide.counts"),
+        ("at_zero_mm: 0}", "at_zero_mm: 1e6}", "joints: 1000000 mm in the mechanical zero"),
+        ("leg_mm", "legs_mm", "machine.yaml: legs_mm"),
+    ],
+)
+def test_a_size_that_makes_no_machine_is_named_by_its_key(tmp_path, old, new, message):
+    folder = tmp_path / "mine"
+    make_robot(SMALL, folder, counting=COUNTING)
+    before = (folder / "mine.urdf").read_text()
+    text = (folder / MACHINE).read_text()
+    assert old in text
+    (folder / MACHINE).write_text(text.replace(old, new, 1))
+    with pytest.raises(RobotError) as e:
+        remake_robot(folder)
+    assert message in str(e.value)
+    assert (folder / "mine.urdf").read_text() == before
+
+
+def test_a_description_without_a_place_for_a_size_is_named(tmp_path):
+    folder = tmp_path / "mine"
+    make_robot(SMALL, folder)
+    yaml = folder / "mine.yaml"
+    yaml.write_text(yaml.read_text().replace("y_slide: {zero_mm: 250}", "y_slide: {}"))
+    with pytest.raises(RobotError, match=r"mine\.yaml: has no line 'y_slide:"):
+        remake_robot(folder)

@@ -1,0 +1,78 @@
+"""Paper and programs to measure by: sheet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from orthocal.cli.options import app
+from orthocal.cli.printing import put_note
+from orthocal.errors import ParameterError, SessionError
+
+COMMAND = "# orthocal calibrate "
+"""Begins the line of a session.yaml that says what to run once all is read."""
+
+
+@app.command()
+def sheet(
+    session: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SESSION", help="A plan or session: session.yaml, or the folder that holds it."
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for it; by default that of the session.")
+    ] = None,
+    feed: Annotated[float, typer.Option(help="From posture to posture, mm/min.")] = 600.0,
+    approach_feed: Annotated[
+        float, typer.Option(help="On the last millimetres to a posture, mm/min.")
+    ] = 120.0,
+    shift_mm: Annotated[
+        str,
+        typer.Option(
+            "--shift-mm",
+            metavar="X,Y,Z",
+            help="What the program's coordinates have more than the world's.",
+        ),
+    ] = "0,0,0",
+    force: Annotated[bool, typer.Option("--force", help="Write over what is there.")] = False,
+) -> None:
+    """A measuring sheet to print, and G-code for each setup with a pause at each reading."""
+    from orthocal.documents import parse_number
+    from orthocal.files import exists, is_folder, require_writable, write_files
+    from orthocal.measurement.motion_program import ProgramOptions
+    from orthocal.measurement.session_file import load_plan
+    from orthocal.show.sheet.page import sheet_files
+
+    parts = shift_mm.split(",")
+    if len(parts) != 3:
+        raise ParameterError(f"found '{shift_mm}'; expected X,Y,Z, in mm", where="--shift-mm")
+    x, y, z = (
+        parse_number(p.strip(), where="--shift-mm", name="part", error=ParameterError)
+        for p in parts
+    )
+    options = ProgramOptions(feed=feed, approach_feed=approach_feed, shift_mm=(x, y, z))
+    options.require_sane()
+    folder = out or (session if is_folder(session) else session.parent)
+    require_writable(folder)
+    planned = load_plan(session)
+    files = sheet_files(planned, options=options, command=find_command(planned.path or session))
+    for name in files:
+        if exists(folder / name) and not force:
+            raise SessionError("is there already; --force writes over it", where=str(folder / name))
+    write_files(folder, files)
+    programs = len(files) - 1
+    more = f" and {programs} programs" if programs else "; its drives command no tool: no programs"
+    put_note(f"Wrote {folder / 'sheet.html'} to print{more}")
+
+
+def find_command(file: Path) -> str:
+    """What a session.yaml says is to be run once all is read, in its own folder."""
+    from orthocal.files import read_file
+
+    lines = read_file(file, error=SessionError).decode("utf-8", "replace").splitlines()
+    found = next((line for line in lines if line.startswith(COMMAND)), f"{COMMAND}.")
+    return found.removeprefix("# ")

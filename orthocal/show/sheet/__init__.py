@@ -1,0 +1,1 @@
+"""Measuring sheets: paper to measure by."""

@@ -1,0 +1,256 @@
+"""The way through a plan and its programs: in order, approached from one side, within reach.
+
+What joints show is held against Pinocchio's loops, programs against a reader of their own and
+LinuxCNC's interpreter.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from machines import place
+
+from orthocal import load_plan
+from orthocal.errors import ParameterError, SessionError
+from orthocal.kinematics.assembly import nominal_assembly
+from orthocal.measurement.motion import APPROACH, plan_motion, shown_joints
+from orthocal.measurement.motion_program import ProgramOptions, program_name, write_program
+from orthocal.robot.making import make_robot
+from orthocal.robot.sizes import Counting, Sizes
+from orthocal.units import MM
+
+ROUNDED = 1e-4
+"""Coordinates of a program and joints in its comments have four decimals, [mm]; half of that in
+each of three joints moves the tool by less."""
+
+SMALL = Sizes(leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004)
+COUNTING = (Counting(True, 0.0), Counting(False, 0.005), Counting(False, None))
+
+PLAN = """robot: mine
+gauge: {sigma_mm: 0.005, range_mm: [-5, 5], tip: {ball: {radius_mm: 1.5}}}
+postures:
+  zero: {tcp_mm: [0, 0, 0]}
+  out: {tcp_mm: [50, -10, 5]}
+  in: {joints_mm: [200, 245, 240]}
+setups:
+  "y(x)#ä": {leg: x, touches: a, direction: y, section: {fraction: 0.5}}
+  xy: {leg: y, touches: b, direction: -x, section: {fraction: 0.4}, postures: [in, out]}
+"""
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A plan on a machine of other sizes, whose joints count in three ways."""
+    folder = tmp_path_factory.mktemp("motion")
+    make_robot(SMALL, folder / "mine", counting=COUNTING)
+    (folder / "plan.yaml").write_text(PLAN)
+    return load_plan(folder / "plan.yaml")
+
+
+@pytest.fixture(scope="module")
+def motions(small):
+    return plan_motion(small)
+
+
+def read_program(text, robot):
+    """Where the machine pauses in a program: coordinates and joints; and all places it goes to."""
+    position: dict[str, float] = {}
+    places, pauses, joints = [], [], None
+    for line in text.splitlines():
+        message = re.search(r"joints ([-0-9. ]+);", line)
+        joints = [float(v) for v in message[1].split()] if message else joints
+        code = re.sub(r"\([^)]*\)", "", line).strip()
+        if code.startswith("G1 "):
+            position.update({w[0]: float(w[1:]) for w in code.split()[1:]})
+            places.append([position[c] for c in "XYZ"])
+        elif code == "M0":
+            pauses.append((np.array(places[-1]), np.array(joints)))
+    return np.array(places), pauses
+
+
+def test_a_program_pauses_in_every_posture_in_order(small, motions):
+    for motion in motions:
+        text = write_program(small, motion)
+        _, pauses = read_program(text, small.robot)
+        rows = [r.posture for r in small.readings if r.setup == motion.setup]
+        assert [s.posture for s in motion.stops if s.role == "reading"] == rows
+        assert len(pauses) == text.splitlines().count("M0") == len(rows)
+        expected = nominal_assembly(small.robot).forward(
+            np.array([small.postures[p].drives for p in rows])
+        )
+        for (at, _), point in zip(pauses, expected, strict=True):
+            assert at == pytest.approx(point / MM, abs=ROUNDED)
+        assert text.splitlines()[-1] == "M2"
+        assert max(len(line) for line in text.splitlines()) < 255
+        assert text.isascii()
+
+
+def test_joints_are_those_of_the_posture_by_pinocchio(small, motions):
+    """What is shown, turned back into coordinates, brings Pinocchio's tool to where it is sent."""
+    robot = small.robot
+    for motion in motions:
+        _, pauses = read_program(write_program(small, motion), robot)
+        for at, joints in pauses:
+            drives = [d.from_joint(v * MM) for d, v in zip(robot.drives, joints, strict=True)]
+            assert place(robot, drives, robot.tcp.frame) / MM == pytest.approx(at, abs=ROUNDED)
+    shown = shown_joints(robot, robot.drive_zero)
+    assert shown == pytest.approx([0.0, 0.005, 0.25])
+    assert shown_joints(robot, robot.drive_zero + 0.01) == pytest.approx([0.01, -0.005, 0.24])
+
+
+def test_every_drive_comes_from_the_same_side(small, motions):
+    """On the last move each drive grows all the way; and by what it was to come back."""
+    robot = small.robot
+    for motion in motions:
+        places, _ = read_program(write_program(small, motion), robot)
+        assert motion.side == -1
+        for before, after in zip(places[0::2], places[1::2], strict=True):
+            shares = np.linspace(0.0, 1.0, 9)[:, None]
+            drives = nominal_assembly(robot).inverse((before + shares * (after - before)) * MM)
+            assert np.all(np.diff(drives, axis=0) > 0.0)
+            assert drives[-1] - drives[0] == pytest.approx([APPROACH] * 3, abs=3e-7)
+
+
+def test_the_other_side_is_taken_at_the_end_of_travel(small):
+    lower = replace(small.robot.drives[0], lower=0.2)
+    robot = replace(small.robot, drives=(lower, *small.robot.drives[1:]))
+    motion = plan_motion(replace(small, robot=robot))[0]
+    assert motion.side == 1
+    stop = motion.stops[0]
+    assert stop.approach_drives - stop.drives == pytest.approx([APPROACH] * 3)
+    both = replace(lower, upper=max(s.drives[0] for s in motion.stops) + 1e-3)
+    robot = replace(small.robot, drives=(both, *small.robot.drives[1:]))
+    with pytest.raises(SessionError, match="neither from below nor from above by 2 mm: x_slide"):
+        plan_motion(replace(small, robot=robot))
+
+
+def test_it_ends_where_it_began(motions, raw_cycles):
+    for motion in motions:
+        assert motion.stops[-1].posture == motion.stops[0].posture
+        assert motion.stops[-1].role == "return"
+    cycles = plan_motion(raw_cycles)[0]
+    # zero, max, min three times over, and back
+    assert [s.posture for s in cycles.stops[-2:]] == ["x_min", "zero"]
+    assert [s.line for s in cycles.stops] == [*range(2, 11), None]
+
+
+def test_differences_stop_in_both_postures(experiment_2):
+    session = experiment_2
+    stops = plan_motion(session)[0].stops
+    reading = session.readings[0]
+    assert [(s.posture, s.role) for s in stops[:2]] == [
+        (reading.minus, "taken off"),
+        (reading.posture, "reading"),
+    ]
+
+
+def test_active_offsets_change_nothing_that_is_shown(small, motions):
+    """The controller shows the same, and its drives stand elsewhere."""
+    entered = small.with_controller([1e-3, -2e-3, 0.0])
+    for before, after in zip(motions, plan_motion(entered), strict=True):
+        assert write_program(entered, after) == write_program(small, before)
+
+
+def test_what_a_perfect_machine_shows_is_told(small, motions):
+    """The rod's own tilt at the section, where the leg moves aside: by Pinocchio's rod."""
+    for motion in motions:
+        first, *rest = motion.stops
+        assert first.expected == 0.0
+        assert rest[-1].expected == pytest.approx(0.0, abs=1e-12)
+    aside = motions[0].stops[1]
+    # y -10 at the tool, less at mid-leg; a ball of a round rod that also goes 5 mm aside less still
+    assert -0.01 < aside.expected < -0.004
+
+
+def test_the_plunger_is_lifted_where_it_would_be_lost(small):
+    """A fine dial, or a tip that passes the rod on the way between postures it may stand in."""
+    gauge = replace(small.gauge, range=(-2e-3, 2e-3))
+    motion = plan_motion(replace(small, gauges={"": gauge}))[0]
+    lifts = [s.lift for s in motion.stops]
+    assert lifts[0] == ""
+    assert "the dial would go" in lifts[1]
+    text = write_program(small, motion)
+    assert "hold the plunger up on the way to line 3" in text
+
+
+def test_a_way_that_leaves_the_travel_goes_over_the_zero(small):
+    """From side to side 10 mm above the zero: between, the z-leg is upright and z furthest."""
+    robot = small.robot
+    points = np.array([[60.0, 0.0, 10.0], [-60.0, 0.0, 10.0]]) * MM
+    drives = nominal_assembly(robot).inverse(points)
+    assert drives[:, 2] == pytest.approx(0.25 * np.cos(np.arcsin(0.06 / 0.25)) + 0.01)
+    z = replace(robot.drives[2], upper=0.256)  # 252.7 mm at the ends, 260 mm between, 250 at zero
+    posture = small.postures["zero"]
+    postures = {
+        n: replace(posture, name=n, values=p, drives=d)
+        for n, p, d in zip("ab", points, drives, strict=True)
+    }
+    readings = tuple(replace(small.readings[0], posture=n, cycle=i) for i, n in enumerate("ab"))
+    session = replace(small, postures=postures, readings=readings)
+    assert not any(s.over_zero for s in plan_motion(session)[0].stops)
+    session = replace(session, robot=replace(robot, drives=(*robot.drives[:2], z)))
+    motion = plan_motion(session)[0]
+    assert [s.over_zero for s in motion.stops] == [False, True, True]
+    places, _ = read_program(write_program(session, motion), robot)
+    assert np.flatnonzero(np.abs(places).max(axis=1) == 0.0).tolist() == [2, 5]
+    for start, end in pairwise(places * MM):
+        way = start + np.linspace(0.0, 1.0, 50)[:, None] * (end - start)
+        assert nominal_assembly(robot).inverse(way)[:, 2].max() < z.upper
+
+
+def test_a_work_offset_moves_all_coordinates(small, motions):
+    motion = motions[0]
+    plain, _ = read_program(write_program(small, motion), small.robot)
+    options = ProgramOptions(shift_mm=(1.0, -2.0, 300.5), feed=1000.0)
+    text = write_program(small, motion, options)
+    moved, _ = read_program(text, small.robot)
+    assert moved - plain == pytest.approx(np.tile([1.0, -2.0, 300.5], (len(plain), 1)))
+    assert "F1000" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (ProgramOptions(feed=0.0), "--feed: found 0; expected 1 to 20000 mm/min"),
+        (ProgramOptions(approach_feed=float("nan")), "--approach-feed: found nan"),
+        (ProgramOptions(shift_mm=(0.0, 1e9, 0.0)), "--shift-mm: expected numbers within"),
+    ],
+)
+def test_feeds_and_offsets_that_nobody_means_are_refused(small, motions, options, message):
+    with pytest.raises(ParameterError) as e:
+        write_program(small, motions[0], options)
+    assert message in str(e.value)
+
+
+def test_too_many_readings_are_refused(small):
+    many = tuple(replace(small.readings[0], cycle=i) for i in range(2001))
+    with pytest.raises(SessionError, match="plans 2001 readings; a sheet holds at most 2000"):
+        plan_motion(replace(small, readings=many))
+
+
+def test_names_of_programs_are_plain(motions):
+    assert [program_name(m) for m in motions] == ["01-y_x___.ngc", "02-xy.ngc"]
+
+
+@pytest.mark.skipif(shutil.which("rs274") is None, reason="LinuxCNC's rs274 is not installed")
+def test_linuxcncs_interpreter_goes_the_same_way(small, motions, tmp_path):
+    for motion in motions:
+        text = write_program(small, motion)
+        file = tmp_path / program_name(motion)
+        file.write_text(text)
+        done = subprocess.run(
+            ["rs274", "-g", str(file)], capture_output=True, text=True, timeout=60, check=False
+        )
+        moves = re.findall(r"STRAIGHT_FEED\(([^)]*)\)", done.stdout)
+        places, pauses = read_program(text, small.robot)
+        seen = np.array([[float(v) for v in m.split(",")[:3]] for m in moves])
+        assert seen == pytest.approx(places)
+        assert done.stdout.count("PROGRAM_STOP()") == len(pauses)
+        assert "PROGRAM_END()" in done.stdout
+        assert done.stdout.count("MESSAGE(") >= len(pauses)

@@ -1,0 +1,73 @@
+"""A first plan for a machine of any size: clear of hinges, within reach, in range of the dial."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from orthocal import load_plan
+from orthocal.errors import RobotError
+from orthocal.measurement.session_file import check_contacts
+from orthocal.planning.first import CLEAR, first_means, paper_plan
+from orthocal.planning.means import Means, reachable
+from orthocal.robot.making import make_robot
+from orthocal.robot.sizes import Sizes
+from orthocal.sensors.leg_indicator import LegIndicator
+from orthocal.sensors.rod_indicator import RodByBlade
+from orthocal.sensors.tips import Tip
+
+
+def test_on_the_papers_machine_it_is_the_papers_plan(orthoglide, root):
+    """The seven postures of the workshop example, and its setups; the zero again at the end."""
+    plan, workshop = paper_plan(orthoglide, Means()), load_plan(root / "examples/workshop")
+    assert {n: p.values.tolist() for n, p in plan.postures.items()} == {
+        n: p.values.tolist() for n, p in workshop.postures.items()
+    }
+    for name, posture in plan.postures.items():
+        assert posture.drives == pytest.approx(workshop.postures[name].drives)
+    for name, setup in workshop.setups.items():
+        assert plan.setups[name].sensor == setup.sensor
+    rows = [(r.setup, r.posture, r.cycle) for r in plan.readings]
+    assert [r for r in rows if r[2] == 1] == [
+        (r.setup, r.posture, r.cycle) for r in workshop.readings
+    ]
+    assert [r for r in rows if r[2] == 2] == [(name, "zero", 2) for name in plan.setups]
+
+
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        Sizes(leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004),
+        Sizes(leg=0.15, lower=0.06, upper=0.24, attachment=0.02),
+        Sizes(leg=0.6, lower=0.3, upper=0.9),
+    ],
+)
+def test_a_machine_of_another_size_is_read_within_its_reach(tmp_path, sizes):
+    robot = make_robot(sizes, tmp_path / "mine")
+    plan = paper_plan(robot, Means())
+    check_contacts(plan)
+    points = np.array([p.values for p in plan.postures.values()])
+    assert reachable(robot, points).all()
+    assert np.abs(points).max() <= 0.1
+    means = first_means(robot, Means())
+    clear = min(CLEAR, 0.2 * sizes.leg)
+    for section in means.sections:  # from a hinge, wherever the leg goes
+        assert section * sizes.leg + means.box.max() <= sizes.leg - clear + 1e-9
+        assert section * sizes.leg + means.box.min() >= clear - 1e-9
+    assert 1 <= len(means.sections) <= 3
+
+
+def test_it_is_read_with_what_one_has(orthoglide):
+    blade = Means(tip=Tip("blade", 0.0, 0.02), rods=("b",))
+    sensors = [s.sensor for s in paper_plan(orthoglide, blade).setups.values()]
+    assert {(type(s), s.rod) for s in sensors} == {(RodByBlade, "b")}
+    none = paper_plan(orthoglide, replace(blade, tip=None))
+    assert {type(s.sensor) for s in none.setups.values()} == {LegIndicator}
+
+
+def test_a_machine_that_hardly_moves_is_refused(tmp_path):
+    robot = make_robot(Sizes(leg=0.25, lower=0.245, upper=0.3), tmp_path / "mine")
+    with pytest.raises(RobotError, match="expected 10 mm to either side of the mechanical zero"):
+        paper_plan(robot, Means())

@@ -1,0 +1,270 @@
+"""orthocal new: from options or answers to a machine, a plan, a sheet and programs."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import pty
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+from lxml import etree
+
+from orthocal import load_plan, load_robot
+from orthocal.cli import asking
+from orthocal.cli.run import main
+from orthocal.errors import ParameterError
+
+SIZES = {
+    "--leg-mm": "250",
+    "--travel-mm": "100:320",
+    "--attachment-mm": "30",
+    "--rods-apart-mm": "60",
+    "--rod-radius-mm": "4",
+    "--counts": "up,down,up",
+    "--at-zero-mm": "0",
+}
+PROGRAMS = [f"{i:02d}-{name}.ngc" for i, name in enumerate("yx zx xy zy xz yz".split(), 1)]
+
+
+def options(**changed):
+    given = {**SIZES, **{f"--{k.replace('_', '-')}": v for k, v in changed.items()}}
+    return [word for option, value in given.items() if value for word in (option, value)]
+
+
+def run(capsys, *words):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["orthocal", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+    out, err = capsys.readouterr()
+    return ended.value.code or 0, out, err
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A machine by options, with the paper's plan."""
+    folder = tmp_path_factory.mktemp("new") / "mill"
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()):
+        patch.setattr(sys, "argv", ["orthocal", "new", str(folder), *options(), "--paper"])
+        with pytest.raises(SystemExit) as ended:
+            main()
+    assert not ended.value.code
+    return folder
+
+
+@pytest.fixture
+def copied(made, tmp_path):
+    shutil.copytree(made, tmp_path / "mill")
+    return tmp_path / "mill"
+
+
+def test_a_folder_has_all_that_is_needed(made):
+    assert {p.name for p in made.iterdir()} == {"machine.yaml", "mill.yaml", "mill.urdf", "first"}
+    assert {p.name for p in (made / "first").iterdir()} == {
+        *("session.yaml", "readings.csv", "sheet.html"),
+        *PROGRAMS,
+    }
+    robot = load_robot(made)
+    assert [d.direction for d in robot.drives] == [1, -1, 1]
+    assert [float(d.to_joint(d.zero)) for d in robot.drives] == [0.0, 0.0, 0.0]
+    rows = (made / "first/readings.csv").read_text().splitlines()
+    assert rows[:2] == ["setup,posture,cycle,reading_mm", "yx,zero,1,"]
+    assert len(rows) == 1 + 24
+    session = load_plan(made / "first")
+    assert session.controller_offsets.tolist() == [0.0, 0.0, 0.0]
+    assert session.robot.sha256 == robot.sha256
+    commands = etree.HTML((made / "first/sheet.html").read_text()).xpath("//code/text()")
+    assert commands == ["orthocal calibrate . --model full"]
+
+
+def test_what_is_read_on_it_calibrates_it(made, capsys, tmp_path):
+    """1.5 mm in one drive's zero come back, the controller counting down or not."""
+    out = tmp_path / "try"
+    error = ["--error", "y_slide.offset_mm=1.5", "--exact"]
+    code, _, err = run(capsys, "simulate", made / "first", "--out", out, *error)
+    assert code == 0, err
+    code, text, _ = run(capsys, "calibrate", out, "--model", "offsets")
+    found = dict(re.findall(r"(?m)^  ([xyz])_slide +\+0\.000 +([-+]\d\.\d+)", text))
+    assert {k: float(v) for k, v in found.items()} == pytest.approx(
+        {"x": 0.0, "y": 1.5, "z": 0.0}, abs=0.002
+    )
+    assert code == 0
+
+
+def test_it_is_made_again_after_a_change(copied, capsys):
+    file = copied / "machine.yaml"
+    file.write_text(file.read_text().replace("leg_mm: 250", "leg_mm: 260"))
+    code, out, _ = run(capsys, "new", copied, "--again")
+    assert code == 0
+    assert f"Made {copied}/first/sheet.html and its programs again." in out
+    # x_max: 60 mm out, and the other two legs lean: 260 − √(260² − 60²) = 7.0178
+    assert "joints 60.0000 7.0178 -7.0178" in (copied / "first/01-yx.ngc").read_text()
+    assert "7.018" in (copied / "first/sheet.html").read_text()
+    assert load_robot(copied).drive_zero == pytest.approx([0.26] * 3)
+    assert "--model full" in (copied / "first/sheet.html").read_text()
+
+
+def test_readings_belong_to_the_sizes_of_their_day(copied, capsys):
+    csv = copied / "first/readings.csv"
+    csv.write_text(csv.read_text().replace("yx,zero,1,", "yx,zero,1,0.12"))
+    before = (copied / "first/sheet.html").read_text()
+    code, out, err = run(capsys, "new", copied, "--again")
+    assert code == 0
+    assert f"orthocal: {copied}/first: has readings, whose postures were other joint" in err
+    assert "sheet" not in out
+    assert (copied / "first/sheet.html").read_text() == before
+
+
+def test_a_plan_that_is_out_of_reach_now_is_told(copied, capsys):
+    file = copied / "machine.yaml"
+    file.write_text(file.read_text().replace("[100, 320]", "[200, 320]"))
+    code, _, err = run(capsys, "new", copied, "--again")
+    assert code == 3
+    assert "first/session.yaml: postures.x_min: " in err
+    assert "sheet.html is not for these sizes any more; plan again" in err
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"leg_mm": "250000"}, "--leg-mm: legs of 250000 mm; expected 20 to 5000 mm"),
+        ({"leg_mm": "0.25"}, "--leg-mm: legs of 0.25 mm; expected 20 to 5000 mm: mm, not m"),
+        ({"leg_mm": "25 cm"}, "--leg-mm: it is '25 cm'; expected a number"),
+        ({"leg_mm": "250,5"}, "a decimal comma? write a point"),
+        ({"travel_mm": "10:400"}, "--travel-mm: travel from 10 to 400 mm; legs of 250 mm reach 25"),
+        ({"travel_mm": "10:200"}, "--travel-mm: travel from 10 to 200 mm; expected the mechanic"),
+        ({"travel_mm": "320"}, "--travel-mm: found '320'; expected LEAST:LARGEST, in mm"),
+        ({"attachment_mm": "-1"}, "--attachment-mm: an attachment offset of -1 mm; expected 0"),
+        ({"rods_apart_mm": "0"}, "--rods-apart-mm: rods of radius"),
+        ({"rod_radius_mm": "31"}, "--rod-radius-mm: rods of radius 31 mm, 60 mm apart; expected"),
+        ({"counts": "left"}, "--counts: found 'left'; expected up or down"),
+        ({"counts": "up,down"}, "--counts: has 2 parts; expected one for all, or three: x,y,z"),
+        ({"at_zero_mm": "1e6"}, "--at-zero-mm: 1000000 mm in the mechanical zero; expected with"),
+        ({"leg_mm": None}, "--leg-mm: is missing, and nobody can be asked: this is no terminal"),
+        ({"leg_mm": None, "counts": None}, "--leg-mm, --counts: missing, and nobody can be asked"),
+        ({"hours": "2"}, "--hours: found with --paper"),
+        ({"gauge": "nowhere.yaml"}, "nowhere.yaml: there is no such file"),
+        ({"model": "all"}, "'all' is not a model of this robot"),
+        ({"travel_mm": "245:300"}, "expected 10 mm to either side of the mechanical zero"),
+    ],
+)
+def test_what_makes_no_machine_is_refused(capsys, tmp_path, changed, message):
+    given = ["new", tmp_path / "mill", "--paper", *options(**changed)]
+    code, out, err = run(capsys, *given)
+    assert (code, out) == (2, "")
+    assert message in err
+    assert len(err.splitlines()) == 1
+    assert not (tmp_path / "mill").exists()
+
+
+def test_what_is_there_is_not_written_over(copied, capsys):
+    before = (copied / "mill.urdf").read_text()
+    given = ["new", copied, *options(leg_mm="260"), "--paper"]
+    code, _, err = run(capsys, *given)
+    assert code == 2
+    assert err == f"orthocal: {copied}/machine.yaml: is there already; --force writes over it\n"
+    assert (copied / "mill.urdf").read_text() == before
+    code, _, _ = run(capsys, *given, "--force")
+    assert code == 0
+    assert load_robot(copied).drive_zero == pytest.approx([0.26] * 3)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["orthoglide", "--paper"], "'orthoglide' is a robot that comes with orthocal"),
+        (["mill", "--again"], "machine.yaml: there is no such file"),
+        (["mill", "--again", "--leg-mm", "260"], "--leg-mm: found with --again, which takes mach"),
+    ],
+)
+def test_other_mistakes_are_told(capsys, tmp_path, words, message):
+    code, _, err = run(capsys, "new", tmp_path / words[0], *words[1:])
+    assert code == 2
+    assert message in err
+
+
+def talk(command, answers, cwd):
+    """What a program says at a terminal when it is given answers, one at each prompt."""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        command, stdin=theirs, stdout=theirs, stderr=theirs, cwd=cwd, close_fds=True
+    )
+    os.close(theirs)
+    said, rest = b"", list(answers)
+    while True:
+        try:
+            part = os.read(ours, 4096)
+        except OSError:  # the other end is closed
+            break
+        if not part:
+            break
+        said += part
+        if rest and said.endswith(b": "):
+            os.write(ours, rest.pop(0).encode())
+    os.close(ours)
+    return process.wait(timeout=300), said.decode(errors="replace").replace("\r\n", "\n")
+
+
+def test_at_a_terminal_it_asks_and_asks_back(root, tmp_path):
+    answers = ["250000\n", "\n", "250\n", "10:600\n", "100:320\n", "30\n", "60\n", "40\n", "4\n"]
+    answers += ["sideways\n", "up,down,up\n", "0\n"]
+    command = [sys.executable, "-m", "orthocal", "new", str(tmp_path / "mill"), "--paper"]
+    code, said = talk(command, answers, root)
+    assert code == 0, said
+    assert said.count("Leg length, from hinge to hinge of a rod, mm: ") == 3
+    assert "  legs of 250000 mm; expected 20 to 5000 mm" in said
+    assert "  travel from 10 to 600 mm; legs of 250 mm reach 25 to 475 mm" in said
+    assert "  rods of radius 40 mm, 60 mm apart; expected them to clear each other" in said
+    assert "  found 'sideways'; expected up or down" in said
+    assert "Plan: 24 readings in 6 setups." in said
+    robot = load_robot(tmp_path / "mill")
+    assert [d.direction for d in robot.drives] == [1, -1, 1]
+    assert robot.legs["x"].rods["a"].radius == pytest.approx(0.004)
+
+
+def test_nothing_is_made_where_answers_end(root, tmp_path):
+    command = [sys.executable, "-m", "orthocal", "new", str(tmp_path / "mill"), "--paper"]
+    code, said = talk(command, ["250\n", "\x04"], root)
+    assert code == 2
+    assert "orthocal: --travel-mm: was not answered: the input ended" in said
+    assert not (tmp_path / "mill").exists()
+
+
+def test_options_are_not_asked_for(monkeypatch):
+    """At a terminal, too; what is missing is asked for in its place."""
+
+    class Terminal:
+        def isatty(self):
+            return True
+
+        def readline(self):
+            return "260\n"
+
+    monkeypatch.setattr(sys, "stdin", Terminal())
+    given = {**SIZES, "--leg-mm": None}
+    assert asking.find_answers(given).sizes.leg == pytest.approx(0.26)
+    with pytest.raises(ParameterError, match=r"--travel-mm: travel from 10 to 20 mm"):
+        asking.find_answers({**given, "--travel-mm": "10:20"})
+
+
+@pytest.mark.slow
+def test_without_the_papers_plan_one_is_chosen(capsys, tmp_path):
+    given = [*options(), "--tolerance", "*.offset_mm=2"]
+    code, out, _ = run(capsys, "new", tmp_path / "mill", *given)
+    assert code == 0
+    assert re.search(r"24 readings in 6 setups, about 72 min: [\d.]+ µm at the tool are to be", out)
+    first = tmp_path / "mill/first"
+    assert {p.name for p in first.iterdir()} == {
+        *("session.yaml", "readings.csv", "sheet.html", "plan.json", "plan.svg"),
+        *PROGRAMS,
+    }
+    session = load_plan(first)
+    assert {s.sensor.tip.form for s in session.setups.values()} == {"ball"}
+    command = "orthocal calibrate . --model full --tolerance '*.offset_mm=2'"
+    assert etree.HTML((first / "sheet.html").read_text()).xpath("//code/text()") == [command]
+    assert "hinge: look" not in (first / "sheet.html").read_text()
