@@ -208,8 +208,8 @@ def _write(
     from orthocal.measurement.session_output import write_session
 
     comment = (
-        "A plan: print sheet.html, measure, and fill in readings.csv in its order. Then, in this "
-        "folder,\n"
+        "A plan: print sheet.html and measure; `orthocal record .` in this folder leads through "
+        "it, or\nfill in readings.csv in its order. Then\n"
         f"orthocal calibrate . {_options(model, tolerance)}\n"
         "offsets_mm: those that are active in the controller while it is measured."
     )
@@ -247,8 +247,9 @@ def _tell(
         f"  orthocal new {folder} --again\n"
         f"Wrote {folder / FIRST}: session.yaml, readings.csv to fill in, sheet.html to print, and\n"
         f"{counted(programs, 'program')} in G-code, one a setup. Next: look at the machine, print "
-        "the sheet, measure,\nfill in readings.csv, and calibrate:\n"
+        "the sheet, measure\n(`record` leads through it and keeps the readings), and calibrate:\n"
         f"  orthocal view {folder}\n"
+        f"  orthocal record {folder / FIRST}\n"
         f"  {command}"
     )
 

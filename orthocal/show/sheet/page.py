@@ -322,8 +322,9 @@ def _name(stop: Stop) -> str:
 
 def _afterwards(command: str) -> str:
     steps = [
-        "Type the readings into readings.csv, column reading_mm, in its order, with a decimal "
-        "point. Leave out lines that were not read.",
+        "`orthocal record` takes the readings one after the other and says at once what is odd. Or "
+        "type them into readings.csv, column reading_mm, in its order; leave out lines that were "
+        "not read. `orthocal import` takes them from a spreadsheet.",
         "The last reading of a setup in its first posture should be the first one again, to the "
         "dial's scatter. If it is not, the stand or the machine has moved: read that setup again.",
         "Then run:",
