@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import Annotated
 
 import typer
 
@@ -11,10 +11,6 @@ from orthocal.characters import printable
 from orthocal.cli.options import Json, app
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import SessionError
-
-if TYPE_CHECKING:
-    from orthocal.measurement.headings import UnitName
-    from orthocal.tables.numerals import Sign
 
 
 @app.command("import")
@@ -67,8 +63,8 @@ def import_(
     options = TableOptions(
         sheet=sheet,
         separator=separator,
-        decimal=cast("Sign | None", decimal),
-        unit=cast("UnitName | None", unit),
+        decimal=decimal,
+        unit=unit,
         encoding=encoding,
         columns=_read_columns(column or []),
         fill=fill,

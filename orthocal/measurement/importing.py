@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import get_args
+from typing import cast, get_args
 
 from orthocal.arguments import require_kind
 from orthocal.errors import SessionError
@@ -40,10 +40,10 @@ class TableOptions:
     """Name of the sheet of a workbook."""
     separator: str | None = None
     """semicolon, tab, comma or pipe."""
-    decimal: Sign | None = None
+    decimal: str | None = None
     """comma or point."""
-    unit: UnitName | None = None
-    """Of readings that state none."""
+    unit: str | None = None
+    """mm, um, inch, cm or thou: of readings that state none."""
     encoding: str | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
     """Role, such as `reading` or `reading 2`, to the heading of its column, or its number (#4)."""
@@ -118,8 +118,8 @@ def import_readings(
         found,
         columns,
         names={"setup": plan.setups, "posture": plan.postures},
-        decimal=options.decimal,
-        unit=options.unit,
+        decimal=cast("Sign | None", options.decimal),
+        unit=cast("UnitName | None", options.unit),
         separator_said=options.separator is not None,
         fill=options.fill,
     )

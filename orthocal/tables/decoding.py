@@ -8,19 +8,11 @@ from dataclasses import dataclass
 
 from orthocal.errors import SessionError
 
-ENCODINGS = {
-    "utf-8": "utf-8-sig",
-    "utf-16": "utf-16",
-    "utf-16-le": "utf-16-le",
-    "utf-16-be": "utf-16-be",
-    "cp1252": "cp1252",
-    "latin-1": "latin-1",
-    "cp1250": "cp1250",
-    "cp850": "cp850",
-    "cp437": "cp437",
-    "mac-roman": "mac-roman",
-}
-"""Names of encodings that may be asked for, and Python's."""
+ENCODINGS = (
+    *("utf-8", "utf-16", "utf-16-le", "utf-16-be"),
+    *("cp1252", "latin-1", "cp1250", "cp850", "cp437", "mac-roman"),
+)
+"""Names of encodings that may be asked for."""
 
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8"),
@@ -75,7 +67,7 @@ def decode(content: bytes, *, where: str, encoding: str | None = None) -> Decode
             raise SessionError(problem, where=where)
     name, reason = _find_encoding(content, encoding, where)
     try:
-        text = content.decode(ENCODINGS.get(name, name))
+        text = content.decode(name)
     except UnicodeDecodeError as e:
         problem = f"is not {name} text (byte {e.start})"
         if encoding is None and name == "cp1252":
