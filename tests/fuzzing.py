@@ -25,6 +25,7 @@ import time
 import unicodedata
 import warnings
 import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -115,7 +116,7 @@ def lay_out(folder: Path) -> None:
         cells = (cell.replace("−", "-").replace(",", ".") for cell in line.split(";"))
         book.active.append([float(c) if c[-1:].isdigit() and c[-2:-1] != " " else c for c in cells])
     book.active.merge_cells("A3:A4")
-    book.active["D4"] = "=C4-0.01"
+    book.active["E4"] = "=C4-0.01"
     book.save(folder / "table.xlsx")
     simulated = simulate_session(load_plan(folder / "plan.yaml"), {"x_slide.offset": 5e-4})
     write_session(simulated.session, folder)
@@ -319,7 +320,8 @@ CELLS = (
 """What stands in the XML of workbooks."""
 
 
-NO_DOCUMENT = (yaml.YAMLError, etree.XMLSyntaxError)
+NO_ARCHIVE = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError)
+NO_DOCUMENT = (yaml.YAMLError, etree.XMLSyntaxError, *NO_ARCHIVE)
 """What says that a file is spoilt so far that it has no structure left."""
 
 
@@ -412,7 +414,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
             folder / KINDS[kind],
             folder,
             TableOptions(unit=rng.choice((None, "mm")), fill=rng.random() < 0.2),
-            overwrite=rng.random() < 0.8,
+            overwrite=True,
         )
         format_import(found)
         json.loads(printed_import(found, written=False))
