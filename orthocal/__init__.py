@@ -51,6 +51,8 @@ _HOMES = {
     "SolverOptions": "orthocal.estimation.options",
     "Study": "orthocal.study.study",
     "StudyTable": "orthocal.study.running",
+    "TableImport": "orthocal.measurement.importing",
+    "TableOptions": "orthocal.measurement.importing",
     "ToolAccuracy": "orthocal.assess.accuracy",
     "UnreachableError": "orthocal.errors",
     "Validation": "orthocal.assess.validation",
@@ -68,6 +70,7 @@ _HOMES = {
     "draw_errors": "orthocal.measurement.synthetic",
     "draw_scene": "orthocal.show.scene.drawing",
     "export_calibration": "orthocal.export.formats",
+    "import_readings": "orthocal.measurement.importing",
     "join_sessions": "orthocal.measurement.joining",
     "load_calibration": "orthocal.calibration.file",
     "load_plan": "orthocal.measurement.session_file",
@@ -85,6 +88,7 @@ _HOMES = {
     "summarize": "orthocal.show.summary",
     "validate_calibration": "orthocal.assess.validation",
     "write_calibration": "orthocal.calibration.file",
+    "write_import": "orthocal.measurement.importing",
     "write_report": "orthocal.show.report.page",
     "write_session": "orthocal.measurement.session_output",
 }
@@ -124,6 +128,8 @@ __all__ = [
     "SolverOptions",
     "Study",
     "StudyTable",
+    "TableImport",
+    "TableOptions",
     "ToolAccuracy",
     "UnreachableError",
     "Validation",
@@ -141,6 +147,7 @@ __all__ = [
     "draw_errors",
     "draw_scene",
     "export_calibration",
+    "import_readings",
     "join_sessions",
     "load_calibration",
     "load_plan",
@@ -158,6 +165,7 @@ __all__ = [
     "summarize",
     "validate_calibration",
     "write_calibration",
+    "write_import",
     "write_report",
     "write_session",
 ]
@@ -197,6 +205,12 @@ if TYPE_CHECKING:
     from orthocal.estimation.solvers.ipopt import NonlinearProgram
     from orthocal.export.formats import export_calibration
     from orthocal.kinematics.workspace import Workspace
+    from orthocal.measurement.importing import (
+        TableImport,
+        TableOptions,
+        import_readings,
+        write_import,
+    )
     from orthocal.measurement.joining import join_sessions
     from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
     from orthocal.measurement.session_file import load_plan, load_session

@@ -52,7 +52,7 @@ class TableOptions:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Import:
+class TableImport:
     """Readings of a table, and what a session's readings.csv is with them."""
 
     table: Table
@@ -85,7 +85,7 @@ def import_readings(
     options: TableOptions | None = None,
     *,
     overwrite: bool = False,
-) -> Import:
+) -> TableImport:
     """Read a table for a session; nothing is written yet.
 
     Args:
@@ -132,7 +132,7 @@ def import_readings(
     again = read_rows(readings_path, text.encode())
     readings = check_readings(again, plan, file=readings_path, planned=True)
     check_contacts(replace(plan, readings=readings))
-    return Import(
+    return TableImport(
         table=found,
         columns=columns,
         long=long,
@@ -147,7 +147,7 @@ def import_readings(
     )
 
 
-def write_import(found: Import) -> None:
+def write_import(found: TableImport) -> None:
     """Write the readings.csv of a session, whole or not at all.
 
     Raises:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from orthocal.measurement.importing import Import
+from orthocal.measurement.importing import TableImport
 from orthocal.measurement.long_table import describe_column, list_lines
 from orthocal.measurement.readings_file import is_house
 from orthocal.show.layout import counted
@@ -17,7 +17,7 @@ MOST_NAMES = 6
 """Names that are others in the session, of which it is said."""
 
 
-def format_import(found: Import) -> str:
+def format_import(found: TableImport) -> str:
     """What was understood, a line each, and what becomes of the session."""
     lines = [f"{counted(len(found.long.rows), 'reading')} in {found.table.path}"]
     understood = _understood(found)
@@ -27,7 +27,7 @@ def format_import(found: Import) -> str:
     return "\n".join(lines)
 
 
-def _understood(found: Import) -> list[tuple[str, str]]:
+def _understood(found: TableImport) -> list[tuple[str, str]]:
     table, long = found.table, found.long
     lines = []
     if table.sheet is not None:
@@ -63,7 +63,7 @@ def _understood(found: Import) -> list[tuple[str, str]]:
     return lines
 
 
-def _decimal(found: Import) -> str:
+def _decimal(found: TableImport) -> str:
     sign = found.long.decimal
     if found.long.decimal_said:
         return f"{sign.sign}, as asked for"
@@ -76,7 +76,7 @@ def _decimal(found: Import) -> str:
     return "none needed: whole numbers alone"
 
 
-def _columns(found: Import) -> list[tuple[str, str]]:
+def _columns(found: TableImport) -> list[tuple[str, str]]:
     columns, table = found.columns, found.table
     named = [
         ("setup", columns.setup),
@@ -92,7 +92,7 @@ def _columns(found: Import) -> list[tuple[str, str]]:
     return [*lines, ("reading", ", ".join(readings))]
 
 
-def _outcome(found: Import) -> str:
+def _outcome(found: TableImport) -> str:
     """What becomes of the session's readings.csv."""
     parts = [
         f"{number} {words}"
@@ -108,7 +108,7 @@ def _outcome(found: Import) -> str:
     return f"{found.readings_path}: {', '.join(parts)}{rest}"
 
 
-def printed_import(found: Import, *, written: bool) -> str:
+def printed_import(found: TableImport, *, written: bool) -> str:
     """The same as JSON."""
     table, long = found.table, found.long
     document: dict[str, Any] = {

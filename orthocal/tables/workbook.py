@@ -32,11 +32,15 @@ LARGEST_PART = 4 * 2**20
 MOST_PARTS = 2_000
 MOST_SHEETS = 50
 
+LARGEST_SHEETS = 4 * LARGEST_CONTENT
+"""Sheets times the size of the largest part, [bytes]: several may name the same part."""
+
 _MERGED = re.compile(
     rb'<(?:\w+:)?mergeCell\s[^>]*?ref="([A-Z]{1,3})([0-9]{1,7}):([A-Z]{1,3})([0-9]{1,7})"'
 )
 _HIDDEN = re.compile(rb'<(?:\w+:)?row\s[^>]*?hidden="(?:1|true)"')
 _FORMULA = re.compile(rb"<(?:\w+:)?f[\s/>]")
+_SHEET = re.compile(rb"<(?:\w+:)?sheet\s")
 _DOCTYPE = re.compile(rb"<!(?:DOCTYPE|ENTITY)")
 _XML_BEGINS = (b"<", b"\xef\xbb\xbf<")
 
@@ -111,6 +115,7 @@ def _check_parts(archive: zipfile.ZipFile, where: str) -> None:
             "MiB",
             where=where,
         )
+    largest = max((p.file_size for p in parts if p.filename.endswith(".xml")), default=0)
     for part in parts:
         if not part.filename.endswith((".xml", ".rels")):
             continue
@@ -133,6 +138,13 @@ def _check_parts(archive: zipfile.ZipFile, where: str) -> None:
             raise SessionError(
                 f"is not an .xlsx as spreadsheets write it: {shorten(part.filename)} is not plain "
                 "XML",
+                where=where,
+            )
+        count = 0 if cells else len(_SHEET.findall(text))
+        if count > MOST_SHEETS or count * largest > LARGEST_SHEETS:
+            raise SessionError(
+                f"has {count} sheets of up to {largest / 2**20:.0f} MiB; expected at most "
+                f"{MOST_SHEETS}, and {LARGEST_SHEETS / 2**20:g} MiB",
                 where=where,
             )
 
@@ -161,8 +173,8 @@ def _opened(content: bytes, *, saved: bool) -> Iterator[Any]:
 def _choose(book: Any, name: str | None, where: str) -> list[Any]:  # noqa: ANN401 - openpyxl's
     """Sheets of cells that are shown, or the one that is named."""
     sheets = list(book.worksheets)
-    if len(sheets) > MOST_SHEETS:
-        raise SessionError(f"has {len(sheets)} sheets; expected at most {MOST_SHEETS}", where=where)
+    if not sheets:
+        raise SessionError("is an .xlsx without sheets of cells", where=where)
     if name is None:
         return [s for s in sheets if s.sheet_state == "visible"] or sheets
     found = [s for s in sheets if s.title == name] or [
