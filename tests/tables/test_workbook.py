@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import time
 import zipfile
+from decimal import Decimal
 
 import openpyxl
 import pytest
@@ -121,6 +122,12 @@ def test_formulas_give_the_values_that_were_saved():
         ("yx", "text"),
     ]
     assert sheet.formulas == 3
+
+
+def test_numbers_have_the_digits_that_a_spreadsheet_shows():
+    row = '<row r="1"><c r="A1"><v>0.30000000000000004</v></c><c r="B1"><v>-1E-3</v></c></row>'
+    (sheet,) = read_workbook(with_sheet(row), where="a.xlsx")
+    assert [c.number for c in sheet.rows[0].cells] == [Decimal("0.3"), Decimal("-0.001")]
 
 
 def test_hidden_rows_are_counted():
