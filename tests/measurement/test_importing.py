@@ -191,7 +191,8 @@ FORMS = [
     text("wide-numbers", "setup;posture;1;2\nxy;zero;0,01;-0,02\nxy;x_max;0,5;0,52\n", WIDE,
          unit="mm"),
     text("wide-told", "setup;posture;Uhr A [mm];Uhr B [mm]\nxy;zero;0,01;-0,02\n"
-         "xy;x_max;0,5;0,52\n", WIDE, columns={"reading 2": "Uhr B [mm]", "reading1": "Uhr A [mm]"}),
+         "xy;x_max;0,5;0,52\n", WIDE,
+         columns={"reading 2": "Uhr B [mm]", "reading1": "Uhr A [mm]"}),
     text("wide-half-read", "setup;posture;cycle 1;cycle 2\nxy;zero;0,01;-0,02\nxy;x_max;0,5;\n",
          WIDE[:3], unit="mm"),
     text("wide-and-a-cycle", "setup;posture;cycle;reading 1;reading 2\nxy;zero;1;0,1;0,2\n",
