@@ -51,6 +51,8 @@ _HOMES = {
     "SolverOptions": "orthocal.estimation.options",
     "Study": "orthocal.study.study",
     "StudyTable": "orthocal.study.running",
+    "TableImport": "orthocal.measurement.importing",
+    "TableOptions": "orthocal.measurement.importing",
     "ToolAccuracy": "orthocal.assess.accuracy",
     "UnreachableError": "orthocal.errors",
     "Validation": "orthocal.assess.validation",
@@ -69,6 +71,7 @@ _HOMES = {
     "draw_scene": "orthocal.show.scene.drawing",
     "export_calibration": "orthocal.export.formats",
     "find_changes": "orthocal.calibration.repeating",
+    "import_readings": "orthocal.measurement.importing",
     "join_sessions": "orthocal.measurement.joining",
     "load_calibration": "orthocal.calibration.file",
     "load_plan": "orthocal.measurement.session_file",
@@ -86,6 +89,7 @@ _HOMES = {
     "summarize": "orthocal.show.summary",
     "validate_calibration": "orthocal.assess.validation",
     "write_calibration": "orthocal.calibration.file",
+    "write_import": "orthocal.measurement.importing",
     "write_report": "orthocal.show.report.page",
     "write_session": "orthocal.measurement.session_output",
 }
@@ -125,6 +129,8 @@ __all__ = [
     "SolverOptions",
     "Study",
     "StudyTable",
+    "TableImport",
+    "TableOptions",
     "ToolAccuracy",
     "UnreachableError",
     "Validation",
@@ -143,6 +149,7 @@ __all__ = [
     "draw_scene",
     "export_calibration",
     "find_changes",
+    "import_readings",
     "join_sessions",
     "load_calibration",
     "load_plan",
@@ -160,6 +167,7 @@ __all__ = [
     "summarize",
     "validate_calibration",
     "write_calibration",
+    "write_import",
     "write_report",
     "write_session",
 ]
@@ -199,6 +207,12 @@ if TYPE_CHECKING:
     from orthocal.estimation.solvers.ipopt import NonlinearProgram
     from orthocal.export.formats import export_calibration
     from orthocal.kinematics.workspace import Workspace
+    from orthocal.measurement.importing import (
+        TableImport,
+        TableOptions,
+        import_readings,
+        write_import,
+    )
     from orthocal.measurement.joining import join_sessions
     from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
     from orthocal.measurement.session_file import load_plan, load_session

@@ -1,4 +1,4 @@
-"""Mutated files of all nine kinds, and what must hold of each: orthocal's errors, or none.
+"""Mutated files of all eleven kinds, and what must hold of each: orthocal's errors, or none.
 
 Case i of a seed is always the same. Workers run cases in processes of their own, so that a crash or
 a blow-up of memory is seen, too. By hand:
@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import itertools
 import json
 import os
 import random
+import re
 import resource
 import shutil
 import subprocess
@@ -22,12 +24,15 @@ import tempfile
 import time
 import unicodedata
 import warnings
+import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import openpyxl
 import yaml
 from lxml import etree
 
@@ -68,6 +73,11 @@ ERRORS = "errors: {x_slide.offset_mm: 0.5, y_slide.offset_mm: -0.3}\nzeros_mm: {
 JOINTS = "x_slide_mm,y_slide_mm\n200,200\n210,190\n190,205.5\n"
 POINTS = "x_mm,y_mm\n0,0\n20,-10\n-15.5,7\n"
 
+TABLE = (
+    "Messprotokoll;;;;\nAufstellung;Stellung;Zyklus 1 [mm];Zyklus 2 [mm];Notiz\n"
+    "xy;zero;0,00;0,01;\nxy;x_max;−0,43;-0,44;gut\nyx;zero;1,5;;\nEnde;;;;\n"
+)
+
 STEERING = ("Cc", "Cf", "Cs", "Co", "Zl", "Zp")
 """Categories of characters that no message may hold."""
 
@@ -81,6 +91,8 @@ KINDS = {
     "errors": "errors.yaml",
     "joints": "joints.csv",
     "points": "points.csv",
+    "table": "table.csv",
+    "workbook": "table.xlsx",
 }
 
 
@@ -98,6 +110,14 @@ def lay_out(folder: Path) -> None:
         (folder / name).write_text(text, encoding="utf-8")
     (folder / "joints.csv").write_text(JOINTS, encoding="utf-8")
     (folder / "points.csv").write_text(POINTS, encoding="utf-8")
+    (folder / "table.csv").write_text(TABLE, encoding="utf-8")
+    book = openpyxl.Workbook()
+    for line in TABLE.splitlines():
+        cells = (cell.replace("−", "-").replace(",", ".") for cell in line.split(";"))
+        book.active.append([float(c) if c[-1:].isdigit() and c[-2:-1] != " " else c for c in cells])
+    book.active.merge_cells("A3:A4")
+    book.active["E4"] = "=C4-0.01"
+    book.save(folder / "table.xlsx")
     simulated = simulate_session(load_plan(folder / "plan.yaml"), {"x_slide.offset": 5e-4})
     write_session(simulated.session, folder)
     write_calibration(calibrate(load_session(folder), "full"), folder / "calibration.json")
@@ -201,9 +221,9 @@ def change_bytes(rng: random.Random, data: bytes) -> bytes:
     return data[:at] + data[other : other + rng.choice((5, 50))] + data[at:]
 
 
-def change_table(rng: random.Random, text: str) -> str:
+def change_table(rng: random.Random, text: str, separator: str = ",") -> str:
     """Spoil the cells and rows of a CSV."""
-    rows = [line.split(",") for line in text.splitlines()]
+    rows = [line.split(separator) for line in text.splitlines()]
     row = rng.choice(rows)
     how = rng.randrange(6)
     if how == 0:
@@ -220,7 +240,7 @@ def change_table(rng: random.Random, text: str) -> str:
     else:
         number = rng.choice(("1e3", "-5000", "0.0001", "299", "1e-300", "0x10", "1_0", "١"))
         row[-1] = number
-    return rng.choice(("\n", "\n", "\n", "\r\n", "\r")).join(",".join(r) for r in rows) + "\n"
+    return rng.choice(("\n", "\n", "\n", "\r\n", "\r")).join(separator.join(r) for r in rows) + "\n"
 
 
 def change_xml(rng: random.Random, data: bytes) -> bytes:
@@ -251,7 +271,57 @@ def change_xml(rng: random.Random, data: bytes) -> bytes:
     return bytes(etree.tostring(root))
 
 
-NO_DOCUMENT = (yaml.YAMLError, etree.XMLSyntaxError)
+ENCODINGS = ("utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-32", "cp1252", "latin-1")
+
+
+def change_workbook(rng: random.Random, data: bytes) -> bytes:
+    """Spoil one part of a workbook: its XML, its bytes, its name, or that it is there."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    cells = [n for n in parts if n.startswith("xl/worksheets/") or n == "xl/sharedStrings.xml"]
+    name = rng.choice(cells if rng.random() < 0.6 else list(parts))
+    how = rng.randrange(8)
+    if how < 4:
+        part = parts[name].decode()
+        found = [m.span(1) for m in re.finditer(r'(?:="|>)([^"<>]+)(?:"|<)', part)]
+        at, to = rng.choice(found)
+        new = str(odd(rng)) if rng.random() < 0.6 else rng.choice(CELLS)
+        parts[name] = (part[:at] + new + part[to:]).encode(errors="surrogatepass")
+    elif how == 4:
+        parts[name] = change_xml(rng, parts[name])
+    elif how == 5:
+        parts[name] = change_bytes(rng, parts[name])
+    elif how == 6:
+        del parts[name]
+    else:
+        parts[rng.choice(list(parts))] = parts.pop(name)
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, part in parts.items():
+            archive.writestr(name, part)
+    return stream.getvalue()
+
+
+CELLS = (
+    *("A1", "XFD1", "A1048576", "ZZZ9999999", "A1:XFD1048576", "A0", "s", "n", "d", "b", "e"),
+    *(
+        "str",
+        "inlineStr",
+        "2026-05-01",
+        "1e309",
+        "-0",
+        "sheet1.xml",
+        "hidden",
+        "0.0%",
+        "14",
+        "9999",
+    ),
+)
+"""What stands in the XML of workbooks."""
+
+
+NO_ARCHIVE = (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError)
+NO_DOCUMENT = (yaml.YAMLError, etree.XMLSyntaxError, *NO_ARCHIVE)
 """What says that a file is spoilt so far that it has no structure left."""
 
 
@@ -269,6 +339,14 @@ def mutate(rng: random.Random, kind: str, data: bytes) -> bytes:
 
 
 def mutate_structure(rng: random.Random, kind: str, data: bytes) -> bytes:
+    if kind == "workbook":
+        return change_workbook(rng, data)
+    if kind == "table":
+        text = change_table(rng, data.decode(), rng.choice((";", ";", ";", ",")))
+        if rng.random() < 0.2:
+            text = text.replace(";", rng.choice(("\t", ",", "|", " ")))
+        encoding = rng.choice(ENCODINGS) if rng.random() < 0.5 else "utf-8"
+        return text.encode(encoding, errors="surrogatepass" if "utf" in encoding else "replace")
     if kind in ("joints", "points", "readings"):
         return change_table(rng, data.decode()).encode(errors="surrogatepass")
     if kind == "urdf":
@@ -299,11 +377,13 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     from orthocal.assess.entering import find_entries
     from orthocal.assess.rows import accuracy_rows, forward_rows, inverse_rows
     from orthocal.kinematics.assembly import nominal_assembly
+    from orthocal.measurement.importing import TableOptions, import_readings
     from orthocal.measurement.session_file import load_plan
     from orthocal.measurement.session_output import write_session
     from orthocal.measurement.synthetic import load_errors, simulate_session, truth_document
     from orthocal.measurement.table import read_joints, read_points
     from orthocal.show.accuracy import format_points
+    from orthocal.show.imported import format_import, printed_import
     from orthocal.show.scene.drawing import draw_scene
 
     deep = rng.random() < thorough
@@ -329,6 +409,17 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
         if deep:
             nominal_assembly(robot).close(robot.drive_zero)
             draw_scene(robot).to_html()
+    elif kind in ("table", "workbook"):
+        found = import_readings(
+            folder / KINDS[kind],
+            folder,
+            TableOptions(unit=rng.choice((None, "mm")), fill=rng.random() < 0.2),
+            overwrite=True,
+        )
+        format_import(found)
+        json.loads(printed_import(found, written=False))
+        (folder / "readings.csv").write_text(found.text, encoding="utf-8")
+        load_plan(folder)
     elif kind == "calibration":
         calibration = load_calibration(folder)
         find_entries(calibration)
@@ -386,7 +477,7 @@ def work(good_folder: Path, seed: int, first: int, last: int, *, thorough: float
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         shutil.copytree(good_folder, folder, dirs_exist_ok=True)
-        for kind in ("calibration", "urdf"):  # what is imported at first takes its time
+        for kind in ("calibration", "urdf", "workbook"):  # what is imported at first takes its time
             use(kind, folder, random.Random(0), thorough=1.0)
         for index in range(first, last):
             kind, data, rng = make_case(seed, index, good)
@@ -415,6 +506,7 @@ def work(good_folder: Path, seed: int, first: int, last: int, *, thorough: float
             if memory > LARGEST:
                 outcome = f"large: {memory:.0f} MiB, {outcome}"
             (folder / KINDS[kind]).write_bytes(good[kind])
+            (folder / KINDS["readings"]).write_bytes(good["readings"])
             tell(f"end {index} {kind} {outcome}".encode("ascii", "replace").decode())
             if memory > LARGEST:
                 return  # what follows would be blamed for it

@@ -812,8 +812,42 @@ READINGS_CASES = [
     readings("infinite", "-0.43", "-inf", ":2: reading_mm is '-inf'; expected a finite number"),
     readings_file(
         "decimal-comma",
-        "setup;posture;minus;reading_mm\nxy;y_max;y_min;-0,43\n",
-        ":2: reading_mm is '-0,43'; expected a number (a decimal comma? write a point)",
+        "setup;posture;minus;reading_mm\nxy;y_max;y_min;-0.43\nxz;z_max;z_min;-0,37\n",
+        ":3: reading_mm is '-0,37'; expected a number (a decimal comma? write a point)",
+    ),
+    readings_file(
+        "decimal-comma-or-thousand",
+        "setup;posture;minus;reading_mm\nxy;y_max;y_min;-1,234\n",
+        ":2: the reading '-1,234' is -1.234 with a decimal comma and -1234 with a decimal point, "
+        "and no other reading tells which; write it with a decimal point, or say it to `orthocal "
+        "import --decimal comma|point`",
+    ),
+    readings_file(
+        "german-column",
+        "Aufstellung;Stellung;Bemerkung;Messwert [mm]\nxy;y_max;;0,43\n",
+        f":1: unknown column 'Bemerkung'; {COLUMNS}",
+    ),
+    readings_file(
+        "german-unit",
+        "Aufstellung;Stellung;Messwert [µm]\nxy;y_max;0,43\n",
+        f":1: unknown column 'Messwert [µm]'; {COLUMNS}",
+    ),
+    readings_file(
+        "two-signs",
+        "Aufstellung;Stellung;Messwert [mm]\nxy;y_max;0,43\nxy;y_min;0.3\n",
+        ":3: the reading '0.3' has a decimal point, and '0,43' in line 2 a decimal comma; write "
+        "all alike",
+    ),
+    readings_file(
+        "three-and-five",
+        "Aufstellung,Stellung,Messwert [mm],Zyklus\nxy,y_max,3,5\n",
+        ":2: '3,5' may be two cells or one number with a decimal comma; if they are two, say "
+        "--separator comma to `orthocal import`, if one, save the table with semicolons",
+    ),
+    readings_file(
+        "workbook",
+        b"PK\x03\x04",
+        ": is a workbook; expected a CSV file: `orthocal import` makes one of it",
     ),
     readings(
         "decimal-comma-between-commas",
@@ -894,7 +928,8 @@ READINGS_CASES = [
         ":1: is blank; expected a header: setup,posture,reading_mm",
     ),
     readings_file("header-only", HEADER + "\n", ": holds no readings"),
-    readings_file("not-utf8", f"{HEADER}\n".encode("utf-16"), ": is not UTF-8 text (byte 0)"),
+    readings_file("not-text", b"\x81\x00\xff", ": is not UTF-8 text (byte 0)"),
+    readings_file("utf16", f"{HEADER}\n".encode("utf-16"), ": holds no readings"),
     Case(
         "readings-too-few",
         "{tmp}/readings.csv: the readings do not determine x_slide.offset, y_slide.offset, "

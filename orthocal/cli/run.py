@@ -15,6 +15,7 @@ from orthocal.characters import printable
 from orthocal.cli import (  # noqa: F401
     calibrating,
     exporting,
+    importing,
     looking,
     making,
     planning,

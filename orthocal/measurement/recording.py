@@ -24,9 +24,10 @@ from orthocal.errors import OrthocalError, OutputError, SessionError
 from orthocal.files import read_file, sync_folder, write_file
 from orthocal.interrupts import postponed_interrupt
 from orthocal.journal import Journal, open_journal_file
+from orthocal.measurement.readings_checks import check_range
 from orthocal.measurement.schema import LARGEST_READING_MM, MOST_READINGS
 from orthocal.measurement.session import Reading, Session
-from orthocal.measurement.session_file import check_range, load_rows
+from orthocal.measurement.session_file import load_rows
 from orthocal.measurement.session_output import readings_table
 from orthocal.measurement.table_of_plan import add_name_of_rows
 from orthocal.units import MM, to_mm

@@ -14,18 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.characters import shorten
-from orthocal.documents import parse_number, read_csv_rows, read_yaml, validate
+from orthocal.documents import read_yaml, validate
 from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.fields import read_only
 from orthocal.files import is_folder, read_file, require_plain_name
 from orthocal.kinematics.assembly import nominal_assembly
-from orthocal.measurement.schema import (
-    LARGEST_READING_MM,
-    MOST_READINGS,
-    GaugeKeys,
-    SessionKeys,
-)
+from orthocal.measurement.readings_checks import check_readings
+from orthocal.measurement.readings_file import read_rows
+from orthocal.measurement.schema import MOST_READINGS, GaugeKeys, SessionKeys
 from orthocal.measurement.sensing import locate_contacts
 from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
 from orthocal.measurement.session_robot import build_offsets, require_given_zero
@@ -60,6 +56,31 @@ def _load_session(
     file: Path, content: bytes, keys: SessionKeys, *, unread: set[int] | None = None
 ) -> Session:
     """A session with readings; where `unread` is given cells may be empty, and it tells which."""
+    plan, readings_path = _build_unread(file, keys)
+    table = read_file(readings_path, error=SessionError)
+    rows = read_rows(readings_path, table)
+    readings = check_readings(rows, plan, file=readings_path, unread=unread)
+    digest = hashlib.sha256(content + b"\0" + table).hexdigest()
+    session = replace(plan, readings=readings, readings_path=readings_path, sha256=digest)
+    check_contacts(session)
+    return session
+
+
+def load_unread(path: str | Path) -> tuple[Session, Path]:
+    """Read a session without its readings, and where they are or shall be.
+
+    Args:
+        path: The session.yaml, or the folder that holds it.
+
+    Raises:
+        SessionError: Naming file and key.
+        RobotError: If the robot does not load.
+    """
+    file, _, keys = _read_keys(Path(path))
+    return _build_unread(file, keys)
+
+
+def _build_unread(file: Path, keys: SessionKeys) -> tuple[Session, Path]:
     if keys.readings is None:
         raise SessionError("is missing; expected the name of a CSV file", where=f"{file}: readings")
     require_plain_name(file, error=SessionError)
@@ -68,13 +89,7 @@ def _load_session(
         raise SessionError(
             f"found {keys.readings!r}; expected the name of a CSV file", where=f"{file}: readings"
         )
-    readings_path = file.parent / keys.readings
-    table = read_file(readings_path, error=SessionError)
-    readings = _read_readings(readings_path, table, plan, unread=unread)
-    digest = hashlib.sha256(content + b"\0" + table).hexdigest()
-    session = replace(plan, readings=readings, readings_path=readings_path, sha256=digest)
-    check_contacts(session)
-    return session
+    return plan, file.parent / keys.readings
 
 
 def load_plan(path: str | Path) -> Session:
@@ -354,131 +369,3 @@ def _check_travel(robot: Robot, drives: Array, *, where: str, joiner: str = ": "
                 f"from {drive.lower / size:g} to {drive.upper / size:g} {unit}"
             )
             raise SessionError(problem, where=file)
-
-
-def _read_readings(
-    path: Path, content: bytes, plan: Session, *, unread: set[int] | None
-) -> tuple[Reading, ...]:
-    readings: list[Reading] = []
-    seen: dict[tuple[Any, ...], int] = {}
-    raw: dict[tuple[str, int], int] = {}
-    joined: dict[tuple[str, int], dict[str, str]] = {}
-    for line, row in read_csv_rows(
-        path,
-        required=("setup", "posture", "reading_mm"),
-        optional=("minus", "cycle"),
-        error=SessionError,
-        content=content,
-    ):
-        where = f"{path}:{line}"
-        setup, posture, minus = row["setup"], row["posture"], row.get("minus", "")
-        if setup not in plan.setups:
-            raise SessionError(
-                f"'{setup}' is not a setup; setups: {', '.join(plan.setups)}", where=where
-            )
-        for name in (posture, minus):
-            if name not in plan.postures and (name or name is posture):
-                raise SessionError(
-                    f"'{name}' is not a posture; postures: {', '.join(plan.postures)}",
-                    where=where,
-                )
-        if minus == posture:
-            raise SessionError(f"takes posture '{posture}' off itself", where=where)
-        cycle = _parse_cycle(row.get("cycle", ""), where)
-        if not row["reading_mm"]:
-            if unread is None:
-                raise SessionError(
-                    "reading_mm is empty; expected what the gauge showed, or no row where nothing "
-                    "was read",
-                    where=where,
-                )
-            unread.add(len(readings))
-        text = row["reading_mm"] or "0"
-        value = parse_number(text, where=where, name="reading_mm", error=SessionError)
-        reading = Reading(setup, posture, minus or None, cycle, value * MM, line)
-        key = (setup, posture, minus, cycle)
-        if key in seen:
-            raise SessionError(
-                f"repeats {reading.label} of cycle {cycle}, first in line {seen[key]}; "
-                "number repeated measurements in the column 'cycle'",
-                where=where,
-            )
-        seen[key] = line
-        if len(readings) >= MOST_READINGS:
-            raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(path))
-        check_range(value, plan.gauges[plan.setups[setup].gauge], bool(minus), where)
-        _check_form(reading, raw, joined, where)
-        readings.append(reading)
-    if not readings:
-        raise SessionError("holds no readings", where=str(path))
-    return tuple(readings)
-
-
-def _parse_cycle(text: str, where: str) -> int:
-    if not text:
-        return 1
-    if not (text.isascii() and text.isdigit() and len(text) < 10 and int(text) >= 1):
-        raise SessionError(f"cycle is '{shorten(text)}'; expected 1, 2, 3 ...", where=where)
-    return int(text)
-
-
-def check_range(value_mm: float, gauge: Gauge, difference: bool, where: str) -> None:
-    """Refuse a reading that no indicator shows, or not this one.
-
-    Raises:
-        SessionError: At `where`.
-    """
-    if abs(value_mm) > LARGEST_READING_MM:
-        raise SessionError(
-            f"reading_mm is {value_mm:g}; expected a number within ±{LARGEST_READING_MM:g}: no "
-            "indicator reaches further",
-            where=where,
-        )
-    if gauge.range is None:
-        return
-    lowest, highest = (v / MM for v in gauge.range)
-    if difference:
-        lowest, highest = lowest - highest, highest - lowest
-    if not lowest - 1e-9 <= value_mm <= highest + 1e-9:
-        kind = "a difference" if difference else "a reading"
-        raise SessionError(
-            f"reading_mm is {value_mm:g}; the gauge's range allows {kind} from "
-            f"{lowest:g} to {highest:g}",
-            where=where,
-        )
-
-
-def _check_form(
-    reading: Reading,
-    raw: dict[tuple[str, int], int],
-    joined: dict[tuple[str, int], dict[str, str]],
-    where: str,
-) -> None:
-    """Refuse readings that say the same thing twice within one cycle of one setup."""
-    group = (reading.setup, reading.cycle)
-    if reading.minus is None:
-        raw.setdefault(group, reading.line or 0)
-    else:
-        leader = joined.setdefault(group, {})
-
-        def find(name: str) -> str:
-            while (above := leader.get(name, name)) != name:
-                leader[name] = leader.get(above, above)  # half the way next time
-                name = above
-            return name
-
-        first, second = find(reading.posture), find(reading.minus)
-        if first == second:
-            raise SessionError(
-                f"{reading.label} follows from the other differences of setup "
-                f"{reading.setup} in cycle {reading.cycle}; leave it out, or give it its own "
-                "cycle if it was measured apart",
-                where=where,
-            )
-        leader[first] = second
-    if group in raw and group in joined:
-        raise SessionError(
-            f"setup {reading.setup} has both readings and differences in cycle {reading.cycle}; "
-            "give the readings only",
-            where=where,
-        )

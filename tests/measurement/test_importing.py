@@ -1,0 +1,531 @@
+"""Tables as spreadsheets and hands write them: the exact readings of each, or the exact refusal."""
+
+from __future__ import annotations
+
+import datetime
+import io
+import json
+import shutil
+import sys
+from dataclasses import dataclass, field
+from decimal import Decimal
+from typing import Any
+
+import openpyxl
+import pytest
+from conftest import ROOT
+
+from orthocal import load_session
+from orthocal.cli import main
+from orthocal.errors import SessionError
+from orthocal.measurement.importing import TableOptions, import_readings, write_import
+
+SESSION = """
+robot: machine
+gauge: {sigma_mm: 0.01, resolution_mm: 0.01, range_mm: [-60, 60]}
+postures:
+  zero: {tcp_mm: [0, 0]}
+  x_max: {tcp_mm: [40, 0]}
+  x_-40: {tcp_mm: [-40, 0]}
+setups:
+  xy: {leg: x, direction: y, section: {fraction: 0.5}}
+  yx: {leg: y, direction: -x, section: {fraction: 0.5}}
+readings: readings.csv
+"""
+
+THREE = (("xy", "zero", "", 1, "0"), ("xy", "x_max", "", 1, "-0.43"), ("yx", "zero", "", 1, "1.5"))
+"""What most of the forms say."""
+
+WIDE = (
+    ("xy", "zero", "", 1, "0.01"),
+    ("xy", "zero", "", 2, "-0.02"),
+    ("xy", "x_max", "", 1, "0.5"),
+    ("xy", "x_max", "", 2, "0.52"),
+)
+
+
+@dataclass(frozen=True)
+class Form:
+    """A table, and what comes of it."""
+
+    name: str
+    content: bytes
+    expected: tuple[tuple[str, str, str, int, str], ...] | str
+    """Readings in mm, or the refusal, in which {} is the table."""
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def text(name, content, expected=THREE, *, encoding="utf-8", **options):
+    return Form(name, content.encode(encoding), expected, options)
+
+
+def book(name, rows, expected=THREE, *, edit=None, **options):
+    """A workbook of openpyxl; rows of one sheet, or sheets by name."""
+    made = openpyxl.Workbook()
+    sheets = rows if isinstance(rows, dict) else {"Tabelle1": rows}
+    made.remove(made.active)
+    for title, lines in sheets.items():
+        sheet = made.create_sheet(title)
+        for line in lines:
+            sheet.append(line)
+    if edit:
+        edit(made)
+    stream = io.BytesIO()
+    made.save(stream)
+    return Form(name, stream.getvalue(), expected, options)
+
+
+ENGLISH = "setup,posture,reading_mm\nxy,zero,0.00\nxy,x_max,-0.43\nyx,zero,1.5\n"
+GERMAN = "Aufstellung;Stellung;Messwert [mm]\r\nxy;zero;0,00\r\nxy;x_max;-0,43\r\nyx;zero;1,5\r\n"
+CELLS = [
+    ["Setup", "Posture", "Reading [mm]"],
+    ["xy", "zero", 0],
+    ["xy", "x_max", -0.43],
+    ["yx", "zero", 1.5],
+]
+HEAD = "setup;posture;reading_mm\n"
+UNITLESS = "setup;posture;value\nxy;zero;0,5\n"
+WHICH = "and no other reading tells which; say which: --decimal comma or --decimal point"
+
+
+def in_sheet(cell, **changes):
+    def edit(made):
+        for key, value in changes.items():
+            setattr(made.worksheets[0][cell], key, value)
+
+    return edit
+
+
+def merge(made):
+    made.worksheets[0].merge_cells("A2:A3")
+
+
+def hide_second(made):
+    made.worksheets[1].sheet_state = "hidden"
+
+
+def one(value, *, unit="mm"):
+    """The reading of a table of one."""
+    factor = {"mm": 1, "um": Decimal("0.001"), "inch": Decimal("25.4")}[unit]
+    return (("xy", "zero", "", 1, str(Decimal(value) * factor)),)
+
+
+FORMS = [
+    text("house", ENGLISH),
+    text("german-excel", GERMAN),
+    text("german-cp1252-en-dash", GERMAN.replace("-0", "–0"), encoding="cp1252"),
+    text("minus-sign", GERMAN.replace("-0", "−0")),
+    text("minus-hyphens", GERMAN.replace("-0", "‐0")),
+    text("minus-and-blank", GERMAN.replace("-0", "− 0")),
+    text("plus-sign", GERMAN.replace("1,5", "+1,5")),
+    text("byte-order-mark", GERMAN, encoding="utf-8-sig"),
+    text("utf16-with-mark", GERMAN.replace(";", "\t"), encoding="utf-16"),
+    text("utf16-le", GERMAN, encoding="utf-16-le"),
+    text("utf16-be", GERMAN.replace("-0", "−0"), encoding="utf-16-be"),
+    Form("utf16-cut", GERMAN.encode("utf-16-le")[:-1],
+         f"{{}}: is not utf-16-le text (byte {2 * len(GERMAN) - 2})"),
+    text("tabs", ENGLISH.replace(",", "\t")),
+    text("tabs-and-decimal-commas", GERMAN.replace(";", "\t")),
+    text("pipes", ENGLISH.replace(",", "|")),
+    text("commas-and-quoted-decimal-commas", ENGLISH.replace("0.00", '"0,00"')
+         .replace("-0.43", '"-0,43"').replace("1.5", '"1,5"')),
+    text("all-quoted", '"Setup";"Posture";"Reading_mm"\n"xy";"zero";"0,00"\n"xy";"x_max";"-0,43"\n'
+         '"yx";"zero";"1,5"\n'),
+    text("lines-of-a-mac", GERMAN.replace("\r\n", "\r")),
+    text("said-separator", f"sep=;\n{GERMAN}"),
+    text("capitals", ENGLISH.replace("setup,posture,reading_mm", " SETUP , Posture ,READING_MM")
+         .replace("xy,", "XY,").replace("x_max", "X max")),
+    text("bracketed-unit", GERMAN.replace("Messwert [mm]", "Ablesung (mm)")),
+    text("line-break-in-heading", GERMAN.replace("Messwert [mm]", '"Messwert\n[mm]"')),
+    text("unit-after-in", GERMAN.replace("Messwert [mm]", "Wert in mm")),
+    text("unit-in-a-row-of-its-own", "Setup;Posture;Value\n;;mm\nxy;zero;0,00\nxy;x_max;-0,43\n"
+         "yx;zero;1,5\n"),
+    text("unit-in-cells", "Setup;Posture;Value\nxy;zero;0,00 mm\nxy;x_max;-430 µm\n"
+         "yx;zero;1,5mm\n"),
+    text("rows-above", f"Messprotokoll;;\n;;\nMaschine 3;12.05.2026;\n{GERMAN}"),
+    text("rows-below", f"{GERMAN};;\nGemessen von Meier;;\n"),
+    text("empty-columns-and-rows", GERMAN.replace("\r\n", ";;;\r\n") + ";;;;;\r\n;;;;;\r\n"),
+    text("extra-columns", "Nr;setup;Temperatur;posture;Messwert_mm;Bemerkung\n"
+         "1;xy;21,5;zero;0,00;\n2;xy;21,5;x_max;-0,43;gut\n3;yx;21,5;zero;1,5;\n"),
+    text("cells-without-heading", GERMAN.replace("-0,43", "-0,43;;wackelt")),
+    text("not-yet-read", GERMAN + "yx;x_max;\r\nyx;x_-40;–\r\nxy;x_-40;n/a\r\n"),
+    text("order-of-columns", "Reading (mm);Posture;Setup\n0,00;zero;xy\n-0,43;x_max;xy\n"
+         "1,5;zero;yx\n"),
+    text("named-columns", "A;B;C\nxy;zero;0,00\nxy;x_max;-0,43\nyx;zero;1,5\n",
+         columns={"setup": "A", "posture": "b", "reading": "#3"}, unit="mm"),
+    text("fill", "setup;posture;Wert mm\nxy;zero;0,00\n;x_max;-0,43\nyx;zero;1,5\n", fill=True),
+    text("not-filled", "setup;posture;Wert mm\nxy;zero;0,00\n;x_max;-0,43\n",
+         "{}:3: has a reading, and its setup is empty; --fill takes the setup above"),
+    text("groups-by-point", HEAD.replace("mm", "um") + "xy;zero;1.234,5\n",
+         one("1234.5", unit="um")),
+    text("groups-by-comma", HEAD.replace("mm", "um") + "xy;zero;1,234.5\n",
+         one("1234.5", unit="um")),
+    text("groups-by-blank", HEAD.replace("mm", "um") + "xy;zero;1\u202f234,5\n",
+         one("1234.5", unit="um")),
+    text("groups-by-apostrophe", HEAD.replace("mm", "µm") + "xy;zero;1’234.5\n",
+         one("1234.5", unit="um")),
+    text("micrometres", "setup;posture;Wert in µm\nxy;zero;-12,5\n", one("-12.5", unit="um")),
+    text("micrometres-cp1252", "setup;posture;Wert [µm]\nxy;zero;-12,5\n", one("-12.5", unit="um"),
+         encoding="cp1252"),
+    text("inches", 'setup;posture;reading (in)\nxy;zero;-.0125\n', one("-.0125", unit="inch")),
+    text("inch-marks", 'setup|posture|reading\nxy|zero|0.005"\n', one("0.005", unit="inch")),
+    text("said-unit", UNITLESS, one("0.5"), unit="mm"),
+    text("said-inch", UNITLESS, one("0.5", unit="inch"), unit="inch"),
+    text("no-unit", UNITLESS, "{}:2: neither the heading 'value' nor the cell says a unit; say it: "
+         "--unit mm, um or inch"),
+    text("other-unit-than-said", UNITLESS.replace("value", "value_mm"),
+         "{}:2: the reading is in mm, and --unit says um", unit="um"),
+    text("other-unit-in-a-cell", HEAD + "xy;zero;0,5 µm\n",
+         "{}:2: the reading is in um, and its heading says mm"),
+    text("exponents", HEAD + "xy;zero;-1,25E-02\n", one("-0.0125")),
+    text("many-digits", HEAD + "xy;zero;0,12345678901234567890123\n",
+         one("0.12345678901234567890123")),
+    text("wide-cycles", "setup,posture,cycle 1,cycle 2\nxy,zero,0.01,-0.02\nxy,x_max,0.5,0.52\n",
+         WIDE, unit="mm"),
+    text("wide-readings", "setup;posture;reading 1_mm;reading 2_mm\nxy;zero;0,01;-0,02\n"
+         "xy;x_max;0,5;0,52\n", WIDE),
+    text("wide-units-first", "setup;posture;reading_mm_1;reading_mm_2\nxy;zero;0,01;-0,02\n"
+         "xy;x_max;0,5;0,52\n", WIDE),
+    text("wide-german", "Aufstellung\tStellung\t1. Durchgang [mm]\t2. Durchgang [mm]\tMittelwert\n"
+         "xy\tzero\t0,01\t-0,02\t-0,005\nxy\tx_max\t0,5\t0,52\t0,51\n", WIDE),
+    text("wide-numbers", "setup;posture;1;2\nxy;zero;0,01;-0,02\nxy;x_max;0,5;0,52\n", WIDE,
+         unit="mm"),
+    text("wide-told", "setup;posture;Uhr A [mm];Uhr B [mm]\nxy;zero;0,01;-0,02\n"
+         "xy;x_max;0,5;0,52\n", WIDE,
+         columns={"reading 2": "Uhr B [mm]", "reading1": "Uhr A [mm]"}),
+    text("wide-half-read", "setup;posture;cycle 1;cycle 2\nxy;zero;0,01;-0,02\nxy;x_max;0,5;\n",
+         WIDE[:3], unit="mm"),
+    text("wide-and-a-cycle", "setup;posture;cycle;reading 1;reading 2\nxy;zero;1;0,1;0,2\n",
+         "{}:1: has cycles side by side ('reading 1' ...) and a column 'cycle' as well; --column "
+         "says which one counts", unit="mm"),
+    text("cycles-below-each-other", "setup;posture;Zyklus;mm\nxy;zero;1;0,01\n",
+         "{}: no row has the headings setup, posture and reading; row 1 has 'setup', 'posture', "
+         "'Zyklus', 'mm', with semicolon as separator. --column ROLE=HEADING says which column is "
+         "which"),
+    text("cycles-in-rows", "setup;posture;Zyklus;Wert mm\nxy;zero;1;0,01\nxy;zero;2;-0,02\n"
+         "xy;x_max;1;0,5\nxy;x_max;2;0,52\n", WIDE),
+    text("differences", "setup;posture;minus;reading_mm\nxy;x_max;zero;-0,43\n",
+         (("xy", "x_max", "zero", 1, "-0.43"),)),
+    text("dash-for-no-minus", "setup;posture;minus;reading_mm\nxy;zero;–;0,5\n", one("0.5")),
+    text("name-with-a-dash", HEAD + "xy;x_–40;0,5\n", (("xy", "x_-40", "", 1, "0.5"),)),
+    text("thousand-or-decimal", HEAD + "xy;zero;12\nxy;x_max;1,234\n",
+         "{}:3: the reading '1,234' is 1.234 with a decimal comma and 1234 with a decimal point, "
+         + WHICH),
+    text("thousand-or-decimal-by-point", UNITLESS.replace("0,5", "-1.234"),
+         "{}:2: the reading '-1.234' is -1234 with a decimal comma and -1.234 with a decimal "
+         "point, " + WHICH, unit="um"),
+    text("told-by-another-cell", HEAD + "xy;zero;1,234\nxy;x_max;0,5\n",
+         (("xy", "zero", "", 1, "1.234"), ("xy", "x_max", "", 1, "0.5"))),
+    text("told-by-an-option", HEAD + "xy;zero;1,234\n", one("1.234"), decimal="comma"),
+    text("thousand-by-an-option", HEAD.replace("mm", "um") + "xy;zero;1,234\n",
+         one("1234", unit="um"), decimal="point"),
+    text("leading-zero", HEAD + "xy;zero;0,123\n", one("0.123")),
+    text("both-signs", HEAD + "xy;zero;0,5\nxy;x_max;0.5\n",
+         "{}:3: the reading '0.5' has a decimal point, and '0,5' in line 2 a decimal comma; write "
+         "all alike"),
+    text("other-sign-than-said", HEAD + "xy;zero;0,5\n",
+         "{}:2: the reading is '0,5'; expected a number with a decimal point", decimal="point"),
+    text("three-and-five", "setup,posture,Wert_um,Zyklus\nxy,zero,3,5\n",
+         "{}:2: '3,5' may be two cells or one number with a decimal comma; if they are two, say "
+         "--separator comma to `orthocal import`, if one, save the table with semicolons"),
+    text("three-and-five-said", "setup,posture,Wert_um,Zyklus\nxy,zero,3,5\n",
+         (("xy", "zero", "", 5, "0.003"),), separator="comma"),
+    text("decimal-comma-between-commas", "setup,posture,reading_mm\nxy,zero,0,5\n",
+         "{}:2: has 4 fields; expected 3; a decimal comma between commas? Save the table with "
+         "semicolons, or its numbers in quotes"),
+    text("temperature-between-commas", "setup,posture,T,reading_mm\nxy,zero,21,5,\n",
+         "{}:2: has 5 fields; expected 4; a decimal comma between commas? Save the table with "
+         "semicolons, or its numbers in quotes"),
+    text("no-number", HEAD + "xy;zero;gut\n", "{}:2: the reading is 'gut'; expected a number"),
+    text("error-of-a-spreadsheet", HEAD + "xy;zero;#DIV/0!\n",
+         "{}:2: the reading is '#DIV/0!'; expected a number"),
+    text("wrong-digits", HEAD + "xy;zero;٣\n", "{}:2: the reading is '٣'; expected a number"),
+    text("minus-behind", HEAD + "xy;zero;0,5-\n", "{}:2: the reading is '0,5-'; expected a number"),
+    text("unknown-setup", HEAD + "xz;zero;0,5\n", "{}:2: 'xz' is not a setup; setups: xy, yx"),
+    text("unknown-posture", HEAD + "xy;null;0,5\n",
+         "{}:2: 'null' is not a posture; postures: zero, x_max, x_-40"),
+    text("twice", HEAD + "xy;zero;0,5\nXY;Zero;0,6\n",
+         "{}:3: repeats xy zero of cycle 1, first in line 2; number repeated measurements in the "
+         "column 'cycle'"),
+    text("two-readings-a-row", "setup;posture;Messwert_mm;Anzeige_mm\nxy;zero;0,5;0,6\n",
+         "{}:1: several columns are the reading: 'Messwert_mm' (#3) and 'Anzeige_mm' (#4); say "
+         "which: --column reading=HEADING"),
+    text("two-readings-told", "setup;posture;Messwert_mm;Anzeige_mm\nxy;zero;0,5;0,6\n", one("0.6"),
+         columns={"reading": "Anzeige_mm"}),
+    text("beyond-the-gauge", HEAD + "xy;zero;500,5\n", "{}:2: reading_mm is 500.5; expected a "
+         "number within ±300: no indicator reaches further"),
+    text("nothing", "", "{}: is empty; expected the headings setup, posture and reading"),
+    text("no-rows", HEAD, "{}: holds no readings"),
+    text("open-quote", f'{HEAD}xy;"zero;0,5\n', "{}:2: is not valid CSV: unexpected end of data"),
+    Form("control-characters", b"\x00\x01\x02\x03" * 9,
+         "{}:1: holds the control character 0x00; expected text (utf-8)"),
+    Form("half-utf8", b"\xef\xbb\xbfsetup\xff", "{}: is not utf-8 text (byte 8)"),
+    Form("said-utf8", GERMAN.replace("-0", "–0").encode("cp1252"),
+         "{}: is not utf-8 text (byte 59)", {"encoding": "utf-8"}),
+    Form("old-workbook", b"\xd0\xcf\x11\xe0" + bytes(600),
+         "{}: is an old .xls, or protected by a password; save it as .xlsx or CSV"),
+    book("workbook", CELLS),
+    book("workbook-with-a-title", [["Protokoll"], [], *CELLS]),
+    book("workbook-of-texts", [CELLS[0], ["xy", "zero", "0,00"], ["xy", "x_max", "−0,43"],
+                               ["yx", "zero", "1,5"]]),
+    book("workbook-of-both", [CELLS[0], ["xy", "zero", "0,00"], *CELLS[2:]]),
+    book("workbook-merged", [*CELLS[:2], [None, "x_max", -0.43], CELLS[3]], edit=merge),
+    book("workbook-not-merged", [*CELLS[:2], [None, "x_max", -0.43]],
+         "{}: sheet 'Tabelle1' row 3: has a reading, and its setup is empty; --fill takes the "
+         "setup above"),
+    book("workbook-merged-readings", [*CELLS[:2], ["xy", "x_max"]],
+         "{}: sheet 'Tabelle1' C2: is merged with cells below; expected a cell for each reading",
+         edit=lambda made: made.worksheets[0].merge_cells("C2:C3")),
+    book("workbook-date", [*CELLS[:2], ["xy", "x_max", datetime.date(2026, 5, 1)]],
+         "{}: sheet 'Tabelle1' C3: the reading is the date 2026-05-01 00:00:00; expected a number: "
+         "the spreadsheet took what was typed for a date"),
+    book("workbook-truth", [CELLS[0], ["xy", "zero", True]],
+         "{}: sheet 'Tabelle1' C2: the reading is TRUE; expected a number"),
+    book("workbook-unsaved-formula", [CELLS[0], ["xy", "zero", "=1+1"]],
+         "{}: sheet 'Tabelle1' C2: the reading is a formula whose value was not saved: open the "
+         "table in a spreadsheet program and save it"),
+    book("workbook-percentage", [CELLS[0], ["xy", "zero", 0.12]],
+         "{}: sheet 'Tabelle1' C2: the reading is shown as a percentage or in thousands, and is "
+         "0.12; give its cell the format of a plain number",
+         edit=in_sheet("C2", number_format="0%")),
+    book("workbook-unit-of-a-format", [["setup", "posture", "value"], ["xy", "zero", 12.5]],
+         one("12.5", unit="um"), edit=in_sheet("C2", number_format='0.0" µm"')),
+    book("workbook-digits-as-shown", [CELLS[0], ["xy", "zero", 0.1 + 0.2]], one("0.3")),
+    book("workbook-numbers-as-names", [["setup", "posture", "1", 2], ["xy", "zero", 0.01, -0.02],
+                                       ["xy", "x_max", 0.5, 0.52]], WIDE, unit="mm"),
+    book("workbook-sheets", {"Notizen": [["nichts"]], "Messung": CELLS}),
+    book("workbook-two-sheets", {"Montag": CELLS, "Dienstag": CELLS},
+         "{}: several sheets have readings: 'Montag', 'Dienstag'; say which: --sheet NAME"),
+    book("workbook-said-sheet", {"Montag": CELLS[:2], "Dienstag": CELLS}, sheet="dienstag"),
+    book("workbook-hidden-sheet", {"Montag": CELLS, "Dienstag": CELLS}, edit=hide_second),
+    book("workbook-no-such-sheet", {"Montag": CELLS},
+         "{}: has no sheet 'Mittwoch'; sheets: 'Montag'", sheet="Mittwoch"),
+    book("workbook-no-readings", {"Montag": [["a", "b"]], "Dienstag": [["c"]]},
+         "{}: no sheet has the headings setup, posture and reading; sheets: 'Montag', 'Dienstag'"),
+    Form("archive", b"PK\x03\x04" + bytes(50), "{}: is not an .xlsx that can be read: File is not "
+         "a zip file"),
+    text("sheet-of-a-csv", ENGLISH, "--sheet: is of no use: {} is no .xlsx", sheet="a"),
+    text("no-such-separator", ENGLISH, "--separator: '!' is not a separator; expected one of "
+         "semicolon, tab, comma, pipe", separator="!"),
+    text("no-such-encoding", ENGLISH, "--encoding: 'x' is not an encoding; expected one of utf-8, "
+         "utf-16, utf-16-le, utf-16-be, cp1252, latin-1, cp1250, cp850, cp437, mac-roman",
+         encoding_said="x"),
+    text("no-such-unit", ENGLISH, "--unit: 'm' is no unit of readings; expected mm, um, inch, cm, "
+         "thou", unit="m"),
+    text("no-such-decimal", ENGLISH, "--decimal: ',' is no decimal sign; expected comma or point",
+         decimal=","),
+    text("no-such-role", ENGLISH, "--column: 'date' is no column of readings; expected one of "
+         "setup, posture, minus, cycle, reading, or reading 1, reading 2 ... for cycles side by "
+         "side", columns={"date": "setup"}),
+    text("no-such-column", ENGLISH, "{}: no row has the headings setup, posture and reading; row 1 "
+         "has 'setup', 'posture', 'reading_mm', with comma as separator. --column ROLE=HEADING "
+         "says which column is which", columns={"setup": "Aufbau"}),
+    Form("mac-roman", GERMAN.replace("-0", "–0").encode("mac-roman"), THREE,
+         {"encoding": "mac-roman"}),
+    Form("mac-roman-unsaid", GERMAN.replace("-0", "–0").encode("mac-roman"),
+         "{}:3: the reading is 'Ð0,43'; expected a number"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("session")
+    shutil.copytree(ROOT / "tests/robots/biglide", made / "machine")
+    (made / "session.yaml").write_text(SESSION)
+    return made
+
+
+@pytest.fixture
+def session(folder):
+    yield folder
+    (folder / "readings.csv").unlink(missing_ok=True)
+
+
+def read(session, form):
+    """What becomes of a form: its readings in mm, or the refusal."""
+    table = session / "table"
+    table.write_bytes(form.content)
+    options = {k.replace("encoding_said", "encoding"): v for k, v in form.options.items()}
+    try:
+        found = import_readings(table, session, TableOptions(**options))
+    except SessionError as e:
+        return str(e).replace(str(table), "{}")
+    write_import(found)
+    return found
+
+
+def test_there_are_forms_enough_and_their_names_are_their_own():
+    assert len({form.name for form in FORMS}) == len(FORMS) >= 40
+
+
+@pytest.mark.parametrize("form", FORMS, ids=lambda form: form.name)
+def test_a_form_gives_its_readings_or_is_refused(form, session):
+    found = read(session, form)
+    if isinstance(form.expected, str):
+        assert found == form.expected
+        assert not (session / "readings.csv").exists()
+        return
+    assert not isinstance(found, str), found
+    rows = [
+        (r.setup, r.posture, r.minus, int(r.cycle or 1), Decimal(r.reading))
+        for r in found.long.rows
+    ]
+    assert rows == [(*key, Decimal(value)) for *key, value in form.expected]
+    again = load_session(session)
+    loaded = [(r.setup, r.posture, r.minus or "", r.cycle, r.value) for r in again.readings]
+    assert loaded == [(*key, float(Decimal(value)) * 1e-3) for *key, value in form.expected]
+
+
+# ---- into a session
+
+PLANNED = "setup,posture,cycle,reading_mm\nxy,zero,1,\nxy,x_max,1,\nxy,zero,2,\nxy,x_max,2,\n"
+
+
+@pytest.fixture
+def orthocal(monkeypatch, capfd):
+    """Runs a command: exit code, stdout, stderr."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["orthocal", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        return (stopped.value.code, *capfd.readouterr())
+
+    return run
+
+
+def put(session, table, readings=PLANNED):
+    (session / "table.csv").write_text(table, encoding="utf-8")
+    if readings is not None:
+        (session / "readings.csv").write_text(readings)
+    return session / "table.csv"
+
+
+def test_a_planned_session_is_filled_in_its_own_order(session, orthocal):
+    table = put(session, "setup;posture;Zyklus 1 [mm];2 [mm]\nxy;x_max;0,5;\nxy;zero;0,01;-0,02\n")
+    code, out, err = orthocal("import", table, session)
+    assert (code, err) == (0, f"Wrote {session}/readings.csv\n")
+    assert (session / "readings.csv").read_text() == (
+        "setup,posture,cycle,reading_mm\nxy,zero,1,0.01\nxy,x_max,1,0.50\nxy,zero,2,-0.02\n"
+        "xy,x_max,2,\n"
+    )
+    assert out.splitlines() == [
+        f"3 readings in {table}",
+        "  encoding       utf-8, ASCII alone",
+        "  separator      semicolon, it gives the columns",
+        "  decimal sign   comma, as in '0,5' (row 2)",
+        "  unit           mm, as the table says",
+        "  setup          'setup'",
+        "  posture        'posture'",
+        "  reading        'Zyklus 1 [mm]' as cycle 1, '2 [mm]' as cycle 2",
+        "  not yet read   1: row 2",
+        f"{session}/readings.csv: 3 filled in; 1 row still without a reading",
+    ]
+
+
+def test_the_rest_comes_later_and_what_is_there_stays(session, orthocal):
+    first = put(session, HEAD + "xy;zero;0,01\n")
+    assert orthocal("import", first, session)[0] == 0
+    second = put(session, HEAD + "xy;zero;0,010\nxy;x_max;0,5\nyx;zero;1\n", None)
+    code, out, _ = orthocal("import", second, session)
+    assert code == 0
+    assert out.endswith("1 filled in, 1 added, 1 there already; 2 rows still without a reading\n")
+    rows = (session / "readings.csv").read_text().splitlines()
+    assert rows[1:] == ["xy,zero,1,0.01", "xy,x_max,1,0.50", "xy,zero,2,", "xy,x_max,2,",
+                        "yx,zero,1,1.00"]  # fmt: skip
+    before = (session / "readings.csv").stat()
+    code, _, err = orthocal("import", second, session)
+    assert (code, err) == (0, "Nothing was written: there is nothing new\n")
+    assert (session / "readings.csv").stat().st_mtime_ns == before.st_mtime_ns
+
+
+def test_a_reading_that_is_there_is_not_written_over_unasked(session, orthocal):
+    there = PLANNED.replace("zero,1,", "zero,1,0.02")
+    table = put(session, HEAD + "xy;zero;0,01\n", there)
+    code, out, err = orthocal("import", table, session)
+    assert (code, out) == (2, "")
+    assert err == (
+        f"orthocal: {session}/readings.csv:2: xy zero of cycle 1 is 0.01 mm in {table}:2, and 0.02 "
+        "mm here; --replace writes over what is there\n"
+    )
+    assert (session / "readings.csv").read_text() == there
+    code, out, _ = orthocal("import", table, session, "--replace")
+    assert code == 0
+    assert "1 replaced" in out
+    assert "zero,1,0.01\n" in (session / "readings.csv").read_text()
+
+
+def test_a_dry_run_says_the_same_and_writes_nothing(session, orthocal):
+    table = put(session, HEAD + "xy;zero;0,01\n")
+    code, out, err = orthocal("import", table, session, "--dry-run")
+    assert (code, err) == (0, "Nothing was written\n")
+    assert (session / "readings.csv").read_text() == PLANNED
+    assert orthocal("import", table, session)[1] == out
+
+
+def test_json_has_all_that_was_understood(session, orthocal):
+    table = put(session, "Setup;posture;T;Wert\nXY;zero;21;-12,5\n;;;\nxy;x_max;21;\nEnde\n")
+    code, out, _ = orthocal("import", table, session, "--json", "--unit", "um")
+    assert code == 0
+    document = json.loads(out)
+    assert document["readings"] == [
+        {"row": 2, "setup": "xy", "posture": "zero", "minus": None, "cycle": 1,
+         "reading_mm": -0.0125}
+    ]  # fmt: skip
+    assert document["units"] == ["um"]
+    assert (document["encoding"], document["separator"]) == ("utf-8", "semicolon")
+    assert document["decimal"] == "comma"
+    assert document["not_used"] == ["'T'"]
+    assert document["left_out"] == [{"row": 5, "reason": "no reading"}]
+    assert document["not_yet_read"] == [4]
+    assert document["names"] == {"XY": "xy"}
+    assert document["written"] == f"{session}/readings.csv"
+    assert (document["filled"], document["empty"]) == (1, 3)
+
+
+def test_the_sessions_own_table_is_written_anew_where_that_is_said(session, orthocal):
+    own = session / "readings.csv"
+    german = "Aufstellung;Stellung;Notiz;Wert_mm\nxy;zero;a;1,234\nxy;x_max;b;\n"
+    put(session, "", german)
+    code, _, err = orthocal("import", own, session, "--decimal", "comma")
+    assert code == 2
+    assert err == (
+        f"orthocal: {own}: is the session's own table; --replace writes it anew, with its readings "
+        "alone\n"
+    )
+    assert own.read_text() == german
+    assert orthocal("import", own, session, "--decimal", "comma", "--replace")[0] == 0
+    assert own.read_text() == "setup,posture,reading_mm\nxy,zero,1.234\nxy,x_max,\n"
+
+
+def test_what_contradicts_the_session_is_refused_and_nothing_is_written(session, orthocal):
+    table = put(session, "setup;posture;minus;reading_mm\nxy;x_max;zero;0,5\n", PLANNED)
+    code, _, err = orthocal("import", table, session)
+    assert code == 2
+    assert "setup xy has both readings and differences in cycle 1; give the readings only" in err
+    assert (session / "readings.csv").read_text() == PLANNED
+
+
+# ---- the same where a session is read
+
+CLEAN = {
+    "semicolons": "setup;posture;reading_mm\nxy;zero;0,00\nxy;x_max;-0,43\nyx;zero;1,5\n",
+    "german": GERMAN,
+    "quoted": 'setup,posture,reading_mm\nxy,zero,0\nxy,x_max,"-0,43"\nyx,zero,"1,5"\n',
+    "typographic": ENGLISH.replace("-", "−"),
+    "tabs": ENGLISH.replace(",", "\t"),
+    "trailing": GERMAN.replace("\r\n", ";;\r\n"),
+    "capitals": ENGLISH.replace("setup,posture", "Setup,Posture"),
+}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "cp1252"])
+@pytest.mark.parametrize("table", CLEAN.values(), ids=CLEAN.keys())
+def test_a_clean_table_is_a_sessions_without_any_flag(table, encoding, session):
+    if encoding == "cp1252":
+        table = table.replace("−", "–")
+    (session / "readings.csv").write_bytes(table.encode(encoding))
+    found = load_session(session).readings
+    assert [(r.setup, r.posture, "", r.cycle) for r in found] == [key[:4] for key in THREE]
+    assert [r.value for r in found] == [float(value) * 1e-3 for *_, value in THREE]
+    assert [r.line for r in found] == [2, 3, 4]
