@@ -7,9 +7,10 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from orthocal.characters import control_character
 from orthocal.errors import OrthocalError, OutputError
@@ -62,6 +63,31 @@ def read_file(
         found = f"{size / 2**20:.0f} MiB" if size > largest else "more"
         raise error(f"has {found}; expected at most {largest / 2**20:g} MiB", where=str(path))
     return content
+
+
+def read_parts(
+    path: Path | BinaryIO, *, longest: int, name: str, error: type[OrthocalError] = OrthocalError
+) -> Iterator[bytes]:
+    """Lines of a file of any size, one at a time, each with what ends it.
+
+    Args:
+        path: A regular file, or a stream that is open.
+        longest: Bytes of a line above which it comes in parts.
+        name: For messages.
+        error: Kind of error to raise.
+
+    Raises:
+        OrthocalError: Of the kind given, if it is missing, no regular file, or cannot be read.
+    """
+    stream = open(_open_regular(path, error), "rb") if isinstance(path, Path) else path
+    try:
+        while part := stream.readline(longest):
+            yield part
+    except OSError as e:
+        raise error(f"cannot be read: {e.strerror}", where=name) from None
+    finally:
+        if isinstance(path, Path):
+            stream.close()
 
 
 def require_file(
@@ -195,7 +221,11 @@ def _require_replaceable(path: Path) -> None:
         raise OutputError("is write-protected", where=str(path))
 
 
-def write_file(path: Path, content: str | bytes) -> None:
+Content = str | bytes | Iterable[bytes]
+"""Of a file: text, which is written as UTF-8, bytes, or parts of them."""
+
+
+def write_file(path: Path, content: Content) -> None:
     """Write a file whole or not at all: beside it first, then renamed.
 
     Raises:
@@ -206,7 +236,7 @@ def write_file(path: Path, content: str | bytes) -> None:
     write_files(path.parent, {path.name: content})
 
 
-def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
+def write_files(folder: Path, files: Mapping[str, Content]) -> None:
     """Write several files of one folder that belong together, all or none.
 
     All are written beside their places first. Then, with no Ctrl-C between, the old ones but the
@@ -216,8 +246,7 @@ def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
 
     Args:
         folder: Where to; made if need be.
-        files: Name to text, which is written as UTF-8, or bytes. Without the first the others
-            mean nothing.
+        files: Name to content. Without the first the others mean nothing.
 
     Raises:
         OrthocalError: If the folder or a file cannot be one.
@@ -233,7 +262,7 @@ def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
         raise _refusal(e, folder) from None
 
 
-def _write(folder: Path, files: Mapping[str, str | bytes]) -> None:
+def _write(folder: Path, files: Mapping[str, Content]) -> None:
     """Stage all files, and put them in place; what was staged is taken away whatever happens."""
     staged: dict[Path, Path] = {}
     aside: dict[Path, Path] = {}
@@ -245,7 +274,7 @@ def _write(folder: Path, files: Mapping[str, str | bytes]) -> None:
             _clean_up(target.parent)
             staged[target] = target.with_name(_temporary_name())
             data = content.encode() if isinstance(content, str) else content
-            _stage(staged[target], data, like=target)
+            _stage(staged[target], [data] if isinstance(data, bytes) else data, like=target)
         with postponed_interrupt():
             _put_in_place(staged, aside)
     finally:
@@ -286,12 +315,12 @@ def _behind_links(path: Path) -> Path:
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
-def _stage(temporary: Path, data: bytes, *, like: Path) -> None:
+def _stage(temporary: Path, parts: Iterable[bytes], *, like: Path) -> None:
     """Write a file to be renamed later, with the mode of the one whose place it will take."""
     with open(os.open(temporary, _WRITE_FLAGS, 0o666), "wb") as stream:
         with suppress(FileNotFoundError):
             os.chmod(temporary, stat.S_IMODE(os.stat(like).st_mode))
-        stream.write(data)
+        stream.writelines(parts)
         stream.flush()
         os.fsync(stream.fileno())
 

@@ -21,6 +21,11 @@ def put_out(text: str) -> None:
     sys.stdout.flush()
 
 
+def put_part(text: str) -> None:
+    """A part of a long result, on stdout."""
+    sys.stdout.write(text)
+
+
 def put_note(text: str) -> None:
     """Anything else, on stderr."""
     sys.stderr.write(printable(text, keep="\n") + "\n")
