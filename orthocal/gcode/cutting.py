@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,14 +56,13 @@ class Correct(Protocol):
         """
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Cut:
+class Cut(NamedTuple):
     """A motion as a polyline."""
 
-    points: Array
-    """Ends of the pieces, without the motion's start, corrected, shape (n_pieces, 3), [m]."""
-    stretch: Array
-    """Length of each piece over that of its part of the motion, shape (n_pieces,)."""
+    points: list[list[float]]
+    """Ends of the pieces, without the motion's start, corrected: x, y, z of each, [m]."""
+    stretch: list[float]
+    """Length of each piece over that of its part of the motion."""
     chord: float
     """Largest distance of the corrected motion from the pieces that was seen, [m]."""
     correction: float
@@ -152,16 +151,16 @@ def _cut_group(
     part = lengths[group[piece]] / n[piece]
     with np.errstate(divide="ignore", invalid="ignore"):
         stretch = np.where(part > 0.0, np.linalg.norm(b - a, axis=1) / part, 1.0)
-    ends = np.cumsum(n)
-    for k, i in enumerate(group.tolist()):
+    ends, stretches = b.tolist(), stretch.tolist()
+    last = 0
+    results = zip(group.tolist(), n.tolist(), worst.tolist(), largest.tolist(), strict=True)
+    for k, (i, count, chord, correction) in enumerate(results):
+        at = slice(last, last + count)
+        last += count
         if k in reasons:
             found[i] = Refused(reasons[k])
-        elif worst[k] > SEEN * tolerance:
+        elif chord > SEEN * tolerance:
             # a chord's distance goes with the square of its length
-            yield (
-                i,
-                max(float(n[k]) + 1.0, math.ceil(n[k] * math.sqrt(worst[k] / tolerance) * 1.05)),
-            )
+            yield i, max(count + 1.0, math.ceil(count * math.sqrt(chord / tolerance) * 1.05))
         else:
-            at = slice(ends[k] - n[k], ends[k])
-            found[i] = Cut(b[at], stretch[at], float(worst[k]), float(largest[k]))
+            found[i] = Cut(ends[at], stretches[at], chord, correction)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from orthocal.errors import GcodeError
-from orthocal.gcode.cutting import LONGEST_PIECE, Correct, Cut, Refused, cut
+from orthocal.gcode.cutting import LONGEST_PIECE, Correct, Refused, cut
 from orthocal.gcode.path import Motion, Paths
 from orthocal.gcode.state import Interpreter, Step
 from orthocal.gcode.words import LONGEST_LINE, split_line
@@ -130,18 +130,14 @@ class ProgramCorrector:
                     raise GcodeError(
                         f"the machine cannot make this motion: it {found.reason}", where=where
                     )
-                self._count(found, step)
+                summary.points += len(found.points)
+                summary.chord = max(summary.chord, found.chord)
+                summary.correction = max(summary.correction, found.correction)
                 if not step.straight and step.modes.motion:
-                    low = min(low, float(found.stretch.min()))
-                    high = max(high, float(found.stretch.max()))
+                    low = min(low, *found.stretch)
+                    high = max(high, *found.stretch)
                 yield from self._writer.write(step, found)
         summary.stretch = [low, high]
-
-    def _count(self, found: Cut, step: Step) -> None:
-        summary = self.summary
-        summary.points += len(found.points)
-        summary.chord = max(summary.chord, found.chord)
-        summary.correction = max(summary.correction, found.correction)
 
 
 def _estimate(motion: Motion) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from orthocal.errors import GcodeError
 from orthocal.gcode.arcs import CENTRES, MOST_TURNS, NAMES, arc_about, center_of_radius
@@ -74,8 +75,7 @@ class Modes:
     ended: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """What a line does."""
 
     line: Line
@@ -84,6 +84,8 @@ class Step:
     offset: Vector
     """Place of the work coordinates' zero, [m]."""
     motion: Motion | None = None
+    fed: bool = False
+    """Whether the line tells a feed."""
     straight: bool = False
     """Whether only its end is known: the first motion, from wherever the machine stands."""
 
@@ -140,8 +142,10 @@ class Interpreter:
         if "F" in words:
             if words["F"] < 0.0:
                 raise GcodeError(f"found a feed of {words['F']:g}", where=where)
-            self.modes = replace(self.modes, feed=words["F"])
-        self._check_p(words, codes, where)
+            if words["F"] != self.modes.feed:
+                self.modes = replace(self.modes, feed=words["F"])
+        if not _TAKEN.isdisjoint(words):
+            self._check_taken(words, codes, where)
         moves = not _MOVES.isdisjoint(words)
         step = Step(line, self.modes, self.offset)
         if moves and dwell:
@@ -190,7 +194,9 @@ class Interpreter:
         code, modes = round(10.0 * word.value, 6), self.modes
         match GROUPS[code]:
             case "motion":
-                self.modes = replace(modes, motion=None if code == 800.0 else int(word.value))
+                motion = None if code == 800.0 else int(word.value)
+                if motion != modes.motion:
+                    self.modes = replace(modes, motion=motion)
             case "plane":
                 self.modes = replace(modes, plane=int(word.value))
             case "unit":
@@ -215,7 +221,7 @@ class Interpreter:
                     )
                 self.modes = replace(modes, system=name)
 
-    def _check_p(self, words: Mapping[str, float], codes: Sequence[Word], where: str) -> None:
+    def _check_taken(self, words: Mapping[str, float], codes: Sequence[Word], where: str) -> None:
         """Refuse P, Q and the words of arcs where nothing takes them."""
         arc = self.modes.motion in (2, 3)
         if "P" in words or "Q" in words:
@@ -261,10 +267,10 @@ class Interpreter:
             )
         self.position = list(end)
         if first:
-            return Step(line, modes, self.offset, Motion(end, end), straight=True)
+            return Step(line, modes, self.offset, Motion(end, end), "F" in words, straight=True)
         begin: Vector = (start[0] or 0.0, start[1] or 0.0, start[2] or 0.0)
         arc = None if modes.motion < 2 else self._arc(begin, end, words, where)
-        return Step(line, modes, self.offset, Motion(begin, end, arc))
+        return Step(line, modes, self.offset, Motion(begin, end, arc), "F" in words)
 
     def _end(self, words: Mapping[str, float], where: str) -> Vector:
         modes, offset = self.modes, self.offset
@@ -347,4 +353,5 @@ class Interpreter:
 
 
 _MOVES = frozenset("XYZIJKR")
+_TAKEN = frozenset("PQIJKR")
 _KNOWN = frozenset("NFSTPQIJKR")

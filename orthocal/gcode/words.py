@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from orthocal.characters import shorten
 from orthocal.errors import GcodeError
@@ -15,6 +15,8 @@ _ITEM = re.compile(
     r"[ \t]*(?:([A-Za-z])[ \t]*([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?![0-9.])"
     r"|(\([^()]*\)|;.*))"
 )
+
+_WORD = re.compile(r"([ \t]*([A-Za-z])[ \t]*([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?![0-9.]))")
 
 _CONTROL = re.compile("[\x00-\x08\x0a-\x1f\x7f-\x9f]")
 _SUBROUTINE = re.compile(r"[ \t]*(?:[Nn][0-9. \t]*)?[Oo]")
@@ -31,13 +33,13 @@ _HINTS = {
 """What a character that begins no word begins instead."""
 
 
-class Word:
-    """A letter and its number, as they were written."""
+class Word(NamedTuple):
+    """A letter and its number."""
 
-    __slots__ = ("letter", "text", "value")
-
-    def __init__(self, letter: str, value: float, text: str) -> None:
-        self.letter, self.value, self.text = letter, value, text
+    letter: str
+    value: float
+    text: str
+    """As it was written, with blanks before it."""
 
     @property
     def code(self) -> str:
@@ -49,8 +51,7 @@ Item = Word | str
 """A word, or a comment; each with the blanks before it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Line:
+class Line(NamedTuple):
     """A line of a program."""
 
     number: int
@@ -79,6 +80,10 @@ def split_line(text: str, number: int, *, file: str) -> Line:
         raise GcodeError(
             f"has {len(text)} characters; expected at most {LONGEST_LINE}", where=f"{file}:{number}"
         )
+    words = _WORD.findall(body)
+    if sum([len(word[0]) for word in words]) == len(body):  # nothing but words
+        alone = [Word(letter.upper(), float(digits), own) for own, letter, digits in words]
+        return Line(number, tuple(alone), text[len(body) :], text)
     items: list[Item] = []
     at, end = 0, len(body)
     while at < end:

@@ -75,6 +75,7 @@ class Writer:
         parts: list[str] = []
         stops = ""
         told = written = False
+        place = 0
         for item in line.items:
             if isinstance(item, str):
                 parts.append(item)
@@ -83,7 +84,7 @@ class Writer:
             if letter in REPLACED or (letter == "P" and modes.motion in _ARCS):
                 if not written:
                     parts.append(f" {places[0]}" if parts else places[0])
-                    written = True
+                    written, place = True, len(parts)
             elif letter == "G" and value in _MOTIONS:
                 parts.append(f" G{motion}" if parts else f"G{motion}")
                 told = True
@@ -93,52 +94,49 @@ class Writer:
                 stops += f" {item.text.strip()}"
             else:
                 parts.append(item.text)
+        count = len(parts)
         if self._motion != motion and not told:
             parts.insert(_after_number(line), f" G{motion}" if line.items else f"G{motion}")
         self._motion = motion
         if feeds[0]:
-            at = next(i for i, part in enumerate(parts) if part.strip() == places[0]) + 1
-            parts.insert(at, f" {feeds[0]}")
-        if not motion:
-            self._feed = next(
-                (w.value for w in line.items if isinstance(w, Word) and w.letter == "F"), self._feed
-            )
+            parts.insert(place + (len(parts) - count), f" {feeds[0]}")
+        if step.fed and not motion:
+            self._feed = modes.feed
         end = line.ending.lstrip(" \t") or "\n"
         texts = ["".join(parts).lstrip()]
-        texts += [
-            f"{place} {feed}" if feed else place
-            for place, feed in zip(places[1:], feeds[1:], strict=True)
-        ]
+        if held:
+            rest = zip(places[1:], feeds[1:], strict=True)
+            texts += [f"{words} {feed}" if feed else words for words, feed in rest]
         texts[-1] += stops
         return [text + end for text in texts]
 
     def _places(self, step: Step, cut: Cut) -> list[str]:
         """Words of the coordinates of each piece's end."""
-        unit, absolute = step.modes.unit, step.modes.absolute
-        decimals, offset, at = self._decimals[unit], step.offset, self._written
+        unit, offset, at = step.modes.unit, step.offset, self._written
+        decimals = self._decimals[unit]
+        negative = f"-{0.0:.{decimals}f}"
+        values = [""] * len(self._axes)
         found = []
-        for point in cut.points.tolist():
-            words = []
-            for k, name in self._axes:
-                base = offset[k] if absolute else at[k]
-                value = round((point[k] - base) / unit, decimals) + 0.0
-                at[k] = value * unit + base
-                words.append(f"{name}{value:.{decimals}f}")
-            found.append(" ".join(words))
+        for point in cut.points:
+            for n, (k, name) in enumerate(self._axes):
+                base = offset[k] if step.modes.absolute else at[k]
+                text = f"{(point[k] - base) / unit:.{decimals}f}"
+                if text == negative:
+                    text = text[1:]
+                at[k] = float(text) * unit + base
+                values[n] = name + text
+            found.append(" ".join(values))
         return found
 
     def _feeds(self, step: Step, cut: Cut) -> list[str]:
         """Words of the feed of each piece; empty where it stays."""
-        if step.modes.motion == 0 or step.modes.feed is None:
+        own, anew = step.modes.feed, step.fed
+        if step.modes.motion == 0 or own is None:
             return [""] * len(cut.points)
         found = []
-        own, anew = (
-            step.modes.feed,
-            any(isinstance(w, Word) and w.letter == "F" for w in step.line.items),
-        )
-        for stretch in cut.stretch.tolist():
-            feed = own * stretch
-            if anew or self._feed is None or abs(feed - self._feed) > FEED_STEP * self._feed:
+        for stretch in cut.stretch:
+            feed, known = own * stretch, self._feed
+            if anew or known is None or abs(feed - known) > FEED_STEP * known:
                 text = _significant(feed)
                 self._feed, anew = float(text), False
                 found.append(f"F{text}")
