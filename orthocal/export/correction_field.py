@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -46,7 +47,11 @@ BEYOND = 0.05
 reached all within is, though limits are curved."""
 
 MOST_DIVISIONS = 3
-"""Boxes are halved so often; then the machine itself is asked."""
+"""Boxes are halved so often; then the machine itself is asked, as where the middle of one that
+was halved is not reached."""
+
+FIRST_ASKED = 8
+"""Points of which the machine itself is asked at first, then twice as many."""
 
 MOST_BOXES = 2000
 
@@ -57,6 +62,14 @@ POINTS_AT_ONCE = 2048
 
 Key = tuple[int, ...]
 """How often a box was halved, and which one of those it is."""
+
+
+class Unknown(Enum):
+    """What is done where no polynomial serves a box."""
+
+    DIVIDED = "divided"
+    ASKED = "asked"
+    """The machine itself, point by point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +121,7 @@ class CorrectionField:
         self._nominal = nominal_assembly(robot)
         self._real = Assembly(robot, fixed=calibration.errors)
         self._side = BOX * robot.characteristic_length
-        self._boxes: dict[Key, _Box | None] = {}
+        self._boxes: dict[Key, _Box | Unknown] = {}
         self._worst = EXACT
         grid = np.cos(np.pi * np.arange(NODES) / (NODES - 1))
         self._nodes = _tensor([grid] * len(self.axes))
@@ -127,12 +140,21 @@ class CorrectionField:
             points: Where the tool is to be, shape (k, 3), [m].
 
         Returns:
-            Shape (k, 3), [m]; and index to why the machine cannot be there, for those.
+            Shape (k, 3), [m]; and index to why the machine cannot be there, for the first of those;
+            some after it may be refused unseen.
         """
-        axes = list(self.axes)
-        refused: dict[int, str] = {}
+        axes = np.array(self.axes, dtype=np.int64)
         result = np.array(points, dtype=np.float64)
-        result[:, axes] += self._add(result[:, axes], np.arange(len(points)), 0, refused)
+        asked: list[int] = []
+        result[:, axes] += self._add(result[:, axes], np.arange(len(points)), 0, asked)
+        refused: dict[int, str] = {}
+        rest, count = np.sort(np.array(asked, dtype=np.int64)), FIRST_ASKED
+        while rest.size and not refused:  # what is not reached takes long to find out
+            own, rest, count = rest[:count], rest[count:], 2 * count
+            sent, odd = self.exactly(points[np.ix_(own, axes)])
+            result[np.ix_(own, axes)] = sent
+            refused.update({int(own[i]): reason for i, reason in odd.items()})
+        refused.update(dict.fromkeys(rest.tolist(), "comes after one that is not reached"))
         return result, refused
 
     def exactly(self, points: Array) -> tuple[Array, Mapping[int, str]]:
@@ -156,12 +178,8 @@ class CorrectionField:
                 result[first + i] = np.nan
         return result, refused
 
-    def _add(self, points: Array, of: Indices, halved: int, refused: dict[int, str]) -> Array:
-        """What is added to points; `of` is what they are called in `refused`."""
-        if halved > MOST_DIVISIONS:
-            sent, odd = self.exactly(points)
-            refused.update({int(of[i]): reason for i, reason in odd.items()})
-            return np.asarray(sent - points)
+    def _add(self, points: Array, of: Indices, halved: int, asked: list[int]) -> Array:
+        """What is added to points; where the machine is to be asked, `of` goes into `asked`."""
         side = self._side / 2**halved
         with np.errstate(invalid="ignore"):
             cells = np.floor(points / side).astype(np.int64)
@@ -169,34 +187,39 @@ class CorrectionField:
         order, starts = _group(cells)
         for own in np.split(order, starts):
             box = self._box((halved, *cells[own[0]].tolist()))
-            if box is None:
-                result[own] = self._add(points[own], of[own], halved + 1, refused)
-            else:
+            if isinstance(box, _Box):
                 result[own] = box(points[own])
+            elif box is Unknown.DIVIDED:
+                result[own] = self._add(points[own], of[own], halved + 1, asked)
+            else:
+                asked.extend(of[own].tolist())
+                result[own] = np.nan
         return result
 
-    def _box(self, key: Key) -> _Box | None:
-        """The box of a key; None where it is to be divided."""
+    def _box(self, key: Key) -> _Box | Unknown:
+        """The box of a key, or what is to be done instead."""
         if key not in self._boxes:
             if len(self._boxes) >= MOST_BOXES:
                 self._boxes.pop(next(iter(self._boxes)))
             box = self._boxes[key] = self._make(key)
-            if box is not None:
+            if isinstance(box, _Box):
                 self._worst = max(self._worst, box.error)
         return self._boxes[key]
 
-    def _make(self, key: Key) -> _Box | None:
+    def _make(self, key: Key) -> _Box | Unknown:
+        instead = Unknown.DIVIDED if key[0] < MOST_DIVISIONS else Unknown.ASKED
         side = self._side / 2 ** key[0]
         middle = (np.array(key[1:]) + 0.5) * side
         half = (0.5 + BEYOND) * side
         nodes = middle + half * self._nodes
         corners = np.flatnonzero((np.abs(self._nodes) > 1.0 - 1e-12).all(axis=1))
-        _, refused = self.exactly(nodes[corners])
-        if refused:
-            return None
+        if self.exactly(middle[None])[1]:
+            return Unknown.ASKED if key[0] else instead
+        if any(self.exactly(nodes[[i]])[1] for i in corners.tolist()):
+            return instead
         sent, refused = self.exactly(nodes)
         if refused:
-            return None
+            return instead
         count = len(self.axes)
         coefficients = (sent - nodes).reshape([NODES] * count + [count])
         for k in range(count):
@@ -205,10 +228,10 @@ class CorrectionField:
         expected, refused = self.exactly(checks)
         box = _Box(middle, half, np.ascontiguousarray(coefficients), 0.0)
         if refused:
-            return None
+            return instead
         seen = float(np.linalg.norm(box(checks) + checks - expected, axis=1).max())
         error = SAFETY * seen + EXACT
-        return None if error > self.bound else _Box(middle, half, box.coefficients, error)
+        return instead if error > self.bound else _Box(middle, half, box.coefficients, error)
 
 
 def _require_commanded(robot: Robot) -> Tcp:

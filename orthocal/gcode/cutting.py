@@ -52,7 +52,8 @@ class Correct(Protocol):
             points: Where the tool is to be, shape (k, 3), [m].
 
         Returns:
-            Shape (k, 3), [m]; and index to why the machine cannot be there, for those.
+            Shape (k, 3), [m]; and index to why the machine cannot be there, for the first of those;
+            some after it may be refused unseen.
         """
 
 
