@@ -7,8 +7,11 @@ import os
 import re
 import secrets
 import stat
+from codecs import getincrementaldecoder
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from io import IncrementalNewlineDecoder
+from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
@@ -18,6 +21,9 @@ from orthocal.interrupts import postponed_interrupt, raised_interrupt
 
 LARGEST_FILE = 64 * 2**20
 """Files above this size are refused, [bytes]."""
+
+PART = 2**16
+"""Bytes that are read together."""
 
 _READ_FLAGS = (
     os.O_RDONLY
@@ -88,6 +94,44 @@ def read_parts(
     finally:
         if isinstance(path, Path):
             stream.close()
+
+
+def read_lines(
+    path: Path | BinaryIO, *, longest: int, name: str, error: type[OrthocalError] = OrthocalError
+) -> Iterator[str]:
+    """Lines of a UTF-8 text of any size, one at a time; all ends of lines are newlines.
+
+    Args:
+        path: A regular file, or a stream that is open.
+        longest: Characters above which a line is refused.
+        name: For messages.
+        error: Kind of error to raise.
+
+    Raises:
+        OrthocalError: Of the kind given, if it cannot be read, or is not UTF-8.
+    """
+    decoder = getincrementaldecoder("utf-8-sig")()
+    newlines = IncrementalNewlineDecoder(decoder, translate=True)
+    count, number, rest = 0, 0, ""
+    parts = chain(read_parts(path, longest=PART, name=name, error=error), [b""])
+    for part in parts:
+        kept = len(decoder.getstate()[0])
+        try:
+            rest += newlines.decode(part, final=not part)
+        except UnicodeDecodeError as e:
+            byte = count - kept + e.start
+            raise error(f"is not UTF-8 text (byte {byte})", where=name) from None
+        count += len(part)
+        *lines, rest = rest.split("\n")
+        for line in lines:
+            number += 1
+            yield f"{line}\n"
+        if len(rest) > longest:
+            raise error(
+                f"has a line of more than {longest} characters", where=f"{name}:{number + 1}"
+            )
+    if rest:
+        yield rest
 
 
 def require_file(
