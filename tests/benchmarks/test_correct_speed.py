@@ -13,8 +13,8 @@ from orthocal.gcode.state import Interpreter
 
 CORRECTED = 5.0
 """Points that are read, corrected and written a second over those that the machine itself corrects
-in blocks of a thousand. 10 to 16 were measured on a busy machine; a program asks for four or five points
-a piece."""
+in blocks of a thousand. 10 to 16 were measured on a busy machine; a program asks for four or five
+points a piece."""
 
 LINES = 8000
 
