@@ -11,7 +11,8 @@ import dataclasses
 import io
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -240,13 +241,48 @@ def read_csv_rows(
         OrthocalError: Of the kind given, naming file and line.
     """
     text = read_text(path, error=error, content=content)
-    first = text.splitlines()[0] if text else ""
+    lines = io.StringIO(text, newline=None)
+    yield from csv_rows(
+        lines,
+        name=str(path),
+        required=required,
+        optional=optional,
+        error=error,
+        most=MOST_CSV_ROWS,
+    )
+
+
+def csv_rows(
+    lines: Iterable[str],
+    *,
+    name: str,
+    required: tuple[str, ...],
+    optional: tuple[str, ...] = (),
+    error: type[OrthocalError],
+    most: int | None = None,
+) -> Iterator[tuple[int, dict[str, str]]]:
+    """Rows of a CSV file as its lines come, as `read_csv_rows` has them.
+
+    Args:
+        lines: Its lines, each with what ends it.
+        name: Of the file, for messages.
+        required: Columns that it must have.
+        optional: Columns that it may have.
+        error: Kind of error to raise.
+        most: Rows above which it is refused.
+
+    Raises:
+        OrthocalError: Of the kind given, naming file and line.
+    """
+    path, lines = name, iter(lines)
+    first = next(lines, "")
     if not first.strip():
-        found = "is blank" if text.strip() else "is empty"
+        found = "is blank" if any(line.strip() for line in lines) else "is empty"
         raise error(f"{found}; expected a header: {','.join(required)}", where=f"{path}:1")
     delimiter = ";" if "," not in first and ";" in first else ","
-    lines = io.StringIO(text, newline=None)
-    reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
+    reader = csv.reader(
+        chain([first], lines), delimiter=delimiter, skipinitialspace=True, strict=True
+    )
     try:
         header = [composed(name.strip()) for name in next(reader)]
         for name in header:
@@ -266,8 +302,8 @@ def read_csv_rows(
                 )
         for row in reader:
             line = reader.line_num
-            if line > MOST_CSV_ROWS:
-                raise error(f"has more than {MOST_CSV_ROWS} rows", where=str(path))
+            if most is not None and line > most:
+                raise error(f"has more than {most} rows", where=path)
             if not any(cell.strip() for cell in row):
                 continue
             if len(row) != len(header):

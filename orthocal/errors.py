@@ -62,6 +62,10 @@ class ExportError(OrthocalError):
     exit_code = 3
 
 
+class GcodeError(OrthocalError):
+    """A program of a controller holds what cannot be corrected."""
+
+
 class ClosureError(OrthocalError):
     """The loops of the robot cannot be closed in a posture.
 

@@ -7,9 +7,13 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Iterable, Mapping
+from codecs import getincrementaldecoder
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from io import IncrementalNewlineDecoder
+from itertools import chain
 from pathlib import Path
+from typing import BinaryIO
 
 from orthocal.characters import control_character
 from orthocal.errors import OrthocalError, OutputError
@@ -17,6 +21,9 @@ from orthocal.interrupts import postponed_interrupt, raised_interrupt
 
 LARGEST_FILE = 64 * 2**20
 """Files above this size are refused, [bytes]."""
+
+PART = 2**16
+"""Bytes that are read together."""
 
 _READ_FLAGS = (
     os.O_RDONLY
@@ -62,6 +69,69 @@ def read_file(
         found = f"{size / 2**20:.0f} MiB" if size > largest else "more"
         raise error(f"has {found}; expected at most {largest / 2**20:g} MiB", where=str(path))
     return content
+
+
+def read_parts(
+    path: Path | BinaryIO, *, longest: int, name: str, error: type[OrthocalError] = OrthocalError
+) -> Iterator[bytes]:
+    """Lines of a file of any size, one at a time, each with what ends it.
+
+    Args:
+        path: A regular file, or a stream that is open.
+        longest: Bytes of a line above which it comes in parts.
+        name: For messages.
+        error: Kind of error to raise.
+
+    Raises:
+        OrthocalError: Of the kind given, if it is missing, no regular file, or cannot be read.
+    """
+    stream = open(_open_regular(path, error), "rb") if isinstance(path, Path) else path
+    try:
+        while part := stream.readline(longest):
+            yield part
+    except OSError as e:
+        raise error(f"cannot be read: {e.strerror}", where=name) from None
+    finally:
+        if isinstance(path, Path):
+            stream.close()
+
+
+def read_lines(
+    path: Path | BinaryIO, *, longest: int, name: str, error: type[OrthocalError] = OrthocalError
+) -> Iterator[str]:
+    """Lines of a UTF-8 text of any size, one at a time; all ends of lines are newlines.
+
+    Args:
+        path: A regular file, or a stream that is open.
+        longest: Characters above which a line is refused.
+        name: For messages.
+        error: Kind of error to raise.
+
+    Raises:
+        OrthocalError: Of the kind given, if it cannot be read, or is not UTF-8.
+    """
+    decoder = getincrementaldecoder("utf-8-sig")()
+    newlines = IncrementalNewlineDecoder(decoder, translate=True)
+    count, number, rest = 0, 0, ""
+    parts = chain(read_parts(path, longest=PART, name=name, error=error), [b""])
+    for part in parts:
+        kept = len(decoder.getstate()[0])
+        try:
+            rest += newlines.decode(part, final=not part)
+        except UnicodeDecodeError as e:
+            byte = count - kept + e.start
+            raise error(f"is not UTF-8 text (byte {byte})", where=name) from None
+        count += len(part)
+        *lines, rest = rest.split("\n")
+        for line in lines:
+            number += 1
+            yield f"{line}\n"
+        if len(rest) > longest:
+            raise error(
+                f"has a line of more than {longest} characters", where=f"{name}:{number + 1}"
+            )
+    if rest:
+        yield rest
 
 
 def require_file(
@@ -195,7 +265,11 @@ def _require_replaceable(path: Path) -> None:
         raise OutputError("is write-protected", where=str(path))
 
 
-def write_file(path: Path, content: str | bytes) -> None:
+Content = str | bytes | Iterable[bytes]
+"""Of a file: text, which is written as UTF-8, bytes, or parts of them."""
+
+
+def write_file(path: Path, content: Content) -> None:
     """Write a file whole or not at all: beside it first, then renamed.
 
     Raises:
@@ -206,7 +280,7 @@ def write_file(path: Path, content: str | bytes) -> None:
     write_files(path.parent, {path.name: content})
 
 
-def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
+def write_files(folder: Path, files: Mapping[str, Content]) -> None:
     """Write several files of one folder that belong together, all or none.
 
     All are written beside their places first. Then, with no Ctrl-C between, the old ones but the
@@ -216,8 +290,7 @@ def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
 
     Args:
         folder: Where to; made if need be.
-        files: Name to text, which is written as UTF-8, or bytes. Without the first the others
-            mean nothing.
+        files: Name to content. Without the first the others mean nothing.
 
     Raises:
         OrthocalError: If the folder or a file cannot be one.
@@ -243,7 +316,7 @@ def sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def _write(folder: Path, files: Mapping[str, str | bytes]) -> None:
+def _write(folder: Path, files: Mapping[str, Content]) -> None:
     """Stage all files, and put them in place; what was staged is taken away whatever happens."""
     staged: dict[Path, Path] = {}
     aside: dict[Path, Path] = {}
@@ -255,7 +328,7 @@ def _write(folder: Path, files: Mapping[str, str | bytes]) -> None:
             _clean_up(target.parent)
             staged[target] = target.with_name(_temporary_name())
             data = content.encode() if isinstance(content, str) else content
-            _stage(staged[target], data, like=target)
+            _stage(staged[target], [data] if isinstance(data, bytes) else data, like=target)
         with postponed_interrupt():
             _put_in_place(staged, aside)
     finally:
@@ -296,12 +369,12 @@ def _behind_links(path: Path) -> Path:
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
-def _stage(temporary: Path, data: bytes, *, like: Path) -> None:
+def _stage(temporary: Path, parts: Iterable[bytes], *, like: Path) -> None:
     """Write a file to be renamed later, with the mode of the one whose place it will take."""
     with open(os.open(temporary, _WRITE_FLAGS, 0o666), "wb") as stream:
         with suppress(FileNotFoundError):
             os.chmod(temporary, stat.S_IMODE(os.stat(like).st_mode))
-        stream.write(data)
+        stream.writelines(parts)
         stream.flush()
         os.fsync(stream.fileno())
 

@@ -375,13 +375,13 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     """Do with a file what the command line does; slow things with a probability of `thorough`."""
     from orthocal import calibrate, load_calibration, load_robot, load_session, summarize
     from orthocal.assess.entering import find_entries
-    from orthocal.assess.rows import accuracy_rows, forward_rows, inverse_rows
+    from orthocal.assess.rows import accuracy_rows, forward_blocks, forward_rows, inverse_rows
     from orthocal.kinematics.assembly import nominal_assembly
     from orthocal.measurement.importing import TableOptions, import_readings
     from orthocal.measurement.session_file import load_plan
     from orthocal.measurement.session_output import write_session
     from orthocal.measurement.synthetic import load_errors, simulate_session, truth_document
-    from orthocal.measurement.table import read_joints, read_points
+    from orthocal.measurement.table import read_points, stream_joints
     from orthocal.show.accuracy import format_points
     from orthocal.show.imported import format_import, printed_import
     from orthocal.show.scene.drawing import draw_scene
@@ -442,9 +442,10 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
             if deep:
                 simulate_session(load_plan(folder / "plan.yaml"), errors)
         elif kind == "joints":
-            names, rows = read_joints(folder / "joints.csv", calibration.robot)
+            path = folder / "joints.csv"
+            blocks = list(stream_joints(path, calibration.robot, name=str(path)))
             if deep:
-                list(forward_rows(calibration, rows, names=names))
+                list(forward_blocks(calibration, blocks))
         else:
             names, rows = read_points(folder / "points.csv", calibration.robot)
             if deep:

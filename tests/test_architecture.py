@@ -31,6 +31,7 @@ ALLOWED = {
     "documents": "characters errors files strict_yaml",
     "fields": "documents",
     "tables": EDGES,
+    "gcode": EDGES,
     "robot": EDGES,
     "kinematics": f"{EDGES} robot",
     "sensors": f"{EDGES} robot kinematics",
@@ -49,7 +50,7 @@ ALLOWED = {
     "show": f"{EDGES} markup robot kinematics sensors measurement statistics diagnosis calibration "
     "assess planning study viewer",
     "cli": f"{EDGES} robot kinematics measurement estimation calibration assess planning study "
-    "export viewer show",
+    "export gcode viewer show",
     "__main__": "cli interrupts",
 }
 """What each room may import besides itself: a viewer knows no calibration, statistics no fit,

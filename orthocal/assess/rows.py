@@ -5,7 +5,7 @@ Memory does not grow with the table, and a row that cannot be reached stops no o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 
 ROWS_AT_ONCE = 512
 """Rows of a chunk: a full model takes 20 kB a row while it is evaluated."""
+
+Block = tuple[Sequence[str], Array]
+"""Names of some rows, and their values."""
 
 _Evaluate = Callable[[Array, Sequence[str], Failures], Array]
 """Values of some rows, by name; fills in which fail, whose values are of no account."""
@@ -54,15 +57,25 @@ def forward_rows(
     Yields:
         Chunks of shape (n, 3), [m].
     """
+    rows, _ = as_rows(joints, len(calibration.robot.drives), "drive coordinates")
+    yield from forward_blocks(calibration, _blocks(rows, names))
+
+
+def forward_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterator[Chunk]:
+    """Tool centre points of the calibrated machine, as `forward_rows`, of rows as they come.
+
+    Args:
+        calibration: The calibration.
+        blocks: Names and drive coordinates of some rows, shape (n, n_drives), [m, rad].
+    """
     robot = calibration.robot
-    rows, _ = as_rows(joints, len(robot.drives), "drive coordinates")
     assembly = Assembly(robot, fixed=calibration.errors)
 
     def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
         failures.update(find_beyond_travel(robot, rows, names))
         return assembly.forward(rows, names=names, failures=failures)
 
-    yield from _by_chunks(evaluate, rows, names)
+    yield from _by_chunks(evaluate, blocks)
 
 
 def inverse_rows(
@@ -78,14 +91,23 @@ def inverse_rows(
     Yields:
         Chunks of shape (n, n_drives), as the encoders give them, [m, rad].
     """
-    robot = calibration.robot
-    rows, _ = as_rows(points, len(robot.drives), "coordinates")
-    assembly = Assembly(robot, fixed=calibration.errors)
+    rows, _ = as_rows(points, len(calibration.robot.drives), "coordinates")
+    yield from inverse_blocks(calibration, _blocks(rows, names))
+
+
+def inverse_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterator[Chunk]:
+    """Drive coordinates of the calibrated machine, as `inverse_rows`, of rows as they come.
+
+    Args:
+        calibration: The calibration.
+        blocks: Names and coordinates of some points, shape (n, n_drives), [m].
+    """
+    assembly = Assembly(calibration.robot, fixed=calibration.errors)
 
     def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
         return assembly.inverse(rows, names=names, failures=failures)
 
-    yield from _by_chunks(evaluate, rows, names)
+    yield from _by_chunks(evaluate, blocks)
 
 
 def accuracy_rows(
@@ -131,15 +153,23 @@ def accuracy_rows(
             result[at, 6:] = np.sqrt(variance)
         return result
 
-    yield from _by_chunks(evaluate, rows, names)
+    yield from _by_chunks(evaluate, _blocks(rows, names))
 
 
-def _by_chunks(evaluate: _Evaluate, rows: Array, names: Sequence[str] | None) -> Iterator[Chunk]:
+def _blocks(rows: Array, names: Sequence[str] | None) -> Iterator[Block]:
+    """Rows some at a time."""
     names = names or [f"row {i + 1}" for i in range(len(rows))]
     for first in range(0, len(rows), ROWS_AT_ONCE):
         part = slice(first, first + ROWS_AT_ONCE)
+        yield names[part], rows[part]
+
+
+def _by_chunks(evaluate: _Evaluate, blocks: Iterable[Block]) -> Iterator[Chunk]:
+    first = 0
+    for names, rows in blocks:
         failures: Failures = {}
-        values = evaluate(rows[part], names[part], failures)
+        values = evaluate(rows, names, failures)
         values[list(failures)] = np.nan
         refused = {first + i: e for i, e in sorted(failures.items())}
         yield Chunk(first, read_only(values), refused)
+        first += len(rows)

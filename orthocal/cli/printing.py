@@ -21,28 +21,49 @@ def put_out(text: str) -> None:
     sys.stdout.flush()
 
 
+def put_part(text: str) -> None:
+    """A part of a long result, on stdout."""
+    sys.stdout.write(text)
+
+
 def put_note(text: str) -> None:
     """Anything else, on stderr."""
     sys.stderr.write(printable(text, keep="\n") + "\n")
+
+
+MOST_HELD = 10_000
+"""Refused rows before the first that is served; the table begins after so many at the latest."""
 
 
 def print_rows(columns: Iterable[str], form: Callable[[Any], str], chunks: Iterable[Chunk]) -> None:
     """Print a table as it is evaluated; rows that are refused are named, and their cells empty.
 
     Raises:
-        SessionError: If the machine can be at none of the rows.
+        SessionError: If the machine can be at none of the rows; or as the chunks do, and how many
+            rows were served before.
         typer.Exit: With code 3 if it cannot be at some.
     """
     refused: list[str] = []
-    count, begun, rest = 0, False, ""
+    count, served, begun, rest = 0, 0, False, ""
     first: tuple[str, str] | None = None
-    for chunk in chunks:
+    rows = iter(chunks)
+    while True:
+        try:
+            chunk = next(rows, None)
+        except SessionError as e:
+            if not begun:
+                raise
+            before = f"; the {served} rows in blocks before it were served"
+            raise SessionError(e.problem + before, where=e.where) from None
+        if chunk is None:
+            break
         count += len(chunk.refused)
-        for e in chunk.refused.values():
-            first = first or (e.posture, e.reason)
-            refused.append(f"orthocal: {e.posture}: {e.reason}")
+        served += len(chunk.values)
+        for why in chunk.refused.values():
+            first = first or (why.posture, why.reason)
+            refused.append(f"orthocal: {why.posture}: {why.reason}")
         rest += form(chunk.values)
-        if not begun and len(chunk.refused) == len(chunk.values):
+        if not begun and len(chunk.refused) == len(chunk.values) and count < MOST_HELD:
             continue  # there may be none to be served at all
         text, rest = rest if begun else printable(",".join(columns)) + "\n" + rest, ""
         begun = True

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,6 +18,10 @@ from orthocal.cli.options import (
 from orthocal.cli.printing import print_rows, put_out
 from orthocal.errors import ClosureError, SessionError
 from orthocal.units import MM
+
+if TYPE_CHECKING:
+    from orthocal.measurement.table import Block
+    from orthocal.robot.model import Robot
 
 
 @app.command()
@@ -91,23 +97,27 @@ def forward(
     calibration: CalibrationPath,
     joints: Annotated[
         Path,
-        typer.Argument(metavar="JOINTS.csv", help="Columns as the drives, such as x_slide_mm."),
+        typer.Argument(
+            metavar="JOINTS.csv",
+            help="Columns as the drives, such as x_slide_mm; - for standard input.",
+        ),
     ],
 ) -> None:
     """Where the calibrated machine's tool is, for drive coordinates: CSV on stdout, mm.
 
     Drive coordinates are those of the encoders, without any offset of the controller.
 
+    Tables of any size: what comes through a pipe is served in blocks as it comes.
+
     Exit code 3: some rows cannot be reached; they are named, and their cells are empty.
     """
-    from orthocal.assess.rows import forward_rows
+    from orthocal.assess.rows import forward_blocks
     from orthocal.calibration.file import load_calibration
-    from orthocal.measurement.table import TOOL_COLUMNS, format_rows, read_joints
+    from orthocal.measurement.table import TOOL_COLUMNS, format_rows, stream_joints
 
     result = load_calibration(calibration)
-    names, values = read_joints(joints, result.robot)
-    form = partial(format_rows, TOOL_COLUMNS)
-    print_rows(TOOL_COLUMNS, form, forward_rows(result, values, names=names))
+    blocks = _read_blocks(stream_joints, joints, result.robot)
+    print_rows(TOOL_COLUMNS, partial(format_rows, TOOL_COLUMNS), forward_blocks(result, blocks))
 
 
 @app.command()
@@ -115,21 +125,42 @@ def inverse(
     calibration: CalibrationPath,
     targets: Annotated[
         Path,
-        typer.Argument(metavar="TARGETS.csv", help="Columns of the tool: x_mm, y_mm, z_mm."),
+        typer.Argument(
+            metavar="TARGETS.csv",
+            help="Columns of the tool: x_mm, y_mm, z_mm; - for standard input.",
+        ),
     ],
 ) -> None:
     """Drive coordinates that bring the calibrated machine's tool to points: CSV on stdout.
 
     Drive coordinates are those of the encoders, without any offset of the controller.
 
+    Tables of any size: what comes through a pipe is served in blocks as it comes.
+
     Exit code 3: some rows cannot be reached; they are named, and their cells are empty.
     """
-    from orthocal.assess.rows import inverse_rows
+    from orthocal.assess.rows import inverse_blocks
     from orthocal.calibration.file import load_calibration
-    from orthocal.measurement.table import drive_columns, format_rows, read_points
+    from orthocal.measurement.table import drive_columns, format_rows, stream_points
 
     result = load_calibration(calibration)
-    names, points = read_points(targets, result.robot)
+    blocks = _read_blocks(stream_points, targets, result.robot)
     columns = drive_columns(result.robot)
-    form = partial(format_rows, columns)
-    print_rows(columns, form, inverse_rows(result, points, names=names))
+    print_rows(columns, partial(format_rows, columns), inverse_blocks(result, blocks))
+
+
+def _read_blocks(
+    stream: Callable[..., Iterator[Block]], path: Path, robot: Robot
+) -> Iterator[Block]:
+    """Rows of a table; a file is looked through as a whole before the first of them is served.
+
+    Raises:
+        SessionError: Naming file and line.
+    """
+    if str(path) != "-":
+        for _ in stream(path, robot, name=str(path)):
+            pass
+        return stream(path, robot, name=str(path))
+    if sys.stdin is None:
+        raise SessionError("is closed", where="standard input")
+    return stream(sys.stdin.buffer, robot, name="standard input")

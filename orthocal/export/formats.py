@@ -43,7 +43,17 @@ def export_calibration(
         raise ParameterError(
             f"found '{to}'; expected one of {', '.join(EXPORTERS)}", where="the format"
         )
-    decision = decide(calibration)
-    if decision.answer == "do not enter" and not anyway:
-        raise ExportError(f"{decision.headline} {decision.reason} {decision.action}".strip())
+    if not anyway:
+        require_entering(calibration)
     return EXPORTERS[to](calibration)
+
+
+def require_entering(calibration: Calibration) -> None:
+    """Refuse a calibration that is not to be entered.
+
+    Raises:
+        ExportError: If its decision is not to enter it.
+    """
+    decision = decide(calibration)
+    if decision.answer == "do not enter":
+        raise ExportError(f"{decision.headline} {decision.reason} {decision.action}".strip())

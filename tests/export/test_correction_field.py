@@ -1,0 +1,184 @@
+"""Corrections by polynomials against the machine, and a nominal controller that obeys them."""
+
+from __future__ import annotations
+
+import io
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from programs import read_polyline
+
+from orthocal import ExportError, calibrate, draw_errors, write_calibration
+from orthocal.assess.entering import entered_offsets
+from orthocal.cli import main
+from orthocal.export.correction_field import CorrectionField
+from orthocal.gcode.program import ProgramCorrector
+from orthocal.gcode.state import Interpreter
+from orthocal.kinematics.assembly import Assembly, nominal_assembly
+
+WITHIN = 1e-6
+
+
+@pytest.fixture(scope="module")
+def bad(orthoglide):
+    """A machine with all errors at their tolerances, and offsets besides."""
+    errors = draw_errors(orthoglide, ["*", "!*.offset"], seed=3)
+    errors |= {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
+    return SimpleNamespace(robot=orthoglide, errors=errors)
+
+
+OFFSETS = np.array([1.1e-3, -0.7e-3, 0.6e-3])
+
+
+@pytest.fixture(scope="module")
+def field(bad):
+    return CorrectionField(bad, OFFSETS, within=WITHIN)
+
+
+def test_it_is_the_machine_to_what_it_says(bad, field):
+    """At points that it never saw, by another assembly: real tool at the point."""
+    points = np.random.default_rng(1).uniform(-0.06, 0.06, (300, 3))
+    sent, refused = field(points)
+    assert not refused
+    real, nominal = Assembly(bad.robot, fixed=bad.errors), nominal_assembly(bad.robot)
+    reached = real.forward(nominal.inverse(sent) - OFFSETS)
+    off = np.linalg.norm(reached - points, axis=1).max()
+    assert off < 1.05 * field.error < 0.1 * WITHIN  # what is sent and what is reached: a percent
+    assert np.abs(sent - points).max() > 100e-6
+
+
+def test_at_the_border_it_says_as_the_machine_what_is_reached(field):
+    """A line that leaves the workspace."""
+    t = np.linspace(0.0, 1.0, 40)[:, None]
+    points = t * np.array([0.09, 0.05, 0.02])
+    sent, refused = field(points)
+    expected, truth = field.exactly(points)
+    assert 0 < min(refused) == min(truth)
+    assert refused[min(truth)] == truth[min(truth)]
+    assert "outside its limits" in truth[min(truth)]
+    assert all(sent[i].tolist() != sent[i].tolist() for i in refused)
+    good = [i for i in range(40) if i not in refused]
+    assert np.linalg.norm(sent[good] - expected[good], axis=1).max() < field.error
+
+
+def test_a_program_brings_the_real_tool_along_its_lines_and_arcs(bad, field):
+    """Joints that a nominal controller commands between the points, through the real machine."""
+    text = ["G21 G0 X-30 Y-20 Z5", "N1 G1 X30 Y10 Z-10 F500", "N2 G3 X10 Y30 I-20 J0"]
+    corrector = ProgramCorrector(
+        "p",
+        axes=field.axes,
+        interpreter=Interpreter("p", axes=field.axes, offsets={}),
+        correct=field,
+        within=WITHIN,
+    )
+    lines = "".join(corrector.run(f"{t}\n" for t in text)).splitlines()
+    pieces = read_polyline(lines)
+    real, nominal = Assembly(bad.robot, fixed=bad.errors), nominal_assembly(bad.robot)
+    start = pieces[0][-1][0]
+    for number in (1, 2):
+        ends = np.array([start, *(p for p, _ in pieces[number])])
+        start = ends[-1]
+        share = np.linspace(0.0, 1.0, 5)[1:, None]
+        chosen = ends if number == 1 else ends[:: len(ends) // 12]
+        between = np.vstack(
+            [a + share * (b - a) for a, b in zip(chosen, ends[1:], strict=False)]
+            if number == 1
+            else [
+                a + share * (ends[i * (len(ends) // 12) + 1] - a) for i, a in enumerate(chosen[:-1])
+            ]
+        )
+        tool = 1e3 * real.forward(nominal.inverse(between * 1e-3) - OFFSETS)
+        if number == 1:
+            a, b = np.array([-30.0, -20.0, 5.0]), np.array([30.0, 10.0, -10.0])
+            along = (b - a) / np.linalg.norm(b - a)
+            off = np.linalg.norm(np.cross(tool - a, along), axis=1)
+        else:
+            flat = np.hypot(tool[:, 0] - 10.0, tool[:, 1] - 10.0) - 20.0
+            off = np.hypot(flat, tool[:, 2] + 10.0)
+        assert off.max() < 1.02e-3  # [mm]
+    assert off.max() > 0.5e-3  # what is allowed is used by an arc
+
+
+def test_robots_of_two_axes_and_those_without_a_tool(biglide, orthoglide):
+    drives = [d.name for d in biglide.drives]
+    machine = SimpleNamespace(robot=biglide, errors={f"{drives[0]}.offset": 1e-3})
+    field = CorrectionField(machine, np.zeros(2), within=WITHIN)
+    middle = nominal_assembly(biglide).forward(biglide.drive_zero)
+    points = middle + np.random.default_rng(0).uniform(-5e-3, 5e-3, (50, 3))
+    sent, refused = field(points)
+    other = [k for k in range(3) if k not in field.axes]
+    assert not refused
+    assert (sent[:, other] == points[:, other]).all()
+    chosen = list(field.axes)
+    expected, _ = field.exactly(points[:, chosen])
+    assert np.abs(sent[:, chosen] - expected).max() < field.error
+    with pytest.raises(ExportError, match="has no tool that its drives command"):
+        CorrectionField(
+            SimpleNamespace(robot=SimpleNamespace(tcp=None), errors={}), OFFSETS, within=WITHIN
+        )
+
+
+@pytest.fixture
+def command(experiment_2, tmp_path, monkeypatch, capsys):
+    found = calibrate(experiment_2)
+    write_calibration(found, tmp_path / "calibration.json")
+
+    def run(text, *words):
+        source = "-" if text is None else str(tmp_path / "p.ngc")
+        if text is not None:
+            (tmp_path / "p.ngc").write_bytes(text.encode("latin-1"))
+        monkeypatch.setattr(sys, "argv", ["orthocal", "correct", str(tmp_path), source, *words])
+        with pytest.raises(SystemExit) as stopped:
+            main()
+        out, err = capsys.readouterr()
+        return stopped.value.code, out, err.replace(str(tmp_path), "")
+
+    run.calibration = found
+    return run
+
+
+PROGRAM = "G21 G0 X1 Y2 Z3\r\nG1 X5 F100 (\xe9)\r\n"
+
+
+def test_the_command_line(command, tmp_path, monkeypatch):
+    """Offsets alone need no correction once they are entered, and one as long as they are not."""
+    code, out, err = command(PROGRAM)
+    assert code == 0
+    assert out.splitlines()[0] == "G21 G0 X1.0000 Y2.0000 Z3.0000"
+    assert "It is for a controller with the offsets to enter: x_slide -0.5" in err
+    assert "The program's coordinates are taken for the machine's own." in err
+    code, out, err = command(PROGRAM, "--offsets", "active", "--work-offset-mm", "10,0,-5")
+    assert code == 0
+    assert "active while measuring: x_slide +0.0000 mm" in err
+    wanted = np.array([11.0, 2.0, -2.0]) * 1e-3
+    machine = command.calibration
+    expected = nominal_assembly(machine.robot).forward(machine.machine.inverse(wanted))
+    got = read_polyline(out.splitlines())[0][0][0] + [10.0, 0.0, -5.0]
+    assert np.abs(got - expected * 1e3).max() < 1e-4
+    assert np.abs(entered_offsets(machine)).max() > 1e-4
+    code, _, _ = command(PROGRAM, "--out", str(tmp_path / "o.ngc"))
+    assert (tmp_path / "o.ngc").read_bytes().endswith(b"F100 (\xe9)\r\n")
+    stream = io.TextIOWrapper(io.BytesIO(PROGRAM.encode("latin-1")))
+    monkeypatch.setattr(sys, "stdin", stream)
+    assert command(None)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "words", "message"),
+    [
+        ("", (), "/p.ngc: is empty; expected a program"),
+        (PROGRAM + "G1 X300", (), "/p.ngc:3: the machine cannot make this motion: it cannot be"),
+        (PROGRAM + "G54", (), "/p.ngc:3: found G54, and nothing says where its zero is"),
+        (PROGRAM, ("--work-offset-mm", "1,2"), "--work-offset-mm: found '1,2'; expected X,Y,Z"),
+        (PROGRAM, ("--work-offset-mm", "G53=1,2,3"), "--work-offset-mm: found 'G53=1,2,3'"),
+        (PROGRAM, ("--start-mm", "1,2,q"), "--start-mm: Z is 'q'; expected a number"),
+    ],
+)
+def test_what_is_refused_leaves_nothing(command, tmp_path, text, words, message):
+    code, out, err = command(text, *words, "--out", str(tmp_path / "o.ngc"))
+    assert (code, out) == (2, "")
+    assert err.startswith(f"orthocal: {message}")
+    assert err.count("\n") == 1
+    assert not (tmp_path / "o.ngc").exists()
