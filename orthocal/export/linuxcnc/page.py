@@ -11,7 +11,7 @@ from orthocal.export.linuxcnc.approximation import BEYOND, LEVER, Approximation
 from orthocal.export.linuxcnc.home_offsets import JointHome
 from orthocal.export.linuxcnc.nominal_form import Tangent
 from orthocal.export.linuxcnc.words import LETTERS, as_millimetres, plain, region_of, rounded_up
-from orthocal.units import MM, UM
+from orthocal.units import DRIVE_UNITS, MM, UM
 
 UNITS = (
     "All numbers are in mm and degrees. A machine whose INI says `LINEAR_UNITS = inch` takes "
@@ -43,7 +43,9 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
         )
         rows.append(f"| {' | '.join(cells)} |")
     table = "\n".join(rows)
-    active = as_millimetres(entered_offsets(calibration))
+    unit = homes[0].joint_unit
+    size = DRIVE_UNITS[homes[0].unit][1]
+    active = ", ".join(f"{v / size:.6g}" for v in entered_offsets(calibration))
     return f"""\
 # {_title(calibration)}: HOME_OFFSET for LinuxCNC
 
@@ -61,7 +63,7 @@ they are.
 3. Start LinuxCNC again and home every joint: until then nothing has changed.
 4. Look before you move: with a slide where it was, its joint shows more by the change above.
 5. Measure again and run `orthocal validate`. Once typed, the offsets are active: the next
-   session.yaml says so (`controller: {{offsets_mm: [{active}]}}`).
+   session.yaml says so (`controller: {{offsets_{unit}: [{active}]}}`).
 
 Home slowly: what a joint moves in one servo period at HOME_LATCH_VEL is how well homing repeats.
 
@@ -114,8 +116,8 @@ them carry {", ".join(carried)} as they are.
 
 ## Where it ends
 
-- **Region.** Beyond {region_of(found)} mm the correction stays what it is on the nearest face.{beyond}
-  A larger region: `--half-side-mm`.
+- **Region.** Beyond {region_of(found)} mm the correction stays what it is on the nearest
+  face.{beyond} A larger region: `--half-side-mm`.
 - **Tool.** The platform is tilted. A tip {LEVER / MM:g} mm farther, in whichever direction, is off
   by up to {longer} µm: for another tool export again with `--tool`. Tool offsets
   (G43) and work offsets go as ever: what they add is added before.
