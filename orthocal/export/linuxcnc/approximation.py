@@ -29,10 +29,11 @@ from orthocal.units import MM, UM
 
 Array = NDArray[np.float64]
 
-MOST_DEGREE = 10
+MOST_DEGREE = {1: 14, 2: 14, 3: 10}
+"""Coordinates of the tool to the highest degree: further ones cost more than they bring."""
 
-LATTICE = 13
-"""Points a side that are fitted: more than a degree needs."""
+SPARE = 3
+"""Points a side that are fitted beyond the highest degree."""
 
 CHECKED = 1000
 """Points within, and as many on faces, edges and corners."""
@@ -104,8 +105,11 @@ def approximate(
     robot = calibration.robot
     middle = tool_at_zero(robot)
     half = np.full(middle.size, _half_side(calibration, half_side))
-    fitted, checked = chebyshev_lattice(middle.size, LATTICE), check_points(middle.size)
+    most = MOST_DEGREE[middle.size]
+    fitted = chebyshev_lattice(middle.size, most + SPARE)
+    checked = check_points(middle.size)
     try:
+        tip.reach(middle + half * corners(middle.size))  # soon, where it cannot be
         drives, _ = tip.reach(middle + half * fitted)
         for error in find_beyond_travel(robot, drives, ["a point"] * len(drives)).values():
             raise error
@@ -118,7 +122,7 @@ def approximate(
     form = find_nominal_form(robot, middle, half)
     points = middle + half * checked
     best = np.inf
-    for degree in range(1, MOST_DEGREE + 1):
+    for degree in range(1, most + 1):
         found = fit_correction(form, middle, half, fitted, drives, degree=degree)
         reached = RESERVE * _estimate(found, points, belong)
         if reached <= within:
@@ -138,7 +142,7 @@ def approximate(
                 longer=_longer(tip, belong, passive),
             )
     raise ExportError(
-        f"no polynomial of a degree up to {MOST_DEGREE} keeps the tool within {within / UM:g} µm "
+        f"no polynomial of a degree up to {most} keeps the tool within {within / UM:g} µm "
         f"over ±{half[0] / MM:g} mm; the best of them reaches {rounded_up(best / UM)} µm"
     )
 
@@ -154,8 +158,12 @@ def check_points(n: int, *, count: int = CHECKED, seed: int = 1) -> Array:
     outside[np.arange(count), pinned] = generator.choice([-1.0, 1.0], count)
     edges = generator.random((count, n)) < 0.3
     outside[edges] = generator.choice([-1.0, 1.0], int(edges.sum()))
-    corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * n, indexing="ij"), axis=-1).reshape(-1, n)
-    return np.concatenate([within, outside, corners])
+    return np.concatenate([within, outside, corners(n)])
+
+
+def corners(n: int) -> Array:
+    """Of a cube of ±1, shape (2^n, n)."""
+    return np.stack(np.meshgrid(*[[-1.0, 1.0]] * n, indexing="ij"), axis=-1).reshape(-1, n)
 
 
 def _half_side(calibration: Calibration, given: float | None) -> float:
