@@ -25,6 +25,7 @@ _HOMES = {
     "Comparison": "orthocal.assess.comparison",
     "Decision": "orthocal.assess.findings.decision",
     "ExportError": "orthocal.errors",
+    "ExportOptions": "orthocal.export.options",
     "Finding": "orthocal.assess.findings.finding",
     "Gauge": "orthocal.measurement.session",
     "LiveScene": "orthocal.viewer.live",
@@ -98,6 +99,7 @@ __all__ = [
     "Comparison",
     "Decision",
     "ExportError",
+    "ExportOptions",
     "Finding",
     "Gauge",
     "LiveScene",
@@ -196,6 +198,7 @@ if TYPE_CHECKING:
     from orthocal.estimation.problem import CalibrationProblem
     from orthocal.estimation.solvers.ipopt import NonlinearProgram
     from orthocal.export.formats import export_calibration
+    from orthocal.export.options import ExportOptions
     from orthocal.kinematics.workspace import Workspace
     from orthocal.measurement.joining import join_sessions
     from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup

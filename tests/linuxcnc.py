@@ -21,9 +21,10 @@ import fcntl
 import os
 import pwd
 import shutil
+import signal
 import subprocess
 import tempfile
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -210,15 +211,10 @@ class Joint:
 
 
 def require_linuxcnc():
-    """Skip where there is no LinuxCNC to run, or one that runs already; fail where one must be."""
+    """Skip where there is no LinuxCNC to run; fail where one must be."""
     missing = [p for p in PROGRAMS if shutil.which(p) is None]
     if missing:
-        reason = f"no LinuxCNC to run: there is no {' and no '.join(missing)}"
-    elif BUSY.exists():
-        reason = f"a LinuxCNC runs already: {BUSY} exists"
-    else:
-        return
-    _without(reason)
+        _without(f"no LinuxCNC to run: there is no {' and no '.join(missing)}")
 
 
 def _without(reason):
@@ -231,8 +227,11 @@ def _without(reason):
 def only_one():
     """Wait for other workers' runs, and keep them out."""
     with open(Path(tempfile.gettempdir()) / "orthocal-linuxcnc.lock", "a") as lock:
-        os.chmod(lock.fileno(), 0o666) if os.stat(lock.name).st_uid == os.geteuid() else None
+        with suppress(PermissionError):  # somebody else's
+            os.chmod(lock.fileno(), 0o666)
         fcntl.flock(lock, fcntl.LOCK_EX)
+        if BUSY.exists():
+            _without(f"a LinuxCNC runs already: {BUSY} exists")
         yield
 
 
@@ -368,8 +367,9 @@ def _run(folder):
         try:
             process.wait(LONGEST)
         except subprocess.TimeoutExpired:
-            process.kill()
+            os.killpg(process.pid, signal.SIGKILL)
             process.wait()
+            subprocess.run(["halrun", "-U"], cwd=folder, env=environment, check=False, **who)
     failed, recorded = folder / "failed.txt", folder / "recorded.txt"
     reason = failed.read_text() if failed.exists() else "nothing was recorded"
     if failed.exists() or not recorded.exists():

@@ -22,7 +22,7 @@ from orthocal.export.linuxcnc.polynomial import (
     fit_correction,
 )
 from orthocal.export.linuxcnc.tool_tip import ToolTip
-from orthocal.export.linuxcnc.words import rounded_up
+from orthocal.export.linuxcnc.words import region_words, rounded_up
 from orthocal.kinematics.assembly import find_beyond_travel
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.units import MM, UM
@@ -74,6 +74,11 @@ class Approximation:
     def lower(self) -> Array:
         """Least coordinates of the region, shape (n,), [m]."""
         return np.asarray(self.inverse.middle - self.inverse.half)
+
+    @property
+    def region(self) -> str:
+        """Where it holds, in words, mm."""
+        return region_words(self.coordinates, self.lower, self.upper)
 
     @property
     def upper(self) -> Array:

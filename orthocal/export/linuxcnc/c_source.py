@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.calibration.calibration import Calibration
 from orthocal.export.linuxcnc.approximation import Approximation
 from orthocal.export.linuxcnc.nominal_form import NominalForm, Tangent
-from orthocal.export.linuxcnc.words import LETTERS, as_millimetres, plain, region_of, rounded_up
+from orthocal.export.linuxcnc.words import LETTERS, as_millimetres, plain, rounded_up
 from orthocal.robot.model import Drive
 from orthocal.units import DRIVE_UNITS, MM, UM
 
@@ -36,7 +36,7 @@ def write_core(calibration: Calibration, found: Approximation) -> dict[str, str]
         **common,
         "title": plain(calibration.session.title) or "without a title",
         "achieved": rounded_up(found.achieved / UM),
-        "region": region_of(found),
+        "region": found.region,
         "tool": as_millimetres(found.tool),
         "degree": inverse.degree,
         "terms": len(inverse.exponents),

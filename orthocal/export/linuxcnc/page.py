@@ -10,7 +10,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.export.linuxcnc.approximation import BEYOND, LEVER, Approximation
 from orthocal.export.linuxcnc.home_offsets import JointHome
 from orthocal.export.linuxcnc.nominal_form import Tangent
-from orthocal.export.linuxcnc.words import LETTERS, as_millimetres, plain, region_of, rounded_up
+from orthocal.export.linuxcnc.words import LETTERS, as_millimetres, plain, rounded_up
 from orthocal.units import DRIVE_UNITS, MM, UM
 
 UNITS = (
@@ -98,7 +98,7 @@ More than offsets was identified: a kinematics module moves the machine as it wa
 {what} ({len(found.inverse.exponents)} terms a joint).
 
 **It keeps the tool within {achieved} µm** of where the calibrated machine
-has it, over {region_of(found)} mm, for a tip at {as_millimetres(found.tool)} mm in the frame of the
+has it, over {found.region} mm, for a tip at {as_millimetres(found.tool)} mm in the frame of the
 tool centre point: the largest of {found.checked} points that were not fitted, and a
 tenth more.{before} How well the calibration itself is known, its report tells.
 
@@ -116,7 +116,7 @@ them carry {", ".join(carried)} as they are.
 
 ## Where it ends
 
-- **Region.** Beyond {region_of(found)} mm the correction stays what it is on the nearest
+- **Region.** Beyond {found.region} mm the correction stays what it is on the nearest
   face.{beyond} A larger region: `--half-side-mm`.
 - **Tool.** The platform is tilted. A tip {LEVER / MM:g} mm farther, in whichever direction, is off
   by up to {longer} µm: for another tool export again with `--tool`. Tool offsets

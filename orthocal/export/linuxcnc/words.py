@@ -5,12 +5,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 from orthocal.units import MM
-
-if TYPE_CHECKING:
-    from orthocal.export.linuxcnc.approximation import Approximation
 
 LETTERS = "XYZABC"
 """LinuxCNC's coordinates, in its order."""
@@ -28,11 +24,11 @@ def as_millimetres(values: Iterable[float]) -> str:
     return ", ".join(f"{round(float(v) / MM, 6) + 0.0:g}" for v in values)
 
 
-def region_of(found: Approximation) -> str:
-    """Where a module holds: X -60 to 60, Y -60 to 60."""
+def region_words(coordinates: Iterable[int], lower: Iterable[float], upper: Iterable[float]) -> str:
+    """A region of [m] in mm: X -60 to 60, Y -60 to 60."""
     return ", ".join(
         f"{LETTERS[k]} {as_millimetres([low])} to {as_millimetres([high])}"
-        for k, low, high in zip(found.coordinates, found.lower, found.upper, strict=True)
+        for k, low, high in zip(coordinates, lower, upper, strict=True)
     )
 
 
