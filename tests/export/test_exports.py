@@ -170,7 +170,7 @@ def test_any_way_to_write_an_origin_is_understood(orthoglide, origin, shape):
 
 
 def test_all_but_the_numbers_stays_byte_for_byte(full, tmp_path):
-    """As others write it: a mark, carriage returns, single quotes, comments, tags of other programs."""
+    """As others write it: a mark, carriage returns, single quotes, comments, others' tags."""
     folder = tmp_path / "orthoglide"
     shutil.copytree(full.robot.folder, folder)
     urdf = folder / "orthoglide.urdf"
