@@ -241,7 +241,9 @@ def build_module(folder, *, install=False):
     done = subprocess.run(
         ["halcompile", how, f"{MODULE}.c"], cwd=folder, capture_output=True, text=True
     )
-    assert done.returncode == 0, done.stdout + done.stderr
+    said = done.stdout + done.stderr
+    assert done.returncode == 0, said
+    assert "warning" not in said
 
 
 @contextmanager

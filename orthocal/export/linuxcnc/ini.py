@@ -29,7 +29,7 @@ def write_home_lines(homes: Sequence[JointHome]) -> str:
 def write_module_lines(found: Approximation, homes: Sequence[JointHome]) -> str:
     """The kinematics module, the region as limits of the axes, and joints as while measuring."""
     n = len(homes)
-    letters = "".join(LETTERS[k] for k in found.coordinates)
+    letters = "".join(LETTERS[k] for k in sorted(found.coordinates))
     lines = [
         "# The calibrated kinematics module; HOME_OFFSET stays as it was while measuring.",
         "",
