@@ -415,10 +415,22 @@ def test_a_module_leaves_home_offset_as_it_was(full, exported):
     assert "HOME_OFFSET stays as it was while measuring" in exported["README.md"]
     assert "for a tip at 5, 0, -50 mm" in exported["README.md"]
     assert "HOME_OFFSET =" not in exported["kinematics.ini"]
+    assert "type the old lines back" in exported["README.md"]
     assert "[AXIS_Z]\nMIN_LIMIT = -60\nMAX_LIMIT = 60\n" in exported["kinematics.ini"]
     assert "# x_slide\nTYPE = LINEAR\nMIN_LIMIT = 120.4000\n" in exported["kinematics.ini"]
     stated = float(re.search(r"within ([\d.]+) µm", exported["README.md"])[1])
     assert 0.0 < stated <= WITHIN * 1e6
+
+
+def test_a_module_may_be_asked_for_where_offsets_alone_are_known(offsets):
+    """HOME_OFFSET that was told stays in it; nominal legs need no more than a constant."""
+    options = ExportOptions(module=True, home_offsets=(0.35, 0.3, -0.02))
+    files = export_calibration(offsets, "linuxcnc", options=options)
+    assert "Offsets alone were identified, and a module was asked for" in files["README.md"]
+    assert "(JOINT_0 350.0000, JOINT_1 300.0000, JOINT_2 -20.0000)" in files["README.md"]
+    assert "HOME_OFFSET = 300.0000\n" in files["kinematics.ini"]
+    assert "#define DEGREE 1\n" in files["orthocal_core.c"]
+    assert "within 0.001 µm" in files["README.md"]
 
 
 # ---- LinuxCNC itself

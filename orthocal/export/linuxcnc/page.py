@@ -18,6 +18,9 @@ UNITS = (
     "lengths divided by 25.4."
 )
 
+FINEST = 1e-9
+"""No page promises more, [m]."""
+
 
 def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str:
     """What to type where offsets alone were identified."""
@@ -88,19 +91,23 @@ def write_module_page(
     if found.beyond is not None:
         left = rounded_up(found.beyond / UM)
         beyond = f" {BEYOND / MM:g} mm beyond a face the tool is off by up to {left} µm."
-    achieved, longer = rounded_up(found.achieved / UM), rounded_up(found.longer / UM)
+    achieved = rounded_up(max(found.achieved, FINEST) / UM)
+    longer = rounded_up(found.longer / UM)
+    reason = "More than offsets was identified"
+    if calibration.only_offsets:
+        reason = "Offsets alone were identified, and a module was asked for"
     known = [f"JOINT_{i} {h.show(h.old)}" for i, h in enumerate(homes) if h.old is not None]
     kept = f" ({', '.join(known)})" if known else ""
     return f"""\
 # {_title(calibration)}: kinematics for LinuxCNC
 
-More than offsets was identified: a kinematics module moves the machine as it was calibrated.
+{reason}: a kinematics module moves the machine as it was calibrated.
 {what} ({len(found.inverse.exponents)} terms a joint).
 
-**It keeps the tool within {achieved} µm** of where the calibrated machine
-has it, over {found.region} mm, for a tip at {as_millimetres(found.tool)} mm in the frame of the
-tool centre point: the largest of {found.checked} points that were not fitted, and a
-tenth more.{before} How well the calibration itself is known, its report tells.
+**It keeps the tool within {achieved} µm** of where the calibrated machine has it,
+over {found.region} mm, for a tip at {as_millimetres(found.tool)} mm
+in the frame of the tool centre point: the largest of {found.checked} points that were not fitted,
+and a tenth more.{before} How well the calibration itself is known, its report tells.
 
 ## Build and enter
 
@@ -109,7 +116,9 @@ tenth more.{before} How well the calibration itself is known, its report tells.
 3. Copy your INI, so that you can go back. Then type the lines of `kinematics.ini` beside this page.
 4. **HOME_OFFSET stays as it was while measuring**{kept}: the module holds the offsets itself.
    Entered beside it they would count twice. Soft limits of joints stay as well.
-5. Start LinuxCNC, home, and measure again.
+5. Start LinuxCNC and home every joint.
+
+Readings for orthocal are taken with nominal kinematics: to measure again, type the old lines back.
 
 The drives are joints 0 to {n - 1}: {", ".join(plain(h.drive) for h in homes)}. Joints after
 them carry {", ".join(carried)} as they are.
