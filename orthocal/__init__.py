@@ -25,6 +25,7 @@ _HOMES = {
     "Comparison": "orthocal.assess.comparison",
     "Decision": "orthocal.assess.findings.decision",
     "ExportError": "orthocal.errors",
+    "ExportOptions": "orthocal.export.options",
     "Finding": "orthocal.assess.findings.finding",
     "Gauge": "orthocal.measurement.session",
     "GcodeError": "orthocal.errors",
@@ -104,6 +105,7 @@ __all__ = [
     "Comparison",
     "Decision",
     "ExportError",
+    "ExportOptions",
     "Finding",
     "Gauge",
     "GcodeError",
@@ -209,6 +211,7 @@ if TYPE_CHECKING:
     from orthocal.estimation.problem import CalibrationProblem
     from orthocal.estimation.solvers.ipopt import NonlinearProgram
     from orthocal.export.formats import export_calibration
+    from orthocal.export.options import ExportOptions
     from orthocal.kinematics.workspace import Workspace
     from orthocal.measurement.importing import (
         TableImport,

@@ -38,6 +38,8 @@ def test_the_wheel_holds_robots_and_types(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert "orthocal/_robots/orthoglide/orthoglide.urdf" in names
     assert "orthocal/_robots/orthoglide/orthoglide.yaml" in names
+    assert "orthocal/export/linuxcnc/templates/orthocal_core.c" in names
+    assert "orthocal/export/linuxcnc/templates/orthocal_core.h" in names
     assert "orthocal/py.typed" in names
     for name in ("web/scene.html", "web/scene.css", "web/scene.js"):
         assert f"orthocal/viewer/{name}" in names

@@ -8,21 +8,49 @@ from orthocal.assess.findings.calibration import decide
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError, ParameterError
 from orthocal.export.corrections import export_corrections
+from orthocal.export.linuxcnc.export import export_linuxcnc
+from orthocal.export.options import ExportOptions
 from orthocal.export.parameters import export_parameters
 from orthocal.export.urdf import export_urdf
 
-Exporter = Callable[[Calibration], dict[str, str]]
-"""A calibration to the texts of files, by their names."""
+Exporter = Callable[[Calibration, ExportOptions], dict[str, str]]
+"""A calibration, and what was asked for, to the texts of files by their names."""
+
+
+def _without_options(export: Callable[[Calibration], dict[str, str]]) -> Exporter:
+    """A format of which nothing can be asked."""
+
+    def exporter(calibration: Calibration, options: ExportOptions) -> dict[str, str]:
+        if options.asked:
+            name = OPTIONS[options.asked[0]]
+            raise ParameterError("goes with --to linuxcnc alone", where=name)
+        return export(calibration)
+
+    return exporter
+
 
 EXPORTERS: dict[str, Exporter] = {
-    "yaml": export_parameters,
-    "table": export_corrections,
-    "urdf": export_urdf,
+    "yaml": _without_options(export_parameters),
+    "table": _without_options(export_corrections),
+    "urdf": _without_options(export_urdf),
+    "linuxcnc": export_linuxcnc,
+}
+
+OPTIONS = {
+    "within": "--within",
+    "tool": "--tool",
+    "home_offsets": "--home-offset",
+    "half_side": "--half-side-mm",
+    "module": "--module",
 }
 
 
 def export_calibration(
-    calibration: Calibration, to: str, *, anyway: bool = False
+    calibration: Calibration,
+    to: str,
+    *,
+    anyway: bool = False,
+    options: ExportOptions | None = None,
 ) -> dict[str, str]:
     """A calibration in some format.
 
@@ -30,12 +58,13 @@ def export_calibration(
         calibration: The calibration.
         to: Name of the format.
         anyway: Also where its decision is not to enter it.
+        options: What is asked for beside the format; nothing by default.
 
     Returns:
         Texts of files by their names.
 
     Raises:
-        ParameterError: If there is no such format.
+        ParameterError: If there is no such format, or it has no such option.
         ExportError: If its decision is not to enter it, or the machine does not reach what the
             format needs.
     """
@@ -45,7 +74,7 @@ def export_calibration(
         )
     if not anyway:
         require_entering(calibration)
-    return EXPORTERS[to](calibration)
+    return EXPORTERS[to](calibration, options or ExportOptions())
 
 
 def require_entering(calibration: Calibration) -> None:

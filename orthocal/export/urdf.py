@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from xml.parsers import expat
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
+from orthocal.characters import composed
 from orthocal.errors import ExportError, RobotError
 from orthocal.files import read_file
 from orthocal.robot.description import load_description
@@ -27,11 +29,8 @@ Array = NDArray[np.float64]
 SAME = 1e-9
 """Placements of what was written and of the calibrated machine, [m, rad]."""
 
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
-_JOINT = re.compile(r"<joint\b[^>]*\btype\s*=[^>]*>", re.DOTALL)
-_NAME = re.compile(r"\bname\s*=\s*([\"'])(.*?)\1", re.DOTALL)
-_ORIGIN = re.compile(r"<origin\b[^>]*?/?>", re.DOTALL)
-_END = re.compile(r"</joint\s*>")
+_TAG = re.compile(rb"""<[^\s/>]+(?:[^>"']|"[^"]*"|'[^']*')*>""")
+_ATTRIBUTE = r"""(?<![\w:.-]){name}\s*=\s*(?P<quote>["'])(?P<value>.*?)(?P=quote)"""
 
 
 def export_urdf(calibration: Calibration) -> dict[str, str]:
@@ -98,57 +97,91 @@ def _mounts(robot: Robot) -> dict[str, str]:
 
 
 def _correct(text: str, twists: Mapping[str, list[Array]], robot: Robot) -> str:
-    """The text with the origins of these joints moved, and nothing else changed."""
-    # comments may hold anything: they keep their length, and lose their content
-    bare = _COMMENT.sub(lambda m: " " * len(m[0]), text)
+    """The text with the numbers of these joints' origins moved, and no other byte changed."""
+    content = text.encode()
+    line_end = "\r\n" if b"\r\n" in content else "\n"
     changes: list[tuple[int, int, str]] = []
     left = dict(twists)
-    for joint in _JOINT.finditer(bare):
-        name = _NAME.search(joint[0])
-        if name is None or name[2] not in left:
+    for name, start, origin in _find_joints(content):
+        if name not in left:
             continue
-        moved = left.pop(name[2])
-        end = _END.search(bare, joint.end())
-        stop = len(bare) if end is None else end.start()
-        origin = _ORIGIN.search(bare, joint.end(), stop)
+        moved = left.pop(name)
+        found = _TAG.match(content, start if origin is None else origin)
+        if found is None:
+            continue
         if origin is None:
             placed = _moved({}, moved)
-            new = f"<origin xyz={placed['xyz']} rpy={placed['rpy']}/>".replace("'", '"')
-            changes.append((joint.end(), joint.end(), f"\n    {new}"))
+            new = "".join(f' {key}="{placed.get(key, "0 0 0")}"' for key in ("xyz", "rpy"))
+            changes.append((found.end(), found.end(), f"{line_end}    <origin{new}/>"))
         else:
-            changes.append((*origin.span(), _rewrite(origin[0], moved)))
+            changes.append((*found.span(), _rewrite(found[0].decode(), moved)))
     if left:
         raise ExportError(
             f"its URDF has no joint '{next(iter(left))}' of its own to correct",
             where=str(robot.urdf),
         )
-    for first, last, new in sorted(changes, reverse=True):
-        text = text[:first] + new + text[last:]
-    return text
+    for first, last, changed in sorted(changes, reverse=True):
+        content = content[:first] + changed.encode() + content[last:]
+    return content.decode()
+
+
+def _find_joints(content: bytes) -> list[tuple[str, int, int | None]]:
+    """Name of each of the robot's own joints, and where in the file it and its origin begin.
+
+    What a parser sees: not what stands in comments, nor joints that other elements name.
+    """
+    found: list[tuple[str, int, int | None]] = []
+    path: list[str] = []
+    parser = expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        path.append(tag)
+        at = parser.CurrentByteIndex
+        if path[1:] == ["joint"]:
+            found.append((composed(attributes.get("name", "")), at, None))
+        elif path[1:] == ["joint", "origin"] and found[-1][2] is None:
+            found[-1] = (*found[-1][:2], at)
+
+    def end(_: str) -> None:
+        path.pop()
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.Parse(content, True)
+    return found
 
 
 def _rewrite(origin: str, twists: list[Array]) -> str:
-    """An origin element with other numbers."""
-    given = {m[1]: m[3] for m in re.finditer(r"\b(xyz|rpy)\s*=\s*([\"'])(.*?)\2", origin, re.S)}
+    """An origin element with other numbers where they are others."""
+    given = {m[0]: m[1]["value"] for m in _attributes(origin)}
     for key, value in _moved(given, twists).items():
-        place = re.search(rf"\b{key}\s*=\s*([\"']).*?\1", origin, re.S)
+        place = next((m for name, m in _attributes(origin) if name == key), None)
         if place is not None:
-            origin = f"{origin[: place.start()]}{key}={value}{origin[place.end() :]}"
+            origin = f"{origin[: place.start('value')]}{value}{origin[place.end('value') :]}"
         else:
             end = re.search(r"\s*/?>$", origin)
             at = len(origin) if end is None else end.start()
-            origin = f"{origin[:at]} {key}={value}{origin[at:]}"
+            origin = f'{origin[:at]} {key}="{value}"{origin[at:]}'
     return origin
 
 
+def _attributes(origin: str) -> list[tuple[str, re.Match[str]]]:
+    """Its attributes of numbers, and where they stand."""
+    found = ((n, re.search(_ATTRIBUTE.format(name=n), origin, re.S)) for n in ("xyz", "rpy"))
+    return [(name, match) for name, match in found if match is not None]
+
+
 def _moved(given: Mapping[str, str], twists: list[Array]) -> dict[str, str]:
-    """The numbers of an origin after it was moved, in quotes."""
+    """The numbers of an origin that are others after it was moved."""
     xyz, rpy = (np.array([float(v) for v in given.get(k, "0 0 0").split()]) for k in ("xyz", "rpy"))
     place = pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz)
     for twist in twists:
         place = place * pin.exp6(twist)
-    numbers = {"xyz": place.translation, "rpy": pin.rpy.matrixToRpy(place.rotation)}
-    return {k: '"' + " ".join(f"{v + 0.0:.15g}" for v in n) + '"' for k, n in numbers.items()}
+    numbers = {}
+    if not np.array_equal(place.translation, xyz):
+        numbers["xyz"] = place.translation
+    if any(twist[3:].any() for twist in twists):
+        numbers["rpy"] = pin.rpy.matrixToRpy(place.rotation)
+    return {k: " ".join(f"{v + 0.0:.15g}" for v in n) for k, n in numbers.items()}
 
 
 def _require_same(machine: Robot, text: str) -> None:

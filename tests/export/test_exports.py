@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -144,15 +145,18 @@ def test_nothing_but_origins_changes_in_it(full):
 @pytest.mark.parametrize(
     ("origin", "shape"),
     [
-        ("", '<origin xyz="0.001 0 0" rpy="0 0 0"/>'),
-        ("<!-- <origin/> --><origin/>", '<origin xyz="0.001 0 0" rpy="0 0 0"/>'),
-        ("<origin rpy = '0 0 0' />", '<origin rpy="0 0 0" xyz="0.001 0 0" />'),
-        ('<origin\n xyz="1 2\n3"></origin>', '<origin\n xyz="1.001 2 3" rpy="0 0 0"></origin>'),
+        ("", '<joint type="fixed" name="a">\n    <origin xyz="0.001 0 0" rpy="0 0 0"/><parent'),
+        ("<!-- <origin/> --><origin/>", '<!-- <origin/> --><origin xyz="0.001 0 0"/><parent'),
+        ("<origin rpy = '0 0 0' />", "<origin rpy = '0 0 0' xyz=\"0.001 0 0\" /><parent"),
+        ("<origin xyz = '1 2\t3'/>", "<origin xyz = '1.001 2 3'/><parent"),
+        ('<origin\n xyz="1 2\n3"></origin>', '<origin\n xyz="1.001 2 3"></origin><parent'),
+        ("<a b='>'/><origin rpy='0 0 0.0'/>", "<origin rpy='0 0 0.0' xyz=\"0.001 0 0\"/><parent"),
     ],
 )
 def test_any_way_to_write_an_origin_is_understood(orthoglide, origin, shape):
     text = (
         f'<robot><!-- <joint name="a" type="fixed"></joint> -->'
+        f'<transmission><joint name="a" type="x"><origin/></joint></transmission>'
         f'<joint type="fixed" name="a">{origin}<parent link="b"/></joint>'
         f'<transmission><joint name="a"/></transmission></robot>'
     )
@@ -163,6 +167,43 @@ def test_any_way_to_write_an_origin_is_understood(orthoglide, origin, shape):
     assert found.endswith('<transmission><joint name="a"/></transmission></robot>')
     with pytest.raises(ExportError, match="has no joint 'c' of its own to correct"):
         _correct(text, {"c": [twist]}, orthoglide)
+
+
+def test_all_but_the_numbers_stays_byte_for_byte(full, tmp_path):
+    """As others write it: a mark, carriage returns, single quotes, comments, others' tags."""
+    folder = tmp_path / "orthoglide"
+    shutil.copytree(full.robot.folder, folder)
+    urdf = folder / "orthoglide.urdf"
+    text = urdf.read_text().replace('"', "'")
+    text = text.replace("<origin ", "<origin  ").replace(
+        "</robot>", f"{OTHERS}</robot>\n<!-- ü -->"
+    )
+    text = text.replace("  <link", f"{OTHERS}  <link", 1)
+    urdf.write_bytes(text.replace("\n", "\r\n").encode("utf-8-sig"))
+    robot = load_robot(folder)
+    before = urdf.read_bytes()
+    errors = robot.parameters.expand(full.errors)
+    after = _correct(before.decode(), _find_twists(robot, errors), robot).encode()
+    numbers = re.compile(rb"(?<=xyz=')[^']*|(?<=rpy=')[^']*")
+    assert after != before
+    assert numbers.sub(b"", after) == numbers.sub(b"", before)
+    # and of the numbers none but those of joints that are off
+    changed = [
+        (a, b)
+        for a, b in zip(numbers.findall(after), numbers.findall(before), strict=True)
+        if a != b
+    ]
+    assert 20 < len(changed) < 60
+    assert all(a.split() != b.split() for a, b in changed)
+
+
+OTHERS = """\
+<gazebo reference='x_slide'>
+  <!-- <joint name='x_slide' type='fixed'><origin xyz='9 9 9'/></joint> -->
+  <joint name='x_slide' type='fixed'><origin xyz='8 8 8'/></joint>
+</gazebo>
+"""
+"""What is no joint of the robot's own, though it says so."""
 
 
 def test_an_offset_moves_its_drives_origin(root, tmp_path):

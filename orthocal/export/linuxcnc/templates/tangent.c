@@ -1,0 +1,18 @@
+/* the joints in the middle of the region, and their slopes there */
+static const double at_middle[N] = $at_middle;
+static const double tangent[N][N] = $tangent;
+
+static int nominal(const double p[N], double q[N], double (*slope)[N])
+{
+    int i, k;
+
+    for (i = 0; i < N; i++) {
+        q[i] = at_middle[i];
+        for (k = 0; k < N; k++) {
+            q[i] += tangent[i][k] * (p[k] - middle[k]);
+            if (slope)
+                slope[i][k] = tangent[i][k];
+        }
+    }
+    return 0;
+}

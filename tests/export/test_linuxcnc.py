@@ -1,0 +1,523 @@
+"""LinuxCNC's files by what they do: compiled, run, put through the machine that was calibrated."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import shutil
+import subprocess
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from linuxcnc import Joint, build_module, require_linuxcnc, run_program, type_lines
+
+from orthocal import (
+    ExportError,
+    calibrate,
+    export_calibration,
+    load_plan,
+    load_robot,
+    simulate_session,
+    write_calibration,
+)
+from orthocal.calibration.machine import Machine
+from orthocal.cli import main
+from orthocal.export.linuxcnc.approximation import approximate
+from orthocal.export.linuxcnc.c_source import braced, write_core
+from orthocal.export.linuxcnc.home_offsets import find_homes
+from orthocal.export.linuxcnc.nominal_form import SlidesWithRods, Tangent, find_nominal_form
+from orthocal.export.linuxcnc.tool_tip import ToolTip
+from orthocal.export.linuxcnc.words import rounded_up
+from orthocal.export.options import ExportOptions
+from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.measurement.synthetic import load_errors
+from orthocal.robot.loading import packaged_robots
+
+MM = 1e-3
+
+WITHIN = 0.05e-6
+"""[m] What modules of these tests are asked for."""
+
+TOOL = (5 * MM, 0.0, -50 * MM)
+
+ACTIVE = np.array([0.4, -0.1, 0.2]) * MM
+
+PATH = 0.5e-6
+"""[m] From the path: 0.05 µm of the module, 0.04 of homing, 0.03 of the interpolator, which takes
+a sixth of the neighbours into each point, and LinuxCNC's own rounding."""
+
+TYPED = 0.2e-6
+"""[m] HOME_OFFSET is typed to 0.1 µm, and homing repeats to 0.02 µm; three drives."""
+
+
+# ---- machines
+
+
+@pytest.fixture(scope="module")
+def mixed(root, tmp_path_factory):
+    """An Orthoglide whose joints count up, down and from nought."""
+    folder = tmp_path_factory.mktemp("robots") / "orthoglide"
+    shutil.copytree(packaged_robots()["orthoglide"], folder)
+    file = folder / "orthoglide.yaml"
+    text = file.read_text()
+    for drive, joint in {
+        "y_slide": "{counts: down}",
+        "z_slide": "{counts: down, at_zero_mm: 0}",
+    }.items():
+        entry = f"{drive}: {{zero_mm: 310.25"
+        assert entry in text
+        text = text.replace(entry, f"{entry}, joint: {joint}")
+    file.write_text(text)
+    return folder
+
+
+def calibrated(root, folder, example, truth, model):
+    """A machine with given errors, read without noise while some offsets were active."""
+    text = (root / f"examples/{example}/plan.yaml").read_text()
+    active = ", ".join(f"{v / MM:g}" for v in ACTIVE)
+    for old, new in {
+        "robot: orthoglide": f"robot: {folder}",
+        "offsets_mm: [0, 0, 0]": f"offsets_mm: [{active}]",
+    }.items():
+        assert old in text
+        text = text.replace(old, new)
+    plan = folder.parent / f"{example}.yaml"
+    plan.write_text(text)
+    loaded = load_plan(plan)
+    errors = load_errors(truth, loaded.robot) if not isinstance(truth, dict) else truth
+    return calibrate(simulate_session(loaded, errors, exact=True).session, model)
+
+
+@pytest.fixture(scope="module")
+def full(root, mixed):
+    return calibrated(root, mixed, "sweep", root / "examples/sweep/truth.yaml", "full")
+
+
+OFFSETS = {"x_slide.offset": 1.2 * MM, "y_slide.offset": -0.8 * MM, "z_slide.offset": 0.5 * MM}
+
+
+@pytest.fixture(scope="module")
+def offsets(root, mixed):
+    return calibrated(root, mixed, "raw-cycles", OFFSETS, "offsets")
+
+
+@pytest.fixture(scope="module")
+def exported(full):
+    """Files of a module for a tool, counting as LinuxCNC's joints do."""
+    options = ExportOptions(within=WITHIN, tool=TOOL)
+    return export_calibration(full, "linuxcnc", anyway=True, options=options)
+
+
+def machine_of(robot, errors):
+    """A machine that was not calibrated from readings, but is known."""
+    n = len(robot.drives)
+    return SimpleNamespace(
+        robot=robot,
+        errors=errors,
+        active_offsets=np.zeros(n),
+        machine=Machine(robot, errors),
+        session=SimpleNamespace(title="*/ known", controller_offsets=None),
+    )
+
+
+# ---- the core in C
+
+
+class Core:
+    """orthocal_core.c, compiled as any C compiler does."""
+
+    def __init__(self, folder, files):
+        if shutil.which("gcc") is None:
+            if os.environ.get("ORTHOCAL_LINUXCNC") == "required":
+                pytest.fail("a C compiler is required here")
+            pytest.skip("no C compiler")
+        for name, text in files.items():
+            (folder / name).write_text(text)
+        strict = "-std=c99 -O2 -Wall -Wextra -Werror -pedantic -Wshadow -Wvla".split()
+        done = subprocess.run(
+            ["gcc", *strict, "-fPIC", "-shared", "-o", "core.so", "orthocal_core.c", "-lm"],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stderr
+        used = subprocess.run(["nm", "-u", "core.so"], cwd=folder, capture_output=True, text=True)
+        # weak ones and the C library's own frame aside, nothing but a root is asked of others
+        asked = {line.split()[1] for line in used.stdout.splitlines() if line.split()[0] == "U"}
+        assert {name.split("@")[0] for name in asked} <= {"sqrt", "__stack_chk_fail"}
+        self.n = int(re.search(r"#define ORTHOCAL_DRIVES (\d)", files["orthocal_core.h"])[1])
+        self.library = ctypes.CDLL(str(folder / "core.so"))
+        self.type = ctypes.c_double * self.n
+
+    def inverse(self, points, *, untouched=7.0):
+        """Joints in mm or degrees, (K, n), NaN where it says no, for points in mm."""
+        return self._each(self.library.orthocal_inverse, points, lambda p: [untouched] * self.n)
+
+    def forward(self, joints, *, start):
+        return self._each(self.library.orthocal_forward, joints, lambda _: start)
+
+    def _each(self, function, rows, begin):
+        found = []
+        for row in rows:
+            result = self.type(*begin(row))
+            if function(self.type(*row), result) != 0:
+                assert list(result) == list(begin(row))
+                result = [np.nan] * self.n
+            found.append(list(result))
+        return np.array(found)
+
+
+@pytest.fixture(scope="module")
+def core(tmp_path_factory, exported):
+    return Core(tmp_path_factory.mktemp("core"), exported)
+
+
+def drives_of(calibration, joints):
+    """Coordinates as the encoders give them, [m], of LinuxCNC's joints, mm."""
+    shown = zip(calibration.robot.drives, (joints * MM).T, ACTIVE, strict=True)
+    return np.stack([d.from_joint(j) - active for d, j, active in shown], axis=-1)
+
+
+def test_the_core_brings_the_tip_where_it_belongs(full, core):
+    points = np.random.default_rng(7).uniform(-0.06, 0.06, (2000, 3))
+    tip = ToolTip(full, TOOL)
+    reached = tip.place(drives_of(full, core.inverse(points / MM)))
+    off = np.linalg.norm(reached - (points + TOOL), axis=1)
+    assert off.max() < WITHIN
+    # its error is in these numbers: without the tilt it were tens of micrometres
+    level = full.machine.inverse(points[:200])
+    assert np.abs(drives_of(full, core.inverse(points[:200] / MM)) - level).max() > 20e-6
+
+
+def test_without_a_tool_it_is_the_calibrated_machine(full, tmp_path):
+    """10,000 points that nobody has fitted or looked at."""
+    found = approximate(full, within=WITHIN)
+    core = Core(tmp_path, write_core(full, found))
+    points = np.random.default_rng(8).uniform(-0.06, 0.06, (10_000, 3))
+    joints = drives_of(full, core.inverse(points / MM))
+    slopes = found.inverse.slopes(points)
+    off = np.linalg.solve(slopes, (joints - full.machine.inverse(points))[..., None])[..., 0]
+    assert np.linalg.norm(off, axis=1).max() < found.achieved <= WITHIN
+
+
+def test_the_tip_is_where_pinocchio_has_it(full, core):
+    """By placements of a robot with these errors, its loops closed by Pinocchio."""
+    robot = full.robot.with_errors(full.errors)
+    points = np.random.default_rng(9).uniform(-0.06, 0.06, (8, 3))
+    data, passive = robot.model.createData(), robot.zero[robot.passive_index]
+    for point, drives in zip(points, drives_of(full, core.inverse(points / MM)), strict=True):
+        closed = robot.close_with_pinocchio(drives, passive)
+        q = robot.configuration(robot.joint_coordinates(drives, closed))
+        pin.framesForwardKinematics(robot.model, data, q)
+        place = data.oMf[robot.frame_id(robot.tcp.frame)]
+        assert np.linalg.norm(place.act(np.array(TOOL)) - point - TOOL) < WITHIN
+
+
+def test_forward_undoes_inverse(core):
+    points = np.random.default_rng(10).uniform(-60.0, 60.0, (2000, 3))
+    for start in ([0.0, 0.0, 0.0], [55.0, -55.0, 55.0], [1e9, float("nan"), -1e9]):
+        assert np.abs(core.forward(core.inverse(points), start=start) - points).max() < 1e-9
+    # also somewhat outside, where what is added no longer changes
+    outside = points * 1.4
+    assert np.abs(core.forward(core.inverse(outside), start=[0.0] * 3) - outside).max() < 1e-9
+
+
+def test_beyond_the_region_what_is_added_is_that_of_the_nearest_face(full, core):
+    form = find_nominal_form(full.robot, np.zeros(3), np.full(3, 0.06))
+    outside = np.array([[75.0, 10.0, -80.0], [-61.0, 0.0, 0.0], [0.0, 70.0, 20.0]])
+    added = [
+        drives_of(full, core.inverse(p)) - form(p * MM)[0]
+        for p in (outside, np.clip(outside, -60.0, 60.0))
+    ]
+    assert np.abs(added[0] - added[1]).max() < 1e-12
+    assert np.abs(added[0]).max() > 0.1 * MM
+
+
+def test_what_has_no_answer_gets_none(core):
+    """And leaves what was there."""
+    nan, inf = float("nan"), float("inf")
+    rows = [[nan, 0, 0], [0, inf, 0], [0, 400.0, 0], [1e200, 1e200, 1e200]]
+    assert np.isnan(core.inverse(rows)).all()
+    rows = [[nan, 0, 0], [inf, 0, 0], [1e300, -1e300, 1e300], [-4000.0, 4000.0, 4000.0]]
+    assert np.isnan(core.forward(rows, start=[1.0, 2.0, 3.0])).all()
+
+
+def test_robots_with_slides_and_rods_are_found_by_their_numbers(orthoglide, biglide, fivebar):
+    form = find_nominal_form(orthoglide, np.zeros(3), np.full(3, 0.06))
+    assert isinstance(form, SlidesWithRods)
+    assert np.array_equal(form.axes, np.eye(3))
+    assert np.array_equal(form.anchors, np.zeros((3, 3)))
+    assert np.array_equal(form.lengths, [0.31025] * 3)
+    found = find_nominal_form(biglide, tool_at_zero(biglide), np.full(2, 0.03))
+    assert isinstance(found, SlidesWithRods)
+    assert found.lengths == pytest.approx([0.2, 0.2])
+
+
+@pytest.mark.parametrize("name", ["biglide", "fivebar"])
+def test_any_robot_with_a_tool_gets_a_core(root, tmp_path, name):
+    """Slides of a planar robot in closed form; motors, which have none here, by numbers alone."""
+    folder = tmp_path / name
+    shutil.copytree(root / "tests/robots" / name, folder)
+    errors = {"x_slide.offset": 1e-3, "y_tip.x": 2e-4} if name == "biglide" else {}
+    if name == "fivebar":
+        with open(folder / "fivebar.yaml", "a") as file:
+            file.write(
+                "orthocal:\n  tcp: {frame: end_a, coordinates: [x, y]}\n"
+                "  drives: {motor_b: {joint: {counts: down, at_zero_deg: 30}}}\n"
+            )
+        errors = {"motor_a.offset": 0.01, "motor_b.offset": -0.02, "elbow_a.y": 3e-4}
+    robot = load_robot(folder)
+    errors = {k: v for k, v in errors.items() if k in robot.parameters.elementary}
+    known = machine_of(robot, errors)
+    found = approximate(known, within=1e-7, half_side=0.02)
+    assert isinstance(found.inverse.nominal, Tangent if name == "fivebar" else SlidesWithRods)
+    files = write_core(known, found)
+    assert "*/ known" not in files["orthocal_core.c"]
+    core = Core(tmp_path, files)
+    points = tool_at_zero(robot) + np.random.default_rng(1).uniform(-0.02, 0.02, (500, 2))
+    joints = core.inverse(points / MM)
+    assert np.abs(core.forward(joints, start=[0.0, 0.0]) - points / MM).max() < 1e-9
+    factor = np.deg2rad(1.0) if name == "fivebar" else MM
+    drives = [d.from_joint(j * factor) for d, j in zip(robot.drives, joints.T, strict=True)]
+    reached = known.machine.forward(np.stack(drives, axis=-1))[:, :2]
+    assert np.abs(reached - points).max() < 1e-7
+
+
+def test_numbers_are_written_with_every_digit():
+    values = np.random.default_rng(0).normal(size=(3, 20))
+    read = [float(v) for v in re.findall(r"[-+.\de]+", braced(values))]
+    assert np.array_equal(np.reshape(read, values.shape), values)
+    assert braced(np.array([1, 2])) == "{1, 2}"
+
+
+# ---- what is refused
+
+
+def test_more_than_polynomials_reach_is_refused_with_what_they_do(full):
+    with pytest.raises(ExportError, match=r"within 1e-09 µm over ±60 mm; the best .* reaches"):
+        approximate(full, within=1e-15)
+    with pytest.raises(ExportError, match=r"does not reach ±150 mm \(.*smaller --half-side-mm"):
+        approximate(full, within=1e-6, half_side=0.15)
+
+
+def test_a_lower_degree_is_taken_where_less_is_asked(full, exported):
+    """And what is stated is at most what was asked."""
+    found = approximate(full, within=5e-6)
+    assert f"#define DEGREE {found.inverse.degree}\n" not in exported["orthocal_core.c"]
+    assert found.inverse.degree < 4
+    assert 1e-7 < found.achieved <= 5e-6
+    assert found.beyond > found.achieved
+    # the tilt is some milliradians
+    assert 1e-6 < found.longer < 100e-6
+    assert found.nominal > 1 * MM
+
+
+def test_numbers_are_never_rounded_to_less():
+    assert [rounded_up(v) for v in (0.02801, 0.028, 12.1, 1.0)] == ["0.029", "0.028", "13", "1"]
+
+
+def run(words):
+    import sys
+
+    old, sys.argv = sys.argv, ["orthocal", *map(str, words)]
+    try:
+        main()
+    except SystemExit as e:
+        return e.code
+    finally:
+        sys.argv = old
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["--tool", "1,2"], 2, "--tool: found '1,2'; expected 3 numbers with commas between"),
+        (["--tool", "0,0,nan"], 2, "--tool: found 0, 0, nan mm; expected numbers of at most 10000"),
+        (["--tool", "0,0,1e6"], 2, "--tool: found 0, 0, 1e+06 mm; expected"),
+        (["--within", "0"], 2, "--within: found 0 µm; expected more than 0"),
+        (["--within", "nan"], 2, "--within: found nan µm"),
+        (["--half-side-mm", "-3"], 2, "--half-side-mm: found -3 mm; expected more than 0"),
+        (["--home-offset", "1;2;3"], 2, "--home-offset: found '1;2;3'; expected 3 numbers"),
+        (["--home-offset", "1,2,inf"], 2, "--home-offset: expected finite numbers"),
+        (["--within", "1"], 2, "--within: is of a kinematics module, and offsets alone"),
+        (["--to", "yaml", "--tool", "0,0,0"], 2, "--tool: goes with --to linuxcnc alone"),
+        (["--module", "--half-side-mm", "250"], 3, "the machine does not reach ±250 mm"),
+    ],
+)
+def test_bad_options_are_named(offsets, tmp_path, capsys, words, code, message):
+    file = write_calibration(offsets, tmp_path / "calibration.json")
+    to = [] if "--to" in words else ["--to", "linuxcnc"]
+    assert run(["export", file, *to, "--out", tmp_path / "out", "--anyway", *words]) == code
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+
+
+# ---- HOME_OFFSET
+
+
+def test_home_offset_follows_direction_and_what_is_active(offsets):
+    """By hand: the slide at its switch shows what it did, and what was missing."""
+    old = (0.35, 0.3, 0.02)
+    homes = find_homes(offsets, old=old)
+    missing = np.array(list(OFFSETS.values())) - ACTIVE
+    change = missing * [1, -1, -1]
+    assert [h.change for h in homes] == pytest.approx(change, abs=1e-9)
+    assert [h.new for h in homes] == pytest.approx(np.array(old) + change, abs=1e-9)
+    # a place of the slide that is a limit: travel 120 ... 390 mm as the encoders count
+    for home, drive, active, now in zip(
+        homes, offsets.robot.drives, ACTIVE, OFFSETS.values(), strict=True
+    ):
+        ends = [0.12, 0.39]
+        assert sorted(drive.to_joint(np.array(ends) + active)) == pytest.approx(home.limits)
+        assert sorted(drive.to_joint(np.array(ends) + now)) == pytest.approx(
+            home.new_limits, abs=1e-9
+        )
+
+
+def test_home_offsets_are_told_as_what_to_add_where_the_old_are_not_known(offsets):
+    files = export_calibration(offsets, "linuxcnc")
+    assert list(files) == ["README.md", "joints.ini"]
+    lines = files["joints.ini"]
+    assert "[JOINT_0]\n# x_slide, counts up: +0.8000 mm\n" in lines
+    assert "# HOME_OFFSET = what it is now +0.8000" in lines
+    assert "[JOINT_1]\n# y_slide, counts down: +0.7000 mm\n" in lines
+    assert "[JOINT_2]\n# z_slide, counts down: -0.3000 mm\n" in lines
+    assert "| JOINT_1 | y_slide | down | what it is now +0.7000 | +0.7000 |" in files["README.md"]
+    assert "offsets_mm: [1.2, -0.8, 0.5]" in files["README.md"]
+
+
+def test_home_offsets_and_limits_are_lines_to_type(offsets, tmp_path):
+    file = write_calibration(offsets, tmp_path / "calibration.json")
+    words = ["export", file, "--to", "linuxcnc", "--out", tmp_path / "out"]
+    assert run([*words, "--home-offset", "350,300.5,-20"]) == 0
+    typed = type_lines("[JOINT_1]\nHOME = 3\n", (tmp_path / "out/joints.ini").read_text())
+    assert "[JOINT_0]\nHOME_OFFSET = 350.8000\nMIN_LIMIT = 121.2000\nMAX_LIMIT = 391.2000" in typed
+    # joint 620.5 - c: its limits change places
+    assert "[JOINT_1]\nHOME = 3\nHOME_OFFSET = 301.2000\nMIN_LIMIT = 231.3000\n" in typed
+    assert "[JOINT_2]\nHOME_OFFSET = -20.3000\n" in typed
+    page = (tmp_path / "out/README.md").read_text()
+    assert "300.5000 → **301.2000**" in page
+
+
+def test_a_module_leaves_home_offset_as_it_was(full, exported):
+    """It says so, with limits as they were; what it promises is in its page and in its source."""
+    assert set(exported) == {
+        "README.md",
+        "kinematics.ini",
+        "orthocal_kins.c",
+        "orthocal_core.c",
+        "orthocal_core.h",
+    }
+    assert "HOME_OFFSET stays as it was while measuring" in exported["README.md"]
+    assert "for a tip at 5, 0, -50 mm" in exported["README.md"]
+    assert "HOME_OFFSET =" not in exported["kinematics.ini"]
+    assert "type the old lines back" in exported["README.md"]
+    assert "[AXIS_Z]\nMIN_LIMIT = -60\nMAX_LIMIT = 60\n" in exported["kinematics.ini"]
+    assert "# x_slide\nTYPE = LINEAR\nMIN_LIMIT = 120.4000\n" in exported["kinematics.ini"]
+    stated = float(re.search(r"within ([\d.]+) µm", exported["README.md"])[1])
+    assert 0.0 < stated <= WITHIN * 1e6
+
+
+def test_a_module_may_be_asked_for_where_offsets_alone_are_known(offsets):
+    """HOME_OFFSET that was told stays in it; nominal legs need no more than a constant."""
+    options = ExportOptions(module=True, home_offsets=(0.35, 0.3, -0.02))
+    files = export_calibration(offsets, "linuxcnc", options=options)
+    assert "Offsets alone were identified, and a module was asked for" in files["README.md"]
+    assert "(JOINT_0 350.0000, JOINT_1 300.0000, JOINT_2 -20.0000)" in files["README.md"]
+    assert "HOME_OFFSET = 300.0000\n" in files["kinematics.ini"]
+    assert "#define DEGREE 1\n" in files["orthocal_core.c"]
+    assert "within 0.001 µm" in files["README.md"]
+
+
+# ---- LinuxCNC itself
+
+
+def from_circle(points, centre, radius):
+    """Distances from a circle in a plane of constant z."""
+    across = np.hypot(points[:, 0] - centre[0], points[:, 1] - centre[1]) - radius
+    return np.hypot(across, points[:, 2] - centre[2])
+
+
+def from_line(points, begin, end):
+    begin, way = np.array(begin), np.array(end) - np.array(begin)
+    along = np.clip((points - begin) @ way / (way @ way), 0.0, 1.0)
+    return np.linalg.norm(points - begin - along[:, None] * way, axis=1)
+
+
+def joints_at_switch(calibration, switch):
+    """HOME_OFFSET while measuring of slides whose switches close there, [m]."""
+    places = zip(calibration.robot.drives, switch, ACTIVE, strict=True)
+    return [float(d.to_joint(s + active)) for d, s, active in places]
+
+
+SWITCH = np.array([352.0, 340.0, 331.0]) * MM
+
+
+def joints_of(calibration, home_offsets):
+    return [
+        Joint(d.direction, float(s) / MM, h / MM, float(d.to_joint(d.zero)) / MM)
+        for d, s, h in zip(calibration.robot.drives, SWITCH, home_offsets, strict=True)
+    ]
+
+
+def test_linuxcnc_follows_a_path_with_the_exported_module(full, tmp_path):
+    """A circle off centre and lines in space: where the calibrated machine had its tool."""
+    require_linuxcnc()
+    files = export_calibration(full, "linuxcnc", anyway=True, options=ExportOptions(within=WITHIN))
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    centre, radius = (12.0, -8.0, 15.0), 16.0
+    corners = [(28.0, -8.0, 15.0), (-35.0, 20.0, -25.0), (-35.0, -30.0, 10.0)]
+    program = [
+        "G21 G90 G61 G1 X28 Y-8 Z15 F6000",
+        "G21 G90 G61 F6000 G2 X28 Y-8 Z15 I-16 J0",
+        *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in corners[1:]),
+    ]
+    old = joints_at_switch(full, SWITCH)
+    slides = run_program(
+        program, joints_of(full, old), lines=files["kinematics.ini"], module=tmp_path
+    )
+
+    def distances(points):
+        lines = [from_line(points, *ends) for ends in pairwise(corners)]
+        return np.array([from_circle(points, centre, radius), *lines]) * MM
+
+    pieces = distances(full.machine.forward(slides[::5] * MM) / MM)
+    assert pieces.min(axis=0).max() < PATH
+    assert (np.count_nonzero(pieces < PATH, axis=1) > [150, 100, 80]).all()
+    # with nominal kinematics these slides would be far from it: the errors are no small ones
+    nominal = Machine(full.robot, {}).forward(slides[::5] * MM + ACTIVE) / MM
+    assert distances(nominal).min(axis=0).max() > 1.0 * MM
+
+
+def test_the_home_offset_that_was_typed_brings_the_tool_where_it_is_sent(offsets):
+    """One joint counts up and two count down; before it was typed the tool was elsewhere."""
+    require_linuxcnc()
+    old = joints_at_switch(offsets, SWITCH)
+    real = Machine(offsets.robot, OFFSETS)
+    point = np.array([20.0, -15.0, 30.0]) * MM
+    options = ExportOptions(home_offsets=tuple(old))
+    typed = export_calibration(offsets, "linuxcnc", options=options)["joints.ini"]
+    reached = []
+    for lines in ("", typed):
+        sent = Machine(offsets.robot, {}).inverse(point)  # as a nominal controller does
+        shown = [float(d.to_joint(r)) / MM for d, r in zip(offsets.robot.drives, sent, strict=True)]
+        go = " ".join(f"{letter}{v:.7f}" for letter, v in zip("XYZ", shown, strict=True))
+        program = [f"G21 G90 G1 {go} F6000", "G4 P0.15"]
+        slides = run_program(program, joints_of(offsets, old), lines=lines)
+        reached.append(real.forward(slides[-1] * MM))
+    before, after = (np.linalg.norm(r - point) for r in reached)
+    assert after < TYPED
+    assert before > 0.5 * MM
+
+
+def test_the_module_is_built_without_a_warning(exported, tmp_path):
+    require_linuxcnc()
+    for name, text in exported.items():
+        (tmp_path / name).write_text(text)
+    build_module(tmp_path)
+    assert (tmp_path / "orthocal_kins.so").exists()

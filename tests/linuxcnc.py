@@ -1,0 +1,381 @@
+"""LinuxCNC in simulation, without a display: what it was told to do, and where its slides were.
+
+Debian's linuxcnc-uspace runs it and linuxcnc-uspace-dev builds modules (`.ci/run` installs both).
+Where $ORTHOCAL_LINUXCNC is `required`, as in continuous integration, their absence is a failure;
+elsewhere these tests are skipped, with the reason.
+
+Its real-time part refuses root. Where the tests run as root, it is run as `nobody`, in a folder of
+that user's. It loads modules from its own folder alone, which root may write to: there the exported
+one is installed as its page says, and taken away again; where the tests run as somebody else, runs
+with a module are skipped. One instance runs on a machine, so runs wait for each other at a lock,
+across all workers.
+
+Each joint moves a slide in HAL: its coordinate as an encoder gives it is c = begin + s m, with the
+motor's position m from where the machine was switched on and the direction s. A home switch closes
+at a place of that slide, whatever the controller shows there.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pwd
+import shutil
+import signal
+import subprocess
+import tempfile
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+PROGRAMS = ("linuxcnc", "halcompile", "halcmd", "halsampler", "make", "gcc")
+
+MODULES = Path("/usr/lib/linuxcnc/modules")
+
+MODULE = "orthocal_kins"
+
+BUSY = Path("/tmp/linuxcnc.lock")
+"""LinuxCNC's own: it runs already."""
+
+LONGEST = 60.0
+"""[s] Of a run that takes five."""
+
+USER = "nobody"
+
+SEARCH = 8.0
+"""[mm/s] Towards the switch."""
+
+LATCH = 0.02
+"""[mm/s] Onto the switch: in a servo period of 1 ms it moves 0.02 µm."""
+
+BEFORE_SWITCH = 2.0
+"""[mm] Of the slides where the machine is switched on."""
+
+BASE = """\
+[EMC]
+VERSION = 1.1
+MACHINE = simulated
+[DISPLAY]
+DISPLAY = ./drive.py
+[RS274NGC]
+PARAMETER_FILE = simulated.var
+[EMCMOT]
+EMCMOT = motmod
+SERVO_PERIOD = 1000000
+[TASK]
+TASK = milltask
+CYCLE_TIME = 0.005
+[HAL]
+HALFILE = simulated.hal
+[EMCIO]
+EMCIO = io
+CYCLE_TIME = 0.1
+TOOL_TABLE = simulated.tbl
+[KINS]
+KINEMATICS = trivkins coordinates={letters} kinstype=BOTH
+JOINTS = {joints}
+[TRAJ]
+COORDINATES = {letters}
+LINEAR_UNITS = mm
+ANGULAR_UNITS = degree
+MAX_LINEAR_VELOCITY = 200
+DEFAULT_LINEAR_VELOCITY = 100
+MAX_LINEAR_ACCELERATION = 2000
+"""
+
+AXIS = """\
+[AXIS_{letter}]
+MIN_LIMIT = -1000
+MAX_LIMIT = 1000
+MAX_VELOCITY = 200
+MAX_ACCELERATION = 2000
+"""
+
+JOINT = """\
+[JOINT_{i}]
+TYPE = LINEAR
+MIN_LIMIT = -1000
+MAX_LIMIT = 1000
+MAX_VELOCITY = 400
+MAX_ACCELERATION = 8000
+FERROR = 10
+MIN_FERROR = 10
+HOME = {home!r}
+HOME_OFFSET = {home_offset!r}
+HOME_SEARCH_VEL = {search!r}
+HOME_LATCH_VEL = {latch!r}
+HOME_FINAL_VEL = 100
+HOME_USE_INDEX = NO
+HOME_IGNORE_LIMITS = YES
+HOME_SEQUENCE = 0
+"""
+
+HAL = """\
+loadrt [KINS]KINEMATICS
+loadrt [EMCMOT]EMCMOT servo_period_nsec=[EMCMOT]SERVO_PERIOD num_joints=[KINS]JOINTS
+loadrt sum2 count={joints}
+loadrt comp count={joints}
+loadrt sampler depth=60000 cfg={kinds}
+addf motion-command-handler servo-thread
+addf motion-controller servo-thread
+net estop iocontrol.0.user-enable-out => iocontrol.0.emc-enable-in
+"""
+
+HAL_JOINT = """\
+addf sum2.{i} servo-thread
+addf comp.{i} servo-thread
+net motor{i} joint.{i}.motor-pos-cmd => joint.{i}.motor-pos-fb sum2.{i}.in0
+setp sum2.{i}.gain0 {direction}
+setp sum2.{i}.offset {begin!r}
+setp comp.{i}.in0 {switch!r}
+net slide{i} sum2.{i}.out => comp.{i}.in1 sampler.0.pin.{i}
+net switch{i} comp.{i}.out => joint.{i}.home-sw-in
+"""
+
+DRIVE = """\
+#!/usr/bin/python3
+import linuxcnc, subprocess, sys, time
+
+command, status, errors = linuxcnc.command(), linuxcnc.stat(), linuxcnc.error_channel()
+lines = open("program.ngc").read().splitlines()
+
+
+def wait(done, what, seconds=30.0):
+    end = time.monotonic() + seconds
+    while True:
+        status.poll()
+        said = errors.poll()
+        if said and said[0] in (linuxcnc.NML_ERROR, linuxcnc.OPERATOR_ERROR):
+            raise RuntimeError(what + ": " + said[1])
+        if done():
+            return
+        if time.monotonic() > end:
+            raise RuntimeError("not in time: " + what)
+        time.sleep(0.005)
+
+
+def finish():
+    command.wait_complete(30.0)
+    wait(lambda: status.interp_state == linuxcnc.INTERP_IDLE and status.inpos, "the program")
+
+
+def main():
+    command.state(linuxcnc.STATE_ESTOP_RESET)
+    command.wait_complete()
+    command.state(linuxcnc.STATE_ON)
+    wait(lambda: status.task_state == linuxcnc.STATE_ON, "to be on")
+    joints = status.joints
+    command.teleop_enable(0)
+    command.wait_complete()
+    command.home(-1)
+    wait(lambda: all(status.homed[:joints]), "to be homed")
+    command.mode(linuxcnc.MODE_MDI)
+    command.wait_complete()
+    command.mdi(lines[0])
+    finish()
+    recording = subprocess.Popen(["halsampler", "recorded.txt"])
+    time.sleep(0.2)
+    subprocess.run(["halcmd", "setp", "sampler.0.enable", "1"], check=True)
+    command.mode(linuxcnc.MODE_AUTO)
+    command.wait_complete()
+    command.program_open("program.ngc")
+    command.auto(linuxcnc.AUTO_RUN, 1)
+    wait(lambda: status.interp_state != linuxcnc.INTERP_IDLE, "to begin", 5.0)
+    finish()
+    time.sleep(0.3)
+    recording.terminate()
+    recording.wait()
+
+
+try:
+    main()
+except Exception as e:
+    open("failed.txt", "w").write(repr(e))
+"""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint as the controller is set up, and the slide that it moves; mm."""
+
+    direction: int
+    """1 where the slide's coordinate grows with the joint, -1 where it falls."""
+    switch: float
+    """Coordinate of the slide, as its encoder gives it, where its home switch closes."""
+    home_offset: float
+    home: float
+    """What the joint shows where it goes after homing."""
+
+
+def require_linuxcnc():
+    """Skip where there is no LinuxCNC to run; fail where one must be."""
+    missing = [p for p in PROGRAMS if shutil.which(p) is None]
+    if missing:
+        _without(f"no LinuxCNC to run: there is no {' and no '.join(missing)}")
+
+
+def _without(reason):
+    if os.environ.get("ORTHOCAL_LINUXCNC") == "required":
+        pytest.fail(f"LinuxCNC is required here: {reason}")
+    pytest.skip(reason)
+
+
+@contextmanager
+def only_one():
+    """Wait for other workers' runs, and keep them out."""
+    with open(Path(tempfile.gettempdir()) / "orthocal-linuxcnc.lock", "a") as lock:
+        with suppress(PermissionError):  # somebody else's
+            os.chmod(lock.fileno(), 0o666)
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if BUSY.exists():
+            _without(f"a LinuxCNC runs already: {BUSY} exists")
+        yield
+
+
+def build_module(folder, *, install=False):
+    """Build the exported module in its folder, which takes no right; or install it."""
+    how = "--install" if install else "--compile"
+    done = subprocess.run(
+        ["halcompile", how, f"{MODULE}.c"], cwd=folder, capture_output=True, text=True
+    )
+    said = done.stdout + done.stderr
+    assert done.returncode == 0, said
+    assert "warning" not in said
+
+
+@contextmanager
+def installed(folder):
+    """An exported module where LinuxCNC finds it, for as long as it takes."""
+    target = MODULES / f"{MODULE}.so"
+    if os.geteuid() != 0:
+        _without("modules are installed by root")
+    if target.exists():
+        _without(f"somebody has installed {target}")
+    try:
+        build_module(folder, install=True)
+        yield
+    finally:
+        target.unlink(missing_ok=True)
+
+
+def run_program(program, joints, *, letters="XYZ", lines="", module=None):
+    """Home, go to the program's first line, run the rest; slides in every servo period.
+
+    Args:
+        program: Lines of G-code; the first brings the tool to where the rest begins.
+        joints: Of the machine.
+        letters: Of the coordinates.
+        lines: Of an INI, typed over those that are there.
+        module: Folder of exported kinematics; each joint is a coordinate of its own by default.
+
+    Returns:
+        Shape (K, n_joints), [mm].
+    """
+    require_linuxcnc()
+    with only_one(), nullcontext() if module is None else installed(module):
+        folder = Path(tempfile.mkdtemp(prefix="orthocal-linuxcnc-"))
+        try:
+            _write(folder, program, joints, letters=letters, lines=lines)
+            return _run(folder)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _write(folder, program, joints, *, letters, lines):
+    n = len(joints)
+    ini = BASE.format(joints=n, letters=letters)
+    ini += "".join(AXIS.format(letter=letter) for letter in letters)
+    hal_joints = ""
+    for i, joint in enumerate(joints):
+        way = joint.direction
+        ini += JOINT.format(
+            i=i,
+            home=joint.home,
+            home_offset=joint.home_offset,
+            search=way * SEARCH,
+            latch=way * LATCH,
+        )
+        hal_joints += HAL_JOINT.format(
+            i=i, direction=way, begin=joint.switch - BEFORE_SWITCH, switch=joint.switch
+        )
+    sections = _sections(ini, lines)
+    if sections["[KINS]"]["KINEMATICS"].startswith("trivkins"):  # axes are joints
+        for i, letter in enumerate(letters):
+            for limit in ("MIN_LIMIT", "MAX_LIMIT"):
+                sections[f"[AXIS_{letter}]"][limit] = sections[f"[JOINT_{i}]"][limit]
+    hal = HAL.format(joints=n, kinds="f" * n) + hal_joints
+    hal += "addf sampler.0 servo-thread\nsetp sampler.0.enable 0\n"
+    files = {
+        "simulated.ini": _as_text(sections),
+        "simulated.hal": hal,
+        "simulated.tbl": "",
+        "program.ngc": "\n".join([*program, "M2", ""]),
+        "drive.py": DRIVE,
+    }
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    (folder / "drive.py").chmod(0o755)
+    folder.chmod(0o755)
+
+
+def type_lines(ini, lines):
+    """An INI with lines typed into their sections, in place of those of the same name."""
+    return _as_text(_sections(ini, lines))
+
+
+def _sections(*texts):
+    sections, current = {}, None
+    for text in texts:
+        for line in text.splitlines():
+            bare = line.strip()
+            if bare.startswith("["):
+                current = sections.setdefault(bare, {})
+            elif bare and not bare.startswith("#"):
+                name, _, value = bare.partition("=")
+                current[name.strip()] = value.strip()
+    return sections
+
+
+def _as_text(sections):
+    return "".join(
+        f"{section}\n" + "".join(f"{k} = {v}\n" for k, v in keys.items())
+        for section, keys in sections.items()
+    )
+
+
+def _run(folder):
+    who = {}
+    if os.geteuid() == 0:
+        found = pwd.getpwnam(USER)
+        who = {"user": found.pw_uid, "group": found.pw_gid, "extra_groups": []}
+        for path in (folder, *folder.iterdir()):
+            os.chown(path, found.pw_uid, found.pw_gid)
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "PYTHONPATH")}
+    environment |= {"HOME": str(folder), "LANG": "C", "TMPDIR": str(folder)}
+    with open(folder / "said.txt", "w") as said:
+        process = subprocess.Popen(
+            ["linuxcnc", "-r", "simulated.ini"],
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=said,
+            start_new_session=True,
+            **who,
+        )
+        try:
+            process.wait(LONGEST)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            subprocess.run(["halrun", "-U"], cwd=folder, env=environment, check=False, **who)
+    failed, recorded = folder / "failed.txt", folder / "recorded.txt"
+    reason = failed.read_text() if failed.exists() else "nothing was recorded"
+    if failed.exists() or not recorded.exists():
+        pytest.fail(f"{reason}\n{(folder / 'said.txt').read_text()[-3000:]}")
+    rows = np.loadtxt(recorded, ndmin=2, comments="o")  # `overrun` stands where samples are lost
+    assert len(rows) > 100
+    return rows
