@@ -12,7 +12,16 @@ import orthocal
 from orthocal.characters import printable
 
 # what registers the commands, in the order in which help lists them
-from orthocal.cli import calibrating, exporting, looking, planning, studying, trying, using  # noqa: F401
+from orthocal.cli import (  # noqa: F401
+    calibrating,
+    checking,
+    exporting,
+    looking,
+    planning,
+    studying,
+    trying,
+    using,
+)
 from orthocal.cli.options import app
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import OrthocalError
