@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -37,7 +37,8 @@ class Edit:
 class Family:
     """Edits of one kind."""
 
-    edits: Sequence[Edit]
+    edits: Sequence[Callable[[], Edit]]
+    """What makes each, where it is asked for: hardly any is."""
     change: Array
     """What is added to the rows, shape (h, n_rows), [m]."""
     size: int
@@ -48,6 +49,8 @@ class Family:
     """Logarithm of what a volume of readings grows by, shape (h,); 0 where empty."""
     unknown: Sequence[tuple[int, ...]] = ()
     """Rows that say nothing, of each edit, instead of a change."""
+    loose: Sequence[Array] = ()
+    """What rows may be wrong by instead, each up to an amount of its own, (k, n_rows) each."""
 
 
 class Table:

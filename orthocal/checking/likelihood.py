@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 Array = NDArray[np.float64]
 
@@ -82,7 +81,7 @@ class Likelihood:
                 shape (h, n); zeros where nothing is.
         """
         logs, _ = self._weigh_pairs(deviations, wrong)
-        return np.asarray(special.logsumexp(logs + self.weights, axis=1))
+        return np.asarray(log_of_sum(logs + self.weights, axis=1))
 
     def settle(self, deviation: Array, wrong: Array | None = None) -> tuple[float, float, float]:
         """Most likely excess and noise, as multiples, and amount of what is wrong, [m]."""
@@ -101,6 +100,39 @@ class Likelihood:
             deviation: As above, shape (n,), [m].
             rows: What each of the k rows does to readings, zeros eliminated, shape (k, n).
         """
+        known, square, slope = self._weigh_rows(deviation, rows)
+        logs = 0.5 * (_quadratic(square, slope) - np.linalg.slogdet(square)[1])
+        logs += 0.5 * len(rows) * np.log(2.0 * np.pi)
+        return float(log_of_sum(known + logs) - log_of_sum(known))
+
+    def weigh_loose(self, deviation: Array, rows: Array) -> tuple[float, Array]:
+        """Logarithm of how likely readings are where each of some may be off by its own amount.
+
+        Args:
+            deviation: As above, shape (n,), [m].
+            rows: What each of k unknown amounts does to readings, zeros eliminated, shape (k, n).
+
+        Returns:
+            That, as `weigh`; and the most likely amounts, shape (k,), [m].
+        """
+        known, square, slope = self._weigh_rows(deviation, rows)
+        logs = []
+        for amount in (AMOUNTS * self.sigma) ** 2:
+            widened = np.eye(len(rows)) + amount * square
+            gain = amount * _quadratic(widened, slope) - np.linalg.slogdet(widened)[1]
+            logs.append(0.5 * gain)
+        every = known + log_of_sum(np.array(logs), axis=0) - np.log(AMOUNTS.size)
+        best = int(np.argmax(every))
+        amounts = np.linalg.lstsq(square[best], slope[:, best], rcond=None)[0]
+        return float(log_of_sum(every)), amounts
+
+    def _weigh_rows(self, deviation: Array, rows: Array) -> tuple[Array, Array, Array]:
+        """Readings, and what k rows D do to them, for all pairs (e, s).
+
+        Returns:
+            Logarithms of how likely they are as they are, shape (g,); Dᵀ V⁻¹ D, (g, k, k); and
+            Dᵀ V⁻¹ y, (k, g).
+        """
         (known,), _ = self._weigh_pairs(deviation[None], None)
         inverse, rest = 1.0 / self._variance, 1.0 / self._noise
         along, own = self.directions @ deviation, rows @ self.directions.T
@@ -108,12 +140,7 @@ class Likelihood:
         square = np.einsum("kr,rg,lr->gkl", own, inverse, own)
         square += rest[:, None, None] * (beside @ beside.T)
         slope = (own * along) @ inverse + np.outer(beside @ deviation, rest)
-        gain = 0.5 * np.einsum(
-            "kg,gk->g", slope, np.linalg.solve(square, slope.T[..., None])[..., 0]
-        )
-        logs = gain + 0.5 * (len(rows) * np.log(2.0 * np.pi) - np.linalg.slogdet(square)[1])
-        weights = known + self.weights
-        return float(special.logsumexp(weights + logs) - special.logsumexp(weights))
+        return np.asarray(known + self.weights), square, np.asarray(slope)
 
     def _weigh_pairs(self, deviations: Array, wrong: Array | None) -> tuple[Array, Array]:
         """Logarithms for all pairs, shape (h, g); and most likely amounts, shape (h, g)."""
@@ -134,9 +161,22 @@ class Likelihood:
         amounts = (AMOUNTS * self.sigma) ** 2
         widened = 1.0 + amounts[:, None, None] * information
         gains = 0.5 * (amounts[:, None, None] * slope**2 / widened - np.log(widened))
-        logs = logs + special.logsumexp(gains, axis=0) - np.log(amounts.size)
+        logs = logs + log_of_sum(gains, axis=0) - np.log(amounts.size)
         with np.errstate(divide="ignore", invalid="ignore"):
             return logs, np.nan_to_num(slope / information)
+
+
+def log_of_sum(logs: Array, axis: int | None = None) -> Array:
+    """Logarithm of the sum of numbers whose logarithms are given."""
+    top = logs.max(axis=axis, keepdims=True)
+    total = np.log(np.exp(logs - top).sum(axis=axis, keepdims=True)) + top
+    return np.asarray(total.squeeze(axis))
+
+
+def _quadratic(square: Array, slope: Array) -> Array:
+    """bᵀ K⁻¹ b of all pairs, shape (g,), of K (g, k, k) and b (k, g)."""
+    found = np.linalg.solve(square, slope.T[..., None])[..., 0]
+    return np.asarray((slope.T * found).sum(axis=1))
 
 
 def likelihood_of(
@@ -159,7 +199,7 @@ def likelihood_of(
             np.log1p(-STATED_WRONGLY) + _normal(NOISES, NOISE_SPREAD),
             np.log(STATED_WRONGLY) + noise,
         )
-    weights = np.repeat(excess - special.logsumexp(excess), NOISES.size)
+    weights = np.repeat(excess - log_of_sum(excess), NOISES.size)
     likelihood = Likelihood(
         rows[kept], sizes[kept] ** 2, sigma, dof, weights + np.tile(noise, EXCESSES.size)
     )
@@ -168,4 +208,4 @@ def likelihood_of(
 
 def _normal(values: Array, spread: float) -> Array:
     logs = -0.5 * (np.log(values) / spread) ** 2
-    return np.asarray(logs - special.logsumexp(logs))
+    return np.asarray(logs - log_of_sum(logs))

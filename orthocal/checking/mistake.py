@@ -13,6 +13,7 @@ MistakeKind = Literal[
     "misread dial",
     "suspicious reading",
     "suspicious posture",
+    "suspicious setup",
     "exchanged readings",
     "shifted rows",
     "stuck dial",

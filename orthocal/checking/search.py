@@ -8,19 +8,20 @@ are tried. What is named must be far likelier than all other edits; else it is o
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from orthocal.checking.edits import Edit, Family, Table
 from orthocal.checking.families.exchanged import find_exchanged
+from orthocal.checking.families.loose import find_loose
 from orthocal.checking.families.moved import find_moved
 from orthocal.checking.families.scaled import find_scaled
 from orthocal.checking.families.shifted import find_shifted
 from orthocal.checking.families.single import find_single
+from orthocal.checking.likelihood import log_of_sum
 from orthocal.checking.mistake import Mistake
 from orthocal.checking.model import Linearised, ReadingModel
 from orthocal.measurement.session import Session
@@ -69,6 +70,7 @@ class _Weighed:
     prior: float
     """Logarithms of its weight, and of what it does to volumes."""
     unknown: tuple[int, ...]
+    loose: Array | None
     evidence: float
 
 
@@ -124,9 +126,12 @@ def _find_one(readings: ReadingModel, table: Table, start: Linearised) -> _Step 
     about = readings.settle(values, None, start)
     deviation = readings.deviations(values[None], about)[0]
     sound = float(about.likelihood.weigh(deviation[None])[0])
-    weighed = list(_weigh(readings, table, about, deviation, sound))
-    if not weighed or special.logsumexp([w.evidence for w in weighed]) < CLEARLY:
+    known = list(_weigh(readings, table, about, deviation, sound, _families(readings, table)))
+    if not known or log_of_sum(np.concatenate([e for _, e in known])) < CLEARLY:
         return None
+    if table.count <= MOST_ROWS:
+        known += _weigh(readings, table, about, deviation, sound, find_loose(table))
+    weighed = [w for family, evidence in known for w in _likeliest(family, evidence)]
     tried = [_refit(readings, values, w, sound, about) for w in _shortlist(weighed)]
     ranked = sorted(tried, key=lambda r: -r.weighed.evidence)
     # of several mistakes at once a single one leaves readings that no machine shows
@@ -162,29 +167,48 @@ def _families(readings: ReadingModel, table: Table) -> Iterator[Family]:
 
 
 def _weigh(
-    readings: ReadingModel, table: Table, about: Linearised, deviation: Array, sound: float
-) -> Iterator[_Weighed]:
-    for family in _families(readings, table):
-        prior = -np.log(family.size * FAMILIES) * np.ones(len(family.edits))
-        if family.log_volume.size:
-            prior = prior + family.log_volume
+    readings: ReadingModel,
+    table: Table,
+    about: Linearised,
+    deviation: Array,
+    sound: float,
+    families: Iterable[Family],
+) -> Iterator[tuple[Family, Array]]:
+    """Families, and how much likelier each of their edits makes the readings."""
+    for family in families:
         if family.unknown:
             logs = np.array(
                 [_weigh_unknown(readings, table, about, deviation, u) for u in family.unknown]
             )
+        elif family.loose:
+            of_each = [readings.entries(rows) for rows in family.loose]
+            logs = np.array([about.likelihood.weigh_loose(deviation, r)[0] for r in of_each])
+            logs -= sound
         else:
             wrong = None if family.wrong is None else readings.entries(family.wrong)
             edited = deviation + readings.entries(family.change)
             logs = about.likelihood.weigh(edited, wrong) - sound
-        for h, edit in enumerate(family.edits):
-            yield _Weighed(
-                edit,
-                family.change[h],
-                None if family.wrong is None else family.wrong[h],
-                float(prior[h]),
-                family.unknown[h] if family.unknown else (),
-                float(logs[h] + prior[h]),
-            )
+        yield family, logs + _prior(family)
+
+
+def _prior(family: Family) -> Array:
+    """Logarithms of the weights of edits, and of what they do to volumes."""
+    prior = np.full(len(family.edits), -np.log(family.size * FAMILIES))
+    return prior + family.log_volume if family.log_volume.size else prior
+
+
+def _likeliest(family: Family, evidence: Array) -> Iterator[_Weighed]:
+    prior = _prior(family)
+    for h in np.argsort(-evidence)[:MOST_REFITTED].tolist():
+        yield _Weighed(
+            family.edits[h](),
+            family.change[h],
+            None if family.wrong is None else family.wrong[h],
+            float(prior[h]),
+            family.unknown[h] if family.unknown else (),
+            family.loose[h] if family.loose else None,
+            float(evidence[h]),
+        )
 
 
 def _weigh_unknown(
@@ -232,6 +256,8 @@ def _refit(
 ) -> _Refitted:
     if w.unknown:
         return _Refitted(w, about, values, plausible=True)
+    if w.loose is not None:
+        return _refit_loose(readings, values, w, w.loose, sound, about)
     rows = values + w.change
     own = readings.settle(rows, w.wrong, about)
     wrong = None if w.wrong is None else readings.entries(w.wrong[None])
@@ -243,6 +269,29 @@ def _refit(
     return _Refitted(
         replace(w, evidence=float(logs[0]) - sound + w.prior),
         own,
+        rows,
+        excess < LARGEST_EXCESS and (noise < LARGEST_NOISE or not readings.stated),
+    )
+
+
+def _refit_loose(
+    readings: ReadingModel,
+    values: Array,
+    w: _Weighed,
+    loose: Array,
+    sound: float,
+    about: Linearised,
+) -> _Refitted:
+    marks, own, rows = readings.entries(loose), about, values
+    for _ in range(2):
+        deviation = readings.deviations(values[None], own)[0]
+        logs, amounts = own.likelihood.weigh_loose(deviation, marks)
+        rows = values - amounts @ loose
+        own, last = readings.settle(rows, None, own), own
+    excess, noise, _ = last.likelihood.settle(readings.deviations(rows[None], last)[0])
+    return _Refitted(
+        replace(w, evidence=logs - sound + w.prior),
+        last,
         rows,
         excess < LARGEST_EXCESS and (noise < LARGEST_NOISE or not readings.stated),
     )

@@ -92,8 +92,8 @@ def spoilt(cycles, table1):
         ),
         "inches": (
             calibrate(cycles.with_values(np.round(cycles.values / 25.4, 7))),
-            "check before entering",
-            "finer than the dial",
+            "do not enter",
+            "wrong unit",
         ),
         "three readings": (calibrate(three), "check before entering", "nothing to check by"),
         "no word": (calibrate(silent(three)), "check before entering", "noise unknown"),

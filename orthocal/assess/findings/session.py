@@ -29,6 +29,7 @@ MISTAKES: tuple[Kind, ...] = (
     "turned reading",
     "misread dial",
     "suspicious posture",
+    "suspicious setup",
     "exchanged readings",
     "shifted rows",
     "stuck dial",
@@ -207,11 +208,13 @@ def _sureness(mistake: Mistake) -> str:
     """What is left before and after, and the odds."""
     odds = math.exp(min(mistake.evidence, math.log(LARGEST_ODDS)))
     told = f"more than {LARGEST_ODDS:,.0f}" if odds > 0.999 * LARGEST_ODDS else f"{odds:,.0f}"
-    left = ""
-    if mistake.kind != "stuck dial" and math.isfinite(mistake.before):
-        left = f"Mended, {um(mistake.after)} µm r.m.s. remain instead of {um(mistake.before)} µm; "
-        return f"{left}odds that something is wrong: {told} to 1."
-    return f"Odds that something is wrong: {told} to 1."
+    sure = f"dds that something is wrong: {told} to 1."
+    if mistake.kind == "stuck dial" or not math.isfinite(mistake.before):
+        return f"O{sure}"
+    before, after = um(mistake.before), um(mistake.after)
+    if mistake.after < mistake.before:
+        return f"Mended, {after} µm r.m.s. remain instead of {before} µm; o{sure}"
+    return f"As they are {before} µm r.m.s. remain, mended {after} µm; o{sure}"
 
 
 def _places(session: Session, mistake: Mistake) -> tuple[Place, ...]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -18,7 +19,7 @@ FAR_APART = 400
 MOST = 4000
 """Pairs of a kind above which none is tried."""
 
-Pair = tuple[str, Indices, Indices, tuple[str, ...]]
+Pair = tuple[Callable[[], str], Indices, Indices, tuple[str, ...]]
 
 
 def find_exchanged(table: Table) -> Iterator[Family]:
@@ -42,16 +43,22 @@ def _exchanged(table: Table, pairs: Sequence[Pair]) -> Family:
     for h, (words, one, other, setups) in enumerate(pairs):
         change[h, one] = table.values[other] - table.values[one]
         change[h, other] = table.values[one] - table.values[other]
-        edits.append(
-            Edit(
-                "exchanged readings",
-                f"{words} were exchanged",
-                "If so, exchange them again.",
-                (*one.tolist(), *other.tolist()),
-                setups,
-            )
-        )
+        edits.append(partial(_edit, words, one, other, setups))
     return Family(edits, change, len(pairs))
+
+
+def _edit(words: Callable[[], str], one: Indices, other: Indices, setups: tuple[str, ...]) -> Edit:
+    return Edit(
+        "exchanged readings",
+        f"{words()} were exchanged",
+        "If so, exchange them again.",
+        (*one.tolist(), *other.tolist()),
+        setups,
+    )
+
+
+def _two_rows(table: Table, one: int, other: int) -> str:
+    return f"the readings {table.label(one)} and {table.label(other)}"
 
 
 def _rows(table: Table) -> list[Pair]:
@@ -61,7 +68,7 @@ def _rows(table: Table) -> list[Pair]:
         pairs = pairwise(rows) if near else combinations(rows, 2)
         found += [
             (
-                f"the readings {table.label(i)} and {table.label(j)}",
+                partial(_two_rows, table, int(i), int(j)),
                 np.array([i]),
                 np.array([j]),
                 (),
@@ -77,7 +84,7 @@ def _across(table: Table) -> list[Pair]:
     for i, r in enumerate(table.session.readings):
         found.setdefault((f"{r.posture}/{r.minus}", r.cycle), []).append(i)
     return [
-        (f"the readings {table.label(i)} and {table.label(j)}", np.array([i]), np.array([j]), ())
+        (partial(_two_rows, table, int(i), int(j)), np.array([i]), np.array([j]), ())
         for rows in found.values()
         for i, j in combinations(rows, 2)
     ]
@@ -90,7 +97,7 @@ def _postures(table: Table) -> list[Pair]:
         by_setup.setdefault(setup, []).append(rows)
     return [
         (
-            f"{_label(table, a)} and {_label(table, b)} in all cycles of setup {setup}",
+            partial(_two_postures, table, a, b, setup),
             a,
             b,
             (),
@@ -99,6 +106,10 @@ def _postures(table: Table) -> list[Pair]:
         for a, b in combinations(groups, 2)
         if len(a) == len(b) > 1
     ]
+
+
+def _two_postures(table: Table, one: Indices, other: Indices, setup: str) -> str:
+    return f"{_label(table, one)} and {_label(table, other)} in all cycles of setup {setup}"
 
 
 def _label(table: Table, rows: Indices) -> str:
@@ -117,13 +128,19 @@ def _postures_everywhere(table: Table) -> list[Pair]:
         both = [k for k in by_label[a] if k in by_label[b]]
         if len({setup for setup, _ in both}) > 1:
             one, other = (np.array([by_label[x][k] for k in both]) for x in (a, b))
-            found.append((f"the readings of postures {a} and {b} in all setups", one, other, ()))
+            words = f"the readings of postures {a} and {b} in all setups"
+            found.append((partial(str, words), one, other, ()))
     return found
 
 
 def _setups(table: Table) -> list[Pair]:
     return [
-        (f"the readings of setups {a} and {b}", table.setups[a], table.setups[b], (a, b))
+        (
+            partial(str, f"the readings of setups {a} and {b}"),
+            table.setups[a],
+            table.setups[b],
+            (a, b),
+        )
         for a, b in combinations(table.setups, 2)
         if table.setups[a].size == table.setups[b].size
     ]
@@ -138,7 +155,7 @@ def _legs(table: Table) -> list[Pair]:
         if sizes[0] == sizes[1]:
             one, other = table.rows_of(legs[a]), table.rows_of(legs[b])
             words = f"the readings of {a.replace('leg', 'legs')} and {b.removeprefix('leg ')}"
-            found.append((words, one, other, (*legs[a], *legs[b])))
+            found.append((partial(str, words), one, other, (*legs[a], *legs[b])))
     return found
 
 
@@ -149,5 +166,5 @@ def _reversed(table: Table) -> list[Pair]:
         half = rows.size // 2
         if half > 1:
             words = f"the first and the last rows of setup {name}, which was written backwards,"
-            found.append((words, rows[:half], rows[::-1][:half], (name,)))
+            found.append((partial(str, words), rows[:half], rows[::-1][:half], (name,)))
     return found

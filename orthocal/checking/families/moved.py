@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,14 +30,16 @@ def find_moved(table: Table) -> Iterator[Family]:
 
 
 def _bumped(table: Table) -> Family:
-    edits, tails = [], []
+    edits: list[Callable[[], Edit]] = []
+    tails = []
     for name, rows in table.setups.items():
         if not table.raw[rows].all():
             continue
         for k in range(2, rows.size - 1):
             tails.append(rows[k:])
             edits.append(
-                Edit(
+                partial(
+                    Edit,
                     "bumped stand",
                     f"the stand of setup {name} was bumped before {table.label(int(rows[k]))}: all "
                     "its later readings are shifted",
@@ -49,7 +52,8 @@ def _bumped(table: Table) -> Family:
 
 
 def _cycles_apart(table: Table) -> Family:
-    edits, groups = [], []
+    edits: list[Callable[[], Edit]] = []
+    groups = []
     for (name, cycle), rows in table.cycles.items():
         own = table.setups[name]
         # of the first and the last cycle the stand was bumped between
@@ -57,7 +61,8 @@ def _cycles_apart(table: Table) -> Family:
         if inner and rows.size > 1 and table.raw[rows].all():
             groups.append(rows)
             edits.append(
-                Edit(
+                partial(
+                    Edit,
                     "bumped stand",
                     f"the gauge of setup {name} was set anew for cycle {cycle}, or touched",
                     f"If so, read cycle {cycle} again, or leave it out.",
@@ -67,7 +72,7 @@ def _cycles_apart(table: Table) -> Family:
     return _additive(table, edits, groups)
 
 
-def _additive(table: Table, edits: list[Edit], groups: list[Indices]) -> Family:
+def _additive(table: Table, edits: list[Callable[[], Edit]], groups: list[Indices]) -> Family:
     wrong = np.zeros((len(groups), table.count))
     for h, rows in enumerate(groups):
         wrong[h, rows] = 1.0
@@ -75,7 +80,8 @@ def _additive(table: Table, edits: list[Edit], groups: list[Indices]) -> Family:
 
 
 def _drift(table: Table) -> Family:
-    edits, ramps = [], []
+    edits: list[Callable[[], Edit]] = []
+    ramps = []
     every, drifting = np.zeros(table.count), []
     for name, rows in table.setups.items():
         if rows.size < FEWEST or not table.raw[rows].all():
@@ -86,7 +92,8 @@ def _drift(table: Table) -> Family:
         drifting.append(rows)
         ramps.append(ramp)
         edits.append(
-            Edit(
+            partial(
+                Edit,
                 "drift",
                 f"the readings of setup {name} drifted from the first to the last",
                 "Let the machine and the stand come to one temperature, return to the first "
@@ -98,7 +105,8 @@ def _drift(table: Table) -> Family:
     if len(ramps) > 1:
         ramps.append(every)
         edits.append(
-            Edit(
+            partial(
+                Edit,
                 "drift",
                 "the readings of every setup drifted alike from its first to its last",
                 "Let the machine and the stand come to one temperature, and read it again.",
@@ -111,7 +119,7 @@ def _drift(table: Table) -> Family:
 
 
 def _stuck(table: Table) -> Family:
-    edits: list[Edit] = []
+    edits: list[Callable[[], Edit]] = []
     unknown: list[tuple[int, ...]] = []
     for name, rows in table.setups.items():
         if not table.raw[rows].all():
@@ -127,7 +135,8 @@ def _stuck(table: Table) -> Family:
                 continue
             unknown.append(tuple(run[1 : MOST_STUCK + 1].tolist()))
             edits.append(
-                Edit(
+                partial(
+                    Edit,
                     "stuck dial",
                     f"the dial stuck in setup {name}: from {table.label(int(run[0]))} on it shows "
                     f"the same {run.size} times",

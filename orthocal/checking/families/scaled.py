@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -84,7 +85,8 @@ def _turned(table: Table, groups: list[tuple[str, tuple[str, ...], Indices]]) ->
     for h, (words, setups, rows) in enumerate(groups):
         change[h, rows] = -2.0 * table.values[rows]
         edits.append(
-            Edit(
+            partial(
+                Edit,
                 "turned setup",
                 f"the sign of {words} was turned",
                 "See which way the gauge stood and whether a minus was forgotten; then turn the "
@@ -104,7 +106,7 @@ def _scaled(
     factors: dict[float, str],
     sigma: float,
 ) -> Family:
-    edits: list[Edit] = []
+    edits: list[Callable[[], Edit]] = []
     pairs = [
         (factor, group)
         for factor in factors
@@ -120,7 +122,8 @@ def _scaled(
         volume[h] = _dimensions(table, rows, bool(setups)) * np.log(factor)
         be = "were" if words.startswith(("all", "the")) else "was"
         edits.append(
-            Edit(
+            partial(
+                Edit,
                 kind,
                 f"{words} {be} written {how}",
                 f"If so, multiply these by {factor:.6g}.",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 
@@ -20,14 +21,14 @@ def find_shifted(table: Table) -> Iterator[Family]:
         for (name, _), rows in table.cycles.items()
         if FEWEST <= rows.size < table.setups[name].size
     ]
-    moves: list[tuple[Edit, list[int], list[int], int]] = []
+    moves: list[tuple[Callable[[], Edit], list[int], list[int], int]] = []
     for name, rows in segments:
         for k in range(rows.size - 1):
             to, last = rows[k:].tolist(), int(rows[-1])
             # what was read next stands in the row of the step that was missed
-            moves.append((_missed(table, name, to), to[1:] + to[:1], to, to[0]))
+            moves.append((partial(_missed, table, name, to), to[1:] + to[:1], to, to[0]))
             if k > 0:
-                moves.append((_doubled(table, name, to), to, [*to[1:], last], last))
+                moves.append((partial(_doubled, table, name, to), to, [*to[1:], last], last))
     if not moves:
         return
     change = np.zeros((len(moves), table.count))

@@ -5,7 +5,8 @@ Each also in all cycles of a posture, where only other postures can tell.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,28 +60,26 @@ def _marks(table: Table, groups: Sequence[Indices]) -> Array:
 
 
 def _slips(table: Table, groups: Sequence[Indices], kind: MistakeKind) -> Family:
-    edits = [
-        Edit(
-            kind,
-            f"{_words(table, rows)} was misread or mistyped",
-            "Read it again, or leave it out.",
-            tuple(rows.tolist()),
-        )
-        for rows in groups
-    ]
+    edits = [partial(_slip, table, rows, kind) for rows in groups]
     marks = _marks(table, groups)
     return Family(edits, np.zeros_like(marks), len(groups), wrong=marks)
+
+
+def _slip(table: Table, rows: Indices, kind: MistakeKind) -> Edit:
+    what = f"{_words(table, rows)} was misread or mistyped"
+    return Edit(kind, what, "Read it again, or leave it out.", tuple(rows.tolist()))
 
 
 def _multiplied(
     table: Table, groups: Sequence[Indices], factors: Sequence[float], kind: MistakeKind
 ) -> Family:
     marks = _marks(table, groups)
-    edits, change, volume = [], [], []
+    edits: list[Callable[[], Edit]] = []
+    change, volume = [], []
     for factor in factors:
         change.append(marks * table.values * (factor - 1.0))
         volume.append(marks.sum(axis=1) * np.log(abs(factor)))
-        edits += [_multiplied_edit(table, rows, factor, kind) for rows in groups]
+        edits += [partial(_multiplied_edit, table, rows, factor, kind) for rows in groups]
     return Family(
         edits,
         np.concatenate(change),
@@ -106,16 +105,15 @@ def _multiplied_edit(table: Table, rows: Indices, factor: float, kind: MistakeKi
 def _misread(table: Table, groups: Sequence[Indices]) -> Family:
     steps = [sign * size for size in MISREAD for sign in (1.0, -1.0)]
     marks = _marks(table, groups)
-    edits = [
-        Edit(
-            "misread dial",
-            f"{_words(table, rows)} was read {abs(step) / MM:g} mm too "
-            f"{'low' if step > 0 else 'high'}, by a turn or a mark of the dial",
-            f"If so, write {(table.values[int(rows[0])] + step) / MM:+.6g} instead of "
-            f"{table.values[int(rows[0])] / MM:+.6g}.",
-            tuple(rows.tolist()),
-        )
-        for step in steps
-        for rows in groups
-    ]
+    edits = [partial(_misread_edit, table, rows, step) for step in steps for rows in groups]
     return Family(edits, np.concatenate([marks * step for step in steps]), len(edits))
+
+
+def _misread_edit(table: Table, rows: Indices, step: float) -> Edit:
+    found = table.values[int(rows[0])]
+    what = (
+        f"{_words(table, rows)} was read {abs(step) / MM:g} mm too "
+        f"{'low' if step > 0 else 'high'}, by a turn or a mark of the dial"
+    )
+    put = f"If so, write {(found + step) / MM:+.6g} instead of {found / MM:+.6g}."
+    return Edit("misread dial", what, put, tuple(rows.tolist()))
