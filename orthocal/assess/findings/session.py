@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from orthocal.arguments import require_kind
 from orthocal.assess.findings.decision import Decision
@@ -126,7 +127,10 @@ def add_mistakes(calibration: Calibration, found: list[Finding]) -> list[Finding
         return [*found, *([] if told or sure else unsure)]
     if all(m.kind == "suspicious reading" for m in new):
         return [*found, *new]
-    return [*(f for f in found if f.kind not in SHADOWS or any(_is_same(m, f) for m in sure)), *new]
+    kept = [f for f in found if f.kind not in SHADOWS or any(_is_same(m, f) for m in sure)]
+    if any(f.severity == "stops" for f in found if f not in kept):
+        new = [replace(m, severity="stops") for m in new]
+    return [*kept, *new]
 
 
 def _mistakes_of(calibration: Calibration) -> tuple[Finding, ...]:
