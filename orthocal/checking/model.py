@@ -118,7 +118,7 @@ class ReadingModel:
             wrong: What they may be wrong by, shape (n_rows,); None for nothing.
             start: Where to begin.
         """
-        found, last = start, np.zeros(self.reference.size)
+        found, last = start, (start.theta - self.reference) / self.problem.theta_scale
         entries = self.entries(rows[None])[0]
         own = None if wrong is None else self.entries(wrong[None])[0]
         for _ in range(MOST_ROUNDS):

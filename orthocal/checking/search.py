@@ -41,7 +41,7 @@ FAMILIES = 24.0
 MOST_ROUNDS = 4
 """Mistakes that are sought one after the other."""
 
-MOST_REFITTED = 8
+MOST_REFITTED = 6
 """Edits that are linearised where they lead."""
 
 LARGEST_EXCESS = 5.0
