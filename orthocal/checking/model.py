@@ -127,7 +127,7 @@ class ReadingModel:
             left = deviation if own is None else deviation - amount * own
             errors = found.errors_for(left, excess, noise)
             change, last = float(np.abs(errors - last).max(initial=0.0)), errors
-            if change < NEAR or not np.abs(errors).max(initial=0.0) < FURTHEST * max(excess, 1.0):
+            if change < NEAR or not np.abs(errors).max(initial=0.0) < FURTHEST:
                 break
             theta = self.reference + errors * self.problem.theta_scale
             try:
@@ -139,6 +139,21 @@ class ReadingModel:
     def deviations(self, rows: Array, about: Linearised) -> Array:
         """Readings less those of the machine as expected, shape (h, n_entries), [m]."""
         return np.asarray(self.entries(rows) - about.expected)
+
+    def left_at_first(self, rows: Array, about: Linearised) -> float:
+        """Root mean square of what a machine within its tolerances leaves of readings, [m].
+
+        To first order: readings with a mistake in them may be of no machine at all.
+
+        Args:
+            rows: Readings, shape (n_rows,), [m].
+            about: Where it is linearised.
+        """
+        deviation = self.deviations(rows[None], about)[0]
+        errors = about.errors_for(deviation, 1.0, 1.0)
+        along = about.sizes * (about.errors.T @ errors)
+        left = (deviation - along @ about.likelihood.directions) * self.problem.noise
+        return float(np.sqrt(np.mean(self.problem.observations.rows(left) ** 2)))
 
     def left_over(self, rows: Array, about: Linearised) -> float:
         """Root mean square of what a machine within its tolerances leaves of readings, [m].

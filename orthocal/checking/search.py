@@ -143,7 +143,7 @@ def _find_one(readings: ReadingModel, table: Table, start: Linearised) -> _Step 
     best, least = chosen[0], chosen[0].weighed.evidence - NEARLY
     near = [r for r in chosen[1:] if r.weighed.evidence > least]
     here = [r for r in near if _is_same_place(best.weighed.edit, r.weighed.edit)]
-    before = readings.left_over(values, about)
+    before = readings.left_at_first(values, about)
     mistake = _told(readings, best, before, here)
     others = [_told(readings, r, before, []) for r in near if r not in here][:MOST_OTHERS]
     return _Step(replace(mistake, others=tuple(others)), best.mended, best.about, bool(whole))

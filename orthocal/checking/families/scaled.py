@@ -107,11 +107,12 @@ def _scaled(
     sigma: float,
 ) -> Family:
     edits: list[Callable[[], Edit]] = []
+    written = [_written(table.values[group[2]]) for group in groups]
     pairs = [
         (factor, group)
         for factor in factors
-        for group in groups
-        if factor < 1.0 or factor * _written(table.values[group[2]]) <= COARSEST * sigma
+        for group, step in zip(groups, written, strict=True)
+        if factor < 1.0 or factor * step <= COARSEST * sigma
     ]
     change = np.zeros((len(pairs), table.count))
     volume = np.zeros(len(pairs))
