@@ -203,7 +203,7 @@ def test_where_readings_stand_out_they_are_to_be_looked_at_before_a_setup(root):
     row = next(i for i, r in enumerate(session.readings) if r.value > 13.5e-3)
     found = decide(calibrate(off(session, row, -2.0 * session.values[row])))
     assert found.answer == "do not enter"
-    assert found.action.startswith("If so, write +13.")
+    assert found.action.startswith("If so, write +14.")
     (turned,) = found.of_kind("turned reading")
     assert [p.line for p in turned.places] == [session.readings[row].line]
     assert not found.of_kind("suspicious reading", "tolerances exceeded")
