@@ -65,6 +65,7 @@ _HOMES = {
     "build_linearisation_study": "orthocal.study.linearisation",
     "build_sensitivity_study": "orthocal.study.sensitivity",
     "calibrate": "orthocal.calibration.calibrate",
+    "check_session": "orthocal.assess.findings.session",
     "compare_models": "orthocal.assess.comparison",
     "decide": "orthocal.assess.findings.calibration",
     "decide_comparison": "orthocal.assess.findings.comparison",
@@ -145,6 +146,7 @@ __all__ = [
     "build_linearisation_study",
     "build_sensitivity_study",
     "calibrate",
+    "check_session",
     "compare_models",
     "decide",
     "decide_comparison",
@@ -183,6 +185,7 @@ if TYPE_CHECKING:
     from orthocal.assess.findings.comparison import decide_comparison
     from orthocal.assess.findings.decision import Decision
     from orthocal.assess.findings.finding import Finding
+    from orthocal.assess.findings.session import check_session
     from orthocal.assess.findings.validation import decide_validation
     from orthocal.assess.validation import Validation, validate_calibration
     from orthocal.calibration.calibrate import calibrate

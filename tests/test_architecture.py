@@ -39,8 +39,10 @@ ALLOWED = {
     "statistics": f"{EDGES} robot measurement",
     "estimation": f"{EDGES} robot kinematics sensors measurement statistics",
     "diagnosis": f"{EDGES} robot kinematics sensors measurement statistics estimation",
+    "checking": f"{EDGES} robot kinematics sensors measurement statistics estimation diagnosis",
     "calibration": f"{EDGES} robot kinematics sensors measurement statistics estimation diagnosis",
-    "assess": f"{EDGES} robot kinematics measurement statistics estimation diagnosis calibration",
+    "assess": f"{EDGES} robot kinematics measurement statistics estimation diagnosis checking "
+    "calibration",
     "planning": f"{EDGES} robot kinematics sensors measurement statistics estimation diagnosis "
     "assess",
     "study": f"{EDGES} robot kinematics sensors measurement statistics estimation diagnosis assess "

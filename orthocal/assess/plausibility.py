@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.assess.findings.finding import Finding, Place, place_of
 from orthocal.calibration.calibration import Calibration
-from orthocal.diagnosis.rows import ResidualRow, root_mean_square, rows_by_setup
+from orthocal.diagnosis.rows import root_mean_square, rows_by_setup
 from orthocal.units import DRIVE_UNITS, MM, UM
 
 Array = NDArray[np.float64]
@@ -86,27 +87,46 @@ def _postures(calibration: Calibration) -> Finding | None:
 
 def _finer(calibration: Calibration) -> Finding | None:
     """Readings between the steps of the gauge: another unit, or another gauge."""
-    step = calibration.session.gauge_resolution
+    rows = calibration.residuals
+    return find_finer(
+        [r.measured for r in rows],
+        calibration.session.gauge_resolution,
+        where=lambda i: calibration.where(rows[i]),
+        place=lambda i: place_of(calibration, rows[i]),
+    )
+
+
+def find_finer(
+    values: Sequence[float],
+    step: float | None,
+    *,
+    where: Callable[[int], str],
+    place: Callable[[int], Place],
+) -> Finding | None:
+    """Whether most readings stand between the steps of a gauge.
+
+    Args:
+        values: Readings, [m].
+        step: Resolution of the gauge, [m]; None where it is not stated.
+        where: File and line of a reading, by its number.
+        place: The same as a place.
+    """
     if not step:
         return None
-
-    def between(row: ResidualRow) -> bool:
-        steps = row.measured / step
-        return abs(steps - round(steps)) > FINER
-
-    finer = [r for r in calibration.residuals if between(r)]
-    if len(finer) * 2 < len(calibration.residuals):
+    steps = np.asarray(values, dtype=np.float64) / step
+    finer = np.flatnonzero(np.abs(steps - np.round(steps)) > FINER).tolist()
+    if len(finer) * 2 < len(values):
         return None
     first = finer[0]
     return Finding(
         "finer than the dial",
         "warns",
-        f"{len(finer)} of {len(calibration.residuals)} readings are finer than the gauge's "
-        f"resolution of {step / MM:g} mm, the first in {calibration.where(first)} "
-        f"({first.measured / MM:.6g} mm).",
+        f"{len(finer)} of {len(values)} readings are finer than the gauge's "
+        f"resolution of {step / MM:g} mm, the first in {where(first)} "
+        f"({values[first] / MM:.6g} mm).",
         "Make sure that they are in mm, not in inches, and that the resolution is right.",
         numbers={"finer": float(len(finer)), "resolution_mm": step / MM},
-        places=tuple(place_of(calibration, r) for r in finer[:MOST_PLACES]),
+        places=tuple(place(i) for i in finer[:MOST_PLACES]),
     )
 
 

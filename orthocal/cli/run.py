@@ -14,6 +14,7 @@ from orthocal.characters import printable
 # what registers the commands, in the order in which help lists them
 from orthocal.cli import (  # noqa: F401
     calibrating,
+    checking,
     correcting,
     exporting,
     importing,

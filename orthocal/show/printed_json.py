@@ -7,6 +7,7 @@ import json
 from orthocal.assess.comparison import Comparison
 from orthocal.assess.findings.calibration import decide
 from orthocal.assess.findings.comparison import decide_comparison
+from orthocal.assess.findings.decision import Decision
 from orthocal.assess.findings.validation import decide_validation
 from orthocal.assess.validation import Validation
 from orthocal.calibration.calibration import Calibration
@@ -20,6 +21,11 @@ def printed_calibration(calibration: Calibration) -> str:
     """
     document = {**calibration_document(calibration), **decide(calibration).to_document()}
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def printed_decision(decision: Decision) -> str:
+    """A decision and its findings."""
+    return json.dumps(decision.to_document(), indent=1, allow_nan=False) + "\n"
 
 
 def printed_comparison(comparison: Comparison) -> str:

@@ -84,7 +84,7 @@ def spoilt(cycles, table1):
         "one cycle": (calibrate(silent(first)), "enter", "noise not known apart"),
         "full": (calibrate(cycles, "full"), "enter", "nothing to check by"),
         "turned": (calibrate(turned(cycles, "zx")), "do not enter", "turned setup"),
-        "one leg": (calibrate(cycles.with_values(leg)), "do not enter", "tolerances exceeded"),
+        "one leg": (calibrate(cycles.with_values(leg)), "do not enter", "suspicious setup"),
         "one reading": (
             calibrate(off(cycles, 4, 0.2e-3)),
             "check before entering",
@@ -92,8 +92,8 @@ def spoilt(cycles, table1):
         ),
         "inches": (
             calibrate(cycles.with_values(np.round(cycles.values / 25.4, 7))),
-            "check before entering",
-            "finer than the dial",
+            "do not enter",
+            "wrong unit",
         ),
         "three readings": (calibrate(three), "check before entering", "nothing to check by"),
         "no word": (calibrate(silent(three)), "check before entering", "noise unknown"),
@@ -203,10 +203,10 @@ def test_where_readings_stand_out_they_are_to_be_looked_at_before_a_setup(root):
     row = next(i for i, r in enumerate(session.readings) if r.value > 13.5e-3)
     found = decide(calibrate(off(session, row, -2.0 * session.values[row])))
     assert found.answer == "do not enter"
-    assert found.action == "Look at the readings first that all others contradict."
-    assert [f.places[0].line for f in found.of_kind("suspicious reading")] == [
-        session.readings[row].line
-    ]
+    assert found.action.startswith("If so, write +14.")
+    (turned,) = found.of_kind("turned reading")
+    assert [p.line for p in turned.places] == [session.readings[row].line]
+    assert not found.of_kind("suspicious reading", "tolerances exceeded")
 
 
 def test_slips_are_not_held_against_the_machine(root):

@@ -12,6 +12,7 @@ from folders import session_folder
 from machines import write_orthoglide
 
 from orthocal import calibrate, load_plan, load_robot, load_session, simulate_session, summarize
+from orthocal.assess.findings.calibration import decide
 from orthocal.assess.plausibility import describe_machine, find_doubts
 from orthocal.calibration.file import calibration_json
 from orthocal.errors import RobotError
@@ -47,8 +48,9 @@ def test_readings_in_inches_are_noticed(session):
     result = calibrate(inches)
     assert "finer than the dial" in kinds(result)
     assert "too little left" in kinds(result)
+    assert [f.kind for f in decide(result).findings if f.severity != "informs"] == ["wrong unit"]
     assert "in inches" in advise(result)
-    assert advise(result).startswith("Check before you enter these.")
+    assert advise(result).startswith("Do not enter these.")
 
 
 def test_readings_in_inches_of_a_dial_in_inches_leave_too_little(session):

@@ -23,6 +23,7 @@ from orthocal.assess.findings.readings import (
     find_turned,
 )
 from orthocal.assess.findings.remainder import find_check, find_remainder, find_tolerances
+from orthocal.assess.findings.session import MISTAKES, add_mistakes
 from orthocal.assess.findings.tool import find_at_tool
 from orthocal.assess.plausibility import find_doubts
 from orthocal.assess.wording import joined
@@ -70,8 +71,9 @@ def find_findings(calibration: Calibration) -> tuple[Finding, ...]:
         *find_hidden(calibration),
         *find_line(calibration),
     ]
+    found = add_mistakes(calibration, found)
     # postures of another machine say more than what they leave of its tolerances
-    order = {"turned setup": -2, "wrong size": -1}
+    order = {"turned setup": -2, "wrong size": -1, **dict.fromkeys(MISTAKES, -2)}
     return tuple(sorted(found, key=lambda f: (_GRAVITY[f.severity], order.get(f.kind, 0))))
 
 

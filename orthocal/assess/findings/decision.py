@@ -16,6 +16,8 @@ Answer = Literal[
     "confirmed",
     "not confirmed",
     "cannot be told",
+    "nothing odd",
+    "something odd",
     "supported",
     "supported with model error",
     "none supported",
@@ -29,6 +31,8 @@ HEADLINES: dict[Answer, str] = {
     "confirmed": "The calibration is confirmed.",
     "not confirmed": "The calibration is not confirmed.",
     "cannot be told": "Whether this is as expected cannot be told.",
+    "nothing odd": "Nothing odd.",
+    "something odd": "Look at these readings first.",
     "supported": "The readings support a model.",
     "supported with model error": "The readings support a model, but it leaves more than noise.",
     "none supported": "The readings support none of the models.",
@@ -37,6 +41,7 @@ HEADLINES: dict[Answer, str] = {
 EXIT_CODES: dict[Answer, int] = {
     "do not enter": 3,
     "not confirmed": 3,
+    "something odd": 3,
     "supported with model error": 3,
     "none supported": 4,
 }
