@@ -160,8 +160,8 @@ def plan(
         options = "".join(f" --tolerance '{t}'" for t in tolerance or [])
         command = f"orthocal calibrate . --model {model}{options}"
         comment = (
-            "A plan: here `orthocal record .` leads through it, or fill in readings.csv in its\n"
-            f"order; then\n{command}\n"
+            "A plan: here `orthocal record .` leads through it, or fill in readings.csv; then\n"
+            f"{command}\n"
             "State the offsets that are active in the controller meanwhile, such as\n"
             "controller: {offsets_mm: [0, 0, 0]}, one number a drive.\n"
             "Approach every posture from the same side; the last reading of a setup is its first\n"

@@ -26,6 +26,9 @@ Indices = NDArray[np.int64]
 
 MOST_ITERATIONS = 12
 
+FAINT = 1e-14
+"""Part of the largest singular value below which one is nothing."""
+
 SETTLED = 1e-3
 """Standard deviations of a change by which the last iteration may move it."""
 
@@ -80,13 +83,14 @@ def fit_changed_machine(
         rows = np.column_stack([slopes[:, used], changing])
         rows = project_out_zeros(rows, o, weights=fit.weights) * whiten[:, None]
         left = project_out_zeros(problem.values - prediction, o, weights=fit.weights) * whiten
-        weight = np.append(precision[used], np.zeros(len(steps)))
-        pull = np.append(precision[used] * (mean - beta)[used], np.zeros(len(steps)))
-        inverse = np.linalg.inv(rows.T @ rows + np.diag(weight))
-        step = inverse @ (rows.T @ left + pull)
+        # what is known beforehand as rows of its own: squares of both would lose what is faint
+        root = np.sqrt(precision[used])
+        known = np.column_stack([np.diag(root), np.zeros((used.size, len(steps)))])
+        inverse = np.linalg.pinv(np.vstack([rows, known]), rcond=FAINT)
+        step = inverse @ np.append(left, root * (mean - beta)[used])
         beta[used] += step[: used.size]
         size = size + step[used.size :] / units
-        deviation = np.sqrt(np.diag(inverse))[used.size :] / units
+        deviation = np.linalg.norm(inverse[used.size :], axis=1) / units
         if (np.abs(step[used.size :]) / units < SETTLED * deviation).all():
             break
     return list(zip(size.tolist(), deviation.tolist(), strict=True))

@@ -77,6 +77,21 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     )
 
 
+def split_sessions(session: Session) -> tuple[Session, ...]:
+    """A joined session's own ones, with what they are named in it; one that is none stays whole."""
+    if not session.joined:
+        return (session,)
+    label = [r.setup.partition("/")[0] for r in session.readings]
+    return tuple(
+        replace(
+            session,
+            setups={k: v for k, v in session.setups.items() if k.partition("/")[0] == own},
+            readings=tuple(r for r, of in zip(session.readings, label, strict=True) if of == own),
+        )
+        for own in dict.fromkeys(label)
+    )
+
+
 def name_within(name: str, *, joined: bool) -> str:
     """A setup's or posture's name in its own session, where sessions were joined or not."""
     return name.partition("/")[2] or name if joined else name

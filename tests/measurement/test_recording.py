@@ -299,7 +299,7 @@ def test_killed_a_hundred_times_no_accepted_reading_is_lost(tmp_path, monkeypatc
     robot = load_plan(folder).robot
     monkeypatch.setattr(session_file, "load_robot", lambda *_, **__: robot)
     rng = np.random.default_rng(0)
-    accepted, redone, unsaid, busy = {}, 0, 0, 0
+    accepted, redone, busy = {}, 0, 0
     for _ in range(KILLS):
         lines_out, lines_in = os.pipe()
         said_out, said_in = os.pipe()
@@ -331,6 +331,7 @@ def test_killed_a_hundred_times_no_accepted_reading_is_lost(tmp_path, monkeypatc
         assert [float(value) for *_, value in found] == numbers[: len(found)]
         accepted |= {(s, p, int(c or 1)): float(v) for s, p, c, v in found}
         with open_recording(folder) as r:  # it loads as it lies there, whenever it was
+            assert r.redone <= 1
             redone += r.redone
             there = {
                 row.key[:2] + row.key[3:]: round(row.value / MM, 9)
@@ -341,11 +342,10 @@ def test_killed_a_hundred_times_no_accepted_reading_is_lost(tmp_path, monkeypatc
         assert accepted.keys() <= there.keys()
         # one more may be there, of which nothing could be said any more: what was typed next
         assert list(other.values()) in ([], [numbers[len(found)]])
-        unsaid += len(other)
         accepted = there
     assert busy == KILLS
     assert len(accepted) > KILLS // 2
-    assert 0 < redone <= unsaid
+    assert redone > 0
 
 
 @pytest.mark.parametrize(

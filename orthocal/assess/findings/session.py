@@ -15,6 +15,7 @@ from orthocal.calibration.repeating import restore_session
 from orthocal.checking.mistake import Mistake
 from orthocal.checking.search import find_mistakes
 from orthocal.errors import OrthocalError
+from orthocal.measurement.joining import split_sessions
 from orthocal.measurement.session import Session
 from orthocal.units import MM, UM
 
@@ -76,7 +77,7 @@ def check_session(session: Session, model: str | None = None) -> tuple[Finding, 
         TypeError: If the session is of another kind.
     """
     require_kind(session, Session, expected="a Session, such as load_session(...)")
-    found = [_finding(session, m) for m in find_mistakes(session, model)]
+    found = _find(session, model)
     if any(f.kind == "wrong unit" for f in found):
         return tuple(found)
     for name, gauge in session.gauges.items():
@@ -137,11 +138,20 @@ def _mistakes_of(calibration: Calibration) -> tuple[Finding, ...]:
     def find() -> tuple[Finding, ...]:
         try:
             session = restore_session(calibration)
-            return tuple(_finding(session, m) for m in find_mistakes(session))
+            return tuple(_find(session, None))
         except OrthocalError:  # the findings of the tool say so
             return ()
 
     return calibration.remember("mistakes", find)
+
+
+def _find(session: Session, model: str | None) -> list[Finding]:
+    """Mistakes of each session by itself: between them the machine may have changed."""
+    return [
+        _finding(part, mistake)
+        for part in split_sessions(session)
+        for mistake in find_mistakes(part, model)
+    ]
 
 
 def _is_same(one: Finding, other: Finding) -> bool:

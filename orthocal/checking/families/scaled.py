@@ -25,6 +25,10 @@ WRONG_PLACES = dict.fromkeys((10.0, 0.1, 100.0, 0.01), "with the decimal point i
 COARSEST = 10.0
 """Standard deviations of a reading that nobody's last figure is worth."""
 
+FINEST = 1e-3
+"""Standard deviations of a reading that nobody writes down more finely than: numbers with more
+digits are no dial's, and that little is left of them is no mistake."""
+
 MOST_DECIMALS = 9
 """Of numbers in mm that are looked at."""
 
@@ -112,7 +116,7 @@ def _scaled(
         (factor, group)
         for factor in factors
         for group, step in zip(groups, written, strict=True)
-        if factor < 1.0 or factor * step <= COARSEST * sigma
+        if factor < 1.0 or FINEST * sigma <= factor * step <= COARSEST * sigma
     ]
     change = np.zeros((len(pairs), table.count))
     volume = np.zeros(len(pairs))
