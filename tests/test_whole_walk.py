@@ -1,0 +1,142 @@
+"""A builder's whole way, by the command line: legs of 250 mm, from nothing to a better part.
+
+new → record → check → calibrate → enter → record → validate → calibrate → export → LinuxCNC. The
+machine itself is simulated: all its errors at tolerance, dials as hands make them stand.
+"""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from linuxcnc import Joint, require_linuxcnc, run_program
+
+from orthocal import (
+    Machine,
+    assess_tool,
+    draw_errors,
+    load_calibration,
+    load_plan,
+    load_robot,
+    simulate_session,
+)
+from orthocal.assess.entering import find_entries
+from orthocal.units import MM
+
+SIZES = """--leg-mm 250 --travel-mm 100:325 --attachment-mm 30 --rods-apart-mm 60 --rod-radius-mm 4
+--counts up,down,up --at-zero-mm 0 --paper"""
+
+MODEL = ["--model", "full", "--tolerance", "*.offset_mm=2"]
+
+SEED = 3
+
+
+def run(folder, *words, typed=None, code=0):
+    done = subprocess.run(
+        [sys.executable, "-m", "orthocal", *words],
+        cwd=folder,
+        input=typed,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == code, (words, done.stdout[-2000:], done.stderr)
+    return done.stdout
+
+
+def measure(folder, session, errors, seed):
+    """Read a planned session on the machine, and type it in, line by line."""
+    shown = simulate_session(load_plan(folder / session), errors, seed=seed).session
+    typed = [f"{v / MM:.2f}".replace(".", ",") for v in shown.values]
+    said = run(folder, "record", session, typed="\n".join([*typed, ""]))
+    assert f"All {len(typed)} readings are there." in said
+    with open(folder / session / "readings.csv") as file:
+        read = [float(row["reading_mm"]) * MM for row in csv.DictReader(file)]
+    assert read == pytest.approx(shown.values, abs=1e-12)
+
+
+def left_at_tool(calibration, errors, send):
+    """What the real machine's tool is off over the workspace, shift and rotation out, [m]."""
+    tool = assess_tool(calibration)
+    reached = Machine(calibration.robot, errors).forward(send(tool.targets))
+    return tool.measure(reached - tool.targets).aligned.rms
+
+
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory):
+    """The folder after two rounds, the machine's errors, both calibrations, and the last answer."""
+    folder = tmp_path_factory.mktemp("walk")
+    run(folder, "new", "mill", *SIZES.split(), "--tolerance", "*.offset_mm=2")
+    robot = load_robot(folder / "mill")
+    errors = draw_errors(robot, ["*"], seed=SEED, tolerances={"*.offset_mm": 2.0})
+    measure(folder, "mill/first", errors, SEED)
+    assert "Nothing odd." in run(folder, "check", "mill/first")
+    assert "Enter these" in run(folder, "calibrate", "mill/first", *MODEL, "--out", "one")
+    one = load_calibration(folder / "one")
+    # the same plan once more, with what is to be entered
+    first, second = folder / "mill/first", folder / "mill/second"
+    second.mkdir()
+    entered = ", ".join(f"{e.enter / MM:.3f}" for e in find_entries(one))
+    text = (first / "session.yaml").read_text()
+    assert "offsets_mm: [0.0, 0.0, 0.0]" in text
+    text = text.replace("offsets_mm: [0.0, 0.0, 0.0]", f"offsets_mm: [{entered}]")
+    (second / "session.yaml").write_text(text)
+    rows = [line.rpartition(",")[0] for line in (first / "readings.csv").read_text().splitlines()]
+    blank = [rows[0] + ",reading_mm", *(f"{row}," for row in rows[1:])]
+    (second / "readings.csv").write_text("\n".join(blank) + "\n")
+    measure(folder, "mill/second", errors, SEED + 1)
+    assert "confirmed" in run(folder, "validate", "one", "mill/second")
+    said = run(folder, "calibrate", "mill/second", *MODEL, "--out", "two")
+    return folder, errors, one, load_calibration(folder / "two"), " ".join(said.split())
+
+
+@pytest.mark.slow
+def test_the_part_is_as_good_as_promised(walked):
+    _, errors, one, two, said = walked
+    robot = one.robot
+    nominal = Machine(robot, {})
+    before = left_at_tool(one, errors, nominal.inverse)
+    entered = np.array([e.enter for e in find_entries(one)])
+    after = left_at_tool(one, errors, lambda p: nominal.inverse(p) - entered + one.active_offsets)
+    whole = left_at_tool(two, errors, two.machine.inverse)
+    promised = assess_tool(two).after.sizes.aligned.rms
+    assert whole < 1.2 * promised
+    assert whole < 0.5 * after
+    assert after < 0.5 * before
+    assert f"In a controller that knows all errors: {promised * 1e6:.0f} µm." in said
+
+
+@pytest.mark.slow
+def test_linuxcnc_moves_the_machine_as_it_was_calibrated(walked):
+    """Its joints, recorded, put through the real machine: off by what the calibration leaves."""
+    require_linuxcnc()
+    folder, errors, _, two, _ = walked
+    said = run(folder, "export", "two", "--to", "linuxcnc", "--out", "cnc", "--within", "0.5")
+    assert said == ""
+    corners = [(30, -30, 20), (-40, 10, -30), (10, 40, 30)]
+    program = [
+        f"G21 G90 G61 {'G1 ' if i == 0 else ''}X{x} Y{y} Z{z} F6000"
+        for i, (x, y, z) in enumerate(corners)
+    ]
+    switch = (270.0, 260.0, 265.0)
+    joints = [
+        Joint(
+            d.direction,
+            s,
+            float(d.to_joint(s * MM + active)) / MM,
+            float(d.to_joint(d.zero)) / MM,
+        )
+        for d, s, active in zip(two.robot.drives, switch, two.active_offsets, strict=True)
+    ]
+    lines = (folder / "cnc/kinematics.ini").read_text()
+    slides = run_program(program, joints, lines=lines, module=folder / "cnc")[::20] * MM
+    commanded = two.machine.forward(slides)
+    assert np.linalg.norm(commanded[-1] / MM - corners[-1]) < 1e-3
+    assert len(commanded) > 30
+    off = Machine(two.robot, errors).forward(slides) - commanded
+    exact = Machine(two.robot, errors).forward(two.machine.inverse(commanded)) - commanded
+    assert np.abs(off - exact).max() < 1e-9
+    promised = assess_tool(two).after.sizes
+    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 3.0 * promised.absolute.rms
