@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
+import orthocal
 from orthocal import calibrate, draw_scene, load_session
 from orthocal.errors import NotIdentifiableError
 
@@ -55,7 +56,7 @@ def commands(page):
     for block in blocks("sh", page):
         for line in block.replace("\\\n", " ").splitlines():
             command, _, comment = line.partition("  # ")
-            if command.startswith(("orthocal ", "printf ", "cp ", "cat ", "mkdir ")):
+            if command.startswith(("orthocal ", "printf ", "cp ", "sed ", "mkdir ")):
                 code = re.search(r"exit code (\d+)", comment)
                 found.append((command, int(code[1]) if code else 0))
     return found
@@ -63,6 +64,9 @@ def commands(page):
 
 def with_code(language):
     return [p.relative_to(ROOT).as_posix() for p in PAGES if blocks(language, p)]
+
+
+TUTORIAL = "docs/tutorial.md"
 
 
 @pytest.mark.parametrize("page", with_code("python"))
@@ -74,7 +78,7 @@ def test_the_python_of_a_page_runs(root, page):
         assert done.stderr == ""
 
 
-@pytest.mark.parametrize("page", with_code("sh"))
+@pytest.mark.parametrize("page", [p for p in with_code("sh") if p != TUTORIAL])
 def test_the_commands_of_a_page_run(root, page, tmp_path):
     """One after the other, as they stand, in a folder with a copy of the examples."""
     shutil.copytree(root / "examples", tmp_path / "examples")
@@ -91,6 +95,31 @@ def test_the_commands_of_a_page_run(root, page, tmp_path):
             stdin=subprocess.DEVNULL,
         )
         assert done.returncode == expected, f"{command}: {done.stderr}"
+
+
+def test_what_the_tutorial_shows_is_what_its_commands_print(root, tmp_path):
+    """A text after commands holds lines that the last of them prints."""
+    (tmp_path / "out").mkdir()
+    text = (root / TUTORIAL).read_text()
+    printed, shown = [], 0
+    for language, block in re.findall(r"```(sh|text)\n(.*?)```", text, flags=re.DOTALL):
+        if language == "sh":
+            for line in block.splitlines():
+                words = re.sub(r"^orthocal ", f"{sys.executable} -m orthocal.cli ", line)
+                done = subprocess.run(
+                    words, shell=True, cwd=tmp_path, capture_output=True, text=True
+                )
+                assert done.returncode == 0, f"{line}: {done.stderr}"
+                printed = [said.rstrip() for said in done.stdout.splitlines()]
+            continue
+        shown += 1
+        assert [line for line in block.splitlines() if line.rstrip() not in printed] == []
+    assert shown >= 4
+
+
+def test_the_reference_has_every_name(root):
+    text = (root / "docs/reference.md").read_text()
+    assert set(re.findall(r"::? orthocal\.(\w+)$", text, flags=re.M)) == set(orthocal.__all__)
 
 
 EXPERIMENT = "examples/table1/experiment-2"
