@@ -24,7 +24,7 @@ def test_the_orthoglide_is_the_designed_machine(orthoglide):
 
 
 def test_joint_axes_and_origins_are_those_of_the_design(orthoglide):
-    """Leg frame: X from slider to tool; Z = e_z, e_x, e_y; the joints of DESIGN, section 3."""
+    """Leg frame: X from slider to tool; Z = e_z, e_x, e_y; the joints of the URDF."""
     r, w, a, length = orthoglide, 0.08, 0.04, 0.31025
     leg_x = {"x": [-1, 0, 0], "y": [0, -1, 0], "z": [0, 0, -1]}
     leg_z = {"x": [0, 0, 1], "y": [1, 0, 0], "z": [0, 1, 0]}

@@ -195,7 +195,7 @@ def test_it_is_written_and_read(tmp_path):
 
 
 def test_a_ball_that_passes_the_rod_is_named_before_measuring(tmp_path):
-    """20 mm beside the axis the rod has moved away: DESIGN's displaced lines, by a ball."""
+    """20 mm beside the axis the rod has moved away: displaced lines, by a ball."""
     path = tmp_path / "plan.yaml"
     plan(tmp_path, "ball")
     path.write_text(
