@@ -104,7 +104,7 @@ def test_what_the_tutorial_shows_is_what_its_commands_print(root, tmp_path):
     printed, shown = [], 0
     for language, block in re.findall(r"```(sh|text)\n(.*?)```", text, flags=re.DOTALL):
         if language == "sh":
-            for line in block.splitlines():
+            for line in block.replace("\\\n", " ").splitlines():
                 words = re.sub(r"^orthocal ", f"{sys.executable} -m orthocal.cli ", line)
                 done = subprocess.run(
                     words, shell=True, cwd=tmp_path, capture_output=True, text=True
