@@ -55,6 +55,17 @@ Free = Annotated[
     list[str] | None,
     typer.Option(metavar="GLOBS", help="Names or globs, on top of the model or instead of one."),
 ]
+Subject = Annotated[
+    str,
+    typer.Argument(
+        metavar="ROBOT|SESSION",
+        help="A robot of the Orthoglide's kind, read as in the paper; or a session.",
+    ),
+]
+LegMm = Annotated[
+    float | None,
+    typer.Option("--leg-mm", help="Leg length of a machine of the Orthoglide's kind."),
+]
 
 
 @studies.command()
@@ -132,13 +143,7 @@ def accuracy(
 
 @studies.command()
 def linearisation(
-    subject: Annotated[
-        str,
-        typer.Argument(
-            metavar="ROBOT|SESSION",
-            help="A robot of the Orthoglide's kind, read as in the paper; or a session.",
-        ),
-    ] = "orthoglide",
+    subject: Subject = "orthoglide",
     free: Annotated[
         list[str] | None,
         typer.Option(metavar="GLOBS", help="Errors that grow; by default offsets."),
@@ -161,10 +166,7 @@ def linearisation(
         ),
     ] = None,
     min_mm: Annotated[float | None, typer.Option("--min-mm", help="And in: -100.")] = None,
-    leg_mm: Annotated[
-        float | None,
-        typer.Option("--leg-mm", help="Leg length of a machine of the Orthoglide's kind."),
-    ] = None,
+    leg_mm: LegMm = None,
     sigma_mm: Annotated[
         float | None, typer.Option("--sigma-mm", help="Noise of a reading; the paper's 0.02.")
     ] = None,
@@ -225,13 +227,7 @@ def linearisation(
 
 @studies.command()
 def sensitivity(
-    subject: Annotated[
-        str,
-        typer.Argument(
-            metavar="ROBOT|SESSION",
-            help="A robot of the Orthoglide's kind, read as in the paper; or a session.",
-        ),
-    ] = "orthoglide",
+    subject: Subject = "orthoglide",
     free: Annotated[
         list[str] | None,
         typer.Option(metavar="MODEL|GLOBS", help="Errors; by default all that change something."),
@@ -242,10 +238,7 @@ def sensitivity(
             metavar="X,Y,Z", help="Where the tool stands, mm, in every setup; may be repeated."
         ),
     ] = None,
-    leg_mm: Annotated[
-        float | None,
-        typer.Option("--leg-mm", help="Leg length of a machine of the Orthoglide's kind."),
-    ] = None,
+    leg_mm: LegMm = None,
     out: Out = None,
     json: Json = False,
     all_rows: AllRows = False,

@@ -134,7 +134,7 @@ class Core:
         if shutil.which("gcc") is None:
             if os.environ.get("ORTHOCAL_LINUXCNC") == "required":
                 pytest.fail("a C compiler is required here")
-            pytest.skip("no C compiler")
+            pytest.skip("no C compiler to build the exported core with: there is no gcc")
         for name, text in files.items():
             (folder / name).write_text(text)
         strict = "-std=c99 -O2 -Wall -Wextra -Werror -pedantic -Wshadow -Wvla".split()

@@ -80,16 +80,19 @@ def check_session(session: Session, model: str | None = None) -> tuple[Finding, 
     found = _find(session, model)
     if any(f.kind == "wrong unit" for f in found):
         return tuple(found)
-    for name, gauge in session.gauges.items():
-        own = [r for r in session.readings if session.setups[r.setup].gauge == name]
-        finer = find_finer(
-            [r.value for r in own],
-            gauge.resolution,
-            where=lambda i, own=own: session.where(own[i]),  # type: ignore[misc]
-            place=lambda i, own=own: _place(session, session.readings.index(own[i])),  # type: ignore[misc]
-        )
-        found += [] if finer is None else [finer]
-    return tuple(found)
+    finer = (_find_finer(session, gauge) for gauge in session.gauges)
+    return (*found, *(f for f in finer if f is not None))
+
+
+def _find_finer(session: Session, gauge: str) -> Finding | None:
+    """Readings of a gauge that are finer than it shows."""
+    own = [i for i, r in enumerate(session.readings) if session.setups[r.setup].gauge == gauge]
+    return find_finer(
+        [session.readings[i].value for i in own],
+        session.gauges[gauge].resolution,
+        where=lambda k: session.where(session.readings[own[k]]),
+        place=lambda k: _place(session, own[k]),
+    )
 
 
 def decide_session(session: Session, model: str | None = None) -> Decision:
