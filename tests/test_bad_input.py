@@ -177,7 +177,10 @@ RANGE = "range_mm: [-5, 5]"
 SIGMA = "sigma_mm: 0.02"
 TITLE = "title: Experiment 2, after mechanical tuning, before calibration"
 FORMS = "coordinate_mm, from_root_mm, fraction"
-SESSION_KEYS = "robot, title, source, gauge, gauges, postures, controller, setups, cycles, readings"
+SESSION_KEYS = (
+    "robot, title, source, gauge, gauges, postures, controller, calibration, setups, cycles, "
+    "readings"
+)
 SETUPS = "xy, xz, yx, yz, zx, zy"
 POSTURES = "x_max, x_min, y_max, y_min, z_max, z_min"
 DRIVES = "x_slide, y_slide, z_slide"
@@ -214,6 +217,45 @@ SESSION_KEY_CASES = [
         f": setups.xy.section.part: unknown key; known keys: {FORMS}",
     ),
     session("key-missing", "robot: orthoglide\n", "", ": robot: is missing"),
+    session(
+        "calibration-model",
+        "readings: readings.csv",
+        "calibration: {model: all}\nreadings: readings.csv",
+        ": calibration.model: 'all' is not a model of this robot; models: offsets, lengths, full",
+    ),
+    session(
+        "calibration-free",
+        "readings: readings.csv",
+        "calibration: {free: ['*.ofset']}\nreadings: readings.csv",
+        ": calibration.free: '*.ofset' matches no error parameter; did you mean z_slide.offset, "
+        "y_slide.offset, x_slide.offset?",
+    ),
+    session(
+        "calibration-nothing-free",
+        "readings: readings.csv",
+        "calibration: {model: offsets, free: ['!*.offset']}\nreadings: readings.csv",
+        ": calibration.free: leaves no error free",
+    ),
+    session(
+        "calibration-tolerance-without-unit",
+        "readings: readings.csv",
+        "calibration: {tolerances: {'*.offset': 2}}\nreadings: readings.csv",
+        ": calibration.tolerances: '*.offset' carries no unit; expected one of the suffixes _mm, "
+        "_um, _m, _mrad, _deg, _rad, _ppm",
+    ),
+    session(
+        "calibration-tolerance-in-metres",
+        "readings: readings.csv",
+        "calibration: {tolerances: {'*.offset_m': 2}}\nreadings: readings.csv",
+        ": calibration.tolerances: the tolerance of 'x_slide.offset' is 2000 mm; expected at most "
+        "200 times the robot's own, 5 mm",
+    ),
+    session(
+        "calibration-tolerance-below-zero",
+        "readings: readings.csv",
+        "calibration: {tolerances: {'*.offset_mm': -2}}\nreadings: readings.csv",
+        ": calibration.tolerances.*.offset_mm: found '-2'; expected greater than 0",
+    ),
     session("key-missing-in-setup", "xy: {leg: y, ", "xy: {", ": setups.xy.leg: is missing"),
     session(
         "key-twice",

@@ -18,6 +18,7 @@ from orthocal import load_plan, load_robot
 from orthocal.cli import asking
 from orthocal.cli.run import main
 from orthocal.errors import ParameterError
+from orthocal.measurement.purpose import Purpose
 
 SIZES = {
     "--leg-mm": "250",
@@ -79,7 +80,8 @@ def test_a_folder_has_all_that_is_needed(made):
     assert session.controller_offsets.tolist() == [0.0, 0.0, 0.0]
     assert session.robot.sha256 == robot.sha256
     commands = etree.HTML((made / "first/sheet.html").read_text()).xpath("//code/text()")
-    assert commands == ["orthocal calibrate . --model full"]
+    assert commands == ["orthocal calibrate ."]
+    assert session.purpose == Purpose("full")
 
 
 def test_what_is_read_on_it_calibrates_it(made, capsys, tmp_path):
@@ -106,7 +108,7 @@ def test_it_is_made_again_after_a_change(copied, capsys):
     assert "joints 60.0000 7.0178 -7.0178" in (copied / "first/01-yx.ngc").read_text()
     assert "7.018" in (copied / "first/sheet.html").read_text()
     assert load_robot(copied).drive_zero == pytest.approx([0.26] * 3)
-    assert "--model full" in (copied / "first/sheet.html").read_text()
+    assert load_plan(copied / "first").purpose == Purpose("full")
 
 
 def test_readings_belong_to_the_sizes_of_their_day(copied, capsys):
@@ -265,6 +267,7 @@ def test_without_the_papers_plan_one_is_chosen(capsys, tmp_path):
     }
     session = load_plan(first)
     assert {s.sensor.tip.form for s in session.setups.values()} == {"ball"}
-    command = "orthocal calibrate . --model full --tolerance '*.offset_mm=2'"
-    assert etree.HTML((first / "sheet.html").read_text()).xpath("//code/text()") == [command]
+    assert session.purpose == Purpose("full")
+    assert session.robot.parameters.stated == {"*.offset_mm": 2.0}
+    assert session.robot.parameters["y_slide.offset"].tolerance == 2e-3
     assert "hinge: look" not in (first / "sheet.html").read_text()

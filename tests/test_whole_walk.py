@@ -30,7 +30,6 @@ from orthocal.units import MM
 SIZES = """--leg-mm 250 --travel-mm 100:325 --attachment-mm 30 --rods-apart-mm 60 --rod-radius-mm 4
 --counts up,down,up --at-zero-mm 0 --paper"""
 
-MODEL = ["--model", "full", "--tolerance", "*.offset_mm=2"]
 
 SEED = 3
 
@@ -74,7 +73,7 @@ def walked(tmp_path_factory):
     errors = draw_errors(robot, ["*"], seed=SEED, tolerances={"*.offset_mm": 2.0})
     measure(folder, "mill/first", errors, SEED)
     assert "Nothing odd." in run(folder, "check", "mill/first")
-    assert "Enter these" in run(folder, "calibrate", "mill/first", *MODEL, "--out", "one")
+    assert "Enter these" in run(folder, "calibrate", "mill/first", "--out", "one")
     one = load_calibration(folder / "one")
     # the same plan once more, with what is to be entered
     first, second = folder / "mill/first", folder / "mill/second"
@@ -89,7 +88,7 @@ def walked(tmp_path_factory):
     (second / "readings.csv").write_text("\n".join(blank) + "\n")
     measure(folder, "mill/second", errors, SEED + 1)
     assert "confirmed" in run(folder, "validate", "one", "mill/second")
-    said = run(folder, "calibrate", "mill/second", *MODEL, "--out", "two")
+    said = run(folder, "calibrate", "mill/second", "--out", "two")
     return folder, errors, one, load_calibration(folder / "two"), " ".join(said.split())
 
 

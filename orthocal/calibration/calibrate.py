@@ -13,7 +13,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.recording import assemble_calibration
 from orthocal.diagnosis.profile import profile_interval
 from orthocal.errors import NotIdentifiableError, ParameterError
-from orthocal.estimation.choice import Choice
+from orthocal.estimation.choice import Choice, choose
 from orthocal.estimation.fit import Fit, first_sigma, fit_problem
 from orthocal.estimation.linear import linearise_at_reference
 from orthocal.estimation.loss import Loss, LossKind
@@ -45,8 +45,8 @@ def calibrate(
 
     Args:
         sessions: The session, or the path to one; or several, which are fitted together.
-        choice: Which errors are free, and what is known of them; or the name of a model. Offsets
-            by default.
+        choice: Which errors are free, and what is known of them; or the name of a model. By default
+            what the session is for, or offsets.
         loss: What a residual costs: `squares` (the default), `huber`, or one with its own width.
         solver: `ipopt` on the whole program, the reference; `eliminated`, the same optimum sooner;
             `linearised`, as the paper; or one with its own settings.
@@ -64,8 +64,7 @@ def calibrate(
     """
     session = join_sessions(gather_sessions(sessions))
     require_names(profile, argument="profile")
-    require_kind(choice, (Choice, str, type(None)), expected="a Choice, or the name of a model")
-    chosen = choice if isinstance(choice, Choice) else Choice(choice)
+    chosen = choose(choice, session)
     options = _solver_options(solver, loss)
     problem = CalibrationProblem(session, chosen.select(session.robot.parameters))
     if start is not None:

@@ -17,7 +17,7 @@ from orthocal.robot.model import Robot
 
 
 def load_recorded_robot(record: RobotRecord, *, file: Path | None) -> Robot:
-    """The nominal robot of a record.
+    """The nominal robot of a record, with the tolerances that are stated there.
 
     Args:
         record: What a calibration says of its robot.
@@ -25,7 +25,7 @@ def load_recorded_robot(record: RobotRecord, *, file: Path | None) -> Robot:
 
     Raises:
         RobotError: If the robot cannot be loaded.
-        CalibrationFileError: If it cannot be found, or has changed since.
+        CalibrationFileError: If it cannot be found or has changed since, or a tolerance is none.
     """
     where = None if file is None else str(file)
     if record.folder is None:
@@ -55,7 +55,11 @@ def load_recorded_robot(record: RobotRecord, *, file: Path | None) -> Robot:
             f"{robot.folder} have changed since",
             where=where,
         )
-    return robot
+    try:
+        return robot.with_tolerances(dict(record.tolerances))
+    except ParameterError as e:
+        at = "robot.tolerances" if where is None else f"{where}: robot.tolerances"
+        raise CalibrationFileError(e.problem, where=at) from None
 
 
 def require_parameters(

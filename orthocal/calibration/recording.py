@@ -240,6 +240,7 @@ def _robot_record(session: Session) -> RobotRecord:
         sha256=robot.sha256,
         legs=tuple((name, leg.length) for name, leg in robot.legs.items()),
         travel=tuple((d.name, d.unit, _bound(d.lower), _bound(d.upper)) for d in robot.drives),
+        tolerances=tuple(robot.parameters.stated.items()),
     )
 
 

@@ -12,7 +12,7 @@ from orthocal.diagnosis.change_records import Changes
 from orthocal.diagnosis.rows import ResidualRow
 from orthocal.diagnosis.turned import TurnedSetup
 from orthocal.diagnosis.unmodelled import Unmodelled
-from orthocal.documents import Count, Number, PositiveInSI
+from orthocal.documents import Count, Number, PositiveInSI, PositiveNumber
 from orthocal.estimation.loss import LossKind
 from orthocal.estimation.options import SolverKind
 from orthocal.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN, Sizes
@@ -40,6 +40,9 @@ class RobotRecord:
     """Legs and their nominal lengths, [m]."""
     travel: Many[tuple[str, Unit, Number | None, Number | None]]
     """Drives, their units, and the ends of their travel, [unit]; None where there is none."""
+    tolerances: Many[tuple[str, PositiveNumber]] = ()
+    """Names or globs with their units, and the tolerances in these units that the session states
+    instead of the robot's."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,8 +26,8 @@ def calibrate(
     model: Annotated[
         str | None,
         typer.Option(
-            help="Which errors are free: offsets (the default), lengths, full, or one of the "
-            "robot's own.",
+            help="Which errors are free: offsets, lengths, full, or one of the robot's own; by "
+            "default what the session says, or offsets.",
         ),
     ] = None,
     free: Annotated[

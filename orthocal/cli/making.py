@@ -113,11 +113,12 @@ def new(
         write_files(Path(trial) / name, files)
         robot = load_robot(Path(trial) / name)
         plan, session = _plan(robot, means, paper=paper, hours=hours, model=model, given=tolerance)
-        extra = _extra(plan, session, model, tolerance)
+        extra = _extra(plan, session)
     write_files(folder, files)
-    session = replace(session, robot=load_robot(folder), robot_reference=str(folder.resolve()))
-    _write(session, folder / FIRST, extra, model, tolerance)
-    _tell(folder, answers.sizes.words, plan, session, extra, _command(folder, model, tolerance))
+    own = load_robot(folder).with_tolerances(session.robot.parameters.stated)
+    session = replace(session, robot=own, robot_reference=str(folder.resolve()))
+    _write(session, folder / FIRST, extra)
+    _tell(folder, answers.sizes.words, plan, session, extra)
 
 
 def _require_new(folder: Path, *, force: bool) -> str:
@@ -163,6 +164,7 @@ def _plan(
     """The plan, and its session with no offsets active; no plan where it is the paper's."""
     from orthocal.estimation.choice import Choice
     from orthocal.estimation.selection import read_tolerances
+    from orthocal.measurement.purpose import Purpose
     from orthocal.planning.first import first_means, paper_plan
     from orthocal.planning.plan import plan_readings
 
@@ -171,7 +173,8 @@ def _plan(
     choice.select(robot.parameters)
     zeros = [0.0] * len(robot.drives)
     if paper:
-        return None, paper_plan(robot, means).with_controller(zeros)
+        session = paper_plan(robot, means).with_tolerances(tolerances).with_controller(zeros)
+        return None, replace(session, purpose=Purpose(model))
     found = plan_readings(
         robot,
         choice,
@@ -182,35 +185,22 @@ def _plan(
     return found, found.session.with_controller(zeros)
 
 
-def _options(model: str, tolerance: list[str] | None) -> str:
-    return f"--model {model}" + "".join(f" --tolerance '{t}'" for t in tolerance or [])
-
-
-def _command(folder: Path, model: str, tolerance: list[str] | None) -> str:
-    return f"orthocal calibrate {folder / FIRST} {_options(model, tolerance)}"
-
-
-def _extra(
-    plan: MeasuringPlan | None, session: Session, model: str, tolerance: list[str] | None
-) -> dict[str, str]:
+def _extra(plan: MeasuringPlan | None, session: Session) -> dict[str, str]:
     """Files beside session.yaml and readings.csv."""
     from orthocal.show.plan import draw_plan, plan_json
     from orthocal.show.sheet.page import sheet_files
 
-    command = f"orthocal calibrate . {_options(model, tolerance)}"
     drawn = {} if plan is None else {"plan.json": plan_json(plan), "plan.svg": draw_plan(plan)}
-    return {**sheet_files(session, command=command), **drawn}
+    return {**sheet_files(session), **drawn}
 
 
-def _write(
-    session: Session, folder: Path, extra: dict[str, str], model: str, tolerance: list[str] | None
-) -> None:
+def _write(session: Session, folder: Path, extra: dict[str, str]) -> None:
     from orthocal.measurement.session_output import write_session
 
     comment = (
         "A plan: print sheet.html and measure; `orthocal record .` in this folder leads through "
         "it, or\nfill in readings.csv in its order. Then\n"
-        f"orthocal calibrate . {_options(model, tolerance)}\n"
+        "orthocal calibrate .\n"
         "offsets_mm: those that are active in the controller while it is measured."
     )
     write_session(session, folder, comment=comment, extra=extra, blank=True)
@@ -222,7 +212,6 @@ def _tell(
     plan: MeasuringPlan | None,
     session: Session,
     extra: dict[str, str],
-    command: str,
 ) -> None:
     """What was made, what it is worth, and what to do with it."""
     from orthocal.show.layout import counted
@@ -250,13 +239,12 @@ def _tell(
         "the sheet, measure\n(`record` leads through it and keeps the readings), and calibrate:\n"
         f"  orthocal view {folder}\n"
         f"  orthocal record {folder / FIRST}\n"
-        f"  {command}"
+        f"  orthocal calibrate {folder / FIRST}"
     )
 
 
 def _make_again(folder: Path) -> None:
     """Robot and sheets of a machine, from its machine.yaml."""
-    from orthocal.cli.sheets import find_command
     from orthocal.files import exists, write_files
     from orthocal.measurement.session_file import load_plan
     from orthocal.robot.making import remake_robot
@@ -276,8 +264,7 @@ def _make_again(folder: Path) -> None:
                     "coordinates before; they belong to the sizes of that day"
                 )
                 continue
-            command = find_command(sheet.parent / "session.yaml")
-            write_files(sheet.parent, sheet_files(session, command=command))
+            write_files(sheet.parent, sheet_files(session))
             put_out(f"Made {sheet} and its programs again.")
         except OrthocalError as e:
             refused = True

@@ -35,7 +35,10 @@ def plan(
         Path | None,
         typer.Option(help="Folder for session.yaml, an empty readings.csv and a sheet."),
     ] = None,
-    model: Annotated[str, typer.Option(help="What will be identified.")] = "full",
+    model: Annotated[
+        str | None,
+        typer.Option(help="What will be identified: full, or what the session is for."),
+    ] = None,
     setups: Annotated[int | None, typer.Option(min=1, help="How many; 6 by default.")] = None,
     readings: Annotated[
         int | None, typer.Option(min=2, help="In all setups together; 3 a setup by default.")
@@ -157,29 +160,27 @@ def plan(
             "which no dial touches; with tip: {ball: {radius_mm: 1.5}} of what it touches"
         )
     if out is not None:
-        options = "".join(f" --tolerance '{t}'" for t in tolerance or [])
-        command = f"orthocal calibrate . --model {model}{options}"
         comment = (
             "A plan: here `orthocal record .` leads through it, or fill in readings.csv; then\n"
-            f"{command}\n"
+            "orthocal calibrate .\n"
             "State the offsets that are active in the controller meanwhile, such as\n"
             "controller: {offsets_mm: [0, 0, 0]}, one number a drive.\n"
             "Approach every posture from the same side; the last reading of a setup is its first\n"
             "posture again."
         )
         extra = {"plan.json": plan_json(found), "plan.svg": draw_plan(found)}
-        extra |= _sheet(found.session, command)
+        extra |= _sheet(found.session)
         path = write_session(found.session, out, comment=comment, extra=extra, blank=True)
         paper = ", sheet.html and its programs" if "sheet.html" in extra else ""
         put_note(f"Wrote {path}, readings.csv to fill in, plan.json, plan.svg{paper}")
 
 
-def _sheet(session: Session, command: str) -> dict[str, str]:
+def _sheet(session: Session) -> dict[str, str]:
     """The measuring sheet and its programs; nothing, and why, where there cannot be one."""
     from orthocal.show.sheet.page import sheet_files
 
     try:
-        return sheet_files(session, command=command)
+        return sheet_files(session)
     except OrthocalError as e:
         put_note(f"orthocal: no measuring sheet: {e}")
         return {}

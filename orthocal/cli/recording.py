@@ -14,14 +14,13 @@ import typer
 from orthocal.characters import printable, shorten
 from orthocal.cli.options import app
 from orthocal.cli.printing import put_out
-from orthocal.errors import OrthocalError, SessionError
+from orthocal.errors import SessionError
 from orthocal.interrupts import INTERRUPTED, raised_interrupt
 
 if TYPE_CHECKING:
     from orthocal.assess.foresight import Foresight
     from orthocal.measurement.oddities import Oddity
     from orthocal.measurement.recording import Recording
-    from orthocal.measurement.session import Session
 
 WIDEST = 100
 """Columns of a line, however wide the terminal is."""
@@ -106,8 +105,7 @@ class _Dialogue:
         from orthocal.show.recording import conclude
 
         r = self._recording
-        model = _planned_model(r.session)
-        self._say("", conclude(r.session, r.rows, self._path, model=model, width=self._width))
+        self._say("", conclude(r.session, r.rows, self._path, width=self._width))
 
     def _go_on(self, at: int | None = None) -> None:
         """Turn to a row; to the first that is not there by default."""
@@ -327,21 +325,6 @@ class _Dialogue:
     def _say(self, *texts: str) -> None:
         for text in texts:
             put_out(text)
-
-
-def _planned_model(session: Session) -> str | None:
-    """Model that a plan is for, where one lies beside the session."""
-    from orthocal.documents import read_json
-    from orthocal.files import exists
-
-    file = None if session.path is None else session.path.with_name("plan.json")
-    if file is None or not exists(file):
-        return None
-    with suppress(OrthocalError):
-        plan = read_json(file, error=OrthocalError)
-        model = plan.get("model") if isinstance(plan, dict) else None
-        return model if model in session.robot.parameters.models else None
-    return None
 
 
 def _read_line() -> str:

@@ -11,9 +11,6 @@ from orthocal.cli.options import app
 from orthocal.cli.printing import put_note
 from orthocal.errors import ParameterError, SessionError
 
-COMMAND = "# orthocal calibrate "
-"""Begins the line of a session.yaml that says what to run once all is read."""
-
 
 @app.command()
 def sheet(
@@ -59,7 +56,7 @@ def sheet(
     folder = out or (session if is_folder(session) else session.parent)
     require_writable(folder)
     planned = load_plan(session)
-    files = sheet_files(planned, options=options, command=find_command(planned.path or session))
+    files = sheet_files(planned, options=options)
     for name in files:
         if exists(folder / name) and not force:
             raise SessionError("is there already; --force writes over it", where=str(folder / name))
@@ -67,12 +64,3 @@ def sheet(
     programs = len(files) - 1
     more = f" and {programs} programs" if programs else "; its drives command no tool: no programs"
     put_note(f"Wrote {folder / 'sheet.html'} to print{more}")
-
-
-def find_command(file: Path) -> str:
-    """What a session.yaml says is to be run once all is read, in its own folder."""
-    from orthocal.files import read_file
-
-    lines = read_file(file, error=SessionError).decode("utf-8", "replace").splitlines()
-    found = next((line for line in lines if line.startswith(COMMAND)), f"{COMMAND}.")
-    return found.removeprefix("# ")

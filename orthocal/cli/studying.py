@@ -50,7 +50,9 @@ Dask = Annotated[
 ]
 Force = Annotated[bool, typer.Option("--force", help="Begin anew, whatever is there.")]
 AllRows = Annotated[bool, typer.Option("--all", help="List every parameter.")]
-Model = Annotated[str | None, typer.Option(help="What is identified.")]
+Model = Annotated[
+    str | None, typer.Option(help="What is identified; by default what the session says.")
+]
 Free = Annotated[
     list[str] | None,
     typer.Option(metavar="GLOBS", help="Names or globs, on top of the model or instead of one."),
@@ -131,7 +133,7 @@ def accuracy(
         )
     study = build_accuracy_study(
         session,
-        Choice(model or (None if free else "full"), free=split_globs(free), tolerances=tolerances),
+        Choice(model, free=split_globs(free), tolerances=tolerances),
         drawn=_drawn(draw, session.robot),
         given=given,
         machines=machines,

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from orthocal.arguments import require_kind, require_names, require_numbers
 from orthocal.errors import ParameterError
-from orthocal.estimation.selection import Known, Selection, select_parameters
+from orthocal.estimation.selection import DEFAULT_MODEL, Known, Selection, select_parameters
+from orthocal.measurement.purpose import Purpose
+from orthocal.measurement.session import Session
 from orthocal.robot.parameters import ParameterSet
 
 
@@ -20,7 +22,8 @@ class Choice:
     {"x_leg.length_mm": 0.12}; the units are _mm, _um, _m, _mrad, _deg, _rad and _ppm.
 
     Args:
-        model: A model of the robot's YAML: `offsets` (the default), `lengths`, `full` or one's own.
+        model: A model of the robot's YAML: `offsets`, `lengths`, `full` or one's own; by default
+            that which a session is for, or `offsets`.
         free: Names or globs that are free too, or instead where no model is named; '!' takes out.
         prior: Whether tolerances act as a prior; by default not where only offsets are free.
         known: Name with its unit to a known value, which is then held, or to a value and its
@@ -89,6 +92,37 @@ class Choice:
             tolerances=parameters.read_tolerances(self.tolerances),
             bounds=_bounds(self.bounds, parameters),
         )
+
+
+def choose(
+    given: Choice | str | None, session: Session | None, *, usual: str = DEFAULT_MODEL
+) -> Choice:
+    """What is to be identified: as is said, else what a session is for, else as usual.
+
+    Args:
+        given: What is said: a choice, or the name of a model.
+        session: That is measured, or joined of several that were.
+        usual: The model where nothing is said.
+
+    Raises:
+        ParameterError: If sessions are for different models, and nothing is said.
+        TypeError: If an argument is of another kind.
+    """
+    require_kind(given, (Choice, str, type(None)), expected="a Choice, or the name of a model")
+    choice = given if isinstance(given, Choice) else Choice(given)
+    if choice.model is not None or choice.free:
+        return choice
+    sessions = () if session is None else session.parts or (session,)
+    purposes = {s.purpose: s for s in sessions if s.purpose is not None}
+    if len(purposes) > 1:
+        said = "; ".join(f"{_in_words(p)} in {s.path or s.title}" for p, s in purposes.items())
+        raise ParameterError(f"sessions are for different models: {said}; say which", where="model")
+    purpose = next(iter(purposes), Purpose(usual))
+    return replace(choice, model=purpose.model, free=purpose.free)
+
+
+def _in_words(purpose: Purpose) -> str:
+    return " ".join(([] if purpose.model is None else [purpose.model]) + list(purpose.free))
 
 
 def _known(known: Mapping[str, Known], parameters: ParameterSet) -> dict[str, Known]:

@@ -14,7 +14,7 @@ from orthocal.characters import composed
 from orthocal.documents import parse_number
 from orthocal.errors import ParameterError
 from orthocal.fields import read_only
-from orthocal.robot.parameters import Parameter, ParameterSet
+from orthocal.robot.parameters import Parameter, ParameterSet, require_tolerance
 from orthocal.units import Unit
 
 Array = NDArray[np.float64]
@@ -22,14 +22,8 @@ Known = float | tuple[float, float]
 
 DEFAULT_MODEL = "offsets"
 
-LARGEST_TOLERANCE = 200.0
-"""Times the robot's own tolerance that no other is: it is in another unit."""
-
 LARGEST_KNOWN = 100.0
 """Tolerances beyond which a known value is taken for a length or an angle instead of an error."""
-
-SMALLEST_TOLERANCE = 1e-9
-"""[m, rad or 1]. Parameters are scaled by their tolerances: with less they would hardly move."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +119,8 @@ def select_parameters(
             parameter = parameters[name]
             _refuse_length(entry[0] if isinstance(entry, tuple) else entry, parameter)
             if isinstance(entry, tuple):
-                own_prior[name] = (_finite(entry[0], name), _tolerance(entry[1], parameter))
+                spread = require_tolerance(entry[1], parameters.own[name])
+                own_prior[name] = (_finite(entry[0], name), spread)
                 chosen.add(name)
             else:
                 held[name] = _finite(entry, name)
@@ -135,12 +130,12 @@ def select_parameters(
         raise ParameterError("no free parameters: there is nothing to identify")
     _refuse_overlap(parameters, [*names, *(n for n, v in held.items() if v != 0.0)])
 
-    spread = {n: parameters[n].tolerance for n in names}
+    tolerance = {n: parameters[n].tolerance for n in names}
     for glob, value in (tolerances or {}).items():
         with _named("tolerances"):
             for name in _match_free(parameters, glob, names):
-                spread[name] = _tolerance(value, parameters[name])
-    spread.update({n: s for n, (_, s) in own_prior.items()})
+                tolerance[name] = require_tolerance(value, parameters.own[name])
+    tolerance.update({n: s for n, (_, s) in own_prior.items()})
     lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
     for glob, (low, high) in (bounds or {}).items():
         with _named("bounds"):
@@ -152,7 +147,7 @@ def select_parameters(
     everywhere = not only_offsets if prior is None else prior
     return Selection(
         label=_label(base, free),
-        parameters=tuple(replace(parameters[n], tolerance=spread[n]) for n in names),
+        parameters=tuple(replace(parameters[n], tolerance=tolerance[n]) for n in names),
         prior=np.array([everywhere or n in own_prior for n in names]),
         mean=read_only([own_prior.get(n, (0.0, 0.0))[0] for n in names]),
         lower=read_only(lower),
@@ -291,22 +286,6 @@ def _refuse_length(value: float, parameter: Parameter) -> None:
 def _finite(value: float, name: str) -> float:
     if not math.isfinite(value):
         raise ParameterError(f"the known value of '{name}' is {value}; expected a finite number")
-    return float(value)
-
-
-def _tolerance(value: float, parameter: Parameter) -> float:
-    if not (math.isfinite(value) and value >= SMALLEST_TOLERANCE):
-        unit, factor = parameter.edge_unit, parameter.edge_factor
-        raise ParameterError(
-            f"the tolerance of '{parameter.name}' is {value * factor:g} {unit}; expected at least "
-            f"{SMALLEST_TOLERANCE * factor:g} {unit}"
-        )
-    if value > LARGEST_TOLERANCE * parameter.tolerance:
-        unit, factor = parameter.edge_unit, parameter.edge_factor
-        raise ParameterError(
-            f"the tolerance of '{parameter.name}' is {value * factor:g} {unit}; expected at most "
-            f"{LARGEST_TOLERANCE:g} times the robot's own, {parameter.tolerance * factor:g} {unit}"
-        )
     return float(value)
 
 

@@ -59,10 +59,12 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
                 "or of another version of it",
                 where=None if session.path is None else str(session.path),
             )
+    tolerances = _join_tolerances(sessions)
+    purposes = {s.purpose for s in sessions} - {None}
     labels = _labels(sessions)
     parts = [_rename(session, label) for session, label in zip(sessions, labels, strict=True)]
     return replace(
-        last,
+        last.with_tolerances(tolerances),
         title=" + ".join(dict.fromkeys(s.title for s in sessions if s.title)),
         source="; ".join(dict.fromkeys(s.source for s in sessions if s.source)),
         gauges=_merged(p.gauges for p in parts),
@@ -74,7 +76,28 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         sha256="",
         parts=tuple(sessions),
         joined=True,
+        purpose=purposes.pop() if len(purposes) == 1 else None,
     )
+
+
+def _join_tolerances(sessions: Sequence[Session]) -> dict[str, float]:
+    """What sessions state of one machine's tolerances.
+
+    Raises:
+        SessionError: If they do not agree.
+    """
+    found: dict[str, float] = {}
+    of: dict[str, Session] = {}
+    for session in sessions:
+        for key, value in session.robot.parameters.stated.items():
+            if found.setdefault(key, value) != value:
+                raise SessionError(
+                    f"is {value:g}; it is {found[key]:g} in {of[key].path or 'another session'}, "
+                    "and the machine is the same",
+                    where=f"{session.path or 'session'}: calibration.tolerances.{key}",
+                )
+            of.setdefault(key, session)
+    return found
 
 
 def split_sessions(session: Session) -> tuple[Session, ...]:

@@ -32,6 +32,9 @@ A calibration takes 10 kB for each."""
 MOST_GAUGES = 100
 """Gauges of a session."""
 
+MOST_NAMES = 1_000
+"""Names or globs of errors; the largest robots have some hundred errors."""
+
 GaugeLength = Annotated[PositiveNumber, Field(le=COARSEST_MM)]
 GaugeEnd = Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)]
 
@@ -106,6 +109,17 @@ class ControllerKeys(_Keys):
         return self
 
 
+class CalibrationKeys(_Keys):
+    """What will be identified, and what is known of the machine's errors beforehand."""
+
+    model: str | None = None
+    """A model of the robot's YAML."""
+    free: Annotated[list[str], Field(max_length=MOST_NAMES)] = []
+    """Names or globs that are free too, or instead of a model."""
+    tolerances: Annotated[dict[str, PositiveNumber], Field(max_length=MOST_NAMES)] = {}
+    """Name or glob with its unit to another standard deviation than the robot's."""
+
+
 class SessionKeys(_Keys):
     """A session.yaml, or a plan: the same without `readings`."""
 
@@ -118,6 +132,7 @@ class SessionKeys(_Keys):
     """Of a session with several; its setups name theirs."""
     postures: Annotated[dict[Name, PostureKeys], Field(min_length=1, max_length=MOST_POSTURES)]
     controller: ControllerKeys | None = None
+    calibration: CalibrationKeys | None = None
     setups: Annotated[dict[Name, dict[str, Any]], Field(min_length=1, max_length=MOST_SETUPS)]
     """What each may say is the sensor's own affair; see `orthocal.sensors.registry`."""
     cycles: Annotated[int, Field(ge=1, le=1000)] = 1

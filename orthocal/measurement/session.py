@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.arguments import require_array
 from orthocal.fields import read_only
 from orthocal.markup import paragraph, table
+from orthocal.measurement.purpose import Purpose
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Sensor
 from orthocal.units import MM
@@ -108,6 +109,8 @@ class Session:
     """The sessions that were joined into this one, where they are at hand."""
     joined: bool = False
     """Whether several were, so that names begin with that of their session and a slash."""
+    purpose: Purpose | None = None
+    """What it is measured for, where it says so."""
 
     @property
     def gauge(self) -> Gauge:
@@ -183,6 +186,17 @@ class Session:
             for name, p in self.postures.items()
         }
         return replace(self, postures=postures, controller_offsets=read_only(active), sha256="")
+
+    def with_tolerances(self, given: Mapping[str, float]) -> Session:
+        """The same session of a robot whose errors have other tolerances.
+
+        Args:
+            given: Name or glob with its unit to one standard deviation.
+
+        Raises:
+            ParameterError: If a name or unit is unknown, or a number makes no sense.
+        """
+        return replace(self, robot=self.robot.with_tolerances(given)) if given else self
 
     def with_values(self, values: Sequence[float] | Array) -> Session:
         """The same session with other readings.

@@ -19,6 +19,7 @@ from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.fields import read_only
 from orthocal.files import is_folder, read_file, require_plain_name
 from orthocal.kinematics.assembly import nominal_assembly
+from orthocal.measurement.purpose import read_purpose
 from orthocal.measurement.readings_checks import check_readings
 from orthocal.measurement.readings_file import read_rows
 from orthocal.measurement.schema import MOST_READINGS, GaugeKeys, SessionKeys
@@ -198,6 +199,7 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
             raise SessionError(e.problem, where=f"{file}: robot") from None
         raise
     require_given_zero(robot, f"{file}: robot")
+    purpose, robot = read_purpose(keys.calibration, robot, where=f"{file}: calibration")
     offsets = build_offsets(keys.controller, robot, f"{file}: controller")
     gauges = _build_gauges(keys)
     setups = {}
@@ -220,6 +222,7 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         path=file,
         readings_path=None,
         sha256="",
+        purpose=purpose,
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 
 from orthocal.files import write_files
+from orthocal.measurement.purpose import Purpose
 from orthocal.measurement.session import Gauge, Reading, Session
 from orthocal.robot.loading import packaged_robots
 from orthocal.sensors.registry import write_sensor
@@ -41,6 +42,8 @@ def session_document(session: Session, *, readings: str = "readings.csv") -> dic
     }
     if session.controller_offsets is not None:
         document["controller"] = _offsets_document(session)
+    if calibration := _calibration_document(session):
+        document["calibration"] = calibration
     document["setups"] = {
         s.name: {**write_sensor(s.sensor), **({"gauge": s.gauge} if s.gauge else {})}
         for s in session.setups.values()
@@ -56,6 +59,17 @@ def _gauge_document(gauge: Gauge) -> dict[str, Any]:
         "range_mm": None if gauge.range is None else [to_mm(v) for v in gauge.range],
     }
     return {k: v for k, v in entries.items() if v is not None}
+
+
+def _calibration_document(session: Session) -> dict[str, Any]:
+    """What it is measured for, and with which tolerances."""
+    purpose = session.purpose or Purpose()
+    entries = {
+        "model": purpose.model,
+        "free": list(purpose.free),
+        "tolerances": dict(session.robot.parameters.stated),
+    }
+    return {key: value for key, value in entries.items() if value}
 
 
 def _offsets_document(session: Session) -> dict[str, list[float]]:

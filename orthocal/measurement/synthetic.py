@@ -122,7 +122,7 @@ def simulate_session(
         if not math.isfinite(value):
             raise SessionError(
                 f"the simulated reading {reading.label} does not exist: on this machine the tip "
-                "passes what it should touch"
+                "passes what it should touch; take smaller errors, or another seed"
             )
         gauge_name, limits = plan.setups[reading.setup].gauge, limits_of(plan, reading)
         if limits is not None and not limits[0] <= value <= limits[1]:

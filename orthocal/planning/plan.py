@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from orthocal.assess.remaining import RemainingError, rank_errors
 from orthocal.errors import ParameterError
-from orthocal.estimation.choice import Choice
+from orthocal.estimation.choice import Choice, choose
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.workspace import Workspace
 from orthocal.measurement.joining import join_sessions
+from orthocal.measurement.purpose import Purpose
 from orthocal.measurement.session import Posture, Reading, Session, Setup
 from orthocal.planning.candidates import (
     FEWEST,
@@ -125,7 +126,8 @@ def plan_readings(
 
     Args:
         robot: The robot.
-        choice: What will be identified, or the name of a model; `full` by default.
+        choice: What will be identified, or the name of a model; by default what the session that
+            was measured is for, or `full`. The plan says it in its file.
         setups: How many to take; by default 6, or what `hours` allow.
         readings: In all of them together, at least 2 a setup; by default 3 a setup, or what `hours`
             allow. Each setup's first posture is read again at its end, on top of these.
@@ -146,7 +148,9 @@ def plan_readings(
     """
     measured = None if measured is None else state_noise(measured)
     means = means or Means()
-    chosen = choice if isinstance(choice, Choice) else Choice(choice or "full")
+    chosen = choose(choice, measured, usual="full")
+    robot = (robot if measured is None else measured.robot).with_tolerances(chosen.tolerances)
+    measured = None if measured is None else measured.with_tolerances(chosen.tolerances)
     forecast = ToolForecast(robot, chosen.select(robot.parameters), workspace)
     session = list_candidates(robot, means, reference=reference)
     candidates = measure_candidates(
@@ -173,6 +177,7 @@ def plan_readings(
     found = _simplify(candidates, found, weigh)
     found = replace(found, setups=order_by_worth(candidates, found, prior, weigh))
     plan = build_session(candidates, found.setups, measured)
+    plan = replace(plan, purpose=Purpose(chosen.model, tuple(chosen.free)))
     whole = plan if measured is None else join_sessions([measured, plan])
     known = forecast.before if measured is None else forecast.after(measured)
     curve = find_curve(candidates, found, counts, means, prior, weigh)

@@ -285,6 +285,16 @@ class Robot:
             jacobians.append(jacobian[rows])
         return np.concatenate(residuals), np.vstack(jacobians)
 
+    def with_tolerances(self, given: Mapping[str, float]) -> Robot:
+        """The robot whose errors have other tolerances; see `ParameterSet.with_tolerances`.
+
+        Raises:
+            ParameterError: If a name or unit is unknown, or a number makes no sense.
+        """
+        if not given:
+            return self
+        return replace(self, parameters=self.parameters.with_tolerances(given))
+
     def with_errors(self, values: Mapping[str, float]) -> Robot:
         """The robot with errors written into its Pinocchio placements.
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from glob import escape, has_magic
@@ -34,6 +34,12 @@ Kind = Literal["offset", "scale", "translation", "rotation"]
 
 COMPLETE: Literal["complete"] = "complete"
 """A model of every error that changes something."""
+
+LARGEST_TOLERANCE = 200.0
+"""Times the robot's own tolerance that no other is: it is in another unit."""
+
+SMALLEST_TOLERANCE = 1e-9
+"""[m, rad or 1]. Parameters are scaled by their tolerances: with less they would hardly move."""
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Components of a twist, translation first."""
@@ -83,6 +89,10 @@ class ParameterSet:
         self._parts = frozenset(parts)
         self.find_idle: Callable[[], frozenset[str]] = frozenset
         """Finds the elementary errors that change nothing; asked once, and only when needed."""
+        self.own: ParameterSet = self
+        """The same with the tolerances of the robot's YAML."""
+        self.stated: Mapping[str, float] = {}
+        """Tolerances that hold instead of those; see `with_tolerances`."""
 
     def __iter__(self) -> Iterator[Parameter]:
         return iter(self._parameters.values())
@@ -199,6 +209,30 @@ class ParameterSet:
         """
         return self.select(self.patterns(model))
 
+    def with_tolerances(self, given: Mapping[str, float]) -> ParameterSet:
+        """The same errors, some with other tolerances.
+
+        Args:
+            given: Name or glob with its unit, such as `*.offset_mm`, to one standard deviation in
+                that unit; they come on top of those that are stated already, and later ones win.
+
+        Raises:
+            ParameterError: If a name or unit is unknown, or a number makes no sense.
+        """
+        stated = {k: v for k, v in self.stated.items() if k not in given} | dict(given)
+        if not stated:
+            return self
+        parameters = {p.name: p for p in self.own}
+        for glob, value in self.own.read_tolerances(stated).items():
+            for name in self.own.select([glob]):
+                size = require_tolerance(value, self.own[name])
+                parameters[name] = replace(parameters[name], tolerance=size)
+        elementary = self.elementary.values()
+        found = ParameterSet(elementary, parameters.values(), self._models, parts=self._parts)
+        found.find_idle = lambda: self.idle
+        found.own, found.stated = self.own, stated
+        return found
+
     def read_quantity(self, key: str, value: float) -> tuple[str, float]:
         """Parameter name and SI value of a key that carries its unit, such as x_slide.offset_mm.
 
@@ -260,6 +294,30 @@ class ParameterSet:
             for term, coefficient in self[name].terms:
                 total[term] = total.get(term, 0.0) + coefficient * value
         return {name: value for name, value in total.items() if value != 0.0}
+
+
+def require_tolerance(value: float, parameter: Parameter) -> float:
+    """Refuse a standard deviation that no machine's error has.
+
+    Args:
+        value: [unit of the parameter].
+        parameter: With the robot's own tolerance.
+
+    Raises:
+        ParameterError: Naming both.
+    """
+    unit, factor = parameter.edge_unit, parameter.edge_factor
+    if not (math.isfinite(value) and value >= SMALLEST_TOLERANCE):
+        raise ParameterError(
+            f"the tolerance of '{parameter.name}' is {value * factor:g} {unit}; expected at least "
+            f"{SMALLEST_TOLERANCE * factor:g} {unit}"
+        )
+    if value > LARGEST_TOLERANCE * parameter.tolerance:
+        raise ParameterError(
+            f"the tolerance of '{parameter.name}' is {value * factor:g} {unit}; expected at most "
+            f"{LARGEST_TOLERANCE:g} times the robot's own, {parameter.tolerance * factor:g} {unit}"
+        )
+    return float(value)
 
 
 def split_unit(key: str) -> tuple[str, Unit, float]:

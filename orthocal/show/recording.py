@@ -260,16 +260,13 @@ def list_commands(*, width: int) -> str:
     return "\n".join(lines)
 
 
-def conclude(
-    session: Session, rows: Sequence[Row], path: str, *, model: str | None = None, width: int
-) -> str:
+def conclude(session: Session, rows: Sequence[Row], path: str, *, width: int) -> str:
     """What is missing, and what comes next: a command on a line of its own, however long it is.
 
     Args:
         session: What was measured.
         rows: Its readings.
         path: Of the session, as it was typed.
-        model: That the readings were planned for.
         width: Columns.
     """
     missing = [(i, r) for i, r in enumerate(rows) if r.value is None]
@@ -296,8 +293,7 @@ def conclude(
             "them can be told."
         )
     told = "\n".join(wrap(line, width) for line in lines)
-    option = f" --model {model}" if model else ""
-    return f"{told}\nNext:\n  orthocal calibrate {own}{option}"
+    return f"{told}\nNext:\n  orthocal calibrate {own}"
 
 
 def _spans(numbers: Sequence[int]) -> str:

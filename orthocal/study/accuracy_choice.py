@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from orthocal.errors import SessionError
-from orthocal.estimation.choice import Choice
+from orthocal.estimation.choice import Choice, choose
 from orthocal.measurement.session import Session
 from orthocal.planning.prediction import default_workspace
 from orthocal.robot.parameters import ParameterSet
@@ -29,8 +29,8 @@ def build_accuracy_study(
 
     Args:
         session: What is read where.
-        choice: What is identified, or the name of a model; `full` by default. Its tolerances are
-            those by which errors are drawn, too.
+        choice: What is identified, or the name of a model; by default what the session is for, or
+            `full`. Its tolerances are those by which errors are drawn, too.
         drawn: Names or globs of the errors that machines have; by default all of the machine's,
             unless errors are given.
         given: Errors that all machines have, [SI].
@@ -44,7 +44,7 @@ def build_accuracy_study(
         SessionError: If the noise of a gauge is not known.
         RobotError: If the drives do not command the tool.
     """
-    chosen = choice if isinstance(choice, Choice) else Choice(choice or "full")
+    chosen = choose(choice, session, usual="full")
     robot = session.robot
     parameters = robot.parameters
     chosen.select(parameters)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import SessionError
-from orthocal.estimation.choice import Choice
+from orthocal.estimation.choice import Choice, choose
 from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
@@ -150,7 +150,8 @@ def build_bootstrap_study(
 
     Args:
         session: The session.
-        choice: What is identified, or the name of a model; offsets by default.
+        choice: What is identified, or the name of a model; by default what the session is for, or
+            offsets.
         how: From residuals, or from the cycles of each setup.
         draws: How often the session is drawn anew.
         seed: Of the draws.
@@ -159,7 +160,7 @@ def build_bootstrap_study(
         SessionError: If there is nothing to draw from.
         NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
     """
-    chosen = choice if isinstance(choice, Choice) else Choice(choice)
+    chosen = choose(choice, session)
     study = BootstrapStudy(ShippedSession.of(session), chosen, how, draws, seed)
     prepare_once(study)  # refuses what cannot be drawn from
     return study

@@ -27,6 +27,8 @@ class ShippedRobot:
     sha256: str
     urdf: bytes
     description: bytes
+    tolerances: tuple[tuple[str, float], ...] = ()
+    """Other ones than its files', as a session states them."""
 
     @classmethod
     def of(cls, robot: Robot) -> ShippedRobot:
@@ -37,11 +39,12 @@ class ShippedRobot:
         """
         urdf, description = (read_file(p, error=RobotError) for p in (robot.urdf, robot.yaml))
         folder = str(robot.folder.resolve())
-        return cls(robot.name, folder, robot.sha256, urdf, description)
+        stated = tuple(robot.parameters.stated.items())
+        return cls(robot.name, folder, robot.sha256, urdf, description, stated)
 
     def unpack(self) -> Robot:
         """The robot; that which is there where nothing has changed."""
-        return _unpack(self)
+        return _unpack(self).with_tolerances(dict(self.tolerances))
 
 
 @lru_cache(maxsize=4)

@@ -8,6 +8,7 @@ import pytest
 
 from orthocal import MeasuringPlan, load_plan, plan_readings, summarize
 from orthocal.cli.run import main
+from orthocal.measurement.purpose import Purpose
 from orthocal.planning.means import Means
 
 QUICK = ["--along", "3", "--across-mm", "0", "--sections", "0.5", "--starts", "1"]
@@ -41,9 +42,9 @@ def test_a_plan_is_written_ready_to_measure(monkeypatch, capsys, tmp_path):
         *("session.yaml", "readings.csv", "plan.json", "plan.svg", "sheet.html"),
         *("01-yx.ngc", "02-zx.ngc", "03-xy.ngc", "04-zy.ngc", "05-xz.ngc", "06-yz.ngc"),
     }
-    comment = (out / "session.yaml").read_text().splitlines()[1]
-    assert comment == "# orthocal calibrate . --model full --tolerance '*.offset_mm=0.5'"
     session = load_plan(out)
+    assert session.purpose == Purpose("full")
+    assert session.robot.parameters.stated == {"*.offset_mm": 0.5}
     assert session.gauge.range == (-1e-3, 1e-3)
     assert {s.sensor.tip.form for s in session.setups.values()} == {"blade"}
     assert {s.sensor.standing.direction for s in session.setups.values()} == {5e-3}

@@ -293,7 +293,7 @@ def _provenance(calibration: Calibration) -> str:
 
 def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
     """What was given beside the readings, of every parameter that it was given for."""
-    usual = calibration.robot.parameters
+    usual = calibration.robot.parameters.own
     tolerances, known, bounds = [], [], []
     for p in calibration.parameters:
         f, unit = p.edge_factor, p.edge_unit

@@ -39,18 +39,12 @@ NOTICED = 5e-5
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
-def sheet_files(
-    session: Session,
-    *,
-    options: ProgramOptions | None = None,
-    command: str = "orthocal calibrate .",
-) -> dict[str, str]:
+def sheet_files(session: Session, *, options: ProgramOptions | None = None) -> dict[str, str]:
     """The sheet of a plan and a program for each of its setups: name of a file to text.
 
     Args:
         session: The plan, or a session.
         options: How programs are written.
-        command: What to run once all is read, as it stands at the end.
 
     Raises:
         SessionError: If the machine cannot go through the plan.
@@ -78,7 +72,7 @@ def sheet_files(
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
         f'<title>{escape(title)}</title>\n<link rel="icon" href="data:,">\n'
         f"<style>\n{style}</style>\n</head>\n<body>\n{front}\n"
-        f"{''.join(setups)}\n{_afterwards(command)}\n</body>\n</html>\n"
+        f"{''.join(setups)}\n{_afterwards()}\n</body>\n</html>\n"
     )
     return {SHEET: page, **programs}
 
@@ -320,7 +314,7 @@ def _name(stop: Stop) -> str:
     return stop.posture if stop.line is None else f"line {stop.line}"
 
 
-def _afterwards(command: str) -> str:
+def _afterwards() -> str:
     steps = [
         "`orthocal record` takes the readings one after the other and says at once what is odd. Or "
         "type them into readings.csv, column reading_mm, in its order; leave out lines that were "
@@ -331,7 +325,7 @@ def _afterwards(command: str) -> str:
     ]
     return (
         f"<section class='last'>{heading('Afterwards')}{_numbered(steps)}"
-        f"<p><code>{escape(command)}</code></p></section>"
+        "<p><code>orthocal calibrate .</code></p></section>"
     )
 
 

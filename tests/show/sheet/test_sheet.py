@@ -58,7 +58,7 @@ def small(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def files(small):
-    return sheet_files(small, command="orthocal calibrate . --tolerance '*.offset_mm=2'")
+    return sheet_files(small)
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +165,7 @@ def test_what_holds_for_the_machine_is_said(page):
     ) in text
     assert "touch nothing of the gauge: not its bezel" in text
     assert "write controller: {offsets_mm: [0, 0, 0]} there" in text
-    assert words(page.find(".//code")) == "orthocal calibrate . --tolerance '*.offset_mm=2'"
+    assert words(page.find(".//code")) == "orthocal calibrate ."
 
 
 def test_odd_names_are_texts(files, page):
