@@ -31,7 +31,8 @@ html_theme = "furo"
 html_title = "orthocal"
 html_show_sourcelink = False
 html_show_sphinx = False
-html_static_path: list[str] = []
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
 
 
 def _begin_with_a_line(app, what, name, obj, options, lines):  # noqa: ANN001, ANN202 - Sphinx's
