@@ -249,7 +249,7 @@ def draw_cut(standing: Standing) -> str:
             width=0.5,
         )
         drawing.text(
-            centre + _beside_rod(view, place - line, direction, rod.radius),
+            centre + _beside_rod(view, direction, rod.radius),
             f"rod {name}",
             colour=BLUE if own else "#4d5661",
             bold=own,
@@ -266,17 +266,17 @@ def draw_cut(standing: Standing) -> str:
     return drawing.to_svg(f"Setup {standing.setup.name}: the rods seen along leg {leg.name}")
 
 
-def _beside_rod(view: _View, aside: Array, direction: Array, radius: float) -> Array:
-    """From a rod's middle to its name on paper: where neither the plunger nor other rods are."""
-    way, away = view.way(direction), view.way(aside)
-    height = -way[1] if abs(way[1]) > abs(way[0]) else away[1]
+def _beside_rod(view: _View, direction: Array, radius: float) -> Array:
+    """From a rod's middle to its name on paper: where neither plunger nor arrow is."""
+    way = view.way(direction)
+    height = -way[1] if abs(way[1]) > abs(way[0]) else -way[0]
     return np.array([0.0, np.copysign(view.scale * radius + 3.8, height)])
 
 
 def _free_corner(taken: Array) -> Array:
     """Where axes stand on paper: in the corner that is furthest from all places."""
-    near, far = 13.0, CUT - 13.0
-    corners = np.array([[near, far], [far, far], [near, near], [far, near]])
+    near, far, below = 13.0, CUT - 13.0, 18.0  # below the line of words at the top
+    corners = np.array([[near, far], [far, far], [near, below], [far, below]])
     distance = np.linalg.norm(corners[:, None] - taken[None], axis=2).min(axis=1)
     return np.asarray(corners[int(distance.argmax())])
 
