@@ -62,9 +62,12 @@ def export(
         ),
     ] = None,
     module: Annotated[
-        bool,
-        typer.Option("--module", help="linuxcnc: a module also where offsets alone are known."),
-    ] = False,
+        bool | None,
+        typer.Option(
+            "--module/--offsets",
+            help="linuxcnc: a module, or HOME_OFFSET alone, whatever was identified.",
+        ),
+    ] = None,
     anyway: Annotated[
         bool, typer.Option("--anyway", help="Also where the decision is not to enter it.")
     ] = False,

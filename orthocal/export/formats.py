@@ -41,7 +41,7 @@ OPTIONS = {
     "tool": "--tool",
     "home_offsets": "--home-offset",
     "half_side": "--half-side-mm",
-    "module": "--module",
+    "module": "--module or --offsets",
 }
 
 

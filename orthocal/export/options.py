@@ -17,7 +17,7 @@ WITHIN = 0.1 * UM
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportOptions:
-    """Of a format that has them; None and False where nothing was asked for.
+    """Of a format that has them; None where nothing was asked for.
 
     Raises:
         ParameterError: If a number can be none.
@@ -31,8 +31,9 @@ class ExportOptions:
     """HOME_OFFSET of each joint while measuring, [m, rad]."""
     half_side: float | None = None
     """Half the side of the region around the zero, [m]."""
-    module: bool = False
-    """A kinematics module also where offsets alone were identified."""
+    module: bool | None = None
+    """Whether a kinematics module is made, or HOME_OFFSET told; by default a module where more than
+    offsets was identified."""
 
     def __post_init__(self) -> None:
         if self.within is not None and not 0.0 < self.within < math.inf:
@@ -56,4 +57,4 @@ class ExportOptions:
     def asked(self) -> tuple[str, ...]:
         """Names of the options that were given."""
         names = (f.name for f in fields(self))
-        return tuple(n for n in names if getattr(self, n) not in (None, False))
+        return tuple(n for n in names if getattr(self, n) is not None)

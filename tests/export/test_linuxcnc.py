@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ from linuxcnc import Joint, build_module, require_linuxcnc, run_program, type_li
 
 from orthocal import (
     ExportError,
+    ParameterError,
     calibrate,
     export_calibration,
     load_plan,
@@ -24,6 +26,7 @@ from orthocal import (
     simulate_session,
     write_calibration,
 )
+from orthocal.assess.entering import entered_offsets
 from orthocal.calibration.machine import Machine
 from orthocal.cli import main
 from orthocal.export.linuxcnc.approximation import approximate
@@ -345,6 +348,7 @@ def run(words):
         (["--home-offset", "1,2,inf"], 2, "--home-offset: expected finite numbers"),
         (["--within", "1"], 2, "--within: is of a kinematics module, and offsets alone"),
         (["--to", "yaml", "--tool", "0,0,0"], 2, "--tool: goes with --to linuxcnc alone"),
+        (["--to", "yaml", "--offsets"], 2, "--module or --offsets: goes with --to linuxcnc alone"),
         (["--module", "--half-side-mm", "250"], 3, "the machine does not reach ±250 mm"),
     ],
 )
@@ -431,6 +435,23 @@ def test_a_module_may_be_asked_for_where_offsets_alone_are_known(offsets):
     assert "HOME_OFFSET = 300.0000\n" in files["kinematics.ini"]
     assert "#define DEGREE 1\n" in files["orthocal_core.c"]
     assert "within 0.001 µm" in files["README.md"]
+
+
+def test_offsets_alone_may_be_asked_for_where_more_is_known(full):
+    """What is entered where legs and axes stay as they are, not the machine's own offsets."""
+    old = (0.35, 0.3, -0.02)
+    options = ExportOptions(module=False, home_offsets=old)
+    files = export_calibration(full, "linuxcnc", options=options)
+    assert set(files) == {"README.md", "joints.ini"}
+    assert "the ones that leave the least error at\nthe tool" in files["README.md"]
+    lines = re.findall(r"^HOME_OFFSET = (\S+)", files["joints.ini"], re.M)
+    changed = np.array(lines, dtype=float) * 1e-3 - old
+    ways = np.array([d.direction for d in full.robot.drives])
+    assert changed == pytest.approx(ways * (entered_offsets(full) - full.active_offsets), abs=6e-8)
+    assert np.abs(changed - ways * (full.offsets - full.active_offsets)).max() > 1e-6
+    with pytest.raises(ParameterError) as e:
+        export_calibration(full, "linuxcnc", options=replace(options, within=1e-6))
+    assert str(e.value) == "--within: is of a kinematics module, and --offsets asks for HOME_OFFSET"
 
 
 # ---- LinuxCNC itself

@@ -14,7 +14,7 @@ from orthocal.export.options import WITHIN, ExportOptions
 
 
 def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[str, str]:
-    """HOME_OFFSET where offsets alone were identified; else a kinematics module.
+    """HOME_OFFSET where offsets alone were identified, or asked for; else a kinematics module.
 
     Returns:
         README.md and joints.ini; or README.md, kinematics.ini, orthocal_kins.c, orthocal_core.c and
@@ -25,15 +25,18 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         ParameterError: If an option is of a module and none is made, or values are missing.
     """
     homes = find_homes(calibration, old=options.home_offsets)
-    if calibration.only_offsets and not options.module:
+    module = not calibration.only_offsets if options.module is None else options.module
+    if not module:
         of_module = {"within": "--within", "tool": "--tool", "half_side": "--half-side-mm"}
         given = [of_module[name] for name in options.asked if name in of_module]
         if given:
-            raise ParameterError(
-                "is of a kinematics module, and offsets alone were identified: they are entered as "
-                "HOME_OFFSET; give --module for a module with nominal legs and axes",
-                where=given[0],
+            why = (
+                "offsets alone were identified: they are entered as HOME_OFFSET; give --module for "
+                "a module with nominal legs and axes"
+                if options.module is None
+                else "--offsets asks for HOME_OFFSET"
             )
+            raise ParameterError(f"is of a kinematics module, and {why}", where=given[0])
         if not find_entries(calibration):
             raise ExportError("no offset was identified: there is nothing to enter")
         return {

@@ -23,7 +23,7 @@ FINEST = 1e-9
 
 
 def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str:
-    """What to type where offsets alone were identified."""
+    """What to type where offsets alone are entered."""
     std = {e.drive: e.std for e in find_entries(calibration)}
     rows = []
     for i, home in enumerate(homes):
@@ -49,10 +49,16 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
     unit = homes[0].joint_unit
     size = DRIVE_UNITS[homes[0].unit][1]
     active = ", ".join(f"{v / size:.6g}" for v in entered_offsets(calibration))
+    what = "Only offsets of the drives were identified."
+    if not calibration.only_offsets:
+        what = (
+            "More than offsets was identified; these are the ones that leave the least error at\n"
+            "the tool while nothing else is corrected."
+        )
     return f"""\
 # {_title(calibration)}: HOME_OFFSET for LinuxCNC
 
-Only offsets of the drives were identified. They belong into HOME_OFFSET; the kinematics stay as
+{what} They belong into HOME_OFFSET; the kinematics stay as
 they are.
 
 | section | drive | counts | HOME_OFFSET | change | one σ | unit |
