@@ -450,6 +450,23 @@ SESSION_FILE_CASES = [
         command="calibrate {tmp}/machine --out {tmp}/out",
     ),
     Case(
+        "plan-cube-not-reached",
+        "--half-side-mm: the machine does not reach a cube of ±500 mm (cannot be reached: the "
+        "loops stay open by # mm, #% of the way from the mechanical zero)",
+        command="plan orthoglide --half-side-mm 500",
+    ),
+    Case(
+        "plan-cube-below-zero",
+        "--half-side-mm: found -5; expected 0.1 mm to 10 m",
+        command="plan orthoglide --half-side-mm -5",
+    ),
+    Case(
+        "session-folder-above",
+        "{tmp}/above/session.yaml: there is no such file; sessions in it: {tmp}/above/first",
+        (write("above/x", ""), write("above/first/session.yaml", "")),
+        command="calibrate {tmp}/above --out {tmp}/out",
+    ),
+    Case(
         "session-name-too-long",
         f"{{tmp}}/{LONG}: cannot be read: File name too long",
         command=f"calibrate {{tmp}}/{LONG} --out {{tmp}}/out",
@@ -844,6 +861,11 @@ READINGS_CASES = [
         "-0.43",
         "",
         ":2: reading_mm is empty; expected what the gauge showed, or no row where nothing was read",
+    ),
+    readings_file(
+        "nothing-read",
+        "setup,posture,minus,reading_mm\nxy,y_max,y_min,\nxz,z_max,z_min,\n",
+        ": nothing was read yet; `orthocal record` takes the readings",
     ),
     readings(
         "unit-in-field", "-0.43", "-0.43 mm", ":2: reading_mm is '-0.43 mm'; expected a number"

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orthocal.errors import SessionError
+from orthocal.errors import ClosureError, ParameterError, SessionError
 
 if TYPE_CHECKING:
+    from orthocal.kinematics.workspace import Workspace
     from orthocal.measurement.session import Session
+    from orthocal.robot.model import Robot
 
 app = typer.Typer(
     add_completion=False,
@@ -68,3 +70,28 @@ def load_each_once(paths: Sequence[Path]) -> list[Session]:
 def split_globs(texts: list[str] | None) -> list[str]:
     """Globs of repeated options, each with commas between."""
     return [glob.strip() for text in texts or [] for glob in text.split(",") if glob.strip()]
+
+
+def require_cube(robot: Robot, half_side_mm: float) -> Workspace:
+    """The cube of --half-side-mm, which the nominal machine must reach.
+
+    Raises:
+        ParameterError: If it is none, or not reached.
+    """
+    from orthocal.kinematics.assembly import nominal_assembly
+    from orthocal.kinematics.workspace import cube
+    from orthocal.units import MM
+
+    if not 0.1 <= half_side_mm <= 1e4:
+        raise ParameterError(
+            f"found {half_side_mm:g}; expected 0.1 mm to 10 m", where="--half-side-mm"
+        )
+    found = cube(robot, half_side=half_side_mm * MM)
+    try:
+        nominal_assembly(robot).inverse(found.points)
+    except ClosureError as e:
+        raise ParameterError(
+            f"the machine does not reach a cube of ±{half_side_mm:g} mm ({e.reason})",
+            where="--half-side-mm",
+        ) from None
+    return found

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orthocal.cli.options import Json, Tolerances, app, split_globs
+from orthocal.cli.options import Json, Tolerances, app, require_cube, split_globs
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import OrthocalError, ParameterError, SessionError
 
@@ -100,7 +100,6 @@ def plan(
     from orthocal.estimation.choice import Choice
     from orthocal.estimation.selection import read_tolerances
     from orthocal.files import exists, require_writable
-    from orthocal.kinematics.workspace import cube
     from orthocal.measurement.session_output import write_session
     from orthocal.planning.plan import plan_readings
     from orthocal.planning.prediction import CRITERIA
@@ -135,6 +134,7 @@ def plan(
         minutes=(minutes_a_setup, minutes_a_reading),
     )
     tolerances = read_tolerances(tolerance or [], robot.parameters, where="--tolerance")
+    workspace = None if half_side_mm is None else require_cube(robot, half_side_mm)
     found = plan_readings(
         robot,
         Choice(model, tolerances=tolerances),
@@ -143,7 +143,7 @@ def plan(
         hours=hours,
         means=means,
         measured=measured,
-        workspace=None if half_side_mm is None else cube(robot, half_side=half_side_mm * MM),
+        workspace=workspace,
         criterion=criterion,
         seed=seed,
         starts=starts,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orthocal.cli.options import Json, Tolerances, app, split_globs
+from orthocal.cli.options import Json, Tolerances, app, require_cube, split_globs
 from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.progress import told
 from orthocal.errors import ParameterError
@@ -127,10 +127,8 @@ def accuracy(
         given = collect_errors(session.robot, file=errors, single=error or [])
     read_tolerances(tolerance or [], parameters, where="--tolerance")
     tolerances = _quantities(tolerance)
-    if half_side_mm is not None and not 0.1 <= half_side_mm <= 1e4:
-        raise ParameterError(
-            f"found {half_side_mm:g}; expected 0.1 mm to 10 m", where="--half-side-mm"
-        )
+    if half_side_mm is not None:
+        require_cube(session.robot, half_side_mm)
     study = build_accuracy_study(
         session,
         Choice(model, free=split_globs(free), tolerances=tolerances),

@@ -48,6 +48,7 @@ def check_readings(
     Raises:
         SessionError: Naming file and line.
     """
+    rows = iter(rows)
     readings: list[Reading] = []
     seen: dict[tuple[Any, ...], int] = {}
     raw: dict[tuple[str, int], int] = {}
@@ -70,6 +71,11 @@ def check_readings(
         cycle = parse_cycle(row.cycle, where)
         if not row.reading:
             if unread is None:
+                if not readings and not any(r.reading for r in rows):
+                    raise SessionError(
+                        "nothing was read yet; `orthocal record` takes the readings",
+                        where=str(file),
+                    )
                 raise SessionError(
                     "reading_mm is empty; expected what the gauge showed, or no row where nothing "
                     "was read",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from orthocal.documents import read_yaml, validate
 from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.fields import read_only
-from orthocal.files import is_folder, read_file, require_plain_name
+from orthocal.files import exists, is_folder, read_file, require_plain_name
 from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.measurement.purpose import read_purpose
 from orthocal.measurement.readings_checks import check_readings
@@ -34,6 +35,11 @@ from orthocal.units import DRIVE_UNITS, MM
 
 Array = NDArray[np.float64]
 
+
+SESSION = "session.yaml"
+
+MOST_NAMED = 5
+"""Sessions of a folder that are named where it is none itself."""
 
 OTHER_KINDS = (".csv", ".json", ".urdf")
 """What the names of files of other kinds end with."""
@@ -164,9 +170,13 @@ def _where(path: Path | None, key: str) -> str:
 
 
 def _read_keys(path: Path) -> tuple[Path, bytes, SessionKeys]:
-    file = path / "session.yaml" if is_folder(path) else path
+    file = path / SESSION if is_folder(path) else path
     if file.suffix.lower() in OTHER_KINDS:
         raise SessionError("is no session.yaml", where=str(file))
+    if file is not path and not exists(file):
+        own = sorted(f.parent for f in islice(path.glob(f"*/{SESSION}"), MOST_NAMED))
+        there = f"; sessions in it: {', '.join(map(str, own))}" if own else ""
+        raise SessionError(f"there is no such file{there}", where=str(file))
     content = read_file(file, error=SessionError)
     data = read_yaml(file, error=SessionError, content=content)
     return file, content, validate(SessionKeys, data, where=str(file), error=SessionError)
