@@ -63,4 +63,4 @@ def to_mm(value: float) -> float:
 
 def tidy(value: float) -> float:
     """A number without what a factor has left in its last digits."""
-    return float(f"{value:.12g}")
+    return float(f"{value:.12g}") + 0.0

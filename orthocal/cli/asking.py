@@ -14,6 +14,12 @@ from orthocal.units import MM
 
 AXES = "xyz"
 
+USUALLY_OFF = "2"
+"""mm"""
+
+MOST_OFF = 50.0
+"""mm"""
+
 
 @dataclass(frozen=True, slots=True)
 class Answers:
@@ -182,6 +188,32 @@ def find_answers(given: Mapping[str, str | None]) -> Answers:
         text = given.get(question.option)
         known = _ask(question, known) if text is None else _take(question, known, text)
     return known
+
+
+def ask_tolerance() -> list[str]:
+    """How far zeros of joints may be off, as the option --tolerance says it.
+
+    Raises:
+        ParameterError: If the input ends.
+    """
+    while True:
+        sys.stderr.write(
+            "How far may the joints' zeros be off, one standard deviation, mm? Enter alone: "
+            f"{USUALLY_OFF}, of home switches that nobody has measured: "
+        )
+        sys.stderr.flush()
+        text = sys.stdin.readline()
+        if not text:
+            put_note("")
+            raise ParameterError("was not answered: the input ended", where="--tolerance")
+        try:
+            size = _number(text.strip() or USUALLY_OFF, "--tolerance") / MM
+        except ParameterError as e:
+            put_note(f"  {e.problem}")
+            continue
+        if 0.0 < size <= MOST_OFF:
+            return [f"*.offset_mm={size:g}"]
+        put_note(f"  found {size:g} mm; expected more than 0, and at most {MOST_OFF:g} mm")
 
 
 def _take(question: Question, known: Answers, text: str) -> Answers:

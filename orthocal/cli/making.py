@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orthocal.cli.options import Tolerances, app
+from orthocal.cli.options import Tolerances, app, require_no_readings
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import OrthocalError, ParameterError, RobotError
 
@@ -100,7 +100,7 @@ def new(
         return
     if paper and hours is not None:
         raise ParameterError("found with --paper, whose setups are given", where="--hours")
-    from orthocal.cli.asking import find_answers
+    from orthocal.cli.asking import ask_tolerance, find_answers
     from orthocal.files import write_files
     from orthocal.robot.loading import load_robot
     from orthocal.robot.making import describe_machine
@@ -108,6 +108,8 @@ def new(
     name = _require_new(folder, force=force)
     means = _means(gauge)
     answers = find_answers(given)
+    if tolerance is None and None in given.values():
+        tolerance = ask_tolerance()
     files = describe_machine(answers.sizes, name=name, counting=answers.counting, where=str(folder))
     with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
         write_files(Path(trial) / name, files)
@@ -142,6 +144,7 @@ def _require_new(folder: Path, *, force: bool) -> str:
     for file in there:
         if exists(folder / file) and not force:
             raise RobotError("is there already; --force writes over it", where=str(folder / file))
+    require_no_readings(folder / FIRST)
     return name
 
 
@@ -215,11 +218,12 @@ def _tell(
 ) -> None:
     """What was made, what it is worth, and what to do with it."""
     from orthocal.show.layout import counted
+    from orthocal.show.plan import first_round_words
     from orthocal.units import UM
 
     readings = counted(len(session.readings), "reading")
     setups = counted(len(session.setups), "setup")
-    worth = ""
+    worth = early = ""
     if plan is not None:
         after, before = (
             f"{float(f'{e.headline.rms / UM:.3g}'):g}" for e in (plan.expected, plan.known)
@@ -228,10 +232,11 @@ def _tell(
             f", about {plan.minutes:.0f} min: {after} µm at the tool are to be expected, instead "
             f"of {before} µm without them"
         )
+        early = f"{first_round_words(plan)}\n" if first_round_words(plan) else ""
     programs = sum(name.endswith(".ngc") for name in extra)
     put_out(
         f"{folder.resolve().name}: {sizes}.\n"
-        f"Plan: {readings} in {setups}{worth}.\n"
+        f"Plan: {readings} in {setups}{worth}.\n{early}"
         f"Wrote {folder}: machine.yaml holds every size; after a change there run\n"
         f"  orthocal new {folder} --again\n"
         f"Wrote {folder / FIRST}: session.yaml, readings.csv to fill in, sheet.html to print, and\n"

@@ -15,6 +15,12 @@ if TYPE_CHECKING:
     from orthocal.measurement.session import Session
     from orthocal.robot.model import Robot
 
+SIMULATED = "Simulated"
+"""What the source of a session begins with that was not measured."""
+
+FEWEST_DIFFERENT = 4
+"""Numbers that differ from each other in sessions that can be told to be the same."""
+
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
@@ -63,13 +69,51 @@ def load_each_once(paths: Sequence[Path]) -> list[Session]:
                 "is the same session as one before it; its readings would count twice",
                 where=str(path),
             )
+        copied = next((other for other in found if _same_readings(session, other)), None)
+        if copied is not None:
+            raise SessionError(
+                f"holds the very readings of {copied.path}: a copy that was not measured anew?",
+                where=str(session.readings_path or path),
+            )
         found.append(session)
     return found
+
+
+def _same_readings(one: Session, other: Session) -> bool:
+    """Whether two sessions were filled with the same numbers, which no dial shows twice."""
+    rows = [
+        [(r.setup, r.posture, r.minus, r.cycle, r.value) for r in s.readings] for s in (one, other)
+    ]
+    return rows[0] == rows[1] and len({r[-1] for r in rows[0]}) >= FEWEST_DIFFERENT
 
 
 def split_globs(texts: list[str] | None) -> list[str]:
     """Globs of repeated options, each with commas between."""
     return [glob.strip() for text in texts or [] for glob in text.split(",") if glob.strip()]
+
+
+def require_no_readings(folder: Path) -> None:
+    """Refuse to write over readings that somebody took; a plan can be made again, they cannot.
+
+    Raises:
+        SessionError: If there are any.
+    """
+    from orthocal.errors import OrthocalError
+    from orthocal.files import exists
+    from orthocal.measurement.session_file import SESSION, load_rows
+
+    if not exists(folder / SESSION):
+        return
+    try:
+        session, unread = load_rows(folder)
+    except OrthocalError:  # what does not load was no session
+        return
+    count = len(session.readings) - len(unread)
+    if count and not session.source.startswith(SIMULATED):
+        raise SessionError(
+            f"holds {count} readings, which --force does not write over; take them elsewhere first",
+            where=str(session.readings_path or folder),
+        )
 
 
 def require_cube(robot: Robot, half_side_mm: float) -> Workspace:

@@ -7,9 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orthocal.cli.options import Json, Tolerances, app, require_cube, split_globs
+from orthocal.cli.options import (
+    Json,
+    Tolerances,
+    app,
+    require_cube,
+    require_no_readings,
+    split_globs,
+)
 from orthocal.cli.printing import put_note, put_out
-from orthocal.errors import OrthocalError, ParameterError, SessionError
+from orthocal.cli.sheets import sheet_or_nothing
+from orthocal.errors import ParameterError, SessionError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -118,6 +126,7 @@ def plan(
                 raise SessionError(
                     "is there already; --force writes over it", where=str(out / name)
                 )
+        require_no_readings(out)
     robot, measured, reference = _load(subject)
     if add is not None and measured is None:
         raise ParameterError("is of a session; this is a robot", where="--add")
@@ -169,21 +178,10 @@ def plan(
             "posture again."
         )
         extra = {"plan.json": plan_json(found), "plan.svg": draw_plan(found)}
-        extra |= _sheet(found.session)
+        extra |= sheet_or_nothing(found.session)
         path = write_session(found.session, out, comment=comment, extra=extra, blank=True)
         paper = ", sheet.html and its programs" if "sheet.html" in extra else ""
         put_note(f"Wrote {path}, readings.csv to fill in, plan.json, plan.svg{paper}")
-
-
-def _sheet(session: Session) -> dict[str, str]:
-    """The measuring sheet and its programs; nothing, and why, where there cannot be one."""
-    from orthocal.show.sheet.page import sheet_files
-
-    try:
-        return sheet_files(session)
-    except OrthocalError as e:
-        put_note(f"orthocal: no measuring sheet: {e}")
-        return {}
 
 
 def _load(subject: str) -> tuple[Robot, Session | None, str]:

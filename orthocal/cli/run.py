@@ -22,6 +22,7 @@ from orthocal.cli import (  # noqa: F401
     making,
     planning,
     recording,
+    repeating,
     sheets,
     studying,
     trying,

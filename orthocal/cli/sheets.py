@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from orthocal.cli.options import app
 from orthocal.cli.printing import put_note
-from orthocal.errors import ParameterError, SessionError
+from orthocal.errors import OrthocalError, ParameterError, SessionError
+
+if TYPE_CHECKING:
+    from orthocal.measurement.session import Session
 
 
 @app.command()
@@ -64,3 +67,14 @@ def sheet(
     programs = len(files) - 1
     more = f" and {programs} programs" if programs else "; its drives command no tool: no programs"
     put_note(f"Wrote {folder / 'sheet.html'} to print{more}")
+
+
+def sheet_or_nothing(session: Session) -> dict[str, str]:
+    """The measuring sheet and its programs; nothing, and why, where there cannot be one."""
+    from orthocal.show.sheet.page import sheet_files
+
+    try:
+        return sheet_files(session)
+    except OrthocalError as e:
+        put_note(f"orthocal: no measuring sheet: {e}")
+        return {}

@@ -14,7 +14,7 @@ from pathlib import Path
 from lxml import etree
 
 from orthocal.errors import RobotError
-from orthocal.files import read_file, write_files
+from orthocal.files import exists, read_file, write_files
 from orthocal.robot.loading import load_robot, packaged_robots
 from orthocal.robot.machine_file import MACHINE, drive_text, machine_text, read_machine
 from orthocal.robot.model import Robot
@@ -107,6 +107,12 @@ def remake_robot(folder: Path) -> Robot:
     name = folder.resolve().name
     sizes, counting = read_machine(folder / MACHINE)
     own = folder / f"{name}.yaml"
+    if not exists(own):
+        others = sorted(p.name for p in folder.glob("*.yaml") if p.name != MACHINE)
+        there = (
+            f"; there is {', '.join(others[:3])}: was the folder named otherwise?" if others else ""
+        )
+        raise RobotError(f"there is no such file{there}", where=str(own))
     description = read_file(own, error=RobotError).decode("utf-8", "replace")
     files = describe_machine(sizes, name=name, counting=counting, description=description)
     del files[MACHINE]

@@ -10,6 +10,7 @@ from orthocal.assess.accuracy import assess_tool
 from orthocal.assess.findings.calibration import decide
 from orthocal.assess.findings.decision import Decision
 from orthocal.assess.findings.finding import Finding, Kind
+from orthocal.assess.wording import joined
 from orthocal.calibration.calibration import Calibration
 from orthocal.show.entering import short_entry_table
 from orthocal.show.heading import render_subject
@@ -91,7 +92,16 @@ def _how(calibration: Calibration) -> str:
         return spread
     if unstated:
         return f"{unstated[0].text} {unstated[0].action} {spread}"
-    return f"Enter the whole offset, in place of the active one. {spread}"
+    falling = [d.name for d in calibration.robot.drives if d.direction < 0]
+    way = ""
+    if falling:
+        one = len(falling) == 1
+        way = (
+            f"{joined(falling)} {'counts' if one else 'count'} down in the controller: there "
+            f"{'its joint' if one else 'their joints'} must show so much less, not more (`orthocal "
+            "export --to linuxcnc --offsets` writes the lines). "
+        )
+    return f"Enter the whole offset, in place of the active one. {way}{spread}"
 
 
 def _at_tool(calibration: Calibration, decision: Decision) -> list[RenderableType]:

@@ -75,8 +75,12 @@ def _example(calibration: Calibration, entry: ControllerEntry) -> str:
             "An offset is what to add to the encoder's coordinate to get the slider's true one; "
             f"these are what to add {whole}."
         )
+    shown = ""
+    if drive.direction < 0 or drive.joint_zero is not None:
+        joint = float(drive.to_joint(drive.zero)) * factor
+        shown = f" (the controller's joint shows {joint:.3f} {unit})"
     return (
         f"An offset is what to add to the encoder's coordinate to get the slider's true one: with "
-        f"{drive.name}'s encoder at {at:.3f} {unit} its slider is at {really:.3f} {unit}. Enter "
-        f"{whole}."
+        f"{drive.name}'s encoder at {at:.3f} {unit}{shown} its slider is at {really:.3f} {unit}. "
+        f"Enter {whole}."
     )

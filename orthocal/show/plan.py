@@ -60,7 +60,7 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
         Text(f"Plan for {robot.name}, model '{plan.forecast.selection.label}'", style="bold"),
         Text(),
         head,
-        *([Text(_first_round(plan))] if _first_round(plan) else []),
+        *([Text(first_round_words(plan))] if first_round_words(plan) else []),
         Text(_when_enough(plan)),
         section("At equal cost", _alternatives(plan, closing)),
         section("What would help", bullets(_helps(plan))),
@@ -75,7 +75,7 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
     return Group(*parts)
 
 
-def _first_round(plan: MeasuringPlan) -> str:
+def first_round_words(plan: MeasuringPlan) -> str:
     """What is to be expected before any offsets were entered, and what of it can be read."""
     first = plan.first_round
     text = f"In a first round, before offsets are entered: {_um(first)} µm."

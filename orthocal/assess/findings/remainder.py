@@ -98,7 +98,7 @@ def find_check(calibration: Calibration) -> list[Finding]:
                 "nothing to check by",
                 "informs",
                 f"{text}; but the readings are such as a machine within its tolerances shows.",
-                "`orthocal compare` says what the readings support.",
+                "",
                 {**numbers, "chance": chance},
             )
         ]

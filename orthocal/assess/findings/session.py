@@ -9,7 +9,7 @@ from orthocal.arguments import require_kind
 from orthocal.assess.findings.decision import Decision
 from orthocal.assess.findings.finding import Finding, Kind, Place, Severity
 from orthocal.assess.plausibility import MOST_PLACES, find_finer
-from orthocal.assess.wording import signed, um
+from orthocal.assess.wording import mm, signed, um
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.repeating import restore_session
 from orthocal.checking.mistake import Mistake
@@ -17,7 +17,11 @@ from orthocal.checking.search import find_mistakes
 from orthocal.errors import OrthocalError
 from orthocal.measurement.joining import split_sessions
 from orthocal.measurement.session import Session
+from orthocal.statistics.chance import chance_of_excess
 from orthocal.units import MM, UM
+
+NO_CHANCE = 1e-6
+"""Probability of what is no chance, in a thousand sessions either."""
 
 LARGEST_ODDS = 1e6
 """Odds above which no number is told."""
@@ -80,8 +84,10 @@ def check_session(session: Session, model: str | None = None) -> tuple[Finding, 
     found = _find(session, model)
     if any(f.kind == "wrong unit" for f in found):
         return tuple(found)
-    finer = (_find_finer(session, gauge) for gauge in session.gauges)
-    return (*found, *(f for f in finer if f is not None))
+    every = [_find_finer(session, gauge) for gauge in session.gauges]
+    if not found:
+        every += [_find_scattered(session, gauge) for gauge in session.gauges]
+    return (*found, *(f for f in every if f is not None))
 
 
 def _find_finer(session: Session, gauge: str) -> Finding | None:
@@ -92,6 +98,48 @@ def _find_finer(session: Session, gauge: str) -> Finding | None:
         session.gauges[gauge].resolution,
         where=lambda k: session.where(session.readings[own[k]]),
         place=lambda k: _place(session, own[k]),
+    )
+
+
+def _find_scattered(session: Session, gauge: str) -> Finding | None:
+    """Readings of a gauge that were repeated and are far from what they were, in several places.
+
+    Where many readings are wrong no single mistake stands out; that they do not repeat does.
+    """
+    known = session.gauges[gauge]
+    if known.sigma is None:
+        return None
+    sigma = math.hypot(known.sigma, (known.resolution or 0.0) / math.sqrt(12.0))
+    places: dict[tuple[str, str, str | None], list[int]] = {}
+    for i, r in enumerate(session.readings):
+        if session.setups[r.setup].gauge == gauge:
+            places.setdefault((r.setup, r.posture, r.minus), []).append(i)
+    repeated = [rows for rows in places.values() if len(rows) > 1]
+    if not repeated:
+        return None
+    values = session.values
+
+    def scatter(rows: list[int]) -> float:
+        own = values[rows]
+        single = 2.0 if session.readings[rows[0]].minus else 1.0
+        return float(((own - own.mean()) ** 2).sum()) / single
+
+    square, dof = sum(map(scatter, repeated)), sum(len(rows) - 1 for rows in repeated)
+    if chance_of_excess(square / sigma**2, dof) > NO_CHANCE:
+        return None
+    worst = max(repeated, key=scatter)
+    shown = ", ".join(
+        f"{signed(values[i] / MM)} in {session.where(session.readings[i])}" for i in worst[:4]
+    )
+    size = math.sqrt(square / dof)
+    return Finding(
+        "scattered cycles",
+        "warns",
+        f"Repeated readings scatter by {mm(size)} mm, more than the gauge's {mm(sigma)} mm "
+        f"explain. They differ most at {session.readings[worst[0]].label}: {shown} mm.",
+        "Look at these for a wrong sign or row, and read them again.",
+        numbers={"scatter_mm": size / MM, "gauge_mm": sigma / MM},
+        places=tuple(_place(session, i) for i in worst[:MOST_PLACES]),
     )
 
 
