@@ -860,7 +860,8 @@ READINGS_CASES = [
         "empty-field",
         "-0.43",
         "",
-        ":2: reading_mm is empty; expected what the gauge showed, or no row where nothing was read",
+        ":2: reading_mm is empty; expected what the gauge showed, or no row where nothing was read "
+        "(`orthocal record` takes it, or drops the row)",
     ),
     readings_file(
         "nothing-read",

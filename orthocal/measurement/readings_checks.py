@@ -78,7 +78,7 @@ def check_readings(
                     )
                 raise SessionError(
                     "reading_mm is empty; expected what the gauge showed, or no row where nothing "
-                    "was read",
+                    "was read (`orthocal record` takes it, or drops the row)",
                     where=where,
                 )
             unread.add(len(readings))

@@ -140,8 +140,8 @@ def turn(session, setup):
 def test_sound_readings_are_to_be_entered(raw_cycles):
     assert advise(calibrate(_silent(raw_cycles))) == (
         "Enter these, and measure again. What remains is what repeated cycles scatter by: the "
-        "model fits. Measure again with these in the controller, and hold the new session against "
-        "this calibration: `orthocal validate`."
+        "model fits. Measure again with these in the controller (`orthocal again` makes that "
+        "session), and hold it against this calibration: `orthocal validate`."
     )
 
 

@@ -30,8 +30,8 @@ from orthocal.assess.wording import joined
 from orthocal.calibration.calibration import Calibration
 
 CONFIRM = (
-    "Measure again with these in the controller, and hold the new session against this "
-    "calibration: `orthocal validate`."
+    "Measure again with these in the controller (`orthocal again` makes that session), and hold it "
+    "against this calibration: `orthocal validate`."
 )
 
 _GRAVITY: dict[Severity, int] = {"stops": 0, "warns": 1, "informs": 2}
@@ -51,9 +51,12 @@ def find_findings(calibration: Calibration) -> tuple[Finding, ...]:
     """All that is recognised in a calibration, the gravest first, else in the order of deciding."""
     at_tool = find_at_tool(calibration)
     promised = [f for f in at_tool if f.kind == "at the tool"]
+    turned, changes = find_turned(calibration), find_machine_changes(calibration)
+    if changes and _leaves_offsets_open(calibration):  # they look like gauges turned round
+        turned = []
     found = [
-        *find_turned(calibration),
-        *find_machine_changes(calibration),
+        *turned,
+        *changes,
         *find_tolerances(calibration),
         *find_doubts(calibration),
         *find_suspicious(calibration),
@@ -75,6 +78,11 @@ def find_findings(calibration: Calibration) -> tuple[Finding, ...]:
     # postures of another machine say more than what they leave of its tolerances
     order = {"turned setup": -2, "wrong size": -1, **dict.fromkeys(MISTAKES, -2)}
     return tuple(sorted(found, key=lambda f: (_GRAVITY[f.severity], order.get(f.kind, 0))))
+
+
+def _leaves_offsets_open(calibration: Calibration) -> bool:
+    """Whether some sessions say which offsets were active in the controller, and others do not."""
+    return len({p.controller_offsets is None for p in calibration.session.parts}) > 1
 
 
 def find_no_offset(calibration: Calibration) -> list[Finding]:
