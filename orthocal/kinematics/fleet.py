@@ -76,7 +76,7 @@ class Machines:
         (found,) = self._compiled.position("" if tcp is None else tcp.frame).unshared(
             self.actuated(self._drives).reshape(self.size * k, -1),
             self.passive.reshape(self.size * k, -1),
-            np.repeat(self.placements, k, axis=0),
+            self.placements,
         )
         return np.asarray(found.reshape(self.size, k, 3))
 

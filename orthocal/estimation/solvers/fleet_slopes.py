@@ -69,7 +69,7 @@ class FleetSlopes:
         found = compiled.sparse_slopes.unshared(
             actuated.reshape(self._size * k, -1),
             passive.reshape(self._size * k, -1),
-            np.repeat(placements, k, axis=0),
+            placements,
         )
         opening, self._by_actuated, by_passive, self._by_twists = (
             v.reshape(self._size, k, *v.shape[1:]) for v in found
@@ -192,7 +192,7 @@ class FleetSlopes:
         h, h_a, h_q, h_t, h_z, h_u = group.reading.slopes.unshared(
             actuated[:, posture].reshape(s * n, -1),
             passive[:, posture].reshape(s * n, -1),
-            np.repeat(placements, n, axis=0),
+            placements,
             zero[:, group.setups].reshape(s * n, -1),
             np.tile(group.constants, (s, 1)),
             unknowns[:, group.unknowns].reshape(s * n, -1),
