@@ -19,6 +19,7 @@ from orthocal.diagnosis.unmodelled import machine_errors
 from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.selection import Selection
+from orthocal.estimation.solvers.fleet import Fleet
 from orthocal.estimation.weighting import split_by_gauge
 from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.kinematics.kept import once_a_robot
@@ -179,8 +180,11 @@ class ToolForecast:
         noise = noise_of(session) if sigma is None else sigma
         drawn = list(self._draw(problem, entered=entered)) if machines is None else machines
         found, lost = [], 0.0
-        for theta in drawn:
-            covariance, share = self._posterior(problem, others, theta, noise, weight)
+        fleet = Fleet(problem, np.array(drawn) / problem.theta_scale)
+        closed = fleet.close()
+        for i, theta in enumerate(drawn):
+            passive = fleet.passive[i] if closed[i] else None
+            covariance, share = self._posterior(problem, others, theta, noise, weight, passive)
             if covariance is not None:
                 found.append(covariance)
             lost += share / len(drawn)
@@ -228,6 +232,7 @@ class ToolForecast:
         theta: Array,
         noise: float,
         weight: float | None = None,
+        passive: Array | None = None,
     ) -> tuple[Array | None, float]:
         """Covariance of what the estimate has wrong about a machine, (n_names, n_names), [SI].
 
@@ -235,7 +240,7 @@ class ToolForecast:
         """
         o, n = problem.observations, problem.n_machine
         try:
-            _, jacobian = problem.linearise(theta)
+            _, jacobian = problem.linearise(theta, passive)
         except ClosureError:
             return None, 1.0
         good = np.asarray(np.isfinite(jacobian).all(axis=1))
