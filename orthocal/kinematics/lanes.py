@@ -3,8 +3,8 @@
 A function of scalar expressions is a list of instructions, which CasADi's virtual machine works
 through for one point after another. Here an interpreter takes each instruction for a lane of points
 (`interpreter`): the same operations in the same order, hence the same numbers, in a tenth of the
-time. Making it takes some hundredths of a second, and so does listing the instructions, so each is
-done once as much has been spent in CasADi's machine (`Way.AUTO`).
+time. Making it takes a tenth of a second, and so does listing the instructions, so each is done
+once as much has been spent in CasADi's machine (`Way.AUTO`), or once somebody expects many points.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ Indices = NDArray[np.int64]
 FEWEST = 8
 """Points below which a lane is not worth filling."""
 
-PATIENCE = 12e6
-"""Instructions, each for a point, that take CasADi's machine as long as the interpreter to make."""
+PATIENCE = 60e6
+"""Instructions, each for a point, that CasADi's machine does first, where no more are expected."""
 
 POINTS = 500
 """Of one function, which take CasADi's machine as long as its instructions to list."""
@@ -59,6 +59,13 @@ def running(way: Way) -> Iterator[None]:
         yield
     finally:
         _chosen = before
+
+
+def expect_many() -> None:
+    """Have the interpreter ready: many points are to come."""
+    global _spent
+    if _chosen is Way.AUTO and is_installed() and interpreter() is not None:
+        _spent = max(_spent, PATIENCE)
 
 
 def pays(instructions: int, points: int, before: int) -> bool:

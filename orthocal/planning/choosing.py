@@ -319,7 +319,7 @@ class _Taking:
         own[np.diag_indices(len(rows))] += self.noise
         solved = np.linalg.solve(own, rest)
         effect = self.effect - solved.T @ self.effect[rows]
-        return self._gains(effect, self.variance - np.vecdot(rest, solved, axis=0))
+        return self._gains(effect, self.variance - (rest * solved).sum(axis=0))
 
     def _gains(self, effect: Array, variance: Array) -> Array:
         return np.asarray(np.vecdot(effect, effect) / (np.maximum(variance, 0.0) + self.noise))
