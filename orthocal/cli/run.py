@@ -54,7 +54,7 @@ def main() -> None:
 
 def _program(words: Sequence[str]) -> typer.Typer:
     """The program with the one command that is called: Typer makes all of those that it has."""
-    called = words[0] if words else None
+    called = words[0] if words else ""
     commands = [c for c in app.registered_commands if called in (c.name, _name(c.callback))]
     groups = [g for g in app.registered_groups if called == g.name]
     if not commands and not groups:
