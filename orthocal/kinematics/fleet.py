@@ -49,10 +49,22 @@ class Machines:
 
     def close(self) -> NDArray[np.bool_]:
         """Close all loops by Newton's method; whether each machine's were, shape (n_sets,)."""
+        near, self.passive = self.passive, self._first_order()
+        every = np.arange(self.size)
+        done = self._newton(every)
+        if not done.all():  # others in the middle may have led them astray
+            left = every[~done]
+            self.passive[left] = near[left]
+            done[left] = self._newton(left)
+        return done
+
+    def _newton(self, sets: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Newton's method from where some machines are; whether each was closed, (n,)."""
         closing, k = self._compiled.closing.unshared, len(self._drives)
         actuated = self.actuated(self._drives).reshape(self.size * k, -1)
-        q = self._first_order().reshape(self.size * k, -1)
-        active, before = np.arange(self.size * k), np.full(self.size * k, np.inf)
+        q = self.passive.reshape(self.size * k, -1)
+        active = (sets[:, None] * k + np.arange(k)).reshape(-1)
+        before = np.full(self.size * k, np.inf)
         for _ in range(NEWTON_STEPS):
             left = []
             for first in range(0, active.size, POSTURES_AT_ONCE):
@@ -69,14 +81,14 @@ class Machines:
         self.passive = q.reshape(self.size, k, -1)
         done = np.ones(self.size, dtype=np.bool_)
         done[active // k] = False
-        return done & np.isfinite(self.passive).all(axis=(1, 2))
+        return (done & np.isfinite(self.passive).all(axis=(1, 2)))[sets]
 
     def _first_order(self) -> Array:
         """Passive coordinates by the slopes of the machine in the middle, shape as `passive`."""
         own, k = self._compiled.errors, len(self._drives)
         if not self.size or not np.isfinite(self._errors).all():
-            return self.passive
-        centre = self._errors.mean(axis=0)
+            return np.array(self.passive)
+        centre = np.median(self._errors, axis=0)
         change = self._errors - centre
         drives = own.drives(centre, self._drives)
         slopes = self._compiled.sparse_slopes
@@ -88,7 +100,7 @@ class Machines:
         moved = own.offsets(change)[:, None] + own.scales(change)[:, None] * self._drives
         opened = g[..., None] + by_twists @ twists.T + g_a @ moved.transpose(1, 2, 0)
         found = self._near - np.moveaxis(_solve(g_q, opened), -1, 0)
-        return found if np.isfinite(found).all() else self.passive
+        return found if np.isfinite(found).all() else np.array(self.passive)
 
     def tool(self) -> Array:
         """Where the tool of each is in each posture, shape (n_sets, n_postures, 3), [m]."""
