@@ -33,7 +33,7 @@ from orthocal.kinematics.workspace import (
 from orthocal.measurement.observations import build_observations
 from orthocal.measurement.session import Session
 from orthocal.robot.model import Robot
-from orthocal.statistics.information import decompose
+from orthocal.statistics.information import posterior_covariance
 from orthocal.statistics.noise import estimate_repeatability, noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -250,9 +250,9 @@ class ToolForecast:
         jacobian, part = jacobian[good], o.only(good)
         precision = np.maximum(problem.prior_precision, VAGUE)
         weight = noise if weight is None else weight
-        inverse = decompose(jacobian, part).covariance(sigma=weight, precision=precision)
-        scale = problem.theta_scale[:n]
         slopes = project_out_zeros(jacobian, part)
+        inverse = posterior_covariance(slopes, sigma=weight, precision=precision)
+        scale = problem.theta_scale[:n]
         spread = inverse
         if weight != noise:  # they scatter by less than they are weighed by
             gain = inverse @ slopes.T

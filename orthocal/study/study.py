@@ -83,7 +83,7 @@ def prepare_once(study: Study) -> Any:  # noqa: ANN401 - as `prepare`
 
 def _tidy(cells: Sequence[Cell]) -> list[Cell]:
     # NumPy's own numbers take several times as long
-    plain = np.asarray(cells).tolist() if type(cells[0]) is np.float64 else cells
+    plain = np.asarray(cells).tolist() if len(cells) and type(cells[0]) is np.float64 else cells
     return [tidy_cell(v) for v in plain]
 
 

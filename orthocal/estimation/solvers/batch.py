@@ -83,17 +83,22 @@ class BatchProgram:
         self._curved: CurvedReadings | None = None
         self._fixed = False
 
+    @property
+    def takes_values(self) -> bool:
+        """Whether what sets share depends on where they are: on polynomials about them."""
+        return self.problem.n_free <= MOST_PARAMETERS
+
     def fixed_by(self, values: ArrayLike, *, sigma: float, count: int) -> BatchProgram:
         """The same with what many sets share found once: each is solved alike beside any others.
 
         Args:
-            values: Some of the sets, as for `solve`.
+            values: Some of the sets, as for `solve`; none need be there unless `takes_values`.
             sigma: Standard deviation of one reading, [m].
             count: How many sets there will be.
         """
         fixed = BatchProgram(self.problem, options=self.options)
         fixed._fixed = True
-        if self.problem.n_free <= MOST_PARAMETERS:
+        if self.takes_values:
             start = _Shared(self.problem, self.options, sigma).linear(self._entries(values))
             fixed._surrogate = self._find_surrogate(start) if count >= FEWEST_SETS else None
         elif count >= FEWEST_SETS_A_PARAMETER * self.problem.n_free:
