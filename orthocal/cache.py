@@ -64,22 +64,6 @@ def keep(key: str, content: bytes) -> None:
             _make_room(folder)
 
 
-def private_folder(name: str) -> Path | None:
-    """A folder within, for what others keep there; None where nothing is kept."""
-    try:
-        with _folder(create=True) as folder:
-            if folder is None:
-                return None
-            with suppress(FileExistsError):
-                os.mkdir(name, 0o700, dir_fd=folder)
-            status = os.stat(name, dir_fd=folder, follow_symlinks=False)
-    except (OSError, ValueError):
-        return None
-    path = cache_folder()
-    safe = stat.S_ISDIR(status.st_mode) and _is_own(status)
-    return path.absolute() / name if safe and path is not None else None
-
-
 def cache_folder() -> Path | None:
     """Where things are kept; None where nothing is."""
     chosen = os.environ.get(VARIABLE)

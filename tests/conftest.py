@@ -31,7 +31,7 @@ from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.kinematics.lanes import Way, is_installed, running
 
 robot = load_robot("orthoglide")
-with running(Way.NUMBA if is_installed() else Way.CASADI):
+with running(Way.LLVM if is_installed() else Way.CASADI):
     nominal_assembly(robot).close(robot.drive_zero)
 """
 """Fills the cache with what takes long to compile."""

@@ -182,6 +182,20 @@ def test_details_and_all_print_the_rest(orthocal, experiment):
     assert len(everything) > len(details) > len(short)
 
 
+def test_only_the_command_that_is_called_is_made():
+    from orthocal.cli import app
+    from orthocal.cli.run import _program
+
+    names = [c.name or c.callback.__name__ for c in app.registered_commands]
+    for name in names:
+        assert len(_program([name, "x"]).registered_commands) == 1
+        assert not _program([name, "x"]).registered_groups
+    assert [g.name for g in _program(["study", "accuracy"]).registered_groups] == ["study"]
+    for words in ([], ["--help"], ["--version"], ["nonsense"]):
+        assert _program(words) is app
+    assert [c.name or c.callback.__name__ for c in app.registered_commands] == names
+
+
 def test_help_says_what_exit_code_3_means(orthocal):
     for command, words in (("calibrate", "is not to be entered"), ("validate", "it is not")):
         text = " ".join(orthocal(command, "--help")[1].split())

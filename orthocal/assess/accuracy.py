@@ -132,7 +132,11 @@ def measure_uncertainty(
         "relative": workspace.remove_shift(jacobian),
         "aligned": workspace.remove_motion(jacobian, positions),
     }
-    spread = {name: j @ covariance @ j.transpose(0, 2, 1) for name, j in fields.items()}
+    n = len(covariance)
+    spread = {
+        name: (j.reshape(-1, n) @ covariance).reshape(j.shape) @ j.transpose(0, 2, 1)
+        for name, j in fields.items()
+    }
     sizes = {name: _spread_size(c, workspace.weights) for name, c in spread.items()}
     few = len(positions) < FEWEST_ALIGNED
     return ToolUncertainty(

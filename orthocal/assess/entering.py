@@ -187,9 +187,10 @@ def _solve_in_order(first: Array, second: Array, first_rows: Array, second_rows:
     Directions of X are told apart by how much of what they do by `second` they do by `first`.
     """
     square = second.T @ second
-    from scipy import linalg
-
-    ratios, directions = linalg.eigh(first.T @ first, square)
+    factor = np.linalg.cholesky(square)
+    half = np.linalg.solve(factor, first.T)
+    ratios, turned = np.linalg.eigh(half @ half.T)
+    directions = np.linalg.solve(factor.T, turned)
     told = ratios > DECIDED**2
     kept = directions[:, told]
     result = kept @ np.linalg.lstsq(first @ kept, first_rows, rcond=None)[0]

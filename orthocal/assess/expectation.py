@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.estimation.fit import Fit
+from orthocal.statistics.distributions import chi_square_tail, f_tail
 from orthocal.statistics.whitening import whiten
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -77,8 +77,8 @@ class Expectation:
         weighed = whiten(self.deviations(), self.spread(), sigma=self.sigma)
         square = float(weighed @ weighed)
         if math.isinf(sigma_dof):
-            return float(special.chdtrc(self.dof, square))
-        return float(special.fdtrc(self.dof, sigma_dof, square / self.dof))
+            return chi_square_tail(self.dof, square)
+        return f_tail(self.dof, sigma_dof, square / self.dof)
 
 
 def expect(calibration: Calibration, fit: Fit, *, stood: Array) -> Expectation:

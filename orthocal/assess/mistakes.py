@@ -16,9 +16,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from orthocal.statistics.chance import BY_CHANCE
+from orthocal.statistics.distributions import chi_square_quantile, f_tail
 from orthocal.statistics.whitening import whiten
 
 Array = NDArray[np.float64]
@@ -116,7 +116,7 @@ def find_mistake(
     """
     seen = _Seen.of(deviate, whiten(slopes, spread, sigma=sigma), spread, sigma)
     shown = seen.shown(entered)
-    chance = math.sqrt(float(special.chdtri(max(seen.rank, 1), BY_CHANCE)) / len(shown))
+    chance = math.sqrt(chi_square_quantile(max(seen.rank, 1), BY_CHANCE) / len(shown))
     if _rms(shown) <= chance:  # other offsets would not help
         return None
     allowed = max(EXPLAINED * _rms(shown), chance)
@@ -136,7 +136,7 @@ def find_mistake(
     left = whiten(deviate(best.active), spread, sigma=model_sigma)
     excess = float(left @ left) / dof
     if best.kind == "one differs":  # any offset of one drive: it must explain all but chance
-        if special.fdtrc(dof, model_dof, excess) < BY_CHANCE:
+        if f_tail(dof, model_dof, excess) < BY_CHANCE:
             return None
     elif excess > KNOWN_LEAVES**2:
         return None

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import special
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.diagnosis.rows import ResidualRow
 from orthocal.measurement.joining import name_within
+from orthocal.statistics.distributions import beta_share
 
 CHANCE = 0.05
 """Probability below which a repetition of residuals is not put down to chance."""
@@ -60,7 +60,7 @@ def measure_repetition(first: Calibration, second: Calibration) -> Repetition:
     chance = math.nan
     if matched >= 3 and dims > 1.0 and not math.isnan(correlation):
         # directions of noise are spread evenly over the space that the fit leaves to residuals
-        tail = 0.5 * (1.0 - float(special.betainc(0.5, 0.5 * (dims - 1.0), cosine**2)))
+        tail = 0.5 * (1.0 - beta_share(0.5, 0.5 * (dims - 1.0), cosine**2))
         chance = tail if cosine > 0.0 else 1.0 - tail
     scatter, scatter_dof = _scatter(first, second)
     return Repetition(matched, correlation, chance, scatter, scatter_dof)

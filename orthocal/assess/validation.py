@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from orthocal.arguments import require_kind
 from orthocal.assess.entering import ControllerEntry, find_entries
@@ -30,6 +29,7 @@ from orthocal.estimation.fit import Fit
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.measurement.session import Session
 from orthocal.statistics.chance import BY_CHANCE, confidence_factor
+from orthocal.statistics.distributions import f_tail
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import InUnit, Unit
 
@@ -367,4 +367,4 @@ def _excess_probability(
     mean = each + float(np.trace(gram)) / count
     square = count * each**2 + 2.0 * each * float(np.trace(gram)) + float(np.trace(gram @ gram))
     independent = (count * mean) ** 2 / square
-    return float(special.fdtrc(independent, dof, achieved / count / mean))
+    return f_tail(independent, dof, achieved / count / mean)

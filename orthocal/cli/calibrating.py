@@ -113,7 +113,6 @@ def calibrate(
     from orthocal.estimation.selection import read_bounds, read_known, read_tolerances
     from orthocal.files import require_writable, write_files
     from orthocal.measurement.joining import join_sessions
-    from orthocal.show.printed_json import printed_calibration
     from orthocal.show.summary import print_summary
 
     if out is not None:
@@ -136,6 +135,8 @@ def calibrate(
         profile=split_globs(profile),
     )
     if json:
+        from orthocal.show.printed_json import printed_calibration
+
         put_out(printed_calibration(result).rstrip("\n"))
     else:
         print_summary(result, details=details, all_rows=all_rows)

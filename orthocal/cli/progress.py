@@ -57,12 +57,15 @@ def _bar(study: Study) -> Iterator[Callable[[Progress], None]]:
         MofNCompleteColumn(),
         TextColumn("{task.fields[left]}"),
     )
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+    # it draws when told to, and needs no thread: a process with one alone can be doubled
+    console = Console(stderr=True)
+    with Bar(*columns, console=console, auto_refresh=False, transient=True) as bar:
         task = bar.add_task(study.counted, total=sum(study.task_sizes), left="")
 
         def show(progress: Progress) -> None:
             left = "" if progress.seconds_left is None else _duration(progress.seconds_left)
             bar.update(task, completed=progress.done, left=f"{left} left" if left else "")
+            bar.refresh()
 
         yield show
 

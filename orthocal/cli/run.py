@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import sys
+from collections.abc import Callable, Sequence
 from typing import Annotated
 
 import typer
@@ -44,9 +46,27 @@ def main() -> None:
     """
     # small matrices only: more threads would but get in each other's way
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # pydantic would look through all that is installed for plugins
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     with guarded_streams(), ending_at_interrupt():
         code = _run()
     sys.exit(code)
+
+
+def _program(words: Sequence[str]) -> typer.Typer:
+    """The program with the one command that is called: Typer makes all of those that it has."""
+    called = words[0] if words else ""
+    commands = [c for c in app.registered_commands if called in (c.name, _name(c.callback))]
+    groups = [g for g in app.registered_groups if called == g.name]
+    if not commands and not groups:
+        return app
+    alone = copy.copy(app)
+    alone.registered_commands, alone.registered_groups = commands, groups
+    return alone
+
+
+def _name(callback: Callable[..., object] | None) -> str:
+    return getattr(callback, "__name__", "")
 
 
 def _run() -> int | str | None:
@@ -54,7 +74,7 @@ def _run() -> int | str | None:
     code: int | str | None = 0
     try:
         try:
-            app()
+            _program(sys.argv[1:])()
         except SystemExit as e:
             code = e.code
         sys.stdout.flush()

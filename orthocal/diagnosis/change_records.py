@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from scipy import special
-
 from orthocal.diagnosis.hypotheses import Part
 from orthocal.documents import Number, PositiveInSI
 from orthocal.fields import CLOSED, Many, NumberOrNaN, Size, SizeOrInf, SizeOrNaN
 from orthocal.statistics.chance import confidence_factor
+from orthocal.statistics.distributions import normal_quantile
 from orthocal.units import InUnit, Unit
 
 FALSE_ALARM = 0.005
@@ -106,7 +105,7 @@ class Changes:
 
     def seen_from(self, tested: TestedChange) -> float:
         """Size from which on a change would have been seen with 95 %, [unit]; NaN if never."""
-        found = (self.threshold + float(special.ndtri(SEEN))) * tested.std
+        found = (self.threshold + normal_quantile(SEEN)) * tested.std
         return found if math.isfinite(found) else math.nan
 
 

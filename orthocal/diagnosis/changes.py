@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from orthocal.diagnosis.change_records import (
     Change,
@@ -39,6 +38,7 @@ from orthocal.diagnosis.together import hold_together, label_sessions, standard_
 from orthocal.diagnosis.unmodelled import OtherErrors
 from orthocal.estimation.fit import Fit
 from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
+from orthocal.statistics.distributions import f_tail
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -235,7 +235,7 @@ def _chance(square: float, dof: float, noise: _Noise) -> float:
     scaled = square / noise.scale**2
     if math.isinf(noise.dof):
         return chance_of_excess(scaled, dof)
-    return float(special.fdtrc(dof, noise.dof, scaled / dof))
+    return f_tail(dof, noise.dof, scaled / dof)
 
 
 def _parts_alone(

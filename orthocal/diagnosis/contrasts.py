@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
 
@@ -120,8 +119,8 @@ class Common:
     contrasts: Contrasts
     used: Indices
     """Columns in common."""
-    factor: tuple[Array, bool]
-    """Of XᵀX + P."""
+    factor: Array
+    """L of XᵀX + P = L Lᵀ."""
     estimate: Array
     """β, shape (n_used,)."""
     square: float
@@ -143,7 +142,7 @@ class Common:
         moved = products[:, : len(directions)] @ directions
         own = np.einsum("ij,ij->j", directions, moved[: len(directions)])
         score = directions.T @ scores[: len(directions)] - moved[self.used].T @ self.estimate
-        taken = moved[self.used] * cho_solve(self.factor, moved[self.used])
+        taken = moved[self.used] * self._solve(moved[self.used])
         information = own - taken.sum(axis=0)
         told = information > BLIND * np.maximum(own, 1e-300)
         return np.where(told, score, 0.0), np.where(told, information, 0.0)
@@ -159,19 +158,29 @@ class Common:
         products, scores = self.contrasts.since(session)
         moved = products[:, columns]
         score = scores[columns] - moved[self.used].T @ self.estimate
-        left = moved[columns] - moved[self.used].T @ cho_solve(self.factor, moved[self.used])
+        left = moved[columns] - moved[self.used].T @ self._solve(moved[self.used])
         sizes, directions = np.linalg.eigh(0.5 * (left + left.T))
         told = sizes > max(1.0, BLIND * float(sizes.max(initial=0.0)))
         along = directions[:, told].T @ score
         return float((along**2 / sizes[told]).sum()), float(told.sum())
 
+    def _solve(self, right: Array) -> Array:
+        return _solve(self.factor, right)
+
     def single_readings(self) -> tuple[Array, Array]:
         """How far each entry is off by itself: (Wy)ᵢ and Wᵢᵢ, shape (n_entries,)."""
         used = self.contrasts.columns[:, self.used]
         left = self.contrasts.values - used @ self.estimate
-        taken = (used * cho_solve(self.factor, used.T).T).sum(axis=1)
+        taken = (used * self._solve(used.T).T).sum(axis=1)
         shown = 1.0 - 1.0 / np.bincount(self.contrasts.zero)[self.contrasts.zero]
         return left, np.where(shown - taken > BLIND, shown - taken, 0.0)
+
+
+def _solve(factor: Array, right: Array) -> Array:
+    """(L Lᵀ)⁻¹ of vectors or columns."""
+    from scipy.linalg import cho_solve
+
+    return np.asarray(cho_solve((factor, True), right))
 
 
 def take_out_common(contrasts: Contrasts) -> Common:
@@ -181,10 +190,10 @@ def take_out_common(contrasts: Contrasts) -> Common:
     precision = contrasts.precision[used]
     whole = products[np.ix_(used, used)]
     rounding = ROUNDING * float(np.diag(whole).max(initial=0.0))
-    factor = cho_factor(whole + np.diag(precision + rounding), lower=True)
-    estimate = cho_solve(factor, scores[used])
+    factor: Array = np.asarray(np.linalg.cholesky(whole + np.diag(precision + rounding)))
+    estimate = _solve(factor, scores[used])
     square = float(contrasts.values @ contrasts.values - scores[used] @ estimate)
-    sizes = 2.0 * np.log(np.diag(factor[0])).sum() - np.log(precision).sum()
+    sizes = 2.0 * np.log(np.diag(factor)).sum() - np.log(precision).sum()
     return Common(contrasts, used, factor, estimate, max(square, 0.0), -0.5 * (square + sizes))
 
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from orthocal.diagnosis.rows import ResidualRow, root_mean_square
 from orthocal.diagnosis.unmodelled import OtherErrors
@@ -92,7 +91,9 @@ class _Spread:
         squares = (along**2 / variance).sum(axis=1) + rest / self.sigma**2
         logs = np.log(variance / self.sigma**2).sum(axis=1)
         weights = -0.5 * (np.log(EXCESSES) / EXCESS_SPREAD) ** 2
-        return float(special.logsumexp(weights - 0.5 * (squares + logs)))
+        likelihoods = weights - 0.5 * (squares + logs)
+        largest = float(likelihoods.max())
+        return largest + float(np.log(np.exp(likelihoods - largest).sum()))
 
 
 NEARLY = 3.0

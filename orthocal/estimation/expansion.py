@@ -27,6 +27,9 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 POSTURES_AT_ONCE = 256
+MANY_ROWS = 400
+"""From which on a product with a sparse matrix takes less than making it."""
+
 READINGS_AT_ONCE = 2048
 """Whose derivatives are held at a time, for their memory."""
 
@@ -181,7 +184,7 @@ class Expander:
         n, n_free = self._observations.size, slopes.offsets.shape[1]
         reading, opening, by_unknowns = np.empty(n), np.empty(n), np.zeros((n, unknowns.size))
         jacobian, correction = np.empty((n, n_free)), np.zeros_like(passive)
-        by_twists = _Chain.of(slopes.twists[self._used])
+        by_twists = _Chain.of(slopes.twists[self._used], n)
         zero = machine.drives(self._zero_drives)
         closings = []
         for part in self._parts:
@@ -298,12 +301,13 @@ class _Chain:
     """Rows by twists to rows by θ̂: each error moves a placement or a few."""
 
     matrix: Any
+    """∂ξ/∂θ̂ᵀ, sparse where there are many rows."""
 
     @staticmethod
-    def of(slopes: Array) -> _Chain:
-        """Of ∂ξ/∂θ̂, shape (n_used, n_free)."""
-        if not slopes.size:
-            return _Chain(None)
+    def of(slopes: Array, n_rows: int) -> _Chain:
+        """Of ∂ξ/∂θ̂, shape (n_used, n_free), for so many rows."""
+        if not slopes.size or n_rows < MANY_ROWS:
+            return _Chain(slopes.T)
         from scipy.sparse import csr_array
 
         return _Chain(csr_array(slopes.T))

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.kinematics.lanes import LaneFunction, list_instructions, pays
+from orthocal.kinematics.lanes import Listing, list_instructions, pays, run_in_lanes
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -49,12 +49,19 @@ class BatchFunction:
         ]
         self._matrices = [function.index_out(name) for name in matrices]
         self._local = threading.local()
+        self._points = 0
+        self._same: BatchFunction | None = None
 
     @cached_property
     def unshared(self) -> BatchFunction:
-        """The same with inputs of their own at every point, shape (K, n) all of them."""
+        """The same with inputs of their own at every point.
+
+        Their shape is (K, n), or (K / m, n) for a row that stands for m points in turn.
+        """
         names = [self._function.name_out(i) for i in self._matrices]
-        return BatchFunction(self._function, matrices=names, sparse=tuple(self._sparse))
+        found = BatchFunction(self._function, matrices=names, sparse=tuple(self._sparse))
+        found._same = self
+        return found
 
     def pattern(self, name: str) -> tuple[Indices, Indices]:
         """Rows and columns of the nonzeros of a sparse output, shape (nnz,) each."""
@@ -73,11 +80,13 @@ class BatchFunction:
             keep their one column; sparse ones have shape (K, nnz).
         """
         arrays = [np.asarray(a, dtype=np.float64) for a in inputs]
-        count = next(len(a) for i, a in enumerate(arrays) if i not in self._shared)
-        lanes = self._by_numba if pays(self._function.n_instructions(), count) else None
-        if lanes is not None:
-            flat = lanes(arrays, self._shared, count)
-        else:
+        count = max(len(a) for i, a in enumerate(arrays) if i not in self._shared)
+        flat = None
+        if pays(self._function.n_instructions(), count, self._points):
+            listing = self._listing
+            flat = None if listing is None else run_in_lanes(listing, arrays, self._shared, count)
+        self._points += count
+        if flat is None:
             flat = self._by_casadi(arrays, count)
         results = [y.reshape(count, c, r) for y, (r, c) in zip(flat, self._shapes, strict=True)]
         return tuple(
@@ -88,10 +97,9 @@ class BatchFunction:
         )
 
     @cached_property
-    def _by_numba(self) -> LaneFunction | None:
-        """The same by numba; None where that does not know one of its operations."""
-        listing = list_instructions(self._function)
-        return None if listing is None else LaneFunction(listing, self._shared)
+    def _listing(self) -> Listing | None:
+        """Its instructions; None where one of them is not known."""
+        return list_instructions(self._function) if self._same is None else self._same._listing
 
     def _by_casadi(self, arrays: list[Array], count: int) -> list[Array]:
         """Nonzeros of each output, shape (count, nnz)."""
@@ -102,7 +110,11 @@ class BatchFunction:
                 continue
             lanes = self._lanes(size)
             lanes.share({i: arrays[i] for i in self._shared})
-            own = [(i, a) for i, a in enumerate(arrays) if i not in self._shared]
+            own = [
+                (i, a if len(a) == count else np.repeat(a, count // len(a), axis=0))
+                for i, a in enumerate(arrays)
+                if i not in self._shared
+            ]
             while count - first >= size:
                 part = slice(first, first + size)
                 for i, a in own:

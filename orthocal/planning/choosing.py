@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -302,7 +303,7 @@ class _Taking:
         size = math.sqrt(column[row] + self.noise)
         step, share = column / size, self.effect[row] / size
         self.gain += float(share @ share)
-        self.effect = self.effect - step[:, None] * share
+        self.effect = self.effect - np.outer(step, share)
         self.variance = self.variance - step**2
         self.steps = (*self.steps, step)
 
@@ -314,13 +315,14 @@ class _Taking:
     def gains_beside(self, rows: list[int]) -> Array:
         """What one more reading would take where these are taken, and no others, shape (m,)."""
         rest = self.spread[rows]
-        solved = np.linalg.solve(rest[:, rows] + self.noise * np.eye(len(rows)), rest)
+        own = rest[:, rows]
+        own[np.diag_indices(len(rows))] += self.noise
+        solved = np.linalg.solve(own, rest)
         effect = self.effect - solved.T @ self.effect[rows]
-        return self._gains(effect, self.variance - np.einsum("rm,rm->m", rest, solved))
+        return self._gains(effect, self.variance - (rest * solved).sum(axis=0))
 
     def _gains(self, effect: Array, variance: Array) -> Array:
-        square = np.einsum("mp,mp->m", effect, effect)
-        return np.asarray(square / (np.maximum(variance, 0.0) + self.noise))
+        return np.asarray(np.vecdot(effect, effect) / (np.maximum(variance, 0.0) + self.noise))
 
     def pairs(self, together: NDArray[np.bool_], most: int) -> list[tuple[float, tuple[int, int]]]:
         """What two readings take that take most together, and which; the gauge is set in the first.
@@ -331,7 +333,7 @@ class _Taking:
         q, v = product.diagonal(), self.variance
         # beside a zero of which nothing is known two readings are worth their difference
         square = q[:, None] + q[None] - 2.0 * product
-        gains = square / (v[:, None] + v[None] - 2.0 * self.spread + 2.0 * self.noise)
+        gains = square / (v[:, None] + (v + 2.0 * self.noise) - 2.0 * self.spread)
         gains[~together] = -1.0
         np.fill_diagonal(gains, -1.0)
         found: list[tuple[float, tuple[int, int]]] = []
@@ -346,6 +348,7 @@ class _Taking:
         return found
 
 
+@lru_cache(maxsize=512)
 def _able(kind: Kind, count: int) -> NDArray[np.bool_]:
     """Which readings a gauge reaches from one (row) from which it reaches enough of them."""
     return np.asarray(kind.together & (kind.together.sum(axis=1) >= count)[:, None])
@@ -379,7 +382,7 @@ def error_left(information: Array, weigh: Weigh) -> float:
     """What the criterion makes small, as large as an error, where so much is said of the state."""
     covariance = _inverse(information)
     root = weigh(covariance)
-    return float(np.sqrt(np.einsum("np,nm,mp->", root, covariance, root, optimize=True)))
+    return float(np.sqrt(np.vdot(root, covariance @ root)))
 
 
 def _inverse(information: Array) -> Array:

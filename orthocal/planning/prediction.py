@@ -19,6 +19,7 @@ from orthocal.diagnosis.unmodelled import machine_errors
 from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.selection import Selection
+from orthocal.estimation.solvers.fleet import Fleet
 from orthocal.estimation.weighting import split_by_gauge
 from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.kinematics.kept import once_a_robot
@@ -32,7 +33,7 @@ from orthocal.kinematics.workspace import (
 from orthocal.measurement.observations import build_observations
 from orthocal.measurement.session import Session
 from orthocal.robot.model import Robot
-from orthocal.statistics.information import decompose
+from orthocal.statistics.information import posterior_covariance
 from orthocal.statistics.noise import estimate_repeatability, noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -179,8 +180,11 @@ class ToolForecast:
         noise = noise_of(session) if sigma is None else sigma
         drawn = list(self._draw(problem, entered=entered)) if machines is None else machines
         found, lost = [], 0.0
-        for theta in drawn:
-            covariance, share = self._posterior(problem, others, theta, noise, weight)
+        fleet = Fleet(problem, np.array(drawn) / problem.theta_scale)
+        closed = fleet.close()
+        for i, theta in enumerate(drawn):
+            passive = fleet.passive[i] if closed[i] else None
+            covariance, share = self._posterior(problem, others, theta, noise, weight, passive)
             if covariance is not None:
                 found.append(covariance)
             lost += share / len(drawn)
@@ -228,6 +232,7 @@ class ToolForecast:
         theta: Array,
         noise: float,
         weight: float | None = None,
+        passive: Array | None = None,
     ) -> tuple[Array | None, float]:
         """Covariance of what the estimate has wrong about a machine, (n_names, n_names), [SI].
 
@@ -235,7 +240,7 @@ class ToolForecast:
         """
         o, n = problem.observations, problem.n_machine
         try:
-            _, jacobian = problem.linearise(theta)
+            _, jacobian = problem.linearise(theta, passive)
         except ClosureError:
             return None, 1.0
         good = np.asarray(np.isfinite(jacobian).all(axis=1))
@@ -245,9 +250,9 @@ class ToolForecast:
         jacobian, part = jacobian[good], o.only(good)
         precision = np.maximum(problem.prior_precision, VAGUE)
         weight = noise if weight is None else weight
-        inverse = decompose(jacobian, part).covariance(sigma=weight, precision=precision)
-        scale = problem.theta_scale[:n]
         slopes = project_out_zeros(jacobian, part)
+        inverse = posterior_covariance(slopes, sigma=weight, precision=precision)
+        scale = problem.theta_scale[:n]
         spread = inverse
         if weight != noise:  # they scatter by less than they are weighed by
             gain = inverse @ slopes.T

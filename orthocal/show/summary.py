@@ -2,34 +2,23 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from rich.console import Group, RenderableType
 from rich.text import Text
 
 from orthocal.arguments import require_kind
-from orthocal.assess.comparison import Comparison
-from orthocal.assess.validation import Validation
 from orthocal.calibration.calibration import Calibration
-from orthocal.planning.plan import MeasuringPlan
-from orthocal.show.accuracy import render_tool
 from orthocal.show.answer import MORE, render_answer
-from orthocal.show.comparison import render_comparison
-from orthocal.show.entering import render_controller
-from orthocal.show.explanation import explain_fit
-from orthocal.show.heading import render_origin
 from orthocal.show.layout import bullets, print_rich, section, to_text
-from orthocal.show.plan import render_plan
-from orthocal.show.report.rich_markup import to_markup
-from orthocal.show.sensors import render_parts
-from orthocal.show.tables import (
-    render_fit,
-    render_identifiability,
-    render_parameters,
-    render_residuals,
-)
-from orthocal.show.validation import render_validation
-from orthocal.study.running import StudyTable
 
-Result = Calibration | Validation | Comparison | MeasuringPlan | StudyTable
+if TYPE_CHECKING:
+    from orthocal.assess.comparison import Comparison
+    from orthocal.assess.validation import Validation
+    from orthocal.planning.plan import MeasuringPlan
+    from orthocal.study.running import StudyTable
+
+    Result = Calibration | Validation | Comparison | MeasuringPlan | StudyTable
 
 
 def summarize(
@@ -44,7 +33,11 @@ def summarize(
         html: As HTML, as a notebook shows it.
     """
     content = _render(result, details, all_rows)
-    return to_markup(content) if html else to_text(content)
+    if not html:
+        return to_text(content)
+    from orthocal.show.report.rich_markup import to_markup
+
+    return to_markup(content)
 
 
 def print_summary(result: Result, *, details: bool = False, all_rows: bool = False) -> None:
@@ -53,6 +46,13 @@ def print_summary(result: Result, *, details: bool = False, all_rows: bool = Fal
 
 
 def _render(result: Result, details: bool, all_rows: bool) -> RenderableType:
+    if isinstance(result, Calibration):
+        return render_calibration(result, details=details, all_rows=all_rows)
+    from orthocal.assess.comparison import Comparison
+    from orthocal.assess.validation import Validation
+    from orthocal.planning.plan import MeasuringPlan
+    from orthocal.study.running import StudyTable
+
     kinds = (Calibration, Comparison, Validation, MeasuringPlan, StudyTable)
     expected = "a Calibration, a Comparison, a Validation, a MeasuringPlan or a StudyTable"
     require_kind(result, kinds, expected=expected)
@@ -61,11 +61,15 @@ def _render(result: Result, details: bool, all_rows: bool) -> RenderableType:
 
         return render_study(result, summarise_study(result), all_rows=all_rows or details)
     if isinstance(result, MeasuringPlan):
+        from orthocal.show.plan import render_plan
+
         return render_plan(result, details=details)
-    if isinstance(result, Calibration):
-        return render_calibration(result, details=details, all_rows=all_rows)
     if isinstance(result, Comparison):
+        from orthocal.show.comparison import render_comparison
+
         return render_comparison(result, all_rows=all_rows)
+    from orthocal.show.validation import render_validation
+
     return render_validation(result, all_rows=all_rows)
 
 
@@ -76,6 +80,18 @@ def render_calibration(
     answer = render_answer(calibration)
     if not (details or all_rows):
         return Group(answer, Text(MORE))
+    from orthocal.show.accuracy import render_tool
+    from orthocal.show.entering import render_controller
+    from orthocal.show.explanation import explain_fit
+    from orthocal.show.heading import render_origin
+    from orthocal.show.sensors import render_parts
+    from orthocal.show.tables import (
+        render_fit,
+        render_identifiability,
+        render_parameters,
+        render_residuals,
+    )
+
     return Group(
         answer,
         section("How it was done", render_origin(calibration)),

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
-from scipy import special
+import math
+
+from orthocal.statistics.distributions import chi_square_tail, f_tail, normal_quantile, t_quantile
 
 BY_CHANCE = 0.01
 """Probability below which residuals that are larger than noise are not put down to chance."""
@@ -19,16 +20,16 @@ def chance_of_excess(chi_square: float, dof: float, *, cycles_dof: float = 0.0) 
             have beside the cycles' own scatter. 0 for a σ that was given: a χ² test.
     """
     if cycles_dof == 0.0:
-        return float(special.chdtrc(dof, chi_square))
+        return chi_square_tail(dof, chi_square)
     rest, rest_dof = chi_square - cycles_dof, dof - cycles_dof
     if rest_dof <= 0.5 or rest <= 0.0:
         return 1.0
-    return float(special.fdtrc(rest_dof, cycles_dof, rest / rest_dof))
+    return f_tail(rest_dof, cycles_dof, rest / rest_dof)
 
 
 def confidence_factor(dof: float, level: float = 0.95) -> float:
     """Standard deviations on either side of an estimate that hold it with a probability."""
     tail = 0.5 + level / 2.0
-    if np.isinf(dof):
-        return float(special.ndtri(tail))
-    return float(special.stdtrit(dof, tail)) if dof > 0 else float("inf")
+    if math.isinf(dof):
+        return normal_quantile(tail)
+    return t_quantile(dof, tail) if dof > 0 else float("inf")

@@ -124,6 +124,18 @@ def _inverse_square(matrix: Array) -> Array:
     return np.asarray(half @ half.T)
 
 
+def posterior_covariance(factor: Array, *, sigma: float, precision: Array) -> Array:
+    """As `Information.covariance` of a factor that needs no decomposition, (n_free, n_free).
+
+    Args:
+        factor: A Jacobian, zeros eliminated, shape (n, n_free), [m per tolerance].
+        sigma: Standard deviation of one reading, [m].
+        precision: Diagonal of P, shape (n_free,).
+    """
+    inverse = _inverse_square(np.vstack([factor / sigma, np.diag(np.sqrt(precision))]))
+    return 0.5 * (inverse + inverse.T)
+
+
 def marginalise(information: Information, kept: int, *, sigma: float) -> Information:
     """What readings say of the first parameters, the others known to their tolerances at most.
 

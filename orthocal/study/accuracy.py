@@ -187,10 +187,12 @@ class _Prepared:
             sigma=noise_of(session),
         )
         found = replace(found, sigma=_weight(study, found))
-        read = found.read(study, range(min(MACHINES_A_TASK, study.machines)))
-        good = read.values[read.status == GOOD]
-        if not len(good):
-            return found
+        good = np.zeros((0, problem.observations.size))
+        if found.program.takes_values:
+            read = found.read(study, range(min(MACHINES_A_TASK, study.machines)))
+            good = read.values[read.status == GOOD]
+            if not len(good):
+                return found
         program = found.program.fixed_by(good, sigma=found.sigma, count=study.machines)
         return replace(found, program=program)
 

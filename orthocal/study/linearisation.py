@@ -199,12 +199,14 @@ class _Prepared:
                 ("twelve_gls", twelve, twelve_row_covariance()),
             ):
                 matrix = self.matrices[rows.shape[1]]
-                own = [solve_equation_8(matrix, y, covariance=covariance).offsets for y in rows]
-                found[name] = missed(np.array(own))
+                unit = np.eye(rows.shape[1])  # what solves is linear: each row alone, then sums
+                own = [solve_equation_8(matrix, y, covariance=covariance).offsets for y in unit]
+                found[name] = missed(rows @ np.array(own))
         centred = project_out_zeros(change.T, problem.observations).T
-        first = [replace(self.linearisation, residual=y).solve(sigma=1.0) for y in centred]
+        unit = np.vstack([np.zeros(centred.shape[1]), np.eye(centred.shape[1])])
+        start, *own = (replace(self.linearisation, residual=y).solve(sigma=1.0) for y in unit)
         foretold = errors / problem.theta_scale @ self.linearisation.slopes.T
-        theta = np.array(first)
+        theta = start + centred @ (np.array(own) - start)
         found["first_order"] = missed(theta)
         steps, trail, exact = self._iterate(read, theta, errors, good)
         for k, found_there in enumerate(trail):

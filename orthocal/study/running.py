@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 from orthocal.errors import OrthocalError
 from orthocal.study.journal import Found, open_journal
 from orthocal.study.study import Cell, Study, run_task
+from orthocal.study.workers import Done, run_on_cores
 
 JOURNAL = "results.jsonl"
 """In a study's folder."""
@@ -20,13 +18,8 @@ JOURNAL = "results.jsonl"
 CONNECTING = 10.0
 """How long a cluster may take to answer, [s]."""
 
-WATCHING = 0.5
-"""How often a worker looks whether it is still wanted, [s]."""
-
 RETRIES = 3
 """How often a task is begun anew whose worker is gone."""
-
-Done = tuple[int, dict[str, list[Cell]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,36 +95,11 @@ def _run(study: Study, todo: Sequence[int], workers: int, dask: str | None) -> I
         return _on_cluster(study, todo, dask)
     if min(workers, len(todo)) == 1:
         return ((task, run_task(study, task)) for task in todo)
-    return _on_cores(study, todo, min(workers, len(todo)))
+    return run_on_cores(study, todo, min(workers, len(todo)))
 
 
 def _one(study: Study, task: int) -> Done:
     return task, run_task(study, task)
-
-
-def _on_cores(study: Study, todo: Sequence[int], workers: int) -> Iterator[Done]:
-    from joblib import Parallel, delayed, parallel_config
-
-    with parallel_config(backend="loky", inner_max_num_threads=1):
-        parallel = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)
-        yield from parallel(delayed(_in_worker)(study, task, os.getpid()) for task in todo)
-
-
-def _in_worker(study: Study, task: int, parent: int) -> Done:
-    _end_with(parent)
-    return _one(study, task)
-
-
-@cache
-def _end_with(parent: int) -> None:
-    """End this process when the one that asked for its work is gone: killed, it cannot say so."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(WATCHING)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 def _on_cluster(study: Study, todo: Sequence[int], address: str) -> Iterator[Done]:

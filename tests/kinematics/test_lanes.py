@@ -1,4 +1,4 @@
-"""Functions run by numba give the numbers that CasADi gives, bit by bit."""
+"""Functions run in lanes give the numbers that CasADi gives, bit by bit."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_both_ways_give_the_same_numbers(request, name, count):
     for function in functions:
         with running(Way.CASADI):
             expected = function(*where)
-        with running(Way.NUMBA):
+        with running(Way.LLVM):
             found = function(*where)
         for ours, theirs in zip(found, expected, strict=True):
             assert ours.shape == theirs.shape
@@ -45,7 +45,7 @@ def test_both_ways_give_the_same_numbers(request, name, count):
 def test_inputs_of_their_own_are_the_same_as_shared_ones(orthoglide):
     function, where = compiled_robot(orthoglide).closing, points(orthoglide, 40)
     own = (*where[:2], np.tile(where[2], (40, 1)))
-    for way in (Way.CASADI, Way.NUMBA):
+    for way in (Way.CASADI, Way.LLVM):
         with running(way):
             for a, b in zip(function(*where), function.unshared(*own), strict=True):
                 assert np.array_equal(a, b)
@@ -68,7 +68,7 @@ def test_every_operation_is_casadis():
     batch = BatchFunction(function)
     with running(Way.CASADI):
         (expected,) = batch(*values)
-    with running(Way.NUMBA):
+    with running(Way.LLVM):
         (ours,) = batch(*values)
     assert np.array_equal(ours, expected, equal_nan=True)
 
@@ -86,16 +86,44 @@ def test_an_operation_that_is_not_known_is_left_to_casadi():
     x = ca.SX.sym("x")
     function = ca.Function("unknown", [x], [ca.erf(x)])
     assert list_instructions(function) is None
-    with running(Way.NUMBA):
+    with running(Way.LLVM):
         (found,) = BatchFunction(function)(np.ones((50, 1)))
     assert found[0, 0] == float(ca.erf(1.0))
 
 
-def test_numba_is_not_imported_for_little(monkeypatch):
+def test_a_row_of_an_input_stands_for_points_in_turn(orthoglide):
+    function, where = compiled_robot(orthoglide).closing.unshared, points(orthoglide, 44)
+    rng = np.random.default_rng(3)
+    rows = where[2] + 1e-4 * rng.normal(size=(11, where[2].size))
+    for way in (Way.CASADI, Way.LLVM):
+        with running(way):
+            expected = function(*where[:2], np.repeat(rows, 4, axis=0))
+            for a, b in zip(function(*where[:2], rows), expected, strict=True):
+                assert np.array_equal(a, b)
+
+
+def test_no_points_are_none(orthoglide):
+    function, where = compiled_robot(orthoglide).closing, points(orthoglide, 3)
+    with running(Way.LLVM):
+        found = function(where[0][:0], where[1][:0], where[2])
+    assert [len(a) for a in found] == [0, 0]
+
+
+def test_nothing_is_made_for_little(monkeypatch):
     monkeypatch.setattr(lanes, "_spent", 0.0)
     monkeypatch.setattr(lanes, "is_installed", lambda: True)
-    assert not lanes.pays(20_000, 1000)
-    assert lanes.pays(20_000, 30_000)
-    assert not lanes.pays(20_000, 1)
+    assert not lanes.pays(20_000, 400, before=0)
+    assert not lanes.pays(20_000, 400, before=50)  # of this function
+    assert lanes.pays(20_000, 400, before=101)
+    assert not lanes.pays(20_000, 1, before=10**6)
     monkeypatch.setattr(lanes, "is_installed", lambda: False)
-    assert not lanes.pays(20_000, 10**9)
+    assert not lanes.pays(20_000, 10**9, before=0)
+
+
+def test_where_there_is_no_interpreter_casadi_does_it(orthoglide, monkeypatch):
+    function, where = compiled_robot(orthoglide).closing, points(orthoglide, 3)
+    with running(Way.LLVM):
+        expected = function(*where)
+        monkeypatch.setattr(lanes, "interpreter", lambda: None)
+        for a, b in zip(function(*where), expected, strict=True):
+            assert np.array_equal(a, b)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import multiprocessing
 import os
@@ -17,6 +18,7 @@ from gauges import exact
 from orthocal import load_session
 from orthocal.errors import OrthocalError
 from orthocal.show.study.views import study_json, summarise_study
+from orthocal.study import workers as workers_module
 from orthocal.study.bootstrap import build_bootstrap_study
 from orthocal.study.journal import open_journal
 from orthocal.study.linearisation import build_linearisation_study
@@ -81,9 +83,87 @@ def test_a_line_without_an_end_is_done_again(study, undisturbed, tmp_path):
         assert file.read_bytes() == whole
 
 
+@pytest.mark.parametrize("forked", [True, False])
 @pytest.mark.parametrize("workers", [2, 3])
-def test_any_number_of_workers_finds_the_same(study, undisturbed, workers):
+def test_any_number_of_workers_finds_the_same(study, undisturbed, workers, forked, monkeypatch):
+    monkeypatch.setattr(workers_module, "_can_fork", lambda: forked)
     assert results(run_study(study, workers=workers)) == results(undisturbed)
+
+
+def test_a_process_with_threads_is_not_doubled():
+    code = (
+        "import threading, time\nfrom orthocal.study.workers import _can_fork\n"
+        "assert _can_fork()\n"
+        "threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
+        "assert not _can_fork()\n"
+    )
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+
+
+def test_a_worker_that_is_killed_is_told(study, tmp_path, monkeypatch):
+    monkeypatch.setattr(workers_module, "_can_fork", lambda: True)
+    here = os.getpid()
+    run = workers_module.run_task
+
+    def kill_itself(study, task):
+        if task == 5:
+            assert os.getpid() != here
+            os.kill(os.getpid(), signal.SIGKILL)
+        return run(study, task)
+
+    monkeypatch.setattr(workers_module, "run_task", kill_itself)
+    with pytest.raises(OrthocalError, match="a process of the study was killed"):
+        run_study(study, workers=2, folder=tmp_path)
+    assert not doubled()
+    with open_journal(tmp_path / JOURNAL, study) as journal:
+        assert journal.found
+        assert 5 not in journal.found
+
+
+@pytest.mark.parametrize("sendable", [True, False])
+def test_what_a_worker_raises_is_raised(study, monkeypatch, sendable):
+    class OwnError(Exception):
+        """Of no module: it cannot be sent."""
+
+    monkeypatch.setattr(workers_module, "_can_fork", lambda: True)
+    error = ValueError("found nothing") if sendable else OwnError("found nothing")
+
+    def fail(study, task):
+        raise error
+
+    monkeypatch.setattr(workers_module, "run_task", fail)
+    with pytest.raises(ValueError if sendable else RuntimeError, match="found nothing"):
+        run_study(study, workers=2)
+
+
+def test_workers_hold_no_lock(study, tmp_path, monkeypatch):
+    """Whoever goes on after a kill need not wait until the last worker has noticed it."""
+    monkeypatch.setattr(workers_module, "_can_fork", lambda: True)
+    locked = tmp_path / "held"
+    descriptor = os.open(locked, os.O_RDWR | os.O_CREAT)
+    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    tasks = workers_module.run_on_cores(study, range(6), 2)
+    next(tasks)
+    os.close(descriptor)
+    other = os.open(locked, os.O_RDWR)
+    until(lambda: is_free(other))  # while both are still there
+    assert len(doubled()) == 2
+    os.close(other)
+    tasks.close()
+    assert not doubled()
+
+
+def is_free(descriptor):
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def doubled():
+    return [p for p in multiprocessing.active_children() if isinstance(p, FORK.Process)]
 
 
 def test_what_is_there_is_not_done_again(study, tmp_path, monkeypatch):

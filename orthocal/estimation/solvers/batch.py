@@ -83,17 +83,22 @@ class BatchProgram:
         self._curved: CurvedReadings | None = None
         self._fixed = False
 
+    @property
+    def takes_values(self) -> bool:
+        """Whether what sets share depends on where they are: on polynomials about them."""
+        return self.problem.n_free <= MOST_PARAMETERS
+
     def fixed_by(self, values: ArrayLike, *, sigma: float, count: int) -> BatchProgram:
         """The same with what many sets share found once: each is solved alike beside any others.
 
         Args:
-            values: Some of the sets, as for `solve`.
+            values: Some of the sets, as for `solve`; none need be there unless `takes_values`.
             sigma: Standard deviation of one reading, [m].
             count: How many sets there will be.
         """
         fixed = BatchProgram(self.problem, options=self.options)
         fixed._fixed = True
-        if self.problem.n_free <= MOST_PARAMETERS:
+        if self.takes_values:
             start = _Shared(self.problem, self.options, sigma).linear(self._entries(values))
             fixed._surrogate = self._find_surrogate(start) if count >= FEWEST_SETS else None
         elif count >= FEWEST_SETS_A_PARAMETER * self.problem.n_free:
@@ -195,7 +200,7 @@ class BatchProgram:
         reading, jacobian = curved(theta)
         jacobian /= about.sigma
         passive = problem.reference_passive + curved.machine.follow(theta - curved.reference)
-        inverses, before = None, None
+        inverses, before, last = None, None, np.zeros_like(theta)
         for _ in range(MOST_STEPS):
             try:
                 exact = FleetSlopes(problem, theta[left], passive[left])
@@ -210,8 +215,7 @@ class BatchProgram:
             step = (inverses @ pull[..., None])[..., 0]
             theta[left] += step
             passive[left] += exact.follow(step)
-            moved = (jacobian[left] @ step[..., None])[..., 0]
-            reading[left] = exact.reading + about.sigma * moved
+            reading[left], last[left] = exact.reading, step
             sizes = np.roll(sizes, 1, axis=0)
             sizes[0, left] = np.abs(step).max(axis=1)
             settled = _settled(sizes[:, left])
@@ -220,6 +224,7 @@ class BatchProgram:
             left, inverses, before = left[on], inverses[on], (step[on], pull[on])
             if not left.size:
                 break
+        reading += about.sigma * (jacobian @ last[..., None])[..., 0]
         about.finish(y, theta, reading, done, found)
 
     def _alone(self, y: Array, sigma: float, found: _Found) -> None:
@@ -321,12 +326,16 @@ class _Shared:
 
     def square(self, residual: Array, jacobian: Array) -> Array:
         """Normal equations of each set, gauge zeros eliminated, shape (n_sets, n_free, n_free)."""
-        weights = self.loss.weight(residual)[..., None]
-        sums = np.swapaxes(self._zeros.T @ weights, 1, 2)
-        means = np.swapaxes(np.swapaxes(weights * jacobian, 1, 2) @ self._zeros / sums, 1, 2)
-        centred = jacobian - means[:, self.problem.observations.zero]
-        own = np.diag(self._precision)
-        return np.asarray(np.swapaxes(centred, 1, 2) @ (weights * centred) + own)
+        if not self.loss.robust:
+            weighted, sums = jacobian, self._counts.astype(np.float64)[None, :, None]
+        else:
+            weights = self.loss.weight(residual)[..., None]
+            weighted, sums = weights * jacobian, self._zeros.T @ weights
+        of_zeros = self._zeros.T @ weighted
+        result = np.swapaxes(jacobian, 1, 2) @ weighted
+        result -= np.swapaxes(of_zeros, 1, 2) @ (of_zeros / sums)
+        result += np.diag(self._precision)
+        return np.asarray(result)
 
     def pull(self, theta: Array, of_readings: Array) -> Array:
         """What pulls at θ̂, readings and prior, shape (n_sets, n_free)."""

@@ -38,7 +38,7 @@ class Fleet(Machines):
             (h,) = group.reading.value.unshared(
                 actuated[:, at].reshape(self.size * n, -1),
                 self.passive[:, at].reshape(self.size * n, -1),
-                np.repeat(self.placements, n, axis=0),
+                self.placements,
                 zero[:, group.setups].reshape(self.size * n, -1),
                 np.tile(group.constants, (self.size, 1)),
                 self._unknowns[:, group.unknowns].reshape(self.size * n, -1),

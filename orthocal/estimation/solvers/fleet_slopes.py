@@ -69,7 +69,7 @@ class FleetSlopes:
         found = compiled.sparse_slopes.unshared(
             actuated.reshape(self._size * k, -1),
             passive.reshape(self._size * k, -1),
-            np.repeat(placements, k, axis=0),
+            placements,
         )
         opening, self._by_actuated, by_passive, self._by_twists = (
             v.reshape(self._size, k, *v.shape[1:]) for v in found
@@ -136,10 +136,11 @@ class FleetSlopes:
         twists = (self._turned @ inner).reshape(len(change), -1)
         drives = errors.offsets(moved)[:, None] + errors.scales(moved)[:, None] * problem.drives
         rows, columns = self._pattern
-        by_row = np.zeros((rows.size, self._inverse.shape[3]))
-        by_row[np.arange(rows.size), rows] = 1.0
-        opened = (self._by_twists * twists[:, None, columns]) @ by_row
-        opened += (self._by_actuated @ drives[..., None])[..., 0]
+        opened = (self._by_actuated @ drives[..., None])[..., 0]
+        if twists.any():
+            by_row = np.zeros((rows.size, self._inverse.shape[3]))
+            by_row[np.arange(rows.size), rows] = 1.0
+            opened += (self._by_twists * twists[:, None, columns]) @ by_row
         return np.asarray(self.correction - (self._inverse @ opened[..., None])[..., 0])
 
     def along(self, change: Array) -> Array:
@@ -166,7 +167,8 @@ class FleetSlopes:
             zero = offsets + gains * problem.session.zero_drives[rows.group.setups]
             own = (rows.by_passive * passive[:, rows.posture]).sum(axis=-1)
             own += (rows.by_actuated * drives[:, rows.posture]).sum(axis=-1)
-            own += (rows.by_twists * twists[:, None, columns]).sum(axis=-1)
+            if twists.any():
+                own += (rows.by_twists * twists[:, None, columns]).sum(axis=-1)
             own += (rows.by_zero * zero).sum(axis=-1)
             own += (rows.by_unknowns * of_sensors[:, rows.group.unknowns]).sum(axis=-1)
             result[:, rows.group.entries] = own
@@ -192,7 +194,7 @@ class FleetSlopes:
         h, h_a, h_q, h_t, h_z, h_u = group.reading.slopes.unshared(
             actuated[:, posture].reshape(s * n, -1),
             passive[:, posture].reshape(s * n, -1),
-            np.repeat(placements, n, axis=0),
+            placements,
             zero[:, group.setups].reshape(s * n, -1),
             np.tile(group.constants, (s, 1)),
             unknowns[:, group.unknowns].reshape(s * n, -1),

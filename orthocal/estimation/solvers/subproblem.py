@@ -25,6 +25,9 @@ SETTLED_WITHIN = 1e-11
 
 MOST_STEPS_WITHIN = 100
 
+FEW = 50
+"""Unknowns up to which an elimination takes less than SciPy's triangular one takes to import."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
@@ -202,21 +205,19 @@ class Task:
         scaled = (square * np.outer(scale, scale))[np.ix_(order, order)]
         target = (pull * scale)[order]
         step = np.empty_like(theta)
-        from scipy import linalg
-
         try:
-            factor = linalg.cholesky(scaled, lower=True).T
-        except linalg.LinAlgError:  # not told by anything: the least change
+            factor: Array = np.asarray(np.linalg.cholesky(scaled).T, dtype=np.float64)
+        except np.linalg.LinAlgError:  # not told by anything: the least change
             values, vectors = np.linalg.eigh(scaled)
             kept = values > 1e-13 * values.max(initial=0.0)
             step[order] = vectors[:, kept] @ ((vectors[:, kept].T @ target) / values[kept])
             return np.asarray(np.clip(step * scale, low, high))
-        target = linalg.solve_triangular(factor, target, trans="T")
+        target = _solve_triangular(factor, target, transposed=True)
         last = slice(n_open, None)
         limits = ((side / scale)[order][last] for side in (low, high))
         found = np.empty_like(target)
         found[last] = _bounded(factor[last, last], target[last], *limits)
-        found[:n_open] = linalg.solve_triangular(
+        found[:n_open] = _solve_triangular(
             factor[:n_open, :n_open], target[:n_open] - factor[:n_open, last] @ found[last]
         )
         step[order] = found
@@ -234,11 +235,18 @@ class Task:
         return np.asarray(values - (totals / sums[:, None])[o.zero])
 
 
-def _bounded(factor: Array, target: Array, low: Array, high: Array) -> Array:
-    """The s that minimises ‖R s − t‖ within bounds, R upper triangular, shape (n,)."""
+def _solve_triangular(factor: Array, target: Array, *, transposed: bool = False) -> Array:
+    """The s with R s = t, or Rᵀ s = t, R upper triangular, shape (n,)."""
+    if len(factor) <= FEW:
+        return np.asarray(np.linalg.solve(factor.T if transposed else factor, target))
     from scipy import linalg
 
-    free = linalg.solve_triangular(factor, target)
+    return np.asarray(linalg.solve_triangular(factor, target, trans="T" if transposed else "N"))
+
+
+def _bounded(factor: Array, target: Array, low: Array, high: Array) -> Array:
+    """The s that minimises ‖R s − t‖ within bounds, R upper triangular, shape (n,)."""
+    free = _solve_triangular(factor, target)
     if ((free >= low) & (free <= high)).all():
         return np.asarray(free)
     from scipy.optimize import lsq_linear
