@@ -214,7 +214,7 @@ def talk(command, answers, cwd):
 
 def test_at_a_terminal_it_asks_and_asks_back(root, tmp_path):
     answers = ["250000\n", "\n", "250\n", "10:600\n", "100:320\n", "30\n", "60\n", "40\n", "4\n"]
-    answers += ["sideways\n", "up,down,up\n", "0\n"]
+    answers += ["sideways\n", "up,down,up\n", "0\n", "0\n", "1.5\n"]
     command = [sys.executable, "-m", "orthocal", "new", str(tmp_path / "mill"), "--paper"]
     code, said = talk(command, answers, root)
     assert code == 0, said
@@ -223,10 +223,13 @@ def test_at_a_terminal_it_asks_and_asks_back(root, tmp_path):
     assert "  travel from 10 to 600 mm; legs of 250 mm reach 25 to 475 mm" in said
     assert "  rods of radius 40 mm, 60 mm apart; expected them to clear each other" in said
     assert "  found 'sideways'; expected up or down" in said
+    assert "  found 0 mm; expected more than 0, and at most 50 mm" in said
     assert "Plan: 24 readings in 6 setups." in said
     robot = load_robot(tmp_path / "mill")
     assert [d.direction for d in robot.drives] == [1, -1, 1]
     assert robot.legs["x"].rods["a"].radius == pytest.approx(0.004)
+    session = load_plan(tmp_path / "mill/first")
+    assert session.robot.parameters.stated == {"*.offset_mm": 1.5}
 
 
 def test_nothing_is_made_where_answers_end(root, tmp_path):

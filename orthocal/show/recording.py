@@ -168,7 +168,9 @@ def describe_row(
 ) -> str:
     """Which reading comes next, and where the machine goes for it."""
     row = rows[index]
-    lines = [wrap(f"{index + 1} of {len(rows)}: {row.label}", width)]
+    lines = [
+        wrap(f"{index + 1} of {len(rows)} (line {index + 2} of the sheet): {row.label}", width)
+    ]
     for posture in (row.posture, *([row.minus] if row.minus else [])):
         name = f"{posture}: " if row.minus else ""
         lines.append(_coordinates(session, guidance, posture, name, width))
