@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import pinocchio as pin
 
@@ -12,11 +14,18 @@ from orthocal.sensors.leg_indicator import DIRECTIONS
 def place(machine, drives, frame, *, start=None):
     """Position of a frame, loops closed by Pinocchio's constraint models, shape (3,), [m]."""
     start = machine.zero[machine.passive_index] if start is None else start
+    data = _closed(machine, tuple(np.ravel(drives).tolist()), tuple(np.ravel(start).tolist()))
+    return np.array(data.oMf[machine.frame_id(frame)].translation)
+
+
+@lru_cache(maxsize=64)
+def _closed(machine, drives, start):
+    """Placements of all frames of a machine, closed once for all that are asked for."""
     passive = machine.close_with_pinocchio(drives, start)
     data = machine.model.createData()
     q = machine.configuration(machine.joint_coordinates(drives, passive))
     pin.framesForwardKinematics(machine.model, data, q)
-    return np.array(data.oMf[machine.frame_id(frame)].translation)
+    return data
 
 
 def reading_by_pinocchio(session, machine, setup, posture):

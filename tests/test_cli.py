@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 import subprocess
 import sys
 
@@ -47,6 +48,20 @@ def experiment(root):
     return root / "examples/table1/experiment-2"
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Where the calibration of the experiment is written by the first who asks for it."""
+    return tmp_path_factory.mktemp("written") / "calibrated"
+
+
+@pytest.fixture
+def calibrated(orthocal, experiment, written, tmp_path):
+    """A folder with what `calibrate` writes of the experiment."""
+    if not written.exists():
+        assert orthocal("calibrate", experiment, "--out", written)[0] == 0
+    return shutil.copytree(written, tmp_path / "calibrated")
+
+
 def test_calibrate_prints_and_writes(orthocal, experiment, tmp_path):
     code, out, err = orthocal("calibrate", experiment, "--out", tmp_path / "new/folder")
     assert code == 0
@@ -59,26 +74,24 @@ def test_calibrate_prints_and_writes(orthocal, experiment, tmp_path):
     assert "What to enter, and can it be believed?" in (folder / "report.html").read_text()
 
 
-def test_report_is_written_beside_its_calibration_or_where_asked(orthocal, experiment, tmp_path):
-    code, _, err = orthocal("calibrate", experiment, "--out", tmp_path)
-    page = (tmp_path / "report.html").read_bytes()
-    (tmp_path / "report.html").unlink()
+def test_report_is_written_beside_its_calibration_or_where_asked(orthocal, calibrated, tmp_path):
+    page = (calibrated / "report.html").read_bytes()
+    (calibrated / "report.html").unlink()
     (tmp_path / "pages").mkdir()
     for words, target in (
-        ([], tmp_path / "report.html"),
+        ([], calibrated / "report.html"),
         (["--out", tmp_path / "pages"], tmp_path / "pages/report.html"),
         (["--out", tmp_path / "new/mine.html"], tmp_path / "new/mine.html"),
     ):
-        code, out, err = orthocal("report", tmp_path, *words)
+        code, out, err = orthocal("report", calibrated, *words)
         assert (code, out, err) == (0, "", f"Wrote {target}\n")
         assert target.read_bytes() == page
 
 
-def test_view_writes_a_page_of_anything(orthocal, experiment, root, tmp_path):
-    orthocal("calibrate", experiment, "--out", tmp_path)
+def test_view_writes_a_page_of_anything(orthocal, calibrated, experiment, root, tmp_path):
     for subject, expected in (
-        (tmp_path, "Machine, calibrated"),
-        (tmp_path / "calibration.json", "Machine, calibrated"),
+        (calibrated, "Machine, calibrated"),
+        (calibrated / "calibration.json", "Machine, calibrated"),
         (experiment, "Machine, nominal"),
         (root / "tests/sessions/lines/plan.yaml", "none taken yet"),
         ("orthoglide", "Mechanical zero"),
@@ -88,9 +101,8 @@ def test_view_writes_a_page_of_anything(orthocal, experiment, root, tmp_path):
         code, out, err = orthocal("view", subject, "--html", page)
         assert (code, out, err) == (0, "", f"Wrote {page}\n")
         assert expected in page.read_text(encoding="utf-8")
-    code, _, _ = orthocal(
-        "view", tmp_path, "--html", page, "--posture", "x_max", "--exaggerate", "1", "--show", "all"
-    )
+    words = "--posture x_max --exaggerate 1 --show all".split()
+    code, _, _ = orthocal("view", calibrated, "--html", page, *words)
     assert code == 0
     assert "true scale" in page.read_text(encoding="utf-8")
 
@@ -202,20 +214,19 @@ def test_help_says_what_exit_code_3_means(orthocal):
         assert words in text[text.index("3: ") :]
 
 
-def test_forward_and_inverse_undo_each_other(orthocal, experiment, tmp_path):
-    orthocal("calibrate", experiment, "--out", tmp_path)
+def test_forward_and_inverse_undo_each_other(orthocal, calibrated, tmp_path):
     joints = tmp_path / "joints.csv"
     joints.write_text("x_slide_mm,y_slide_mm,z_slide_mm\n310.25,310.25,310.25\n330,290,300.5\n")
-    code, out, _ = orthocal("forward", tmp_path, joints)
+    code, out, _ = orthocal("forward", calibrated, joints)
     assert code == 0
     rows = list(csv.DictReader(io.StringIO(out)))
     assert list(rows[0]) == ["x_mm", "y_mm", "z_mm"]
     first = np.array([float(v) for v in rows[0].values()]) * 1e-3
-    expected = load_calibration(tmp_path).machine.forward([0.31025] * 3)
+    expected = load_calibration(calibrated).machine.forward([0.31025] * 3)
     assert np.abs(first - expected).max() < 1e-9
     points = tmp_path / "points.csv"
     points.write_text(out)
-    code, out, _ = orthocal("inverse", tmp_path / "calibration.json", points)
+    code, out, _ = orthocal("inverse", calibrated / "calibration.json", points)
     assert code == 0
     assert out.splitlines()[0] == "x_slide_mm,y_slide_mm,z_slide_mm"
     back = np.array([[float(v) for v in r.split(",")] for r in out.splitlines()[1:]])
@@ -236,21 +247,20 @@ def test_compare_gives_its_verdict_as_exit_code(orthocal, experiment, root):
     assert document["verdict"]["supported"] == "offsets"
 
 
-def test_accuracy_over_a_cube_and_at_points(orthocal, experiment, tmp_path):
-    orthocal("calibrate", experiment, "--out", tmp_path)
-    code, out, _ = orthocal("accuracy", tmp_path, "--half-side-mm", 40)
+def test_accuracy_over_a_cube_and_at_points(orthocal, calibrated, tmp_path):
+    code, out, _ = orthocal("accuracy", calibrated, "--half-side-mm", 40)
     assert code == 0
     assert "Over a cube of ±40 mm around the zero" in out
     points = tmp_path / "points.csv"
     points.write_text("x_mm,y_mm,z_mm\n0,0,0\n10,20,-30.5\n")
-    code, out, _ = orthocal("accuracy", tmp_path, points)
+    code, out, _ = orthocal("accuracy", calibrated, points)
     assert code == 0
     rows = list(csv.DictReader(io.StringIO(out)))
     assert [r["z_mm"] for r in rows] == ["0", "-30.5"]
     # at the zero an offset moves the tool by itself
     assert float(rows[0]["deviation_z_um"]) == pytest.approx(-1760, abs=5)
     assert float(rows[0]["sigma_x_um"]) > 387
-    code, out, _ = orthocal("accuracy", tmp_path, points, "--json")
+    code, out, _ = orthocal("accuracy", calibrated, points, "--json")
     assert json.loads(out)["points"] == 2
 
 
@@ -286,13 +296,12 @@ def test_base_parameters_and_hubers_loss_by_option(orthocal, root):
     assert "stands for" in out
 
 
-def test_validate_holds_experiment_3_against_2(orthocal, experiment, tmp_path):
-    orthocal("calibrate", experiment, "--out", tmp_path)
+def test_validate_holds_experiment_3_against_2(orthocal, calibrated, experiment):
     new = experiment.parent / "experiment-3"
-    code, out, _ = orthocal("validate", tmp_path, new)
+    code, out, _ = orthocal("validate", calibrated, new)
     assert code == 0
     assert "The calibration is confirmed" in out
-    code, out, _ = orthocal("validate", tmp_path, new, "--json")
+    code, out, _ = orthocal("validate", calibrated, new, "--json")
     assert json.loads(out)["as_expected"] is True
     assert json.loads(out)["decision"]["answer"] == "confirmed"
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
-import sys
-import tempfile
 from functools import cache
 
 import numpy as np
 import pytest
+from commands import run_here, run_line, run_orthocal, run_script
 from conftest import ROOT
 
 import orthocal
@@ -20,20 +18,16 @@ from orthocal.errors import NotIdentifiableError
 SCRIPTS = sorted((ROOT / "examples").glob("[0-9]*.py"))
 
 
-@cache
-def run(*words):
-    """A script, or orthocal with arguments; once, for all that look at what it prints."""
-    script = words[0].endswith(".py")
-    command = [sys.executable, *(() if script else ("-m", "orthocal.cli")), *words]
-    with tempfile.TemporaryDirectory() as elsewhere:
-        return subprocess.run(
-            command, cwd=elsewhere if script else ROOT, capture_output=True, text=True
-        )
+@pytest.fixture(scope="module")
+def run_example(tmp_path_factory):
+    """What a script prints; run once, elsewhere, for all that look at it."""
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    return cache(lambda script: run_script(elsewhere, script))
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda p: p.name)
-def test_an_example_runs_from_anywhere(script):
-    done = run(str(script))
+def test_an_example_runs_from_anywhere(run_example, script):
+    done = run_example(script)
     assert done.returncode == 0
     assert done.stderr == ""
     assert done.stdout
@@ -69,32 +63,47 @@ def with_code(language):
 TUTORIAL = "docs/tutorial.md"
 
 
+@pytest.fixture(scope="module")
+def beside_examples(tmp_path_factory):
+    """Makes a folder with a copy of the examples, and a place for what is written."""
+
+    def make():
+        folder = tmp_path_factory.mktemp("page")
+        shutil.copytree(ROOT / "examples", folder / "examples")
+        (folder / "out").mkdir()
+        return folder
+
+    return make
+
+
 @pytest.mark.parametrize("page", with_code("python"))
-def test_the_python_of_a_page_runs(root, page):
+def test_the_python_of_a_page_runs(beside_examples, page):
+    folder = beside_examples()
     for code in blocks("python", page):
-        done = subprocess.run(
-            [sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True
-        )
-        assert done.stderr == ""
+        done = run_here(folder, lambda code=code: exec(code, {"__name__": "__main__"}))
+        assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.fixture(scope="module")
+def run_page(beside_examples):
+    """What each command of a page prints, run once, one after the other, as they stand."""
+
+    @cache
+    def run(page):
+        folder, found = beside_examples(), {}
+        for command, expected in commands(page):
+            done = run_line(folder, command)
+            assert done.returncode == expected, f"{command}: {done.stderr}"
+            found[command.strip()] = done.stdout
+        return found
+
+    return run
 
 
 @pytest.mark.parametrize("page", [p for p in with_code("sh") if p != TUTORIAL])
-def test_the_commands_of_a_page_run(root, page, tmp_path):
+def test_the_commands_of_a_page_run(run_page, page):
     """One after the other, as they stand, in a folder with a copy of the examples."""
-    shutil.copytree(root / "examples", tmp_path / "examples")
-    (tmp_path / "out").mkdir()
-    assert commands(page)
-    for command, expected in commands(page):
-        words = re.sub(r"\borthocal (?=[a-z])", f"{sys.executable} -m orthocal.cli ", command)
-        done = subprocess.run(
-            words,
-            shell=True,
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            stdin=subprocess.DEVNULL,
-        )
-        assert done.returncode == expected, f"{command}: {done.stderr}"
+    assert run_page(page)
 
 
 def test_what_the_tutorial_shows_is_what_its_commands_print(root, tmp_path):
@@ -105,10 +114,7 @@ def test_what_the_tutorial_shows_is_what_its_commands_print(root, tmp_path):
     for language, block in re.findall(r"```(sh|text)\n(.*?)```", text, flags=re.DOTALL):
         if language == "sh":
             for line in block.replace("\\\n", " ").splitlines():
-                words = re.sub(r"^orthocal ", f"{sys.executable} -m orthocal.cli ", line)
-                done = subprocess.run(
-                    words, shell=True, cwd=tmp_path, capture_output=True, text=True
-                )
+                done = run_line(tmp_path, line)
                 assert done.returncode == 0, f"{line}: {done.stderr}"
                 printed = [said.rstrip() for said in done.stdout.splitlines()]
             continue
@@ -123,33 +129,47 @@ def test_the_reference_has_every_name(root):
 
 
 EXPERIMENT = "examples/table1/experiment-2"
+CALIBRATE = f"calibrate {EXPERIMENT}"
 
 
 @pytest.mark.parametrize(
     ("page", "title", "command"),
     [
-        ("README.md", "Calibration of orthoglide", f"calibrate {EXPERIMENT}"),
-        ("docs/results.md", "Calibration of orthoglide", f"calibrate {EXPERIMENT}"),
-        ("docs/results.md", "What was identified\n", f"calibrate {EXPERIMENT} --details"),
-        ("docs/results.md", "At the tool\n", f"calibrate {EXPERIMENT} --details"),
+        ("README.md", "Calibration of orthoglide", f"{CALIBRATE} --out out/experiment-2"),
+        ("docs/results.md", "Calibration of orthoglide", f"{CALIBRATE} --out out/experiment-2"),
+        ("docs/results.md", "What was identified\n", f"{CALIBRATE} --details"),
+        ("docs/results.md", "At the tool\n", f"{CALIBRATE} --details"),
         ("docs/results.md", "Verdict", f"compare {EXPERIMENT}"),
-        ("docs/planning.md", "The paper's six equations", "study linearisation orthoglide"),
+        (
+            "docs/planning.md",
+            "The paper's six equations",
+            "study linearisation orthoglide --out out/linearisation",
+        ),
     ],
 )
-def test_printed_results_on_a_page_are_the_real_ones(page, title, command):
+def test_printed_results_on_a_page_are_the_real_ones(root, run_page, page, title, command):
+    """By the command as it stands there, or else without what is written beside."""
     shown = next(b for b in blocks("text", page) if title in b)
-    done = run(*command.split())
-    printed = [line.rstrip() for line in done.stdout.splitlines()]
+    of_page = f"orthocal {command}" in [c for c, _ in commands(page)]
+    said = run_page(page)[f"orthocal {command}"] if of_page else said_by(root, command)
+    assert of_page == ("--out" in command)
+    printed = [line.rstrip() for line in said.splitlines()]
     for line in shown.splitlines():
         assert line.rstrip() in printed
     if title.startswith("Calibration"):  # the whole of it
         assert [line.rstrip() for line in shown.splitlines()] == printed
 
 
-def test_what_is_said_of_the_papers_readings_is_what_the_example_prints():
+@cache
+def said_by(folder, command):
+    """What a command prints."""
+    return run_orthocal(folder, *command.split()).stdout
+
+
+def test_what_is_said_of_the_papers_readings_is_what_the_example_prints(run_example):
     text = " ".join((ROOT / "docs/results.md").read_text().split())
     script = ROOT / "examples/02_what_readings_are_worth.py"
-    done = run(str(script))
+    done = run_example(script)
     rows = {}
     for line in done.stdout.split("\n\n")[0].splitlines()[1:]:
         rows[line[:36].strip()] = [float(v) / 1e3 for v in line[36:].split()]

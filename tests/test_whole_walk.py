@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import csv
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from commands import run_orthocal
 from linuxcnc import Joint, require_linuxcnc, run_program
 
 from orthocal import (
@@ -34,14 +33,8 @@ SIZES = """--leg-mm 250 --travel-mm 100:325 --attachment-mm 30 --rods-apart-mm 6
 SEED = 3
 
 
-def run(folder, *words, typed=None, code=0):
-    done = subprocess.run(
-        [sys.executable, "-m", "orthocal", *words],
-        cwd=folder,
-        input=typed,
-        capture_output=True,
-        text=True,
-    )
+def run(folder, *words, typed="", code=0):
+    done = run_orthocal(folder, *words, typed=typed)
     assert done.returncode == code, (words, done.stdout[-2000:], done.stderr)
     return done.stdout
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from orthocal.sensors.leg_indicator import DIRECTIONS
@@ -109,20 +110,21 @@ def _between(root, end, edge):
 
 
 def _touch(distance, touching):
-    """How far a plunger is out when its tip touches, by bisection; NaN where it passes.
+    """How far a plunger is out when its tip touches; NaN where it passes.
 
-    The distance is convex: first where it is least, then from there outwards.
+    The distance is convex: towards where it is least until the solids overlap, then outwards to
+    where they no longer do.
     """
     low, far = -0.1, 0.1
     high = far
     for _ in range(80):
         a, b = low + (high - low) / 3.0, high - (high - low) / 3.0
-        low, high = (low, b) if distance(a) < distance(b) else (a, high)
-    inner, outer = 0.5 * (low + high), far
-    if distance(inner) > touching:
+        to_a, to_b = distance(a), distance(b)
+        inner = a if to_a < to_b else b
+        if min(to_a, to_b) < touching:
+            break
+        low, high = (low, b) if to_a < to_b else (a, high)
+    else:
         return np.nan
-    assert distance(outer) > touching
-    while outer - inner > 1e-13:
-        middle = 0.5 * (inner + outer)
-        inner, outer = (middle, outer) if distance(middle) < touching else (inner, middle)
-    return 0.5 * (inner + outer)
+    assert distance(far) > touching
+    return brentq(lambda h: distance(h) - touching, inner, far, xtol=1e-13)

@@ -271,11 +271,14 @@ def _residual_rows(
         return session.values - noise * o.rows(residual)
 
     n = problem.n_machine
+    own = nominal_theta is None
     reference = problem.reference[:n] if nominal_theta is None else nominal_theta
     # gauges stood as they did, whatever the machine is held to be
-    nominal = fitted(problem.predict(np.append(reference, fit.solution.theta[n:])))
+    held = np.append(reference, fit.solution.theta[n:])
+    nominal = fitted(problem.predict(held, problem.reference_passive if own else None))
     try:
-        by_linear = fitted(problem.predict(fit.linear))
+        closed = problem.close(fit.linear, start=fit.solution.passive)
+        by_linear = fitted(problem.predict(fit.linear, closed))
     except ClosureError:  # the linearised machine cannot be assembled
         by_linear = np.full(len(session.readings), np.nan)
     predicted = session.values - noise * o.rows(fit.residual)

@@ -198,7 +198,7 @@ def linearise_at_reference(problem: CalibrationProblem) -> Linearisation:
         ClosureError: If the reference machine cannot reach a posture.
         SessionError: If a sensor shows nothing in one.
     """
-    prediction, jacobian = problem.linearise(problem.reference)
+    prediction, jacobian = problem.linearise(problem.reference, problem.reference_passive)
     _require_numbers(problem, prediction, jacobian)
     return Linearisation(
         problem,

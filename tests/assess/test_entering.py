@@ -83,7 +83,7 @@ def test_what_is_promised_with_the_offsets_entered_is_kept(quarter):
         drawn = fleet.draw(np.random.default_rng(100 + seed))
         errors = fleet.machine.split_errors(drawn)
         session = simulate_session(quarter, errors, seed=seed).session
-        full, alone = calibrate(session, "full"), calibrate(session)
+        full, alone = (calibrate(session, m, solver="eliminated") for m in ("full", "offsets"))
         space = find_tool(alone).workspace
         identified = np.array([e.identified for e in find_entries(full)])
         for name, offsets in (

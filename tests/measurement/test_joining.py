@@ -11,6 +11,7 @@ from gauges import exact
 from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
 from orthocal.calibration.file import calibration_document, write_calibration
 from orthocal.errors import SessionError
+from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.eliminated import EliminatedProgram
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
@@ -106,18 +107,25 @@ def test_noise_is_told_for_each_session(root):
 
 
 def test_deviations_of_mixed_sessions_are_those_of_many(root):
-    """Offsets from a coarse and a fine session: z scores of 80 calibrations."""
+    """Offsets from a coarse and a fine session: z scores of 80 fits, as calibrations have them."""
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     plan = plan.with_gauge(replace(plan.gauge, sigma=None, resolution=None))
-    scores = []
+    options, scores = SolverOptions(solver="eliminated"), []
     for seed in range(80):
         pair = [
             simulate_session(plan, TRUTH, seed=2 * seed + i, sigma=s).session
             for i, s in enumerate((40e-6, 5e-6))
         ]
-        found = calibrate(pair, solver=SolverOptions(solver="eliminated"))
-        scores.append([(p.value - TRUTH[p.name]) / p.std for p in found.free])
+        fit = fit_problem(build_problem(join_sessions(pair)), options=options)
+        n = fit.problem.n_machine
+        names, values = fit.problem.free[:n], fit.solution.theta[:n]
+        std = np.sqrt(np.diag(fit.covariance())[:n])
+        scores.append((values - [TRUTH[name] for name in names]) / std)
     assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.0, abs=0.2)
+    found = calibrate(pair, solver=options)
+    assert [p.name for p in found.free] == list(names)
+    assert [p.value for p in found.free] == values.tolist()
+    assert [p.std for p in found.free] == pytest.approx(std, rel=1e-12)
 
 
 def test_both_solvers_weigh_gauges_alike(root):

@@ -20,6 +20,7 @@ from orthocal.calibration.file import calibration_json, write_calibration
 from orthocal.cli import app
 from orthocal.diagnosis.unmodelled import machine_errors
 from orthocal.errors import OrthocalError, SessionError
+from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.eliminated import EliminatedProgram
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
@@ -99,16 +100,21 @@ def test_what_is_not_known_of_it_is_identified_beside_the_machine(plan):
 
 
 def test_its_deviations_are_those_of_many_simulated_calibrations(plan):
-    """Offsets and slopes, both drawn: z scores of 60 calibrations."""
-    scores = []
+    """Offsets and slopes, both drawn: z scores of 60 fits, as calibrations have them."""
+    options, scores = SolverOptions(solver="eliminated"), []
     for seed in range(60):
         simulated = simulate_session(plan, TRUTH, seed=seed)
-        result = calibrate(simulated.session, solver=SolverOptions(solver="eliminated"))
+        fit = fit_problem(build_problem(simulated.session), options=options)
         truth = {**TRUTH, **simulated.unknowns}
-        estimates = (*result.free, *result.sensors)
-        scores.append([(p.value - truth[p.name]) / p.std for p in estimates])
+        names, std = fit.problem.free, np.sqrt(np.diag(fit.covariance()))
+        scores.append((fit.solution.theta - [truth[name] for name in names]) / std)
     spread = np.sqrt(np.mean(np.square(scores), axis=0))
     assert spread == pytest.approx(1.0, abs=0.3)  # 3 standard deviations of a spread of 60
+    result = calibrate(simulated.session, solver=options)
+    estimates = (*result.free, *result.sensors)
+    assert [p.name for p in estimates] == list(names)
+    assert [p.value for p in estimates] == fit.solution.theta.tolist()
+    assert [p.std for p in estimates] == pytest.approx(std, rel=1e-12)
 
 
 def test_all_that_is_not_known_of_it_holds_on_machines_with_all_errors(plan):

@@ -39,7 +39,7 @@ MOST_EXACT = 2_000
 
 WIDENINGS = (256.0, 64.0, 16.0, 4.0, 2.0, 1.0)
 """Widths of a robust loss, as multiples of the one wanted, each solution the next one's start: for
-readings so far out that neither Hessian converges."""
+readings so far out that a loss as narrow as wanted does not converge at once."""
 
 CONVERGED = frozenset({"Solve_Succeeded"})
 """Ipopt's words for a solution; anything else is an error."""
@@ -112,6 +112,7 @@ class NonlinearProgram:
             KeyboardInterrupt: At Ctrl-C, which CasADi would swallow.
         """
         y = self.problem.values if values is None else np.asarray(values, dtype=np.float64)
+        begun = start, start_passive
 
         def run(program: NonlinearProgram, widening: float = 1.0) -> Solution:
             return program._solve(
@@ -124,24 +125,24 @@ class NonlinearProgram:
                 widening=widening,
             )
 
-        exact = self.options.hessian == "exact"
+        exact, robust = self.options.hessian == "exact", self.options.loss.robust
         try:
             return run(self)
         except SolverError:
-            if self.problem.observations.size > MOST_EXACT or (
-                exact and not self.options.loss.robust
-            ):
+            if self.problem.observations.size > MOST_EXACT or (exact and not robust):
                 raise
         program = self if exact else self._exact
-        if not exact:
-            try:
-                return run(program)
-            except SolverError:
-                if not self.options.loss.robust:
-                    raise
-        for widening in WIDENINGS:  # nearly squares first, then as wanted
-            solution = run(program, widening)
-            start, start_passive = solution.theta, solution.passive
+        if not robust:
+            return run(program)
+        try:
+            for widening in WIDENINGS:  # nearly squares first, then as wanted
+                solution = run(program, widening)
+                start, start_passive = solution.theta, solution.passive
+        except SolverError:
+            if exact:
+                raise
+            start, start_passive = begun
+            return run(program)
         return solution
 
     def _solve(

@@ -1,0 +1,67 @@
+"""Commands as a shell has them, run here: their imports and functions are those of one process.
+
+A process of its own begins the command line in `test_cli.py`, `test_streams.py`, `test_package.py`.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import runpy
+import shlex
+import subprocess
+import sys
+from contextlib import chdir, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from unittest.mock import patch
+
+from orthocal.cli import main
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a command has printed, and how it ended."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def run_here(folder, act, *, argv=("orthocal",), typed=""):
+    """Do something as a program does: in a folder, with streams and arguments of its own."""
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8") for _ in range(2))
+    stdin = io.TextIOWrapper(io.BytesIO(typed.encode()), encoding="utf-8")
+    code = 0
+    with chdir(folder), redirect_stdout(out), redirect_stderr(err):
+        with patch.object(sys, "argv", list(argv)), patch.object(sys, "stdin", stdin):
+            try:
+                act()
+            except SystemExit as e:
+                code = e.code or 0
+            for stream in (out, err):
+                stream.flush()
+    return Done(code, *(stream.buffer.getvalue().decode() for stream in (out, err)))
+
+
+def run_orthocal(folder, *words, typed=""):
+    """`orthocal` with arguments, in a folder; what is typed comes through a pipe."""
+    return run_here(folder, main, argv=("orthocal", *map(str, words)), typed=typed)
+
+
+def run_script(folder, path):
+    """A script, in a folder."""
+    return run_here(folder, lambda: runpy.run_path(str(path), run_name="__main__"), argv=[path])
+
+
+def run_line(folder, line):
+    """A line of a shell; orthocal's alone, and what they write to a file, without a shell."""
+    command, target = re.fullmatch(r"(.*?)(?: > (\S+))?\s*", line).groups()
+    words = shlex.split(command)
+    if words[0] != "orthocal" or re.search(r"[|&;<>$`]", re.sub(r"'[^']*'", "", command)):
+        done = subprocess.run(line, shell=True, cwd=folder, capture_output=True, text=True)
+        return Done(done.returncode, done.stdout, done.stderr)
+    done = run_orthocal(folder, *words[1:])
+    if target is None:
+        return done
+    (folder / target).write_text(done.stdout)
+    return Done(done.returncode, "", done.stderr)
