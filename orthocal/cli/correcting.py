@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, BinaryIO
@@ -113,7 +115,8 @@ def correct(
         file, axes=field.axes, interpreter=interpreter, correct=field, within=within
     )
     with tempfile.TemporaryFile() as spool:  # nothing is written before all of it is good
-        _spool(corrector.run(_lines(program, file)), spool)
+        with _frozen():
+            _spool(corrector.run(_lines(program, file)), spool)
         if not corrector.summary.lines:
             raise GcodeError("is empty; expected a program", where=file)
         if out is not None:
@@ -130,6 +133,19 @@ def correct(
         + ("" if zeros else "\nThe program's coordinates are taken for the machine's own.")
         + ("\nNo G20 or G21 before its coordinates: mm." if corrector.summary.unit_assumed else "")
     )
+
+
+@contextmanager
+def _frozen() -> Iterator[None]:
+    """Keep the collector of garbage from looking at all that is loaded, again and again.
+
+    Lines come and go by the thousand, in no circles.
+    """
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def _lines(program: Path, file: str) -> Iterator[str]:

@@ -100,29 +100,30 @@ class ProgramCorrector:
                 try:
                     step = interpreter.read(split_line(text, summary.lines, file=self._file))
                 except GcodeError:
-                    for _ in self._flush(steps):
-                        pass  # what cannot be reached stands before it
+                    self._flush(steps)  # what cannot be reached stands before it
                     raise
                 steps.append(step)
                 if step.motion is not None:
                     summary.unit_assumed |= not step.modes.unit_told
                     pieces += _estimate(step.motion)
             if len(steps) >= LINES_AT_ONCE or pieces > PIECES_AT_ONCE:
-                yield from self._flush(steps)
+                yield self._flush(steps)
                 steps, pieces = [], 0.0
-        yield from self._flush(steps)
+        yield self._flush(steps)
         summary.ended = interpreter.modes.ended or marks > 1
 
-    def _flush(self, steps: Sequence[Step | str]) -> Iterator[str]:
+    def _flush(self, steps: Sequence[Step | str]) -> str:
+        """What is written for some steps."""
         moving = [s for s in steps if isinstance(s, Step) and s.motion is not None]
         motions = [s.motion for s in moving if s.motion is not None]
         cuts = iter(cut(Paths.of(motions), self._correct, tolerance=self._tolerance))
         summary, low, high = self.summary, *self.summary.stretch
+        texts: list[str] = []
         for step in steps:
             if isinstance(step, str):
-                yield step
+                texts.append(step)
             elif step.motion is None:
-                yield self._writer.keep(step.line)
+                texts.append(self._writer.keep(step.line))
             else:
                 found = next(cuts)
                 if isinstance(found, Refused):
@@ -136,8 +137,9 @@ class ProgramCorrector:
                 if not step.straight and step.modes.motion:
                     low = min(low, *found.stretch)
                     high = max(high, *found.stretch)
-                yield from self._writer.write(step, found)
+                texts += self._writer.write(step, found)
         summary.stretch = [low, high]
+        return "".join(texts)
 
 
 def _estimate(motion: Motion) -> float:

@@ -44,8 +44,13 @@ class Writer:
     def __init__(
         self, axes: Sequence[int], *, rounding: float, start: Sequence[float | None]
     ) -> None:
-        self._axes = tuple((k, "XYZ"[k]) for k in axes)
-        self._decimals = {unit: find_decimals(unit, rounding) for unit in (MM, INCH)}
+        self._axes = tuple(axes)
+        self._forms: dict[float, tuple[int, str, str]] = {}
+        """Unit to decimals, words of a point, and a zero that came from below."""
+        for unit in (MM, INCH):
+            n = find_decimals(unit, rounding)
+            words = " ".join(f"{'XYZ'[k]}%.{n}f" for k in axes)
+            self._forms[unit] = (n, words, f"-{0.0:.{n}f}")
         self._written: list[float] = [0.0 if v is None else v for v in start]
         """Where the controller is sent, [m]."""
         self._motion: int | None = None
@@ -112,20 +117,20 @@ class Writer:
 
     def _places(self, step: Step, cut: Cut) -> list[str]:
         """Words of the coordinates of each piece's end."""
-        unit, offset, at = step.modes.unit, step.offset, self._written
-        decimals = self._decimals[unit]
-        negative = f"-{0.0:.{decimals}f}"
-        values = [""] * len(self._axes)
+        unit, axes = step.modes.unit, self._axes
+        decimals, form, zero = self._forms[unit]
+        base: Sequence[float] = step.offset
         found = []
         for point in cut.points:
-            for n, (k, name) in enumerate(self._axes):
-                base = offset[k] if step.modes.absolute else at[k]
-                text = f"{(point[k] - base) / unit:.{decimals}f}"
-                if text == negative:
-                    text = text[1:]
-                at[k] = float(text) * unit + base
-                values[n] = name + text
-            found.append(" ".join(values))
+            if not step.modes.absolute:
+                base = tuple(self._written)
+            values = tuple([(point[k] - base[k]) / unit for k in axes])
+            text = form % values
+            if zero in text:
+                text = text.replace(zero, zero[1:])
+            found.append(text)
+            for k, value in zip(axes, values, strict=True):
+                self._written[k] = round(value, decimals) * unit + base[k]
         return found
 
     def _feeds(self, step: Step, cut: Cut) -> list[str]:
