@@ -10,7 +10,7 @@ from orthocal.errors import GcodeError
 from orthocal.gcode.cutting import LONGEST_PIECE, Correct, Refused, cut
 from orthocal.gcode.path import Motion, Paths
 from orthocal.gcode.state import Interpreter, Step
-from orthocal.gcode.words import LONGEST_LINE, split_line
+from orthocal.gcode.words import LONGEST_LINE, Line, split_line, split_plain
 from orthocal.gcode.writing import Writer
 
 LINES_AT_ONCE = 2000
@@ -97,8 +97,12 @@ class ProgramCorrector:
                     raise GcodeError("is no text", where=f"{self._file}:{summary.lines}")
                 steps.append(text)
             else:
+                plain = split_plain(text, summary.lines)
+                step = None if plain is None else interpreter.read_plain(plain)
                 try:
-                    step = interpreter.read(split_line(text, summary.lines, file=self._file))
+                    if step is None:
+                        line = split_line(text, summary.lines, file=self._file)
+                        step = interpreter.read(line)
                 except GcodeError:
                     self._flush(steps)  # what cannot be reached stands before it
                     raise
@@ -122,7 +126,7 @@ class ProgramCorrector:
         for step in steps:
             if isinstance(step, str):
                 texts.append(step)
-            elif step.motion is None:
+            elif isinstance(step.line, Line) and step.motion is None:
                 texts.append(self._writer.keep(step.line))
             else:
                 found = next(cuts)

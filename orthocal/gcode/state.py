@@ -12,7 +12,7 @@ from orthocal.errors import GcodeError
 from orthocal.gcode.arcs import CENTRES, MOST_TURNS, NAMES, arc_about, center_of_radius
 from orthocal.gcode.path import PLANES, Arc, Motion, Vector
 from orthocal.gcode.refusals import refuse_code, refuse_letter
-from orthocal.gcode.words import Line, Word
+from orthocal.gcode.words import Line, Plain, Word
 from orthocal.units import MM
 
 INCH = 25.4 * MM
@@ -79,7 +79,7 @@ class Modes:
 class Step(NamedTuple):
     """What a line does."""
 
-    line: Line
+    line: Line | Plain
     modes: Modes
     """Those of the line."""
     offset: Vector
@@ -156,6 +156,29 @@ class Interpreter:
         if ends:
             self.modes = replace(self.modes, ended=True)
         return step
+
+    def read_plain(self, line: Plain) -> Step | None:
+        """What such a line does: as `read`; None where that has more to look at."""
+        modes, offset, position = self.modes, self._offset, self.position
+        told, unit = line.motion, modes.unit
+        if (
+            not self._moved
+            or (modes.motion != 0 and (modes.motion != 1 or not modes.feed))
+            or (told is not None and int(told) != modes.motion)
+        ):
+            return None
+        begin: Vector = (position[0] or 0.0, position[1] or 0.0, position[2] or 0.0)
+        end = list(begin)
+        for k, digits in enumerate(line[3:6]):
+            if digits is not None:
+                base = offset[k] if modes.absolute else begin[k]
+                end[k] = place = float(digits) * unit + base
+                if k not in self._letters or abs(place) > LARGEST_COORDINATE:
+                    return None
+        if line[3:6] == _NOWHERE:
+            return None
+        self.position[:] = end
+        return Step(line, modes, offset, Motion(begin, (end[0], end[1], end[2])))
 
     def _sort(self, line: Line, where: str) -> tuple[dict[str, float], list[Word]]:
         """Values by letter, and G and M words; each once, and none that is not known."""
@@ -358,6 +381,7 @@ def _tenfold(value: float) -> float:
     return round(10.0 * value, 6)
 
 
+_NOWHERE = (None, None, None)
 _MOVES = frozenset("XYZIJKR")
 _TAKEN = frozenset("PQIJKR")
 _KNOWN = frozenset("NFSTPQIJKR")

@@ -89,6 +89,66 @@ def test_what_is_written_is_near_the_corrected_path(seed):
     ]
 
 
+PLAIN = [
+    "G1 X1", "X1.5 Y-2.25 Z3", "N7 G01 X-1 Z+2.", "N8X.5Y2", "G00Z5", "Y1 ", "G0 X0 Y0 Z0", "G1 Y3",
+    "G91", "X0.3333", "X0.3333Y-.1", "G90", "G20", "F4", "X.25 Y.125", "G21", "F300", "X3 Y3",
+    "G54", "X0 Y-0 Z-0.00004", "G3 X2 Y0 I1 J0", "X0 I-1", "G1 X9 Y8 Z7", "N1 G1", "G1 G90 X2",
+    "M4 G1 X1", "F200 X2", "X20 Y20 Z20", "%", "G1 X3",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_lines_that_are_nothing_but_a_place_are_read_the_short_way_alike(seed, monkeypatch):
+    """Most lines are; what they mean is told once more, and must be what the long way says."""
+    from orthocal.gcode import program
+
+    text = [re.sub(r" \(.*\)$", "", line) for line in random_program(seed, moves=20).text[:-1]]
+    text += ["G21 G90 G91.1 G17 G0 X0 Y0 Z0", "F100", *PLAIN]
+    offsets = {"G54": (0.0125, -0.001, 0.003)}
+    read, split = [], program.split_plain
+
+    def seen(text, number):
+        read.append(split(text, number))
+        return read[-1]
+
+    monkeypatch.setattr(program, "split_plain", seen)
+    short, summary = corrected(text, offsets=offsets)
+    assert sum(line is not None for line in read) > 20
+    monkeypatch.setattr(program, "split_plain", lambda text, number: None)
+    long, expected = corrected(text, offsets=offsets)
+    assert short == long
+    assert summary == expected
+
+
+BY_THE_LONG_WAY = [
+    "X600", "X1 Z1e1", "X", "X1..2", "X1.2.3", "X--1", "X" + "9" * 999, "G2 X2 I1\nX3", "G20\nX1",
+    "G80\nX1", "G1", "G2 X2",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("lines", BY_THE_LONG_WAY, ids=lambda lines: lines[:10])
+def test_the_short_way_refuses_nothing_by_itself(lines, monkeypatch):
+    from orthocal.gcode import program
+
+    said = []
+    for _ in range(2):
+        with pytest.raises(GcodeError) as refused:
+            corrected([*HEAD, "G1", *lines.splitlines(), "G81"])
+        said.append(str(refused.value))
+        monkeypatch.setattr(program, "split_plain", lambda text, number: None)
+    assert said[0] == said[1]
+
+
+def test_a_spindle_that_turns_left_is_no_dwell():
+    lines, _ = corrected(["G21 G0 X0 Y0 Z0", "M4 S100 G0 X1"], correct=lambda_of(lambda p: p))
+    assert lines[1] == "M4 S100 G0 X1.0000 Y0.0000 Z0.0000"
+
+
+def test_no_zero_is_below_nought():
+    lines, _ = corrected(["G21 G0 X-0.00004 Y-0.0 Z-10.00001"], correct=lambda_of(lambda p: p))
+    assert lines == ["G21 G0 X0.0000 Y0.0000 Z-10.0000"]
+
+
 def test_as_few_pieces_as_that_takes():
     """The chord of an arc of 20 mm within 1 µm: s² = 8 r h."""
     text = ["G21 G0 X20 Y0 Z0", "G3 X-20 I-20 F100"]
