@@ -76,6 +76,13 @@ def correct(
             "not say X, Y and Z.",
         ),
     ] = None,
+    tool: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="The tip of the tool in the frame of the tool centre point, mm; 0,0,0 by default.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="File for the result, instead of standard output.")
     ] = None,
@@ -94,12 +101,14 @@ def correct(
     from orthocal.calibration.file import load_calibration
     from orthocal.export.correction_field import CorrectionField
     from orthocal.export.formats import require_entering
+    from orthocal.export.options import ExportOptions
     from orthocal.files import require_writable_file, write_file
     from orthocal.gcode.program import ProgramCorrector
     from orthocal.gcode.state import Interpreter
 
     zeros = _read_offsets(work_offset or [])
     begin = None if start is None else _read_vector(start, "--start-mm")
+    tip = ExportOptions(tool=None if tool is None else _read_vector(tool, "--tool")).tool
     if out is not None:
         require_writable_file(out)
     result = load_calibration(calibration)
@@ -108,7 +117,7 @@ def correct(
     active = offsets is Offsets.ACTIVE
     values = result.active_offsets if active else entered_offsets(result)
     within = within_um * UM
-    field = CorrectionField(result, values, within=within)
+    field = CorrectionField(result, values, within=within, tool=tip or (0.0, 0.0, 0.0))
     file = "standard input" if str(program) == "-" else str(program)
     interpreter = Interpreter(file, axes=field.axes, offsets=zeros, start=begin)
     corrector = ProgramCorrector(
@@ -130,6 +139,7 @@ def correct(
         _describe(corrector.summary, field, within)
         + "\n"
         + _describe_controller(result, values, active=active)
+        + _describe_tool(tip)
         + ("" if zeros else "\nThe program's coordinates are taken for the machine's own.")
         + ("\nNo G20 or G21 before its coordinates: mm." if corrector.summary.unit_assumed else "")
     )
@@ -214,6 +224,11 @@ def _describe(summary: Summary, field: CorrectionField, within: float) -> str:
         f"{field.error / UM:.2g}, decimals {ROUNDING * within / UM:.2g}. Feeds were changed by "
         f"{low:+.2f} … {high:+.2f} %, so that the tool keeps them."
     )
+
+
+def _describe_tool(tip: Vector | None) -> str:
+    shown = ", ".join(f"{v / MM:g}" for v in tip or ())
+    return f"\nIt is for a tip at {shown} mm from the tool centre point." if tip else ""
 
 
 def _describe_controller(result: Calibration, values: Iterable[float], *, active: bool) -> str:

@@ -1,11 +1,12 @@
 """Where a nominal controller is to be sent for a point, at the speed of a program's lines.
 
 A controller that is nominal but for its offsets o sends the drives to ρ(p) − o for a point p; they
-belong at c(p), the calibrated machine's inverse. So it is to be sent to f(c(p) + o), with f the
-nominal forward kinematics (`corrections.py`). That takes up to a millisecond a point. What is added
-to p is smooth: in boxes of space, made as points fall into them, it is a polynomial between
-Chebyshev's points, held against the machine itself at others. A box that is not known well enough,
-or not reached as a whole, is divided; what is left at the border of the workspace is the machine.
+belong at c(p), where the calibrated machine's tip is right (`tool_tip.py`). So it is to be sent to
+f(c(p) + o), with f the nominal forward kinematics (`corrections.py`). That takes up to a
+millisecond a point. What is added to p is smooth: in boxes of space, made as points fall into
+them, it is a polynomial between Chebyshev's points, held against the machine itself at others. A
+box that is not known well enough, or not reached as a whole, is divided; what is left at the border
+of the workspace is the machine.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError
-from orthocal.kinematics.assembly import Assembly, nominal_assembly
+from orthocal.export.tool_tip import ToolTip
+from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.kinematics.continuation import Failures
 from orthocal.robot.model import Robot, Tcp
 
@@ -105,12 +107,20 @@ class CorrectionField:
         calibration: The calibration.
         offsets: In the controller, shape (n_drives,), [m, rad].
         within: By how much what follows may be off in all, of which this takes a part, [m].
+        tool: The tip in the frame of the robot's tool centre point, [m].
 
     Raises:
         ExportError: If the robot's drives command no tool.
     """
 
-    def __init__(self, calibration: Calibration, offsets: Array, *, within: float) -> None:
+    def __init__(
+        self,
+        calibration: Calibration,
+        offsets: Array,
+        *,
+        within: float,
+        tool: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
         robot = calibration.robot
         tcp = _require_commanded(robot)
         self.axes = tuple(tcp.coordinates)
@@ -119,7 +129,7 @@ class CorrectionField:
         """No point is farther off, [m]."""
         self._offsets = np.array(offsets, dtype=np.float64)
         self._nominal = nominal_assembly(robot)
-        self._real = Assembly(robot, fixed=calibration.errors)
+        self._tip = ToolTip(calibration, tool)
         self._side = BOX * robot.characteristic_length
         self._boxes: dict[Key, _Box | Unknown] = {}
         self._worst = EXACT
@@ -163,14 +173,11 @@ class CorrectionField:
         refused: dict[int, str] = {}
         for first in range(0, len(points), POINTS_AT_ONCE):
             part = points[first : first + POINTS_AT_ONCE]
-            names = [""] * len(part)
             failures: Failures = {}
-            drives = self._real.inverse(part, names=names, failures=failures) + self._offsets
+            drives = self._tip.reach(part, failures=failures)[0] + self._offsets
             good = np.array([i for i in range(len(part)) if i not in failures], dtype=np.int64)
             beyond: Failures = {}
-            sent = self._nominal.forward(
-                drives[good], names=[names[i] for i in good], failures=beyond
-            )
+            sent = self._nominal.forward(drives[good], failures=beyond)
             result[first + good] = sent[:, list(self.axes)]
             failures.update({int(good[i]): e for i, e in beyond.items()})
             for i, e in failures.items():

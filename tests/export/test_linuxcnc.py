@@ -30,9 +30,9 @@ from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.export.linuxcnc.c_source import braced, write_core
 from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.export.linuxcnc.nominal_form import SlidesWithRods, Tangent, find_nominal_form
-from orthocal.export.linuxcnc.tool_tip import ToolTip
 from orthocal.export.linuxcnc.words import rounded_up
 from orthocal.export.options import ExportOptions
+from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.synthetic import load_errors
 from orthocal.robot.loading import packaged_robots
