@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import io
+import os
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
 
 PART = 2**16
 """Characters or bytes that are read or written together."""
+
+
+PROGRESS_ASKED = "AXIS_PROGRESS_BAR"
+"""Variable of the environment in which LinuxCNC's window says that it shows how far a filter is."""
 
 
 class Offsets(StrEnum):
@@ -168,8 +173,23 @@ def _lines(program: Path, file: str) -> Iterator[str]:
         raise GcodeError("is closed", where=file)
     else:
         source = sys.stdin.buffer
-    for line in read_parts(source, longest=LONGEST_LINE + 2, name=file, error=GcodeError):
+    parts = read_parts(source, longest=LONGEST_LINE + 2, name=file, error=GcodeError)
+    if isinstance(source, Path) and PROGRESS_ASKED in os.environ:
+        parts = _tell_progress(parts, source)
+    for line in parts:
         yield line.decode("utf-8", "surrogateescape")
+
+
+def _tell_progress(parts: Iterable[bytes], source: Path) -> Iterator[bytes]:
+    """The parts of a file, and on stderr how far one is, as LinuxCNC's windows understand it."""
+    done = told = size = 0
+    for part in parts:
+        size = size or source.stat().st_size
+        done += len(part)
+        if 100 * done // size > told:
+            told = 100 * done // size
+            put_note(f"FILTER_PROGRESS={min(told, 100)}")
+        yield part
 
 
 def _spool(texts: Iterable[str], spool: IO[bytes]) -> None:
