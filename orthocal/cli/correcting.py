@@ -176,8 +176,10 @@ def _lines(program: Path, file: str) -> Iterator[str]:
     parts = read_parts(source, longest=LONGEST_LINE + 2, name=file, error=GcodeError)
     if isinstance(source, Path) and PROGRESS_ASKED in os.environ:
         parts = _tell_progress(parts, source)
-    for line in parts:
-        yield line.decode("utf-8", "surrogateescape")
+    for part in parts:
+        text = part.decode("utf-8", "surrogateescape")
+        # what is too long in bytes is so in characters: a part of a line is none
+        yield text.ljust(len(part)) if len(part) > LONGEST_LINE else text
 
 
 def _tell_progress(parts: Iterable[bytes], source: Path) -> Iterator[bytes]:

@@ -228,6 +228,17 @@ def test_the_command_line(command, tmp_path, monkeypatch):
     assert command(None)[0] == 0
 
 
+def test_a_line_that_is_too_long_in_bytes_is_not_read_as_two(command, monkeypatch):
+    """What stands behind the place where it would be cut is a comment, not a motion."""
+    line = "X1" + " " * 900 + "Y2 ;" + "é" * 48 + "G91 G0 X5\n"
+    assert len(line[:-9].encode()) == 1003 > 1000 > len(line)
+    stream = io.TextIOWrapper(io.BytesIO(("G21 G0 X1 Y2 Z3\n" + line).encode()))
+    monkeypatch.setattr(sys, "stdin", stream)
+    code, out, err = command(None)
+    assert (code, out) == (2, "")
+    assert err.startswith("orthocal: standard input:2: has 1002 characters; expected at most 1000")
+
+
 @pytest.mark.parametrize(
     ("text", "words", "message"),
     [

@@ -313,13 +313,19 @@ def test_memory_does_not_grow_with_the_program(monkeypatch):
     assert peaks[1] < 1.3 * peaks[0]
 
 
+@pytest.mark.parametrize("line", ["%" + " " * 260, "(" + "a" * 300 + ")", "x" * 253])
+def test_no_line_behind_the_end_is_longer_than_linuxcnc_reads(line):
+    with pytest.raises(GcodeError, match=r"^p\.ngc:5: has \d+ bytes once it is corrected"):
+        corrected([*HEAD, "M2", line])
+
+
 RS274 = shutil.which("rs274")
 
 
 def interpret(text, folder):
     """Motions of a program as LinuxCNC's interpreter makes them."""
     path = folder / "program.ngc"
-    path.write_text("\n".join(text) + "\n")
+    path.write_text("\n".join(text) + "\n", newline="")
     done = subprocess.run(
         [RS274, "-g", "-v", str(folder / "none.var"), str(path)],
         capture_output=True, text=True, check=True, cwd=folder,
@@ -374,3 +380,32 @@ def test_another_interpreter_before_and_after(seed, tmp_path):
     assert np.abs(polyline[-1] - bend(before[-1].end[None])[0]).max() < 2 * PRINTED_MM
     times = [sum(m.length / m.feed for m in moves if m.feed) for moves in (before, after)]
     assert times[1] == pytest.approx(times[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("line", ["G1 X1 (%s)", "(%s)", "G1 X25 (%s)", "G1 X1 M8 ;%s", "M7%s"])
+def test_no_line_is_written_that_is_longer_than_linuxcnc_reads(line, end, tmp_path, monkeypatch):
+    """One of 252 bytes, which it reads; one of 253, which is refused here, and there."""
+    from orthocal.gcode import program
+
+    def written(fill):
+        interpreter = Interpreter("p.ngc", axes=(0, 1, 2), offsets={})
+        corrector = ProgramCorrector(
+            "p.ngc", axes=(0, 1, 2), interpreter=interpreter, correct=Bent(), within=WITHIN
+        )
+        text = "".join(corrector.run(f"{t}{end}" for t in [*HEAD, line % fill, "M2"]))
+        return text, max(len(part.encode()) for part in text.split("\n"))
+
+    fill = " " if line == "M7%s" else "\xe9"
+    missing = 252 - (written(60 * "x" if fill != " " else 60 * " ")[1] - 60)
+    n = len(fill.encode())
+    longest = " " * (missing % n) + fill * (missing // n)
+    text, size = written(longest)
+    assert size == 252
+    with pytest.raises(GcodeError, match=r"^p\.ngc:4: has 253 bytes once it is corrected"):
+        written(" " + longest)
+    if RS274:
+        interpret(text.split("\n"), tmp_path)
+        monkeypatch.setattr(program, "LONGEST_READ", 1000)
+        with pytest.raises(subprocess.CalledProcessError):
+            interpret(written(" " + longest)[0].split("\n"), tmp_path)
