@@ -151,21 +151,54 @@ class CorrectionField:
 
         Returns:
             Shape (k, 3), [m]; and index to why the machine cannot be there, for the first of those;
-            some after it may be refused unseen.
+            all after it are refused, too, some of them unseen.
         """
         axes = np.array(self.axes, dtype=np.int64)
+        wanted = np.array(points, dtype=np.float64)[:, axes]
+        sent, asked, refused = np.full(wanted.shape, np.nan), list[int](), dict[int, str]()
+        end = len(points)
+        for group, key in self._boxes_of(wanted):
+            if asked and key not in self._boxes:  # what is not reached takes long to find out
+                end = self._ask(wanted, sent, asked, refused)
+            own = group[group < end]
+            if own.size:
+                sent[own] = wanted[own] + self._add(wanted[own], own, 0, asked)
+        end = self._ask(wanted, sent, asked, refused)
+        for i in range(end, len(points)):
+            refused.setdefault(i, "comes after one that is not reached")
+        sent[end:] = np.nan
         result = np.array(points, dtype=np.float64)
-        asked: list[int] = []
-        result[:, axes] += self._add(result[:, axes], np.arange(len(points)), 0, asked)
-        refused: dict[int, str] = {}
-        rest, count = np.sort(np.array(asked, dtype=np.int64)), FIRST_ASKED
-        while rest.size and not refused:  # what is not reached takes long to find out
-            own, rest, count = rest[:count], rest[count:], 2 * count
-            sent, odd = self.exactly(points[np.ix_(own, axes)])
-            result[np.ix_(own, axes)] = sent
-            refused.update({int(own[i]): reason for i, reason in odd.items()})
-        refused.update(dict.fromkeys(rest.tolist(), "comes after one that is not reached"))
+        result[:, axes] = sent
         return result, refused
+
+    def _ask(self, wanted: Array, sent: Array, asked: list[int], refused: dict[int, str]) -> int:
+        """Ask the machine itself for points up to the first that it refuses.
+
+        Args:
+            wanted: Shape (k, n_axes), [m].
+            sent: Filled with what it says, shape (k, n_axes), [m].
+            asked: Indices of the points; emptied.
+            refused: Filled with those that it refuses.
+
+        Returns:
+            The first index that is refused; k where none is.
+        """
+        end = min(refused, default=len(wanted))
+        rest, count = np.sort(np.array(asked, dtype=np.int64)), FIRST_ASKED
+        while rest.size and rest[0] < end:
+            own, rest, count = rest[:count], rest[count:], 2 * count
+            sent[own], odd = self.exactly(wanted[own])
+            refused.update({int(own[i]): reason for i, reason in odd.items()})
+            end = min(refused, default=end)
+        asked.clear()
+        return end
+
+    def _boxes_of(self, wanted: Array) -> list[tuple[Indices, Key]]:
+        """Points by the box that they are in, undivided, in the order in which they come."""
+        with np.errstate(invalid="ignore"):
+            cells = np.floor(wanted / self._side).astype(np.int64)
+        groups = np.split(*_group(cells)) if len(cells) else []
+        return [(own, (0, *cells[own[0]].tolist())) for own in sorted(groups, key=lambda g: g[0])]
 
     def exactly(self, points: Array) -> tuple[Array, Mapping[int, str]]:
         """The same by the machine itself; coordinates that the drives command, (k, n_axes), [m]."""
