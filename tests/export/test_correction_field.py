@@ -15,7 +15,7 @@ from programs import read_polyline
 from orthocal import ExportError, calibrate, draw_errors, write_calibration
 from orthocal.assess.entering import entered_offsets
 from orthocal.cli import main
-from orthocal.export.correction_field import CorrectionField
+from orthocal.export.correction_field import CorrectionField, Unknown
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.state import Interpreter
 from orthocal.kinematics.assembly import Assembly, nominal_assembly
@@ -63,6 +63,28 @@ def test_at_the_border_it_says_as_the_machine_what_is_reached(field):
     assert all(sent[i].tolist() != sent[i].tolist() for i in refused)
     good = [i for i in range(40) if i not in refused]
     assert np.linalg.norm(sent[good] - expected[good], axis=1).max() < field.error
+
+
+def test_the_first_point_that_is_not_reached_is_named_wherever_others_are(bad):
+    """Points in any order, in boxes where the machine is asked, which are known or not yet."""
+    field = CorrectionField(bad, OFFSETS, within=WITHIN)
+    field._make = lambda key: Unknown.ASKED
+    field.exactly = lambda p: (
+        np.where(p > 0.1, np.nan, p + 1e-3),
+        {int(i): f"{p[i][0]}" for i in np.flatnonzero((p > 0.1).any(axis=1))},
+    )
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        field._boxes.clear()
+        points = rng.uniform(-0.3, 0.11, (rng.integers(1, 200), 3))
+        truth = np.flatnonzero((points > 0.1).any(axis=1))
+        for _ in range(2):  # boxes that are known afterwards
+            sent, refused = field(points)
+            first = min(truth, default=len(points))
+            assert sorted(refused) == list(range(first, len(points)))
+            assert refused.get(first) in (None, f"{points[first][0]}" if len(truth) else None)
+            assert sent[:first] == pytest.approx(points[:first] + 1e-3)
+            assert np.isnan(sent[first:]).all()
 
 
 TOOL = np.array([20.0, -5.0, -80.0]) * 1e-3
