@@ -11,15 +11,15 @@ from orthocal.errors import GcodeError
 LONGEST_LINE = 1000
 """Characters; controllers read 255."""
 
-_NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)"
+_NUMBER = r"[-+]?(?:[0-9]++\.?+[0-9]*+|\.[0-9]++)"  # one way to read it, however long
 
 _ITEM = re.compile(rf"[ \t]*(?:([A-Za-z])[ \t]*({_NUMBER})(?![0-9.])|(\([^()]*\)|;.*))")
 
 _WORD = re.compile(rf"([ \t]*([A-Za-z])[ \t]*({_NUMBER})(?![0-9.]))")
 
 _PLAIN = re.compile(
-    r"(N[0-9]+)?[ \t]*(?:G0?([01]))?"
-    rf"[ \t]*(?:X({_NUMBER}))?[ \t]*(?:Y({_NUMBER}))?[ \t]*(?:Z({_NUMBER}))?[ \t]*(\r?\n)"
+    r"(N[0-9]++)?+(?:[ \t]*+G0?([01]))?+"
+    rf"(?:[ \t]*+X({_NUMBER}))?+(?:[ \t]*+Y({_NUMBER}))?+(?:[ \t]*+Z({_NUMBER}))?+[ \t]*+(\r?\n)"
 )
 
 _CONTROL = re.compile("[\x00-\x08\x0a-\x1f\x7f-\x9f]")

@@ -12,6 +12,7 @@ import pytest
 from programs import Move, distances, own_distances, random_program, read_polyline
 
 from orthocal import GcodeError
+from orthocal.gcode import words as program_words
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.state import Interpreter
 
@@ -137,6 +138,20 @@ def test_the_short_way_refuses_nothing_by_itself(lines, monkeypatch):
         said.append(str(refused.value))
         monkeypatch.setattr(program, "split_plain", lambda text, number: None)
     assert said[0] == said[1]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "X1" + " " * 980 + "M8",
+        "G1" + " " * 980 + "Q",
+        "X" + "1" * 320 + "Y" + "2" * 320 + "Z" + "3" * 320 + "Q",
+    ],
+    ids=["blanks", "blanks-behind", "digits"],
+)
+def test_a_line_is_read_once_however_long_its_blanks_and_digits_are(line):
+    """In steps in proportion to its length: with as many ways to read it this would take hours."""
+    assert program_words.split_plain(f"{line}\n", 1) is None
 
 
 def test_a_spindle_that_turns_left_is_no_dwell():
