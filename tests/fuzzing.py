@@ -1,4 +1,4 @@
-"""Mutated files of all eleven kinds, and what must hold of each: orthocal's errors, or none.
+"""Mutated files of all kinds, and what must hold of each: orthocal's errors, or none.
 
 Case i of a seed is always the same. Workers run cases in processes of their own, so that a crash or
 a blow-up of memory is seen, too. By hand:
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import io
 import itertools
 import json
@@ -27,9 +28,10 @@ import warnings
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import openpyxl
@@ -78,6 +80,40 @@ TABLE = (
     "xy;zero;0,00;0,01;\nxy;x_max;−0,43;-0,44;gut\nyx;zero;1,5;;\nEnde;;;;\n"
 )
 
+PROGRAM = """%
+(a part) G21 G90 G17 G64 P0.01
+N10 G0 X0 Y0
+F100.5 S1000 M3
+G1 X10 Y-5
+X12.5 Y-4.25
+N50 G2 X2.5 Y-4.25 I-5 J0 (half)
+G3 X12.5 R5 F80
+G91
+G1 X-1 Y.5
+X-1
+G90 G20
+G54 G1 X0.25 Y0.1 F4 ; inches
+G21 F100
+G3 X20 Y0 I6.825 J-1.27 P1
+G1 X0 Y0 M9
+M2
+behind the end
+%
+"""
+
+DIAL = """
+sigma_mm: 0.005
+resolution_mm: 0.01
+range_mm: [-5, 5]
+scale_tolerance: 0.002
+tip: {ball: {radius_mm: 1.5}}
+direction_tolerance_mrad: 10
+section_tolerance_mm: 0.5
+"""
+
+STUDY = SimpleNamespace(document={"kind": "none", "draws": 4}, digest="0" * 64, task_sizes=[2] * 4)
+"""What a journal says of its study, and how many tasks there are."""
+
 STEERING = ("Cc", "Cf", "Cs", "Co", "Zl", "Zp")
 """Categories of characters that no message may hold."""
 
@@ -93,12 +129,17 @@ KINDS = {
     "points": "points.csv",
     "table": "table.csv",
     "workbook": "table.xlsx",
+    "program": "part.ngc",
+    "machine": "made/machine.yaml",
+    "dial": "dial.yaml",
+    "journal": "recorded/readings.csv.journal",
+    "study": "study.jsonl",
 }
 
 
 def lay_out(folder: Path) -> None:
     """Good files of every kind."""
-    from orthocal import calibrate, load_session
+    from orthocal import Sizes, calibrate, load_session, make_robot
     from orthocal.measurement.session_file import load_plan
     from orthocal.measurement.session_output import write_session
     from orthocal.measurement.synthetic import simulate_session
@@ -121,6 +162,33 @@ def lay_out(folder: Path) -> None:
     simulated = simulate_session(load_plan(folder / "plan.yaml"), {"x_slide.offset": 5e-4})
     write_session(simulated.session, folder)
     write_calibration(calibrate(load_session(folder), "full"), folder / "calibration.json")
+    (folder / "part.ngc").write_text(PROGRAM, encoding="utf-8")
+    (folder / "dial.yaml").write_text(DIAL, encoding="utf-8")
+    make_robot(Sizes(), folder / "made")
+    lay_out_journals(folder)
+
+
+def lay_out_journals(folder: Path) -> None:
+    """A recording and a study that were killed, the recording before its CSV was written."""
+    from orthocal.measurement.recording import open_recording
+    from orthocal.study.journal import open_journal
+
+    recorded = folder / "recorded"
+    recorded.mkdir()
+    text = SESSION.replace("robot: machine", "robot: ../machine")
+    (recorded / "session.yaml").write_text(text + PLAN, encoding="utf-8")
+    with open_recording(recorded) as recording:
+        recording.read(0, 1e-4)
+        csv = (recorded / "readings.csv").read_bytes()
+        recording.read(1, -2e-4)
+        recording.repeat(0)
+        recording.read(2, 3.5e-4)
+        journal = (folder / KINDS["journal"]).read_bytes()
+    (recorded / "readings.csv").write_bytes(csv)
+    (folder / KINDS["journal"]).write_bytes(journal)
+    with open_journal(folder / "study.jsonl", STUDY) as found:
+        for task in (2, 0):
+            found.add(task, {"draw": [task, task + 1], "error": [0.5, None]})
 
 
 # ---- mutation
@@ -271,6 +339,79 @@ def change_xml(rng: random.Random, data: bytes) -> bytes:
     return bytes(etree.tostring(root))
 
 
+WORDS = (
+    *("G0", "G1", "G2", "G3", "G20", "G21", "G90", "G91", "G90.1", "G91.1", "G18", "G4 P1", "G80"),
+    *("G54", "G55", "G59.3", "G61", "M0", "M2", "M30", "M6 T1", "%", "F0", "F1e3", "F0.0001", "N1"),
+    *("X0", "Y0", "X-40", "Y40", "X1000", "Y-1e3", "I0", "J0", "I-5", "R0", "R-5", "P2", "P10000"),
+    *(
+        "X" + "0" * 300,
+        "Y0." + "1" * 300,
+        "Z1",
+        "A1",
+        "G38.2",
+        "G92",
+        "#1=2",
+        "o1 sub",
+        "/",
+        "(",
+        ")",
+    ),
+    *(
+        "(" + "c" * 260 + ")",
+        ";" + "\xe9" * 400,
+        " " * 1200,
+        "\t",
+        "\r",
+        "G-0",
+        "M3.0",
+        "G1.0",
+        "X+.5",
+    ),
+)
+"""What stands in programs, or nearly."""
+
+
+def change_program(rng: random.Random, text: str) -> str:
+    """Spoil the words and lines of a program."""
+    lines = text.split("\n")
+    at = rng.randrange(len(lines))
+    words = lines[at].split(" ")
+    how = rng.randrange(8)
+    if how < 3:
+        words[rng.randrange(len(words))] = rng.choice(WORDS)
+    elif how == 3:
+        words.insert(rng.randrange(len(words) + 1), str(odd(rng)))
+    elif how == 4:
+        lines.insert(rng.randrange(len(lines)), rng.choice(lines))
+    elif how == 5:
+        words.insert(rng.randrange(len(words) + 1), rng.choice(WORDS))
+    elif how == 6:
+        k = rng.randrange(len(words))
+        words[k] = words[k][:1] + str(rng.choice(NUMBERS))
+    lines[at] = " ".join(words)
+    if how == 7:
+        del lines[at]
+    return rng.choice(("\n", "\n", "\n", "\r\n")).join(lines)
+
+
+def change_journal(rng: random.Random, text: str) -> str:
+    """Spoil the lines of JSON of a journal."""
+    lines = text.splitlines()
+    at = rng.randrange(len(lines))
+    how = rng.randrange(8)
+    if how == 0:
+        del lines[at]
+    elif how == 1:
+        lines.insert(rng.randrange(len(lines) + 1), lines[at])
+    elif how == 2:
+        lines[at] = json.dumps(odd(rng))
+    else:
+        document = json.loads(lines[at])
+        change(rng, document)
+        lines[at] = json.dumps(document)
+    return "\n".join(lines) + rng.choice(("\n", "\n", "\n", ""))
+
+
 ENCODINGS = ("utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-32", "cp1252", "latin-1")
 
 
@@ -298,7 +439,7 @@ def change_workbook(rng: random.Random, data: bytes) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, part in parts.items():
-            archive.writestr(name, part)
+            archive.writestr(zipfile.ZipInfo(name), part, zipfile.ZIP_DEFLATED)  # of no date
     return stream.getvalue()
 
 
@@ -351,6 +492,10 @@ def mutate_structure(rng: random.Random, kind: str, data: bytes) -> bytes:
         return change_table(rng, data.decode()).encode(errors="surrogatepass")
     if kind == "urdf":
         return change_xml(rng, data)
+    if kind == "program":
+        return change_program(rng, data.decode()).encode(errors="surrogatepass")
+    if kind in ("journal", "study"):
+        return change_journal(rng, data.decode()).encode(errors="surrogatepass")
     document = json.loads(data) if kind == "calibration" else yaml.safe_load(data)
     if not isinstance(document, dict):
         return change_bytes(rng, data)
@@ -378,13 +523,17 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     from orthocal.assess.rows import accuracy_rows, forward_blocks, forward_rows, inverse_rows
     from orthocal.kinematics.assembly import nominal_assembly
     from orthocal.measurement.importing import TableOptions, import_readings
+    from orthocal.measurement.recording import open_recording
     from orthocal.measurement.session_file import load_plan
     from orthocal.measurement.session_output import write_session
     from orthocal.measurement.synthetic import load_errors, simulate_session, truth_document
     from orthocal.measurement.table import read_points, stream_joints
+    from orthocal.planning.dial import load_dial
+    from orthocal.planning.means import Means
     from orthocal.show.accuracy import format_points
     from orthocal.show.imported import format_import, printed_import
     from orthocal.show.scene.drawing import draw_scene
+    from orthocal.study.journal import open_journal
 
     deep = rng.random() < thorough
     if kind in ("session", "readings"):
@@ -420,6 +569,18 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
         json.loads(printed_import(found, written=False))
         (folder / "readings.csv").write_text(found.text, encoding="utf-8")
         load_plan(folder)
+    elif kind == "program":
+        use_program(folder, deep=deep)
+    elif kind == "machine":
+        use_machine(folder / "made", deep=deep)
+    elif kind == "dial":
+        load_dial(folder / "dial.yaml", Means())
+    elif kind == "journal":
+        with restored(folder / "recorded"), open_recording(folder / "recorded") as recording:
+            assert recording.rows
+    elif kind == "study":
+        with open_journal(folder / "study.jsonl", STUDY) as found:
+            assert set(found.found) <= set(range(4))
     elif kind == "calibration":
         calibration = load_calibration(folder)
         find_entries(calibration)
@@ -451,6 +612,72 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
             if deep:
                 list(inverse_rows(calibration, rows, names=names))
                 list(accuracy_rows(calibration, rows, names=names))
+
+
+@contextlib.contextmanager
+def restored(folder: Path) -> Iterator[None]:
+    """A folder whose files are put back as they were."""
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    try:
+        yield
+    finally:
+        for path in folder.iterdir():
+            if path not in before:
+                path.unlink()
+        for path, content in before.items():
+            path.write_bytes(content)
+
+
+class Shifted:
+    """A correction that is cheap, and refuses what is far."""
+
+    bound = 0.0
+
+    def __call__(self, points: Any) -> tuple[Any, dict[int, str]]:
+        far = abs(points).max(axis=1) > 0.2
+        return points + 1e-4, {int(i): "is too far" for i in far.nonzero()[0]}
+
+
+@functools.cache
+def correction_of(file: Path) -> Any:
+    from orthocal import load_calibration
+    from orthocal.assess.entering import entered_offsets
+    from orthocal.export.correction_field import CorrectionField
+
+    calibration = load_calibration(file)
+    return CorrectionField(calibration, entered_offsets(calibration), within=1e-5)
+
+
+def use_program(folder: Path, *, deep: bool) -> None:
+    """Correct a program; what comes out has lines that are read, and is a program of G0 and G1."""
+    from orthocal.cli.correcting import _lines
+    from orthocal.gcode.program import ProgramCorrector
+    from orthocal.gcode.state import Interpreter
+
+    def correct(lines: Any, by: Any) -> str:
+        interpreter = Interpreter("p", axes=(0, 1), offsets={"G54": (0.0, 0.0, 0.0)})
+        corrector = ProgramCorrector(
+            "p", axes=(0, 1), interpreter=interpreter, correct=by, within=1e-4
+        )
+        return "".join(corrector.run(lines))
+
+    by = correction_of(folder / "calibration.json") if deep else Shifted()
+    text = correct(_lines(folder / "part.ngc", "part.ngc"), by)
+    lines = text.encode("utf-8", "surrogateescape").split(b"\n")
+    assert max(map(len, lines)) <= 252
+    again = [f"{line}\n" for line in text.removesuffix("\n").split("\n")]
+    assert correct(again, Shifted()).count("\n") >= text.count("\n")
+
+
+def use_machine(folder: Path, *, deep: bool) -> None:
+    """Make a machine again from its sizes."""
+    from orthocal.robot.machine_file import read_machine
+    from orthocal.robot.making import remake_robot
+
+    read_machine(folder / "machine.yaml")
+    if deep:
+        with restored(folder):
+            remake_robot(folder)
 
 
 def tell(line: str) -> None:

@@ -18,6 +18,7 @@ at a place of that slide, whatever the controller shows there.
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import pwd
 import shutil
@@ -53,6 +54,51 @@ LATCH = 0.02
 
 BEFORE_SWITCH = 2.0
 """[mm] Of the slides where the machine is switched on."""
+
+WINDOW = Path("/usr/bin/axis")
+"""Program of the window that opens programs, and has them filtered first."""
+
+PYTHON = "/usr/bin/python3"
+"""The one that LinuxCNC's window runs in."""
+
+OPEN = """\
+import ast, json, linuxcnc, os, re, select, subprocess, sys
+
+window, ini, program, result = sys.argv[1:]
+told = []
+
+
+class Progress:
+    def __init__(self, *_):
+        pass
+
+    def update(self, count, force=0):
+        told.append(count)
+
+    def set_text(self, *_):
+        pass
+
+    done = set_text
+
+
+class t:
+    update = staticmethod(lambda: None)
+
+
+names = {"progress_re", "filter_program", "get_filter"}
+tree = ast.parse(open(window).read())
+own = [
+    node for node in tree.body
+    if getattr(node, "name", None) in names
+    or (isinstance(node, ast.Assign) and getattr(node.targets[0], "id", None) in names)
+]
+space = {"os": os, "re": re, "select": select, "sys": sys, "_": str, "t": t,
+         "Progress": Progress, "inifile": linuxcnc.ini(ini)}
+exec(compile(ast.Module(own, []), window, "exec"), space)
+command = space["get_filter"](program)
+code, said = (None, "") if command is None else space["filter_program"](command, program, result)
+json.dump({"code": code, "said": said, "progress": told}, sys.stdout)
+"""
 
 BASE = """\
 [EMC]
@@ -282,6 +328,32 @@ def run_program(program, joints, *, letters="XYZ", lines="", module=None):
             return _run(folder)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def filter_program(ini, program, result):
+    """What LinuxCNC's window makes of a program before it opens it, by the window's own functions.
+
+    Args:
+        ini: Text of the INI.
+        program: The file that somebody opens.
+        result: The file that is opened instead.
+
+    Returns:
+        Exit code of the filter, None where the INI has none for such files; what it said; and how
+        far the window was told that it is, in percent.
+    """
+    require_linuxcnc()
+    if not WINDOW.exists():
+        _without(f"no window of LinuxCNC's: there is no {WINDOW}")
+    with tempfile.TemporaryDirectory(prefix="orthocal-linuxcnc-") as name:
+        folder = Path(name)
+        (folder / "filtered.ini").write_text(ini)
+        (folder / "open.py").write_text(OPEN)
+        words = [PYTHON, "open.py", str(WINDOW), "filtered.ini", str(program), str(result)]
+        done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    return found["code"], found["said"], found["progress"]
 
 
 def _write(folder, program, joints, *, letters, lines):

@@ -33,8 +33,11 @@ CALIBRATE = "calibrate {tmp} --out {tmp}/out"
 FORWARD = "forward {tmp}/calibration.json {tmp}/joints.csv"
 INVERSE = "inverse {tmp}/calibration.json {tmp}/points.csv"
 VALIDATE = "validate {tmp}/calibration.json {tmp}"
+CORRECT = "correct {tmp}/calibration.json {tmp}/part.ngc --out {tmp}/out.ngc --anyway"
 SIMULATE = "simulate {tmp}/plan.yaml --out {tmp}/out"
 ONE_ERROR = " --error x_slide.offset_mm=1.2"
+
+PROGRAM = "G21 G0 X0 Y0 Z0\nG1 X1 F100\n"
 
 COMMA = "; a decimal comma? write a point"
 MAKE_ONE = "; `orthocal calibrate SESSION --out FOLDER` makes one"
@@ -164,6 +167,12 @@ def points(name: str, table: str, message: str) -> Case:
     edits = (write("points.csv", table),)
     message = "{tmp}/points.csv" + message
     return Case(f"points-{name}", message, edits, INVERSE, "machine", calibrated=True)
+
+
+def program(name: str, content: str | bytes, message: str, options: str = "") -> Case:
+    edits = (write("part.ngc", content),)
+    message = message if message.startswith("--") else "{tmp}/part.ngc" + message
+    return Case(f"program-{name}", message, edits, CORRECT + options, "machine", calibrated=True)
 
 
 def simulate(name: str, options: str, message: str, *edits: Edit) -> Case:
@@ -2061,6 +2070,93 @@ VIEW_CASES = [
     ),
 ]
 
+EXPECTED = "; expected words such as X1.5 and comments"
+
+PROGRAM_CASES = [
+    program("empty", "", ": is empty; expected a program"),
+    program("binary", b"\x7fELF\x02\x01", ":1: found '\\x7fELF\\x02\\x01'" + EXPECTED),
+    program("utf-16", "G0".encode("utf-16"), ":1: found '\\xff\\xfeG\\x000\\x00'" + EXPECTED),
+    program("zero-bytes", PROGRAM + "G1 \0 X2\n", ":3: found '\\x00 X2'" + EXPECTED),
+    program(
+        "no-feed",
+        "G0 X0 Y0 Z0\nG1 X1\n",
+        ":2: found G1, and no feed is known; expected F before it, and again after another unit",
+    ),
+    program(
+        "too-far",
+        PROGRAM + "G1 X999\n",
+        ":3: the machine cannot make this motion: it cannot be reached: joint 'x_slide' would be "
+        "at 391.6 mm, outside its limits 120 ... 390 mm",
+    ),
+    program(
+        "cycle",
+        PROGRAM + "G81 Z-1 R1\n",
+        ":3: found G81, which is a canned cycle, whose motions the controller makes; write the "
+        "motion as lines and arcs (G0 to G3)",
+    ),
+    program(
+        "long-line",
+        PROGRAM + "(" + "a" * 300 + ")\n",
+        ":3: has 302 bytes once it is corrected; expected at most 252, as LinuxCNC reads: shorten "
+        "what stands beside its words",
+    ),
+    program(
+        "longer-line",
+        PROGRAM + "X1" + " " * 2000,
+        ":3: has 1002 characters; expected at most 1000",
+    ),
+    program("tool-one", PROGRAM, "--tool: found '5'; expected X,Y,Z", " --tool 5"),
+    program(
+        "tool-no-number",
+        PROGRAM,
+        "--tool: Z is 'nan'; expected a finite number",
+        " --tool 0,0,nan",
+    ),
+    program(
+        "tool-long",
+        PROGRAM,
+        "--tool: found 0, 0, 1e+06 mm; expected numbers of at most 10000 mm",
+        " --tool 0,0,1e6",
+    ),
+    program(
+        "system-unknown",
+        PROGRAM,
+        "--work-offset-mm: found 'G60=0,0,0'; expected X,Y,Z or one of G54, G55, G56, G57, G58, "
+        "G59, G59.1, G59.2, G59.3 = X,Y,Z",
+        " --work-offset-mm G60=0,0,0",
+    ),
+    program(
+        "system-twice",
+        PROGRAM,
+        "--work-offset-mm: G54 stands twice",
+        " --work-offset-mm 0,0,0 --work-offset-mm G54=0,0,0",
+    ),
+    Case(
+        "program-missing",
+        "{tmp}/part.ngc: there is no such file",
+        (remove("part.ngc"),),
+        CORRECT,
+        "machine",
+        calibrated=True,
+    ),
+    Case(
+        "program-folder",
+        "{tmp}/part.ngc: is a folder; expected a file",
+        (remove("part.ngc"), make_folder("part.ngc")),
+        CORRECT,
+        "machine",
+        calibrated=True,
+    ),
+    Case(
+        "program-out-a-folder",
+        "{tmp}/out.ngc: is a folder; expected a file",
+        (make_folder("out.ngc"),),
+        CORRECT,
+        "machine",
+        calibrated=True,
+    ),
+]
+
 
 CASES = [
     *SESSION_KEY_CASES,
@@ -2075,11 +2171,14 @@ CASES = [
     *TABLE_CASES,
     *SIMULATE_CASES,
     *VIEW_CASES,
+    *PROGRAM_CASES,
 ]
 
 BY_NAME = {case.name: case for case in CASES}
 
 USAGE = {
+    "within-nothing": CORRECT + " --within 0",
+    "within-no-number": CORRECT + " --within nan",
     "no-command": "",
     "command-unknown": "calibrat {tmp}",
     "session-missing": "calibrate",
@@ -2121,6 +2220,7 @@ def spoil(tmp_path: Path, calibrated: str) -> Callable[[Case], None]:
             (tmp_path / FILE).write_text(calibrated, encoding="utf-8")
             (tmp_path / "joints.csv").write_text(f"{JOINTS}\n310,310,310\n")
             (tmp_path / "points.csv").write_text("x_mm,y_mm,z_mm\n0,0,0\n")
+            (tmp_path / "part.ngc").write_text(PROGRAM)
         for edit in case.edits:
             edit(tmp_path)
 
@@ -2163,7 +2263,7 @@ def test_what_the_cases_spoil_is_good(base, tmp_path, monkeypatch, capfd):
     assert capfd.readouterr().err == f"Wrote {out}/calibration.json and {out}/report.html\n"
 
 
-@pytest.mark.parametrize("command", [FORWARD, INVERSE, SIMULATE + ONE_ERROR, "validate"])
+@pytest.mark.parametrize("command", [FORWARD, INVERSE, CORRECT, SIMULATE + ONE_ERROR, "validate"])
 def test_what_other_commands_spoil_is_good(command, spoil, tmp_path, monkeypatch, capfd):
     edits = (NO_CONTROLLER,) if command == "validate" else ()
     spoil(Case("good", "", edits, base="machine", calibrated=True))

@@ -1,4 +1,4 @@
-"""Mutated files of all eleven kinds: orthocal's errors or none, in 5 s and 500 MB; see `fuzzing`.
+"""Mutated files of all kinds: orthocal's errors or none, in 5 s and 500 MB; see `fuzzing`.
 
 What a longer run found stands below as tests of their own.
 """

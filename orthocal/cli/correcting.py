@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import io
+import os
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, BinaryIO
@@ -26,6 +29,10 @@ if TYPE_CHECKING:
 
 PART = 2**16
 """Characters or bytes that are read or written together."""
+
+
+PROGRESS_ASKED = "AXIS_PROGRESS_BAR"
+"""Variable of the environment in which LinuxCNC's window says that it shows how far a filter is."""
 
 
 class Offsets(StrEnum):
@@ -74,6 +81,13 @@ def correct(
             "not say X, Y and Z.",
         ),
     ] = None,
+    tool: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="The tip of the tool in the frame of the tool centre point, mm; 0,0,0 by default.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="File for the result, instead of standard output.")
     ] = None,
@@ -92,12 +106,14 @@ def correct(
     from orthocal.calibration.file import load_calibration
     from orthocal.export.correction_field import CorrectionField
     from orthocal.export.formats import require_entering
+    from orthocal.export.options import ExportOptions
     from orthocal.files import require_writable_file, write_file
     from orthocal.gcode.program import ProgramCorrector
     from orthocal.gcode.state import Interpreter
 
     zeros = _read_offsets(work_offset or [])
     begin = None if start is None else _read_vector(start, "--start-mm")
+    tip = ExportOptions(tool=None if tool is None else _read_vector(tool, "--tool")).tool
     if out is not None:
         require_writable_file(out)
     result = load_calibration(calibration)
@@ -106,14 +122,15 @@ def correct(
     active = offsets is Offsets.ACTIVE
     values = result.active_offsets if active else entered_offsets(result)
     within = within_um * UM
-    field = CorrectionField(result, values, within=within)
+    field = CorrectionField(result, values, within=within, tool=tip or (0.0, 0.0, 0.0))
     file = "standard input" if str(program) == "-" else str(program)
     interpreter = Interpreter(file, axes=field.axes, offsets=zeros, start=begin)
     corrector = ProgramCorrector(
         file, axes=field.axes, interpreter=interpreter, correct=field, within=within
     )
     with tempfile.TemporaryFile() as spool:  # nothing is written before all of it is good
-        _spool(corrector.run(_lines(program, file)), spool)
+        with _frozen():
+            _spool(corrector.run(_lines(program, file)), spool)
         if not corrector.summary.lines:
             raise GcodeError("is empty; expected a program", where=file)
         if out is not None:
@@ -127,9 +144,23 @@ def correct(
         _describe(corrector.summary, field, within)
         + "\n"
         + _describe_controller(result, values, active=active)
+        + _describe_tool(tip)
         + ("" if zeros else "\nThe program's coordinates are taken for the machine's own.")
         + ("\nNo G20 or G21 before its coordinates: mm." if corrector.summary.unit_assumed else "")
     )
+
+
+@contextmanager
+def _frozen() -> Iterator[None]:
+    """Keep the collector of garbage from looking at all that is loaded, again and again.
+
+    Lines come and go by the thousand, in no circles.
+    """
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def _lines(program: Path, file: str) -> Iterator[str]:
@@ -142,8 +173,25 @@ def _lines(program: Path, file: str) -> Iterator[str]:
         raise GcodeError("is closed", where=file)
     else:
         source = sys.stdin.buffer
-    for line in read_parts(source, longest=LONGEST_LINE + 2, name=file, error=GcodeError):
-        yield line.decode("utf-8", "surrogateescape")
+    parts = read_parts(source, longest=LONGEST_LINE + 2, name=file, error=GcodeError)
+    if isinstance(source, Path) and PROGRESS_ASKED in os.environ:
+        parts = _tell_progress(parts, source)
+    for part in parts:
+        text = part.decode("utf-8", "surrogateescape")
+        # what is too long in bytes is so in characters: a part of a line is none
+        yield text.ljust(len(part)) if len(part) > LONGEST_LINE else text
+
+
+def _tell_progress(parts: Iterable[bytes], source: Path) -> Iterator[bytes]:
+    """The parts of a file, and on stderr how far one is, as LinuxCNC's windows understand it."""
+    done = told = size = 0
+    for part in parts:
+        size = size or source.stat().st_size
+        done += len(part)
+        if 100 * done // size > told:
+            told = 100 * done // size
+            put_note(f"FILTER_PROGRESS={min(told, 100)}")
+        yield part
 
 
 def _spool(texts: Iterable[str], spool: IO[bytes]) -> None:
@@ -198,6 +246,11 @@ def _describe(summary: Summary, field: CorrectionField, within: float) -> str:
         f"{field.error / UM:.2g}, decimals {ROUNDING * within / UM:.2g}. Feeds were changed by "
         f"{low:+.2f} … {high:+.2f} %, so that the tool keeps them."
     )
+
+
+def _describe_tool(tip: Vector | None) -> str:
+    shown = ", ".join(f"{v / MM:g}" for v in tip or ())
+    return f"\nIt is for a tip at {shown} mm from the tool centre point." if tip else ""
 
 
 def _describe_controller(result: Calibration, values: Iterable[float], *, active: bool) -> str:

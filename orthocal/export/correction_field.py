@@ -1,11 +1,12 @@
 """Where a nominal controller is to be sent for a point, at the speed of a program's lines.
 
 A controller that is nominal but for its offsets o sends the drives to ρ(p) − o for a point p; they
-belong at c(p), the calibrated machine's inverse. So it is to be sent to f(c(p) + o), with f the
-nominal forward kinematics (`corrections.py`). That takes up to a millisecond a point. What is added
-to p is smooth: in boxes of space, made as points fall into them, it is a polynomial between
-Chebyshev's points, held against the machine itself at others. A box that is not known well enough,
-or not reached as a whole, is divided; what is left at the border of the workspace is the machine.
+belong at c(p), where the calibrated machine's tip is right (`tool_tip.py`). So it is to be sent to
+f(c(p) + o), with f the nominal forward kinematics (`corrections.py`). That takes up to a
+millisecond a point. What is added to p is smooth: in boxes of space, made as points fall into
+them, it is a polynomial between Chebyshev's points, held against the machine itself at others. A
+box that is not known well enough, or not reached as a whole, is divided; what is left at the border
+of the workspace is the machine.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError
-from orthocal.kinematics.assembly import Assembly, nominal_assembly
+from orthocal.export.tool_tip import ToolTip
+from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.kinematics.continuation import Failures
 from orthocal.robot.model import Robot, Tcp
 
@@ -105,12 +107,20 @@ class CorrectionField:
         calibration: The calibration.
         offsets: In the controller, shape (n_drives,), [m, rad].
         within: By how much what follows may be off in all, of which this takes a part, [m].
+        tool: The tip in the frame of the robot's tool centre point, [m].
 
     Raises:
         ExportError: If the robot's drives command no tool.
     """
 
-    def __init__(self, calibration: Calibration, offsets: Array, *, within: float) -> None:
+    def __init__(
+        self,
+        calibration: Calibration,
+        offsets: Array,
+        *,
+        within: float,
+        tool: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
         robot = calibration.robot
         tcp = _require_commanded(robot)
         self.axes = tuple(tcp.coordinates)
@@ -119,7 +129,7 @@ class CorrectionField:
         """No point is farther off, [m]."""
         self._offsets = np.array(offsets, dtype=np.float64)
         self._nominal = nominal_assembly(robot)
-        self._real = Assembly(robot, fixed=calibration.errors)
+        self._tip = ToolTip(calibration, tool)
         self._side = BOX * robot.characteristic_length
         self._boxes: dict[Key, _Box | Unknown] = {}
         self._worst = EXACT
@@ -141,21 +151,54 @@ class CorrectionField:
 
         Returns:
             Shape (k, 3), [m]; and index to why the machine cannot be there, for the first of those;
-            some after it may be refused unseen.
+            all after it are refused, too, some of them unseen.
         """
         axes = np.array(self.axes, dtype=np.int64)
+        wanted = np.array(points, dtype=np.float64)[:, axes]
+        sent, asked, refused = np.full(wanted.shape, np.nan), list[int](), dict[int, str]()
+        end = len(points)
+        for group, key in self._boxes_of(wanted):
+            if asked and key not in self._boxes:  # what is not reached takes long to find out
+                end = self._ask(wanted, sent, asked, refused)
+            own = group[group < end]
+            if own.size:
+                sent[own] = wanted[own] + self._add(wanted[own], own, 0, asked)
+        end = self._ask(wanted, sent, asked, refused)
+        for i in range(end, len(points)):
+            refused.setdefault(i, "comes after one that is not reached")
+        sent[end:] = np.nan
         result = np.array(points, dtype=np.float64)
-        asked: list[int] = []
-        result[:, axes] += self._add(result[:, axes], np.arange(len(points)), 0, asked)
-        refused: dict[int, str] = {}
-        rest, count = np.sort(np.array(asked, dtype=np.int64)), FIRST_ASKED
-        while rest.size and not refused:  # what is not reached takes long to find out
-            own, rest, count = rest[:count], rest[count:], 2 * count
-            sent, odd = self.exactly(points[np.ix_(own, axes)])
-            result[np.ix_(own, axes)] = sent
-            refused.update({int(own[i]): reason for i, reason in odd.items()})
-        refused.update(dict.fromkeys(rest.tolist(), "comes after one that is not reached"))
+        result[:, axes] = sent
         return result, refused
+
+    def _ask(self, wanted: Array, sent: Array, asked: list[int], refused: dict[int, str]) -> int:
+        """Ask the machine itself for points up to the first that it refuses.
+
+        Args:
+            wanted: Shape (k, n_axes), [m].
+            sent: Filled with what it says, shape (k, n_axes), [m].
+            asked: Indices of the points; emptied.
+            refused: Filled with those that it refuses.
+
+        Returns:
+            The first index that is refused; k where none is.
+        """
+        end = min(refused, default=len(wanted))
+        rest, count = np.sort(np.array(asked, dtype=np.int64)), FIRST_ASKED
+        while rest.size and rest[0] < end:
+            own, rest, count = rest[:count], rest[count:], 2 * count
+            sent[own], odd = self.exactly(wanted[own])
+            refused.update({int(own[i]): reason for i, reason in odd.items()})
+            end = min(refused, default=end)
+        asked.clear()
+        return end
+
+    def _boxes_of(self, wanted: Array) -> list[tuple[Indices, Key]]:
+        """Points by the box that they are in, undivided, in the order in which they come."""
+        with np.errstate(invalid="ignore"):
+            cells = np.floor(wanted / self._side).astype(np.int64)
+        groups = np.split(*_group(cells)) if len(cells) else []
+        return [(own, (0, *cells[own[0]].tolist())) for own in sorted(groups, key=lambda g: g[0])]
 
     def exactly(self, points: Array) -> tuple[Array, Mapping[int, str]]:
         """The same by the machine itself; coordinates that the drives command, (k, n_axes), [m]."""
@@ -163,14 +206,11 @@ class CorrectionField:
         refused: dict[int, str] = {}
         for first in range(0, len(points), POINTS_AT_ONCE):
             part = points[first : first + POINTS_AT_ONCE]
-            names = [""] * len(part)
             failures: Failures = {}
-            drives = self._real.inverse(part, names=names, failures=failures) + self._offsets
+            drives = self._tip.reach(part, failures=failures)[0] + self._offsets
             good = np.array([i for i in range(len(part)) if i not in failures], dtype=np.int64)
             beyond: Failures = {}
-            sent = self._nominal.forward(
-                drives[good], names=[names[i] for i in good], failures=beyond
-            )
+            sent = self._nominal.forward(drives[good], failures=beyond)
             result[first + good] = sent[:, list(self.axes)]
             failures.update({int(good[i]): e for i, e in beyond.items()})
             for i, e in failures.items():

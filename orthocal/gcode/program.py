@@ -10,7 +10,7 @@ from orthocal.errors import GcodeError
 from orthocal.gcode.cutting import LONGEST_PIECE, Correct, Refused, cut
 from orthocal.gcode.path import Motion, Paths
 from orthocal.gcode.state import Interpreter, Step
-from orthocal.gcode.words import LONGEST_LINE, split_line
+from orthocal.gcode.words import Line, split_line, split_plain
 from orthocal.gcode.writing import Writer
 
 LINES_AT_ONCE = 2000
@@ -20,6 +20,12 @@ PIECES_AT_ONCE = 20_000
 
 ROUNDING = 0.1
 """Part of what is asked for that the decimals of coordinates may take."""
+
+LONGEST_READ = 252
+"""Bytes of a line that LinuxCNC reads, without the newline."""
+
+SHORT = LONGEST_READ // 4
+"""Characters of which there are not more bytes than that."""
 
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
@@ -91,38 +97,46 @@ class ProgramCorrector:
             summary.lines += 1
             if text.strip() == "%":
                 marks += 1
+                self._require_readable([text], summary.lines)
                 steps.append(text)
             elif interpreter.modes.ended or marks > 1:
-                if _CONTROL.search(text.rstrip("\r\n")) or len(text) > LONGEST_LINE:
+                if _CONTROL.search(text.rstrip("\r\n")):
                     raise GcodeError("is no text", where=f"{self._file}:{summary.lines}")
+                self._require_readable([text], summary.lines)
                 steps.append(text)
             else:
+                plain = split_plain(text, summary.lines)
+                step = None if plain is None else interpreter.read_plain(plain)
                 try:
-                    step = interpreter.read(split_line(text, summary.lines, file=self._file))
+                    if step is None:
+                        line = split_line(text, summary.lines, file=self._file)
+                        step = interpreter.read(line)
                 except GcodeError:
-                    for _ in self._flush(steps):
-                        pass  # what cannot be reached stands before it
+                    self._flush(steps)  # what cannot be reached stands before it
                     raise
                 steps.append(step)
                 if step.motion is not None:
                     summary.unit_assumed |= not step.modes.unit_told
                     pieces += _estimate(step.motion)
             if len(steps) >= LINES_AT_ONCE or pieces > PIECES_AT_ONCE:
-                yield from self._flush(steps)
+                yield self._flush(steps)
                 steps, pieces = [], 0.0
-        yield from self._flush(steps)
+        yield self._flush(steps)
         summary.ended = interpreter.modes.ended or marks > 1
 
-    def _flush(self, steps: Sequence[Step | str]) -> Iterator[str]:
+    def _flush(self, steps: Sequence[Step | str]) -> str:
+        """What is written for some steps."""
         moving = [s for s in steps if isinstance(s, Step) and s.motion is not None]
         motions = [s.motion for s in moving if s.motion is not None]
         cuts = iter(cut(Paths.of(motions), self._correct, tolerance=self._tolerance))
         summary, low, high = self.summary, *self.summary.stretch
+        texts: list[str] = []
         for step in steps:
             if isinstance(step, str):
-                yield step
-            elif step.motion is None:
-                yield self._writer.keep(step.line)
+                texts.append(step)
+                continue
+            if isinstance(step.line, Line) and step.motion is None:
+                own = [self._writer.keep(step.line)]
             else:
                 found = next(cuts)
                 if isinstance(found, Refused):
@@ -136,8 +150,23 @@ class ProgramCorrector:
                 if not step.straight and step.modes.motion:
                     low = min(low, *found.stretch)
                     high = max(high, *found.stretch)
-                yield from self._writer.write(step, found)
+                own = self._writer.write(step, found)
+            if len(own[0]) > SHORT or len(own[-1]) > SHORT:  # those between are places and feeds
+                self._require_readable(own, step.line.number)
+            texts += own
         summary.stretch = [low, high]
+        return "".join(texts)
+
+    def _require_readable(self, texts: Sequence[str], number: int) -> None:
+        """Refuse lines that a controller would cut off or stop at."""
+        for text in texts:
+            size = len(text.removesuffix("\n").encode("utf-8", "surrogateescape"))
+            if size > LONGEST_READ:
+                raise GcodeError(
+                    f"has {size} bytes once it is corrected; expected at most {LONGEST_READ}, "
+                    "as LinuxCNC reads: shorten what stands beside its words",
+                    where=f"{self._file}:{number}",
+                )
 
 
 def _estimate(motion: Motion) -> float:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 from orthocal.errors import GcodeError
 from orthocal.gcode.arcs import CENTRES, MOST_TURNS, NAMES, arc_about, center_of_radius
 from orthocal.gcode.path import PLANES, Arc, Motion, Vector
 from orthocal.gcode.refusals import refuse_code, refuse_letter
-from orthocal.gcode.words import Line, Word
+from orthocal.gcode.words import Line, Plain, Word
 from orthocal.units import MM
 
 INCH = 25.4 * MM
@@ -78,7 +79,7 @@ class Modes:
 class Step(NamedTuple):
     """What a line does."""
 
-    line: Line
+    line: Line | Plain
     modes: Modes
     """Those of the line."""
     offset: Vector
@@ -111,8 +112,9 @@ class Interpreter:
     ) -> None:
         self.modes = Modes()
         self._file, self._axes, self._offsets = file, tuple(axes), offsets
-        self._letters = frozenset("XYZ"[k] for k in self._axes)
-        zero = self.offset
+        self._letters = {k: NAMES[k] for k in self._axes}
+        self._known = _KNOWN.union(self._letters.values())
+        self._offset = zero = offsets.get("G54", (0.0, 0.0, 0.0))
         self.position: list[float | None] = [
             (None if start is None else start[k] + zero[k]) if k in self._axes else 0.0
             for k in range(3)
@@ -123,7 +125,7 @@ class Interpreter:
     @property
     def offset(self) -> Vector:
         """Place of the work coordinates' zero, [m]."""
-        return self._offsets.get(self.modes.system or "G54", (0.0, 0.0, 0.0))
+        return self._offset
 
     def read(self, line: Line) -> Step:
         """What a line does; the position and the modes follow.
@@ -133,12 +135,13 @@ class Interpreter:
         """
         where = f"{self._file}:{line.number}"
         words, codes = self._sort(line, where)
-        dwell = False
-        if codes:
-            for word in codes:
+        dwell = ends = False
+        for word in codes:
+            if word.letter == "M":
+                ends = ends or word.value in ENDS
+            elif word.value != self.modes.motion:
                 dwell = dwell or word.value == 4.0
-                if word.letter == "G":
-                    self._set_mode(word, where)
+                self._set_mode(word, where)
         if "F" in words:
             if words["F"] < 0.0:
                 raise GcodeError(f"found a feed of {words['F']:g}", where=where)
@@ -147,14 +150,35 @@ class Interpreter:
         if not _TAKEN.isdisjoint(words):
             self._check_taken(words, codes, where)
         moves = not _MOVES.isdisjoint(words)
-        step = Step(line, self.modes, self.offset)
         if moves and dwell:
             raise GcodeError("found a dwell and coordinates; expected one of them", where=where)
-        if moves:
-            step = self._move(line, words, where)
-        if codes and any(w.letter == "M" and w.value in ENDS for w in codes):
+        step = self._move(line, words, where) if moves else Step(line, self.modes, self._offset)
+        if ends:
             self.modes = replace(self.modes, ended=True)
         return step
+
+    def read_plain(self, line: Plain) -> Step | None:
+        """What such a line does: as `read`; None where that has more to look at."""
+        modes, offset, position = self.modes, self._offset, self.position
+        told, unit = line.motion, modes.unit
+        if (
+            not self._moved
+            or (modes.motion != 0 and (modes.motion != 1 or not modes.feed))
+            or (told is not None and int(told) != modes.motion)
+        ):
+            return None
+        begin: Vector = (position[0] or 0.0, position[1] or 0.0, position[2] or 0.0)
+        end = list(begin)
+        for k, digits in enumerate(line[3:6]):
+            if digits is not None:
+                base = offset[k] if modes.absolute else begin[k]
+                end[k] = place = float(digits) * unit + base
+                if k not in self._letters or abs(place) > LARGEST_COORDINATE:
+                    return None
+        if line[3:6] == _NOWHERE:
+            return None
+        self.position[:] = end
+        return Step(line, modes, offset, Motion(begin, (end[0], end[1], end[2])))
 
     def _sort(self, line: Line, where: str) -> tuple[dict[str, float], list[Word]]:
         """Values by letter, and G and M words; each once, and none that is not known."""
@@ -165,8 +189,12 @@ class Interpreter:
             if isinstance(item, str):
                 continue
             letter = item.letter
-            if letter == "G":
-                group = GROUPS.get(round(10.0 * item.value, 6))
+            if letter in self._known:
+                if letter in words:
+                    raise GcodeError(f"the word {letter} stands twice", where=where)
+                words[letter] = item.value
+            elif letter == "G":
+                group = GROUPS.get(_tenfold(item.value))
                 if group is None:
                     refuse_code(item, where)
                 elif group in groups:
@@ -181,17 +209,12 @@ class Interpreter:
                 if item.value not in M_WORDS:
                     refuse_code(item, where)
                 codes.append(item)
-            elif letter in words:
-                raise GcodeError(f"the word {letter} stands twice", where=where)
-            elif letter in self._letters or letter in _KNOWN:
-                words[letter] = item.value
             else:
-                names = ", ".join("XYZ"[k] for k in self._axes)
-                refuse_letter(item, where, axes=names)
+                refuse_letter(item, where, axes=", ".join(self._letters.values()))
         return words, codes
 
     def _set_mode(self, word: Word, where: str) -> None:
-        code, modes = round(10.0 * word.value, 6), self.modes
+        code, modes = _tenfold(word.value), self.modes
         match GROUPS[code]:
             case "motion":
                 motion = None if code == 800.0 else int(word.value)
@@ -219,7 +242,7 @@ class Interpreter:
                         "theirs)",
                         where=where,
                     )
-                self.modes = replace(modes, system=name)
+                self.modes, self._offset = replace(modes, system=name), self._offsets[name]
 
     def _check_taken(self, words: Mapping[str, float], codes: Sequence[Word], where: str) -> None:
         """Refuse P, Q and the words of arcs where nothing takes them."""
@@ -267,29 +290,29 @@ class Interpreter:
             )
         self.position = list(end)
         if first:
-            return Step(line, modes, self.offset, Motion(end, end), "F" in words, straight=True)
+            return Step(line, modes, self._offset, Motion(end, end), "F" in words, straight=True)
         begin: Vector = (start[0] or 0.0, start[1] or 0.0, start[2] or 0.0)
         arc = None if modes.motion < 2 else self._arc(begin, end, words, where)
-        return Step(line, modes, self.offset, Motion(begin, end, arc), "F" in words)
+        return Step(line, modes, self._offset, Motion(begin, end, arc), "F" in words)
 
     def _end(self, words: Mapping[str, float], where: str) -> Vector:
-        modes, offset = self.modes, self.offset
+        absolute, unit, offset = self.modes.absolute, self.modes.unit, self._offset
         end: list[float] = [0.0, 0.0, 0.0]
-        for k in self._axes:
-            value, old = words.get(NAMES[k]), self.position[k]
-            if value is not None and modes.absolute:
-                end[k] = value * modes.unit + offset[k]
+        for k, letter in self._letters.items():
+            value, old = words.get(letter), self.position[k]
+            if value is not None and absolute:
+                end[k] = place = value * unit + offset[k]
             elif old is None:
-                names = ", ".join(NAMES[a] for a in self._axes)
+                names = ", ".join(self._letters.values())
                 raise GcodeError(
-                    f"where the tool is along {NAMES[k]} is not known before this motion; expected "
+                    f"where the tool is along {letter} is not known before this motion; expected "
                     f"a first G0 to {names} in G90, or --start-mm",
                     where=where,
                 )
             else:
-                end[k] = old + (value or 0.0) * modes.unit
-            if abs(end[k]) > LARGEST_COORDINATE:
-                raise GcodeError(f"{NAMES[k]} is beyond any machine", where=where)
+                end[k] = place = old + (value or 0.0) * unit
+            if not -LARGEST_COORDINATE <= place <= LARGEST_COORDINATE:
+                raise GcodeError(f"{letter} is beyond any machine", where=where)
         return (end[0], end[1], end[2])
 
     def _arc(self, start: Vector, end: Vector, words: Mapping[str, float], where: str) -> Arc:
@@ -298,7 +321,7 @@ class Interpreter:
         if i not in self._axes or j not in self._axes:
             raise GcodeError(
                 f"found an arc in the plane of {NAMES[i]} and {NAMES[j]}; the drives command "
-                f"{', '.join(NAMES[a] for a in self._axes)}",
+                f"{', '.join(self._letters.values())}",
                 where=where,
             )
         clockwise = modes.motion == 2
@@ -352,6 +375,13 @@ class Interpreter:
         return (base[0] + values[0], base[1] + values[1])
 
 
+@lru_cache(maxsize=256)
+def _tenfold(value: float) -> float:
+    """Ten times the number of a G-word, without what binary fractions add."""
+    return round(10.0 * value, 6)
+
+
+_NOWHERE = (None, None, None)
 _MOVES = frozenset("XYZIJKR")
 _TAKEN = frozenset("PQIJKR")
 _KNOWN = frozenset("NFSTPQIJKR")

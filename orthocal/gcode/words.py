@@ -11,12 +11,16 @@ from orthocal.errors import GcodeError
 LONGEST_LINE = 1000
 """Characters; controllers read 255."""
 
-_ITEM = re.compile(
-    r"[ \t]*(?:([A-Za-z])[ \t]*([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?![0-9.])"
-    r"|(\([^()]*\)|;.*))"
-)
+_NUMBER = r"[-+]?(?:[0-9]++\.?+[0-9]*+|\.[0-9]++)"  # one way to read it, however long
 
-_WORD = re.compile(r"([ \t]*([A-Za-z])[ \t]*([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?![0-9.]))")
+_ITEM = re.compile(rf"[ \t]*(?:([A-Za-z])[ \t]*({_NUMBER})(?![0-9.])|(\([^()]*\)|;.*))")
+
+_WORD = re.compile(rf"([ \t]*([A-Za-z])[ \t]*({_NUMBER})(?![0-9.]))")
+
+_PLAIN = re.compile(
+    r"(N[0-9]++)?+(?:[ \t]*+G0?([01]))?+"
+    rf"(?:[ \t]*+X({_NUMBER}))?+(?:[ \t]*+Y({_NUMBER}))?+(?:[ \t]*+Z({_NUMBER}))?+[ \t]*+(\r?\n)"
+)
 
 _CONTROL = re.compile("[\x00-\x08\x0a-\x1f\x7f-\x9f]")
 _SUBROUTINE = re.compile(r"[ \t]*(?:[Nn][0-9. \t]*)?[Oo]")
@@ -62,6 +66,32 @@ class Line(NamedTuple):
     """Blanks at its end, and what ends it."""
     text: str
     """All of it."""
+
+
+class Plain(NamedTuple):
+    """A line with nothing but a place, as most are."""
+
+    number: int
+    """Counted from 1."""
+    label: str | None
+    """N and its digits."""
+    motion: str | None
+    """0 or 1."""
+    x: str | None
+    y: str | None
+    z: str | None
+    ending: str
+
+
+def split_plain(text: str, number: int) -> Plain | None:
+    """A line with nothing but a place; None for any other, and for some of those.
+
+    Args:
+        text: With what ends it.
+        number: Of the line.
+    """
+    found = _PLAIN.fullmatch(text)
+    return None if found is None or len(text) > LONGEST_LINE else Plain(number, *found.groups())
 
 
 def split_line(text: str, number: int, *, file: str) -> Line:

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 
 from orthocal.gcode.cutting import Cut
-from orthocal.gcode.state import INCH, STOPS, Step
-from orthocal.gcode.words import Line, Word
+from orthocal.gcode.state import INCH, STOPS, Modes, Step
+from orthocal.gcode.words import Line, Plain, Word
 from orthocal.units import MM
 
 FEWEST_DECIMALS = {MM: 4, INCH: 5}
@@ -44,8 +44,13 @@ class Writer:
     def __init__(
         self, axes: Sequence[int], *, rounding: float, start: Sequence[float | None]
     ) -> None:
-        self._axes = tuple((k, "XYZ"[k]) for k in axes)
-        self._decimals = {unit: find_decimals(unit, rounding) for unit in (MM, INCH)}
+        self._axes = tuple(axes)
+        self._forms: dict[float, tuple[int, str, str]] = {}
+        """Unit to decimals, words of a point, and a zero that came from below."""
+        for unit in (MM, INCH):
+            n = find_decimals(unit, rounding)
+            words = " ".join(f"{'XYZ'[k]}%.{n}f" for k in axes)
+            self._forms[unit] = (n, words, f"-{0.0:.{n}f}")
         self._written: list[float] = [0.0 if v is None else v for v in start]
         """Where the controller is sent, [m]."""
         self._motion: int | None = None
@@ -66,16 +71,34 @@ class Writer:
 
     def write(self, step: Step, cut: Cut) -> list[str]:
         """A line with a motion as the lines of its pieces."""
-        line, modes = step.line, step.modes
-        motion = 0 if modes.motion == 0 else 1
         feeds = self._feeds(step, cut)
         places = self._places(step, cut)
-        last = len(places) - 1
-        held = last > 0
+        motion = 0 if step.modes.motion == 0 else 1
+        if isinstance(step.line, Plain):
+            first, stops = _begin_plain(step.line, places[0], feeds[0]), ""
+        else:
+            held = len(places) > 1
+            first, stops = self._begin(step.line, step.modes, places[0], feeds[0], held=held)
+        self._motion = motion
+        if step.fed and not motion:
+            self._feed = step.modes.feed
+        end = step.line.ending.lstrip(" \t") or "\n"
+        if len(places) == 1:
+            return [first + end]
+        rest = zip(places[1:], feeds[1:], strict=True)
+        texts = [first, *(f"{words} {feed}" if feed else words for words, feed in rest)]
+        texts[-1] += stops
+        return [text + end for text in texts]
+
+    def _begin(
+        self, line: Line, modes: Modes, place: str, feed: str, *, held: bool
+    ) -> tuple[str, str]:
+        """A line up to its first place, the feed there, and what follows the last."""
+        motion = 0 if modes.motion == 0 else 1
         parts: list[str] = []
         stops = ""
         told = written = False
-        place = 0
+        at = 0
         for item in line.items:
             if isinstance(item, str):
                 parts.append(item)
@@ -83,8 +106,8 @@ class Writer:
             letter, value = item.letter, item.value
             if letter in REPLACED or (letter == "P" and modes.motion in _ARCS):
                 if not written:
-                    parts.append(f" {places[0]}" if parts else places[0])
-                    written, place = True, len(parts)
+                    parts.append(f" {place}" if parts else place)
+                    written, at = True, len(parts)
             elif letter == "G" and value in _MOTIONS:
                 parts.append(f" G{motion}" if parts else f"G{motion}")
                 told = True
@@ -94,38 +117,28 @@ class Writer:
                 stops += f" {item.text.strip()}"
             else:
                 parts.append(item.text)
-        count = len(parts)
+        if feed:
+            parts.insert(at, f" {feed}")
         if self._motion != motion and not told:
             parts.insert(_after_number(line), f" G{motion}" if line.items else f"G{motion}")
-        self._motion = motion
-        if feeds[0]:
-            parts.insert(place + (len(parts) - count), f" {feeds[0]}")
-        if step.fed and not motion:
-            self._feed = modes.feed
-        end = line.ending.lstrip(" \t") or "\n"
-        texts = ["".join(parts).lstrip()]
-        if held:
-            rest = zip(places[1:], feeds[1:], strict=True)
-            texts += [f"{words} {feed}" if feed else words for words, feed in rest]
-        texts[-1] += stops
-        return [text + end for text in texts]
+        return "".join(parts).lstrip(), stops
 
     def _places(self, step: Step, cut: Cut) -> list[str]:
         """Words of the coordinates of each piece's end."""
-        unit, offset, at = step.modes.unit, step.offset, self._written
-        decimals = self._decimals[unit]
-        negative = f"-{0.0:.{decimals}f}"
-        values = [""] * len(self._axes)
+        unit, axes = step.modes.unit, self._axes
+        decimals, form, zero = self._forms[unit]
+        base: Sequence[float] = step.offset
         found = []
         for point in cut.points:
-            for n, (k, name) in enumerate(self._axes):
-                base = offset[k] if step.modes.absolute else at[k]
-                text = f"{(point[k] - base) / unit:.{decimals}f}"
-                if text == negative:
-                    text = text[1:]
-                at[k] = float(text) * unit + base
-                values[n] = name + text
-            found.append(" ".join(values))
+            if not step.modes.absolute:
+                base = tuple(self._written)
+            values = tuple([(point[k] - base[k]) / unit for k in axes])
+            text = form % values
+            if zero in text:
+                text = text.replace(zero, zero[1:])
+            found.append(text)
+            for k, value in zip(axes, values, strict=True):
+                self._written[k] = round(value, decimals) * unit + base[k]
         return found
 
     def _feeds(self, step: Step, cut: Cut) -> list[str]:
@@ -149,6 +162,17 @@ _MOTIONS = frozenset({0.0, 1.0, 2.0, 3.0})
 _ARCS = frozenset({2, 3})
 _CANCEL = 80.0
 _FORGETS = frozenset({_CANCEL, 20.0, 21.0})
+
+
+def _begin_plain(line: Plain, place: str, feed: str) -> str:
+    """A line up to its first place, and the feed there."""
+    parts = [] if line.label is None else [line.label]
+    if line.motion is not None:
+        parts.append(f"G{line.motion}")
+    parts.append(place)
+    if feed:
+        parts.append(feed)
+    return " ".join(parts)
 
 
 def _after_number(line: Line) -> int:

@@ -195,6 +195,7 @@ class Assembly:
         points: Array,
         *,
         theta: ArrayLike | None = None,
+        start: Array | None = None,
         names: Sequence[str] | None = None,
         failures: Failures | None = None,
     ) -> tuple[Array, Array]:
@@ -203,6 +204,8 @@ class Assembly:
         Args:
             points: As for `inverse`, shape (K, n_drives).
             theta: As for `inverse`.
+            start: Drive and passive coordinates to start from, shape (K, n_drives + n_passive); the
+                mechanical zero by default.
             names: As for `inverse`.
             failures: As for `inverse`.
 
@@ -214,7 +217,9 @@ class Assembly:
         """
         p, machine = points, self.machine(theta)
         if failures is not None:
-            x = follow(self._inverting, p, machine, None, names, failures)
+            x = follow(self._inverting, p, machine, start, names, failures)
+        elif start is not None:
+            x = follow(self._inverting, p, machine, start, names, None)
         else:
             x = self._once(
                 ("inverse", p.tobytes(), *(part.tobytes() for part in machine)),

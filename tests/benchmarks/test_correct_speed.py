@@ -11,9 +11,9 @@ from orthocal.export.correction_field import CorrectionField
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.state import Interpreter
 
-CORRECTED = 5.0
+CORRECTED = 9.0
 """Points that are read, corrected and written a second over those that the machine itself corrects
-in blocks of a thousand. 10 to 16 were measured on a busy machine; a program asks for four or five
+in blocks of a thousand. 19 to 28 were measured on a busy machine; a program asks for four or five
 points a piece."""
 
 LINES = 8000

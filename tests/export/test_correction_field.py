@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import io
 import sys
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from programs import read_polyline
 
 from orthocal import ExportError, calibrate, draw_errors, write_calibration
 from orthocal.assess.entering import entered_offsets
 from orthocal.cli import main
-from orthocal.export.correction_field import CorrectionField
+from orthocal.export.correction_field import CorrectionField, Unknown
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.state import Interpreter
 from orthocal.kinematics.assembly import Assembly, nominal_assembly
@@ -61,6 +63,88 @@ def test_at_the_border_it_says_as_the_machine_what_is_reached(field):
     assert all(sent[i].tolist() != sent[i].tolist() for i in refused)
     good = [i for i in range(40) if i not in refused]
     assert np.linalg.norm(sent[good] - expected[good], axis=1).max() < field.error
+
+
+def test_the_first_point_that_is_not_reached_is_named_wherever_others_are(bad):
+    """Points in any order, in boxes where the machine is asked, which are known or not yet."""
+    field = CorrectionField(bad, OFFSETS, within=WITHIN)
+    field._make = lambda key: Unknown.ASKED
+    field.exactly = lambda p: (
+        np.where(p > 0.1, np.nan, p + 1e-3),
+        {int(i): f"{p[i][0]}" for i in np.flatnonzero((p > 0.1).any(axis=1))},
+    )
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        field._boxes.clear()
+        points = rng.uniform(-0.3, 0.11, (rng.integers(1, 200), 3))
+        truth = np.flatnonzero((points > 0.1).any(axis=1))
+        for _ in range(2):  # boxes that are known afterwards
+            sent, refused = field(points)
+            first = min(truth, default=len(points))
+            assert sorted(refused) == list(range(first, len(points)))
+            assert refused.get(first) in (None, f"{points[first][0]}" if len(truth) else None)
+            assert sent[:first] == pytest.approx(points[:first] + 1e-3)
+            assert np.isnan(sent[first:]).all()
+
+
+TOOL = np.array([20.0, -5.0, -80.0]) * 1e-3
+
+
+def tips(robot, errors, drives, tool):
+    """Where Pinocchio has the tip, its loops closed by Pinocchio, too."""
+    real = robot.with_errors(errors)
+    data, passive, found = real.model.createData(), real.zero[real.passive_index], []
+    for row in drives:
+        passive = real.close_with_pinocchio(row, passive)
+        q = real.configuration(real.joint_coordinates(row, passive))
+        pin.framesForwardKinematics(real.model, data, q)
+        found.append(data.oMf[real.frame_id(real.tcp.frame)].act(tool))
+    return np.array(found)
+
+
+def test_a_tool_s_tip_is_brought_along_the_program(bad, field):
+    """Dense samples of what is written, by a nominal controller, the real machine and Pinocchio."""
+    tilted = CorrectionField(bad, OFFSETS, within=WITHIN, tool=tuple(TOOL))
+    begin, corner, end = np.array([[-30, -20, 5], [30, 10, -10], [5, 40, 20]]) * 1e-3
+    names = [" ".join(f"{n}{v * 1e3:g}" for n, v in zip("XYZ", p, strict=True)) for p in
+             (begin, corner, end)]  # fmt: skip
+    corrector = ProgramCorrector(
+        "p",
+        axes=tilted.axes,
+        interpreter=Interpreter("p", axes=tilted.axes, offsets={}),
+        correct=tilted,
+        within=WITHIN,
+    )
+    text = [f"G21 G0 {names[0]}\n", f"N1 G1 {names[1]} F500\n", f"N2 {names[2]}\n"]
+    pieces = read_polyline("".join(corrector.run(text)).splitlines())
+    ends = [p for number in sorted(pieces) for p, _ in pieces[number]]
+    dense = np.array([a + s * (b - a) for a, b in pairwise(ends) for s in (0.0, 0.3, 0.5, 0.8)])
+    sent = nominal_assembly(bad.robot).inverse(dense * 1e-3) - OFFSETS
+    reached = tips(bad.robot, bad.errors, sent, TOOL) - TOOL
+    off = [distances_to(reached, *way) for way in ((begin, corner), (corner, end))]
+    assert np.min(off, axis=0).max() < 1.02 * WITHIN
+    points = np.array([begin, corner, end])
+    difference = np.linalg.norm(tilted(points)[0] - field(points)[0], axis=1)
+    assert difference.min() > 20e-6  # without being told of the tool it were so far off
+
+
+def distances_to(points, begin, end):
+    way = end - begin
+    along = np.clip((points - begin) @ way / (way @ way), 0.0, 1.0)
+    return np.linalg.norm(points - begin - along[:, None] * way, axis=1)
+
+
+def test_a_tool_leaves_what_cannot_be_reached_unreached(bad):
+    tilted = CorrectionField(bad, OFFSETS, within=WITHIN, tool=tuple(TOOL))
+    points = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.01, 0.02, 0.03], [np.nan, 0.0, 0.0]])
+    sent, refused = tilted.exactly(points)
+    assert sorted(refused) == [1, 3]
+    assert "cannot be reached" in refused[1]
+    assert "not numbers" in refused[3]
+    for i in (0, 2):
+        assert sent[i].tolist() == pytest.approx(tilted.exactly(points[[i]])[0][0], abs=1e-11)
+    many = np.vstack([np.zeros((1001, 3)), points])
+    assert sorted(tilted.exactly(many)[1]) == [1002, 1004]
 
 
 def test_a_program_brings_the_real_tool_along_its_lines_and_arcs(bad, field):
@@ -158,11 +242,23 @@ def test_the_command_line(command, tmp_path, monkeypatch):
     got = read_polyline(out.splitlines())[0][0][0] + [10.0, 0.0, -5.0]
     assert np.abs(got - expected * 1e3).max() < 1e-4
     assert np.abs(entered_offsets(machine)).max() > 1e-4
-    code, _, _ = command(PROGRAM, "--out", str(tmp_path / "o.ngc"))
+    code, _, err = command(PROGRAM, "--out", str(tmp_path / "o.ngc"), "--tool=-3,0,-50.5")
+    assert "It is for a tip at -3, 0, -50.5 mm from the tool centre point." in err
     assert (tmp_path / "o.ngc").read_bytes().endswith(b"F100 (\xe9)\r\n")
     stream = io.TextIOWrapper(io.BytesIO(PROGRAM.encode("latin-1")))
     monkeypatch.setattr(sys, "stdin", stream)
     assert command(None)[0] == 0
+
+
+def test_a_line_that_is_too_long_in_bytes_is_not_read_as_two(command, monkeypatch):
+    """What stands behind the place where it would be cut is a comment, not a motion."""
+    line = "X1" + " " * 900 + "Y2 ;" + "é" * 48 + "G91 G0 X5\n"
+    assert len(line[:-9].encode()) == 1003 > 1000 > len(line)
+    stream = io.TextIOWrapper(io.BytesIO(("G21 G0 X1 Y2 Z3\n" + line).encode()))
+    monkeypatch.setattr(sys, "stdin", stream)
+    code, out, err = command(None)
+    assert (code, out) == (2, "")
+    assert err.startswith("orthocal: standard input:2: has 1002 characters; expected at most 1000")
 
 
 @pytest.mark.parametrize(
@@ -173,6 +269,8 @@ def test_the_command_line(command, tmp_path, monkeypatch):
         (PROGRAM + "G54", (), "/p.ngc:3: found G54, and nothing says where its zero is"),
         (PROGRAM, ("--work-offset-mm", "1,2"), "--work-offset-mm: found '1,2'; expected X,Y,Z"),
         (PROGRAM, ("--work-offset-mm", "G53=1,2,3"), "--work-offset-mm: found 'G53=1,2,3'"),
+        (PROGRAM, ("--tool", "1,2"), "--tool: found '1,2'; expected X,Y,Z"),
+        (PROGRAM, ("--tool", "0,0,-1e6"), "--tool: found 0, 0, -1e+06 mm; expected numbers of at"),
         (PROGRAM, ("--start-mm", "1,2,q"), "--start-mm: Z is 'q'; expected a number"),
     ],
 )

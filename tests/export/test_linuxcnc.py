@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
@@ -14,7 +15,14 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
-from linuxcnc import Joint, build_module, require_linuxcnc, run_program, type_lines
+from linuxcnc import (
+    Joint,
+    build_module,
+    filter_program,
+    require_linuxcnc,
+    run_program,
+    type_lines,
+)
 
 from orthocal import (
     ExportError,
@@ -33,9 +41,9 @@ from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.export.linuxcnc.c_source import braced, write_core
 from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.export.linuxcnc.nominal_form import SlidesWithRods, Tangent, find_nominal_form
-from orthocal.export.linuxcnc.tool_tip import ToolTip
 from orthocal.export.linuxcnc.words import rounded_up
 from orthocal.export.options import ExportOptions
+from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.synthetic import load_errors
 from orthocal.robot.loading import packaged_robots
@@ -78,13 +86,13 @@ def mixed(root, tmp_path_factory):
     return folder
 
 
-def calibrated(root, folder, example, truth, model):
+def calibrated(root, folder, example, truth, model, *, active=ACTIVE):
     """A machine with given errors, read without noise while some offsets were active."""
     text = (root / f"examples/{example}/plan.yaml").read_text()
-    active = ", ".join(f"{v / MM:g}" for v in ACTIVE)
+    told = ", ".join(f"{v / MM:g}" for v in active)
     for old, new in {
         "robot: orthoglide": f"robot: {folder}",
-        "offsets_mm: [0, 0, 0]": f"offsets_mm: [{active}]",
+        "offsets_mm: [0, 0, 0]": f"offsets_mm: [{told}]",
     }.items():
         assert old in text
         text = text.replace(old, new)
@@ -513,6 +521,88 @@ def test_linuxcnc_follows_a_path_with_the_exported_module(full, tmp_path):
     # with nominal kinematics these slides would be far from it: the errors are no small ones
     nominal = Machine(full.robot, {}).forward(slides[::5] * MM + ACTIVE) / MM
     assert distances(nominal).min(axis=0).max() > 1.0 * MM
+
+
+FILTERED = 0.3
+"""[µm] By how much a program that is filtered in these tests may be off."""
+
+
+@pytest.fixture
+def filtered(root, full, tmp_path):
+    """A program as LinuxCNC's window opens it, with the lines of the page on controllers."""
+    write_calibration(full, tmp_path / "calibration.json")
+    page = (root / "docs/controllers.md").read_text()
+    ini = re.search(r"(?m)(?:^    .+\n)+", page[page.index("    [FILTER]") :])[0]
+    ini = "".join(f"{line.strip()}\n" for line in ini.splitlines())
+    tip = ",".join(f"{v / MM:g}" for v in TOOL)
+    for old, new in {
+        "/home/me/.venv/bin/orthocal": f"{sys.executable} -m orthocal.cli",
+        "/home/me/out/two": f"{tmp_path} --anyway --offsets active --within {FILTERED}",
+        "--tool 0,0,-50": f"--tool {tip}",
+    }.items():
+        assert old in ini
+        ini = ini.replace(old, new)
+
+    def open_program(lines, *, name="it's a part.ngc"):
+        (tmp_path / "result").mkdir(exist_ok=True)
+        (tmp_path / name).write_text("".join(f"{line}\n" for line in lines))
+        result = tmp_path / "result" / name
+        code, said, progress = filter_program(ini, tmp_path / name, result)
+        return code, said, progress, result.read_text() if result.exists() else None
+
+    return open_program
+
+
+def test_linuxcnc_runs_what_its_window_has_had_filtered(root, mixed, full, filtered, tmp_path):
+    """With nominal kinematics; a circle and lines, where the calibrated machine had its tip."""
+    centre, radius = (10.0, -8.0, 15.0), 10.0
+    corners = [(20.0, -8.0, 15.0), (-20.0, 10.0, -15.0), (-15.0, -20.0, 10.0)]
+    program = [
+        "G21 G90 G61 G0 X20 Y-8 Z15 (begins)",
+        "N1 F6000 G2 X20 Y-8 Z15 I-10 J0",
+        *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in corners[1:]),
+    ]
+    code, said, progress, text = filtered(program)
+    assert code == 0, said
+    assert "It is for a tip at 5, 0, -50 mm" in said
+    assert progress[-1] == 100
+    assert progress == sorted(progress)
+    nominal = calibrated(root, mixed, "raw-cycles", {}, "offsets", active=np.zeros(3))
+    options = ExportOptions(module=True)
+    files = export_calibration(nominal, "linuxcnc", anyway=True, options=options)
+    for name, content in files.items():
+        (tmp_path / name).write_text(content)
+    slides = run_program(
+        text.splitlines(),
+        joints_of(full, joints_at_switch(full, SWITCH)),
+        lines=files["kinematics.ini"],
+        module=tmp_path,
+    )
+    tip = ToolTip(full, TOOL)
+    points = tip.place(slides[::5] * MM) / MM - np.array(TOOL) / MM
+
+    def distances(points):
+        lines = [from_line(points, *ends) for ends in pairwise(corners)]
+        return np.array([from_circle(points, centre, radius), *lines]) * MM
+
+    pieces = distances(points)
+    assert pieces.min(axis=0).max() < FILTERED * 1e-6 + PATH
+    assert (np.count_nonzero(pieces < FILTERED * 1e-6 + PATH, axis=1) > [150, 80, 60]).all()
+    # as it was written it would be far off
+    unfiltered = Machine(full.robot, {}).forward(slides[::5] * MM + ACTIVE) / MM
+    assert distances(unfiltered).min(axis=0).max() > 1.0 * MM
+
+
+def test_linuxcnc_s_window_opens_nothing_where_the_filter_refuses(filtered):
+    """And shows why."""
+    code, said, _, text = filtered(["G21 G0 X0 Y0 Z0", "G81 X1 Z-1 R1 F100"])
+    assert (code, text) == (2, "")
+    assert said.startswith("orthocal: ")
+    assert "part.ngc:2: found G81, which is a canned cycle" in said
+    assert said.count("\n") == 1
+    # a name that the INI has no line for is opened as it is
+    assert filtered(["G0 X0 Y0 Z0"], name="part.nc")[0] is None
+    assert filtered(["G0 X0 Y0 Z0"], name="PART.NGC")[0] is None
 
 
 def test_the_home_offset_that_was_typed_brings_the_tool_where_it_is_sent(offsets):

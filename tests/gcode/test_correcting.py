@@ -12,6 +12,7 @@ import pytest
 from programs import Move, distances, own_distances, random_program, read_polyline
 
 from orthocal import GcodeError
+from orthocal.gcode import words as program_words
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.state import Interpreter
 
@@ -87,6 +88,80 @@ def test_what_is_written_is_near_the_corrected_path(seed):
     assert [line for line in lines if "(move" in line] == [
         line for line in lines if re.match(r"N\d+ .*\(move \d+\)$", line) and "N1 " not in line
     ]
+
+
+PLAIN = [
+    "G1 X1", "X1.5 Y-2.25 Z3", "N7 G01 X-1 Z+2.", "N8X.5Y2", "G00Z5", "Y1 ", "G0 X0 Y0 Z0", "G1 Y3",
+    "G91", "X0.3333", "X0.3333Y-.1", "G90", "G20", "F4", "X.25 Y.125", "G21", "F300", "X3 Y3",
+    "G54", "X0 Y-0 Z-0.00004", "G3 X2 Y0 I1 J0", "X0 I-1", "G1 X9 Y8 Z7", "N1 G1", "G1 G90 X2",
+    "M4 G1 X1", "F200 X2", "X20 Y20 Z20", "%", "G1 X3",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_lines_that_are_nothing_but_a_place_are_read_the_short_way_alike(seed, monkeypatch):
+    """Most lines are; what they mean is told once more, and must be what the long way says."""
+    from orthocal.gcode import program
+
+    text = [re.sub(r" \(.*\)$", "", line) for line in random_program(seed, moves=20).text[:-1]]
+    text += ["G21 G90 G91.1 G17 G0 X0 Y0 Z0", "F100", *PLAIN]
+    offsets = {"G54": (0.0125, -0.001, 0.003)}
+    read, split = [], program.split_plain
+
+    def seen(text, number):
+        read.append(split(text, number))
+        return read[-1]
+
+    monkeypatch.setattr(program, "split_plain", seen)
+    short, summary = corrected(text, offsets=offsets)
+    assert sum(line is not None for line in read) > 20
+    monkeypatch.setattr(program, "split_plain", lambda text, number: None)
+    long, expected = corrected(text, offsets=offsets)
+    assert short == long
+    assert summary == expected
+
+
+BY_THE_LONG_WAY = [
+    "X600", "X1 Z1e1", "X", "X1..2", "X1.2.3", "X--1", "X" + "9" * 999, "G2 X2 I1\nX3", "G20\nX1",
+    "G80\nX1", "G1", "G2 X2",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("lines", BY_THE_LONG_WAY, ids=lambda lines: lines[:10])
+def test_the_short_way_refuses_nothing_by_itself(lines, monkeypatch):
+    from orthocal.gcode import program
+
+    said = []
+    for _ in range(2):
+        with pytest.raises(GcodeError) as refused:
+            corrected([*HEAD, "G1", *lines.splitlines(), "G81"])
+        said.append(str(refused.value))
+        monkeypatch.setattr(program, "split_plain", lambda text, number: None)
+    assert said[0] == said[1]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "X1" + " " * 980 + "M8",
+        "G1" + " " * 980 + "Q",
+        "X" + "1" * 320 + "Y" + "2" * 320 + "Z" + "3" * 320 + "Q",
+    ],
+    ids=["blanks", "blanks-behind", "digits"],
+)
+def test_a_line_is_read_once_however_long_its_blanks_and_digits_are(line):
+    """In steps in proportion to its length: with as many ways to read it this would take hours."""
+    assert program_words.split_plain(f"{line}\n", 1) is None
+
+
+def test_a_spindle_that_turns_left_is_no_dwell():
+    lines, _ = corrected(["G21 G0 X0 Y0 Z0", "M4 S100 G0 X1"], correct=lambda_of(lambda p: p))
+    assert lines[1] == "M4 S100 G0 X1.0000 Y0.0000 Z0.0000"
+
+
+def test_no_zero_is_below_nought():
+    lines, _ = corrected(["G21 G0 X-0.00004 Y-0.0 Z-10.00001"], correct=lambda_of(lambda p: p))
+    assert lines == ["G21 G0 X0.0000 Y0.0000 Z-10.0000"]
 
 
 def test_as_few_pieces_as_that_takes():
@@ -253,13 +328,19 @@ def test_memory_does_not_grow_with_the_program(monkeypatch):
     assert peaks[1] < 1.3 * peaks[0]
 
 
+@pytest.mark.parametrize("line", ["%" + " " * 260, "(" + "a" * 300 + ")", "x" * 253])
+def test_no_line_behind_the_end_is_longer_than_linuxcnc_reads(line):
+    with pytest.raises(GcodeError, match=r"^p\.ngc:5: has \d+ bytes once it is corrected"):
+        corrected([*HEAD, "M2", line])
+
+
 RS274 = shutil.which("rs274")
 
 
 def interpret(text, folder):
     """Motions of a program as LinuxCNC's interpreter makes them."""
     path = folder / "program.ngc"
-    path.write_text("\n".join(text) + "\n")
+    path.write_text("\n".join(text) + "\n", newline="")
     done = subprocess.run(
         [RS274, "-g", "-v", str(folder / "none.var"), str(path)],
         capture_output=True, text=True, check=True, cwd=folder,
@@ -314,3 +395,32 @@ def test_another_interpreter_before_and_after(seed, tmp_path):
     assert np.abs(polyline[-1] - bend(before[-1].end[None])[0]).max() < 2 * PRINTED_MM
     times = [sum(m.length / m.feed for m in moves if m.feed) for moves in (before, after)]
     assert times[1] == pytest.approx(times[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("line", ["G1 X1 (%s)", "(%s)", "G1 X25 (%s)", "G1 X1 M8 ;%s", "M7%s"])
+def test_no_line_is_written_that_is_longer_than_linuxcnc_reads(line, end, tmp_path, monkeypatch):
+    """One of 252 bytes, which it reads; one of 253, which is refused here, and there."""
+    from orthocal.gcode import program
+
+    def written(fill):
+        interpreter = Interpreter("p.ngc", axes=(0, 1, 2), offsets={})
+        corrector = ProgramCorrector(
+            "p.ngc", axes=(0, 1, 2), interpreter=interpreter, correct=Bent(), within=WITHIN
+        )
+        text = "".join(corrector.run(f"{t}{end}" for t in [*HEAD, line % fill, "M2"]))
+        return text, max(len(part.encode()) for part in text.split("\n"))
+
+    fill = " " if line == "M7%s" else "\xe9"
+    missing = 252 - (written(60 * "x" if fill != " " else 60 * " ")[1] - 60)
+    n = len(fill.encode())
+    longest = " " * (missing % n) + fill * (missing // n)
+    text, size = written(longest)
+    assert size == 252
+    with pytest.raises(GcodeError, match=r"^p\.ngc:4: has 253 bytes once it is corrected"):
+        written(" " + longest)
+    if RS274:
+        interpret(text.split("\n"), tmp_path)
+        monkeypatch.setattr(program, "LONGEST_READ", 1000)
+        with pytest.raises(subprocess.CalledProcessError):
+            interpret(written(" " + longest)[0].split("\n"), tmp_path)

@@ -21,8 +21,8 @@ from orthocal.export.linuxcnc.polynomial import (
     chebyshev_lattice,
     fit_correction,
 )
-from orthocal.export.linuxcnc.tool_tip import ToolTip
 from orthocal.export.linuxcnc.words import region_words, rounded_up
+from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.assembly import find_beyond_travel
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.units import MM, UM

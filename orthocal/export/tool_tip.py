@@ -14,6 +14,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError
 from orthocal.kinematics.assembly import Assembly
 from orthocal.kinematics.compiled import compiled_robot, zero_poses
+from orthocal.kinematics.continuation import Failures
 
 Array = NDArray[np.float64]
 
@@ -60,30 +61,40 @@ class ToolTip:
             [self._poses(drives[p], None if start is None else start[p]) for p in parts]
         )
 
-    def reach(self, points: Array) -> tuple[Array, Array]:
+    def reach(self, points: Array, *, failures: Failures | None = None) -> tuple[Array, Array]:
         """Drive and passive coordinates that bring the tip where it belongs for points.
 
         Args:
             points: Shape (K, n), [m].
+            failures: Filled with the points that cannot be reached, which are NaN then; by default
+                the first of them raises.
 
         Raises:
             ClosureError: If one cannot be reached.
             ExportError: If turning platforms bring the tip no nearer.
         """
-        found = [self._reach(points[p]) for p in _parts(len(points))]
+        found = []
+        for part in _parts(len(points)):
+            own: Failures | None = None if failures is None else {}
+            found.append(self._reach(points[part], own))
+            if failures is not None and own:
+                failures.update({part.start + i: e for i, e in own.items()})
         drives, passive = (np.concatenate(part) for part in zip(*found, strict=True))
         return drives, passive
 
-    def _reach(self, points: Array) -> tuple[Array, Array]:
-        sent, targets = np.array(points), self.targets(points)
+    def _reach(self, points: Array, failures: Failures | None) -> tuple[Array, Array]:
+        sent, targets, start = np.array(points), self.targets(points), None
         for _ in range(MOST_STEPS):
-            drives, passive = self._assembly.reach(sent)
-            if not self.tool.any():
+            drives, passive = self._assembly.reach(sent, start=start, failures=failures)
+            good = np.isfinite(drives).all(axis=1)
+            if not self.tool.any() or not good.any():
                 return drives, passive
-            missing = targets - self._tips(self._poses(drives, passive))
+            missing = targets[good] - self._tips(self._poses(drives[good], passive[good]))
             if np.abs(missing).max() < REACHED:
                 return drives, passive
-            sent = sent + missing
+            sent[good] += missing
+            sent[~good] = np.nan  # refused already
+            start = np.hstack([drives, passive])
         raise ExportError("the platform turns too much for such a tool; give one nearer to it")
 
     def _poses(self, drives: Array, start: Array | None) -> Array:
