@@ -14,6 +14,7 @@ from conftest import ROOT
 import orthocal
 from orthocal import calibrate, draw_scene, load_session
 from orthocal.errors import NotIdentifiableError
+from orthocal.measurement.purpose import Purpose
 
 SCRIPTS = sorted((ROOT / "examples").glob("[0-9]*.py"))
 
@@ -208,5 +209,7 @@ def test_the_session_that_a_page_shows_can_be_read(tmp_path):
     (tmp_path / "readings.csv").write_text(readings)
     loaded = load_session(tmp_path)
     np.testing.assert_allclose(loaded.values, [0.0, 0.21e-3, -0.18e-3], rtol=1e-12)
+    assert loaded.purpose == Purpose("full")
+    assert loaded.robot.parameters.stated == {"*.offset_mm": 2.0}
     with pytest.raises(NotIdentifiableError, match=r"do not determine z_slide\.offset"):
-        calibrate(loaded)  # "If readings leave an offset open, orthocal says so."
+        calibrate(loaded, "offsets")  # "If readings leave an offset open, orthocal says so."

@@ -169,7 +169,7 @@ def describe_row(
     """Which reading comes next, and where the machine goes for it."""
     row = rows[index]
     lines = [
-        wrap(f"{index + 1} of {len(rows)} (line {index + 2} of the sheet): {row.label}", width)
+        wrap(f"{index + 1} of {len(rows)} (line {index + 2} of the table): {row.label}", width)
     ]
     for posture in (row.posture, *([row.minus] if row.minus else [])):
         name = f"{posture}: " if row.minus else ""

@@ -112,10 +112,11 @@ def test_no_points_are_none(orthoglide):
 def test_nothing_is_made_for_little(monkeypatch):
     monkeypatch.setattr(lanes, "_spent", 0.0)
     monkeypatch.setattr(lanes, "is_installed", lambda: True)
-    assert not lanes.pays(20_000, 400, before=0)
-    assert not lanes.pays(20_000, 400, before=50)  # of this function
-    assert lanes.pays(20_000, 400, before=101)
-    assert not lanes.pays(20_000, 1, before=10**6)
+    much = int(lanes.PATIENCE / 400)
+    assert not lanes.pays(much - 1, 400, before=101)  # in all
+    assert not lanes.pays(much, 400, before=50)  # of this function
+    assert lanes.pays(1, 400, before=101)
+    assert not lanes.pays(much, 1, before=10**6)
     monkeypatch.setattr(lanes, "is_installed", lambda: False)
     assert not lanes.pays(20_000, 10**9, before=0)
 

@@ -247,6 +247,6 @@ def test_somebody_who_records_is_shown_degrees_as_the_controller_has_them(root, 
             recording.session, guide(recording.session), recording.rows, 1, width=100
         )
     assert shown.splitlines()[:2] == [
-        "2 of 18: ya p-10",
+        "2 of 18 (line 3 of the table): ya p-10",
         "  joints motor_a -6.000 deg, motor_b 0.000 deg",
     ]

@@ -138,7 +138,9 @@ def test_a_setup_begins_where_its_gauge_is_set_and_ends_there(planned):
 
 def test_a_folder_is_ready_to_measure(planned, tmp_path):
     path = write_session(planned.session, tmp_path / "monday", blank=True)
-    with pytest.raises(SessionError, match=r"readings.csv:2: reading_mm is empty; expected what"):
+    with pytest.raises(
+        SessionError, match=r"readings.csv: nothing was read yet; `orthocal record` takes"
+    ):
         load_session(path)
     again = load_plan(path)
     assert [(r.setup, r.posture, r.cycle) for r in again.readings] == [
