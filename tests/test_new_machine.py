@@ -111,6 +111,43 @@ def test_it_is_made_again_after_a_change(copied, capsys):
     assert load_plan(copied / "first").purpose == Purpose("full")
 
 
+def test_readings_are_not_written_over(copied, capsys):
+    file = copied / "first/readings.csv"
+    head, *rows = file.read_text().splitlines()
+    file.write_text("\n".join([head, *(f"{row}0.12" for row in rows)]) + "\n")
+    before = {p: p.read_bytes() for p in copied.rglob("*") if p.is_file()}
+    for words in (
+        ["new", copied, *options(), "--paper"],
+        ["plan", copied, "--out", copied / "first"],
+    ):
+        code, _, err = run(capsys, *words, "--force")
+        assert (code, err) == (
+            2,
+            f"orthocal: {copied}/first/readings.csv: holds {len(rows)} readings, which --force "
+            "does not write over; take them elsewhere first\n",
+        )
+    assert {p: p.read_bytes() for p in copied.rglob("*") if p.is_file()} == before
+
+
+def test_a_folder_that_was_named_otherwise_says_so(copied, capsys):
+    renamed = copied.rename(copied.with_name("lathe"))
+    code, _, err = run(capsys, "new", renamed, "--again")
+    assert (code, err) == (
+        2,
+        f"orthocal: {renamed}/lathe.yaml: there is no such file; there is {copied.name}.yaml: was "
+        "the folder named otherwise?\n",
+    )
+
+
+def test_what_joints_that_count_down_must_show_is_said(made, capsys, tmp_path):
+    words = ["--out", tmp_path / "try", "--error", "y_slide.offset_mm=1.5"]
+    code, _, err = run(capsys, "simulate", made / "first", *words)
+    assert code == 0, err
+    _, text, _ = run(capsys, "calibrate", tmp_path / "try", "--model", "offsets")
+    said = " ".join(text.split())
+    assert "y_slide counts down in the controller: there its joint must show so much less" in said
+
+
 def test_readings_belong_to_the_sizes_of_their_day(copied, capsys):
     csv = copied / "first/readings.csv"
     csv.write_text(csv.read_text().replace("yx,zero,1,", "yx,zero,1,0.12"))

@@ -1,0 +1,31 @@
+"""Readings of which many are wrong: no single mistake stands out, but they do not repeat."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from orthocal import check_session
+
+
+def shuffle_cycle(session, cycle, seed):
+    """The readings of a cycle, each in another row of it."""
+    values = session.values
+    rows = np.array([i for i, r in enumerate(session.readings) if r.cycle == cycle])
+    values[rows] = values[np.random.default_rng(seed).permutation(rows)]
+    return session.with_values(values)
+
+
+def test_readings_that_do_not_repeat_are_told(raw_cycles):
+    found = check_session(shuffle_cycle(raw_cycles, 2, 3))
+    told = [f for f in found if f.kind == "scattered cycles"]
+    assert [f.severity for f in told] == ["warns"]
+    assert told[0].text.startswith("Repeated readings scatter by 0.")
+    assert "They differ most at " in told[0].text
+    numbers = told[0].numbers
+    assert numbers["scatter_mm"] > 10.0 * numbers["gauge_mm"]
+    assert numbers["gauge_mm"] == pytest.approx(np.hypot(0.01, 0.01 / 12**0.5), rel=1e-12)
+
+
+def test_sound_cycles_are_not(raw_cycles):
+    assert not [f for f in check_session(raw_cycles) if f.kind == "scattered cycles"]
