@@ -109,7 +109,7 @@ def _serve(study: Study, theirs: Connection[Any, Any], parent: int) -> None:
             os._exit(0)
         try:
             theirs.send((task, run_task(study, task)))
-        except Exception as e:
+        except Exception as e:  # whatever it is, it is raised where it was asked for
             theirs.send(_sendable(e))
 
 
@@ -117,7 +117,7 @@ def _sendable(error: Exception) -> Exception:
     """An error as it is, or what it says where it cannot be sent."""
     try:
         pickle.loads(pickle.dumps(error))
-    except Exception:
+    except Exception:  # pickling runs the error's own code
         return RuntimeError(f"{type(error).__name__}: {error}")
     return error
 

@@ -102,21 +102,24 @@ def tips(robot, errors, drives, tool):
     return np.array(found)
 
 
+def correct(field, *text):
+    """Lines of a program as they are written."""
+    corrector = ProgramCorrector(
+        "p",
+        axes=field.axes,
+        interpreter=Interpreter("p", axes=field.axes, offsets={}),
+        correct=field,
+        within=WITHIN,
+    )
+    return "".join(corrector.run(f"{line}\n" for line in text)).splitlines()
+
+
 def test_a_tool_s_tip_is_brought_along_the_program(bad, field):
     """Dense samples of what is written, by a nominal controller, the real machine and Pinocchio."""
     tilted = CorrectionField(bad, OFFSETS, within=WITHIN, tool=tuple(TOOL))
     begin, corner, end = np.array([[-30, -20, 5], [30, 10, -10], [5, 40, 20]]) * 1e-3
-    names = [" ".join(f"{n}{v * 1e3:g}" for n, v in zip("XYZ", p, strict=True)) for p in
-             (begin, corner, end)]  # fmt: skip
-    corrector = ProgramCorrector(
-        "p",
-        axes=tilted.axes,
-        interpreter=Interpreter("p", axes=tilted.axes, offsets={}),
-        correct=tilted,
-        within=WITHIN,
-    )
-    text = [f"G21 G0 {names[0]}\n", f"N1 G1 {names[1]} F500\n", f"N2 {names[2]}\n"]
-    pieces = read_polyline("".join(corrector.run(text)).splitlines())
+    lines = correct(tilted, "G21 G0 X-30 Y-20 Z5", "N1 G1 X30 Y10 Z-10 F500", "N2 X5 Y40 Z20")
+    pieces = read_polyline(lines)
     ends = [p for number in sorted(pieces) for p, _ in pieces[number]]
     dense = np.array([a + s * (b - a) for a, b in pairwise(ends) for s in (0.0, 0.3, 0.5, 0.8)])
     sent = nominal_assembly(bad.robot).inverse(dense * 1e-3) - OFFSETS
@@ -150,15 +153,7 @@ def test_a_tool_leaves_what_cannot_be_reached_unreached(bad):
 def test_a_program_brings_the_real_tool_along_its_lines_and_arcs(bad, field):
     """Joints that a nominal controller commands between the points, through the real machine."""
     text = ["G21 G0 X-30 Y-20 Z5", "N1 G1 X30 Y10 Z-10 F500", "N2 G3 X10 Y30 I-20 J0"]
-    corrector = ProgramCorrector(
-        "p",
-        axes=field.axes,
-        interpreter=Interpreter("p", axes=field.axes, offsets={}),
-        correct=field,
-        within=WITHIN,
-    )
-    lines = "".join(corrector.run(f"{t}\n" for t in text)).splitlines()
-    pieces = read_polyline(lines)
+    pieces = read_polyline(correct(field, *text))
     real, nominal = Assembly(bad.robot, fixed=bad.errors), nominal_assembly(bad.robot)
     start = pieces[0][-1][0]
     for number in (1, 2):
