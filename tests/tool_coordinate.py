@@ -63,6 +63,9 @@ class ToolCoordinate:
         shared = None if self.dial is None else f"dial.{self.dial}"
         return (Unknown("slope", "1", self.slope_tolerance, shared),)
 
+    def set_by(self, robot):
+        return {}
+
     def expression(self, view, robot):
         return ca.dot(view.constants, view.frames[0].position) * (1.0 + view.unknowns[0])
 

@@ -27,7 +27,7 @@ class Crooked:
     section: float = 0.0
     """Along the leg, [m]."""
     lateral: float = 0.0
-    """Across leg and plunger, [m]."""
+    """Across leg and plunger, from the rod as drawn, [m]."""
     scale: float = 0.0
     zero: float = 0.0
     """[m]"""
@@ -51,28 +51,36 @@ class Workshop:
     def __init__(self, session, errors):
         self.session = session
         self.machine = session.robot.with_errors(errors)
-        self.frames = [self._place(p.drives) for p in session.postures.values()]
-        self.at_zero = self._place(session.robot.drive_zero)
+        self.frames = [_place(self.machine, p.drives) for p in session.postures.values()]
+        self.zero_drives = session.robot.drive_zero - session.active_offsets
+        self.at_zero = _place(self.machine, self.zero_drives)
 
-    def _place(self, drives):
-        """Positions of all frames, loops closed by Pinocchio."""
-        m = self.machine
-        passive = m.close_with_pinocchio(drives, m.zero[m.passive_index])
-        data = m.model.createData()
-        q = m.configuration(m.joint_coordinates(drives, passive))
-        pin.framesForwardKinematics(m.model, data, q)
-        return {f.name: np.array(data.oMf[i].translation) for i, f in enumerate(m.model.frames)}
+    def beside(self, setup):
+        """How far the rod lies beside its drawing where the setup begins, across leg and plunger.
+
+        A hand that puts a ball over the rod puts it there, [m].
+        """
+        sensor, robot = self.session.setups[setup].sensor, self.session.robot
+        leg = robot.legs[sensor.leg]
+        rod, _, side = leg.rods[sensor.rod], *_across(sensor, leg)
+        first = next(r.posture for r in self.session.readings if r.setup == setup)
+        commanded, active = self.session.postures[first].drives, self.session.active_offsets
+        found = []
+        for machine, more in ((self.machine, 0.0), (robot, active)):  # as it is, and as drawn
+            places = _place(machine, commanded + more)
+            root, way = places[rod.root], places[rod.tip] - places[rod.root]
+            zero = _place(machine, self.zero_drives + more)[leg.root]
+            plane = leg.axis @ zero + sensor.section.value * leg.length
+            share = (plane - leg.axis @ root) / (leg.axis @ way)
+            found.append(side @ (root + share * way))
+        return found[0] - found[1]
 
     def read(self, setup, posture, crooked):
         """What a dial shows, [m]."""
         sensor = self.session.setups[setup].sensor
         leg = self.session.robot.legs[sensor.leg]
         rod, axis = leg.rods[sensor.rod], leg.axis
-        given = sensor.direction
-        said = np.array(DIRECTIONS[given] if isinstance(given, str) else given)
-        said = said / np.linalg.norm(said)
-        side = np.cross(axis, said)
-        side = side / np.linalg.norm(side)
+        said, side = _across(sensor, leg)
         rolled = Rotation.from_rotvec(crooked.roll * axis)
         pitched = Rotation.from_rotvec(-crooked.pitch * side)
         plunger, edge = rolled.apply(pitched.apply(said)), rolled.apply(side)
@@ -89,6 +97,23 @@ class Workshop:
         distance = _to_axis(root, end) if ball else _between(root, end, edge)
         h = _touch(lambda h: distance(start + h * plunger), touching)
         return (1.0 + crooked.scale) * h + crooked.zero
+
+
+def _place(machine, drives):
+    """Positions of all frames, loops closed by Pinocchio."""
+    passive = machine.close_with_pinocchio(drives, machine.zero[machine.passive_index])
+    data = machine.model.createData()
+    q = machine.configuration(machine.joint_coordinates(drives, passive))
+    pin.framesForwardKinematics(machine.model, data, q)
+    return {f.name: np.array(data.oMf[i].translation) for i, f in enumerate(machine.model.frames)}
+
+
+def _across(sensor, leg):
+    """Of a plunger as it is said to stand: its direction, and what is across leg and plunger."""
+    given = sensor.direction
+    said = np.array(DIRECTIONS[given] if isinstance(given, str) else given)
+    side = np.cross(leg.axis, said)
+    return said / np.linalg.norm(said), side / np.linalg.norm(side)
 
 
 def _to_axis(root, end):

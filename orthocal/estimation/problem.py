@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import RobotError
-from orthocal.estimation.expansion import Expander, Expansion
 from orthocal.estimation.pieces import (
     DirectExpressions,
     PosturePiece,
@@ -34,9 +33,16 @@ from orthocal.kinematics.error_map import Slopes
 from orthocal.kinematics.kept import once_a_robot
 from orthocal.kinematics.machine_map import MachineMap
 from orthocal.kinematics.symbolic import SymbolicRobot
+from orthocal.measurement.expansion import Expander, Expansion
 from orthocal.measurement.observations import Observations, build_observations, drive_table
-from orthocal.measurement.sensing import SensorGroup, SensorUnknowns, group_sensors, sensor_unknowns
+from orthocal.measurement.sensor_groups import (
+    SensorGroup,
+    SensorUnknowns,
+    group_sensors,
+    sensor_unknowns,
+)
 from orthocal.measurement.session import Session
+from orthocal.measurement.setting import Setting, find_setting
 from orthocal.robot.model import Robot, closure_row_units, coordinate_units
 from orthocal.robot.parameters import AXES
 from orthocal.sensors.protocol import View
@@ -292,13 +298,19 @@ class CalibrationProblem:
             tuple(readings),
         )
 
+    def standing(self, theta: ArrayLike) -> Array:
+        """How sensors stand, (n_unknowns,), [SI], of all parameters or the machine's alone."""
+        given = np.asarray(theta, dtype=np.float64)[self.n_machine :]
+        begun = self.setting(self.assembly.errors(self._of_machine(theta)))
+        return begun + given if given.size else begun
+
     def predict(self, theta: ArrayLike, passive: Array | None = None) -> Array:
         """Readings h(q(θ), θ) of all entries, gauge zeros at 0.
 
         Shape (n_entries,), [m of the first gauge].
         """
         q = self.close(theta) if passive is None else passive
-        machine, unknowns = self.assembly.machine(self._of_machine(theta)), self._of_sensors(theta)
+        machine, unknowns = self.assembly.machine(self._of_machine(theta)), self.standing(theta)
         result = np.empty(self.observations.size)
         for group in self.sensor_groups:
             for entries, part in group.parts(READINGS_AT_ONCE):
@@ -336,8 +348,9 @@ class CalibrationProblem:
         Raises:
             LinAlgError: If a posture is singular.
         """
-        unknowns = self._of_sensors(theta)
-        found = self._expander(*self._machine_and_slopes(theta), passive, unknowns)
+        machine, slopes = self._machine_and_slopes(theta)
+        unknowns = self.standing(theta)
+        found = self._expander(machine, slopes, passive, unknowns, self.set_by)
         return found.scaled(self.theta_scale[self.n_machine :], self.noise)
 
     @cached_property
@@ -361,11 +374,6 @@ class CalibrationProblem:
     def _of_machine(self, theta: ArrayLike) -> Array:
         return np.asarray(theta, dtype=np.float64)[: self.n_machine]
 
-    def _of_sensors(self, theta: ArrayLike) -> Array:
-        """What is not known of sensors; 0 where only the machine's errors are given."""
-        given = np.asarray(theta, dtype=np.float64)[self.n_machine :]
-        return given if given.size else np.zeros(self.n_free - self.n_machine)
-
     def _errors(self, theta: ca.SX) -> dict[str, ca.SX | float]:
         errors: dict[str, ca.SX | float] = dict(self.fixed)
         names = self.machine_selection.names
@@ -387,6 +395,16 @@ class CalibrationProblem:
     def sensor_groups(self) -> tuple[SensorGroup, ...]:
         """Entries by the expression that they are readings of."""
         return group_sensors(self.session, self.observations)
+
+    @cached_property
+    def setting(self) -> Setting:
+        """What the unknowns of the sensors begin at on a machine with errors."""
+        return find_setting(self.session)
+
+    @cached_property
+    def set_by(self) -> Array:
+        """What one tolerance of each free error adds to that, (n_unknowns, n_machine), [SI]."""
+        return np.asarray(self.setting.slopes @ self.columns)
 
     @cached_property
     def _fixed_errors(self) -> Array:

@@ -17,7 +17,8 @@ from orthocal.arguments import require_kind, require_names, require_numbers, req
 from orthocal.documents import Number, parse_number, read_yaml, validate
 from orthocal.errors import ParameterError, SessionError
 from orthocal.measurement.observations import Observations, build_observations
-from orthocal.measurement.sensing import predict_entries, sensor_unknowns
+from orthocal.measurement.sensing import predict_entries
+from orthocal.measurement.sensor_groups import sensor_unknowns
 from orthocal.measurement.session import Reading, Session
 from orthocal.robot.model import Robot
 from orthocal.units import MM, to_mm

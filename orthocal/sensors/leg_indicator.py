@@ -13,7 +13,7 @@ zero posture (the paper's X-leg midpoint, section 3.2).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from orthocal.documents import Name, Number
 from orthocal.errors import SessionError
 from orthocal.robot.model import Leg, Robot
-from orthocal.sensors.protocol import Contact, Frames, SetupKeys, Unknown, View
+from orthocal.sensors.protocol import Contact, Frames, Sensor, SetupKeys, Unknown, View
 from orthocal.sensors.standing import USUAL, Standing, StandingKeys, stand
 from orthocal.sensors.tips import touch_by_blade
 from orthocal.units import MM, to_mm
@@ -201,6 +201,11 @@ class LegIndicator:
     def unknowns(self) -> tuple[Unknown, ...]:
         """How it stands."""
         return self.standing.unknowns(ball=False)
+
+    def set_by(self, robot: Robot) -> Mapping[str, Sensor]:
+        """Nothing: how it stands is measured along the leg."""
+        del robot
+        return {}
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """What it shows, [m]."""

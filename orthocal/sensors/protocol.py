@@ -7,7 +7,7 @@ unknowns of its own, plus the zero of its setup, which is free and comes on top.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Protocol, Self
 
@@ -145,6 +145,13 @@ class Sensor(Protocol):
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
         """What of it is not known exactly, besides the zero of its setup."""
+
+    def set_by(self, robot: Robot) -> Mapping[str, Sensor]:
+        """Unknowns that a hand sets by what it sees, by their names: what it sees.
+
+        Such an unknown counts from what that other sensor would show in the first posture of the
+        setup, less what it would show on the machine as drawn.
+        """
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """What it shows, its zero at 0, [m]."""

@@ -6,7 +6,7 @@ section along the leg; the zero of the setup takes what it is off along the plun
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Self
@@ -27,8 +27,16 @@ from orthocal.sensors.leg_indicator import (
     direction_vector,
     read_direction,
 )
-from orthocal.sensors.protocol import Contact, Frames, SetupKeys, TouchingTip, Unknown, View
-from orthocal.sensors.standing import USUAL, Standing, stand
+from orthocal.sensors.protocol import (
+    Contact,
+    Frames,
+    Sensor,
+    SetupKeys,
+    TouchingTip,
+    Unknown,
+    View,
+)
+from orthocal.sensors.standing import EXACT, USUAL, Standing, stand
 from orthocal.sensors.tips import Tip, TipKeys, touch_by_ball, touch_by_blade
 from orthocal.units import MM, to_mm
 
@@ -44,6 +52,9 @@ touches with its back."""
 
 LARGEST_BESIDE_MM = 500.0
 """No rod moves further aside: it is a wrong unit."""
+
+EDGE = Tip("blade", 0.0)
+"""An eye that looks along a plunger."""
 
 NOT_ACROSS = 1e-5
 """How far from across leg and plunger a tip may be said to begin, [m]: what rounding leaves."""
@@ -158,6 +169,13 @@ class RodIndicator:
     def unknowns(self) -> tuple[Unknown, ...]:
         """How it stands."""
         return self.standing.unknowns(ball=self.tip.form == "ball")
+
+    def set_by(self, robot: Robot) -> Mapping[str, Sensor]:
+        """Where a ball is across leg and plunger: over the rod, wherever that lies."""
+        if self.tip.form != "ball":
+            return {}
+        x, y, z = self._side(robot).tolist()
+        return {"lateral": RodByBlade(self.leg, self.rod, (x, y, z), self.section, EDGE, EXACT)}
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """What it shows, [m]."""

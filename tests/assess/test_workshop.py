@@ -1,7 +1,7 @@
 """Machines as a workshop has and reads them, by a simulator that shares no formula with the model.
 
-All errors at tolerance; a ball on rod a; a gauge turned by 10 mrad, its section off by 0.5 mm, its
-scale by 0.2 %; readings rounded to 10 µm.
+All errors at tolerance; a ball on rod a; a gauge turned by 10 mrad, its section off by 0.5 mm, a
+ball as far from over the rod that is there, its scale off by 0.2 %; readings rounded to 10 µm.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ def as_measured(plan, errors, rng):
     """Readings of a plan on a machine, with a new stand for each setup, shape (n_rows,), [m]."""
     workshop, scale = Workshop(plan, errors), 0.002 * rng.normal()
     stands = {name: draw_crooked(rng) for name in plan.setups}
+    for name, stand in stands.items():  # by eye over the rod that is there
+        stands[name] = replace(stand, lateral=stand.lateral + workshop.beside(name))
     values = []
     for r in plan.readings:
         h = workshop.read(r.setup, r.posture, stands[r.setup]) * (1.0 + scale)

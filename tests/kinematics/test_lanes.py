@@ -12,7 +12,7 @@ from orthocal.kinematics.batch import BatchFunction
 from orthocal.kinematics.compiled import compiled_robot
 from orthocal.kinematics.lanes import Way, list_instructions, running
 from orthocal.measurement.observations import build_observations
-from orthocal.measurement.sensing import group_sensors
+from orthocal.measurement.sensor_groups import group_sensors
 
 
 def points(robot, count):

@@ -18,8 +18,11 @@ from orthocal import (
     write_session,
 )
 from orthocal.errors import SessionError
+from orthocal.kinematics.error_map import error_map
 from orthocal.measurement.observations import build_observations
 from orthocal.measurement.sensing import locate_contacts, predict_entries
+from orthocal.measurement.sensor_groups import sensor_unknowns
+from orthocal.measurement.setting import find_setting
 
 PLAN = """robot: orthoglide
 gauge: {{sigma_mm: 0.005, resolution_mm: 0.001, range_mm: [-20, 20]}}
@@ -55,6 +58,20 @@ def plan(folder, tip, rod="a"):
     return load_plan(folder / "plan.yaml")
 
 
+def set_beside(session, o, errors):
+    """How far each entry's ball is beside the drawing, over the rod that is there, [m]."""
+    known = sensor_unknowns(session)
+    found = dict(
+        zip(
+            [p.name for p in known.parameters],
+            find_setting(session)(error_map(session.robot).expand(errors)),
+            strict=True,
+        )
+    )
+    setups = list(session.setups)
+    return [found.get(f"setup.{setups[k]}.lateral", 0.0) for k in o.setup]
+
+
 @pytest.mark.parametrize("tip", TIPS)
 @pytest.mark.parametrize("rod", ["a", "b"])
 def test_readings_are_those_of_solids_that_touch(tmp_path, tip, rod):
@@ -63,6 +80,7 @@ def test_readings_are_those_of_solids_that_touch(tmp_path, tip, rod):
     o = build_observations(session)
     found = predict_entries(session, o, TRUTH)
     robot = session.robot
+    beside = set_beside(session, o, TRUTH)
     real = robot.with_errors(TRUTH)
     drives = np.array([p.drives for p in session.postures.values()])
     for i in range(o.size):
@@ -76,7 +94,7 @@ def test_readings_are_those_of_solids_that_touch(tmp_path, tip, rod):
         side = np.cross(leg.axis, d)
         zero = 0.5 * (leg.rods[rod].zero_root + leg.rods[rod].zero_tip)
         offset = TRUTH[f"{leg.name}_slide.offset"] * -leg.axis
-        c = zero + (offset @ leg.axis) * leg.axis
+        c = zero + (offset @ leg.axis) * leg.axis + beside[i] * side
         centre, unit = c + found[i] * d, (end - root) / np.linalg.norm(end - root)
         if tip == "ball":
             apart = centre - root - ((centre - root) @ unit) * unit

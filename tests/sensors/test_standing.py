@@ -18,9 +18,12 @@ from orthocal import (
     write_session,
 )
 from orthocal.errors import SessionError
+from orthocal.kinematics.error_map import error_map
 from orthocal.measurement.joining import join_sessions
 from orthocal.measurement.observations import build_observations
-from orthocal.measurement.sensing import predict_entries, sensor_unknowns
+from orthocal.measurement.sensing import predict_entries
+from orthocal.measurement.sensor_groups import sensor_unknowns
+from orthocal.measurement.setting import find_setting
 
 TIPS = {
     "ball": "{ball: {radius_mm: 1.5}}",
@@ -75,13 +78,14 @@ def test_crooked_readings_are_those_of_solids_that_touch(tmp_path, tip, oblique)
             )
         session = load_plan(path)
     o, workshop = build_observations(session), Workshop(session, ERRORS)
+    beside = find_setting(session)(error_map(session.robot).expand(ERRORS))
     rng, known = np.random.default_rng(0), sensor_unknowns(session)
     setups, missed = list(session.setups), 0
     for _ in range(40):
         values = 3.0 * rng.normal(size=len(known.parameters))
         values *= [p.tolerance for p in known.parameters]
         found = predict_entries(session, o, ERRORS, unknowns=values)
-        said = dict(zip(names(session), values.tolist(), strict=True))
+        said = dict(zip(names(session), (values + beside).tolist(), strict=True))
         for i, r in enumerate(session.readings):
             own = {f.name: said.get(f"setup.{r.setup}.{f.name}", 0.0) for f in fields(Crooked)}
             stood = replace(Crooked(**own), scale=said["gauge.scale"])

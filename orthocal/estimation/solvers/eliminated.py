@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError, SolverError
-from orthocal.estimation.expansion import Expansion
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.solvers.program import Solution, no_convergence
 from orthocal.estimation.solvers.subproblem import State, Task
+from orthocal.measurement.expansion import Expansion
 
 Array = NDArray[np.float64]
 

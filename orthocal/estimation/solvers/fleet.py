@@ -23,8 +23,8 @@ class Fleet(Machines):
         self._problem = problem
         self.theta = np.array(theta)
         n = problem.n_machine
-        self._unknowns = self.theta[:, n:] * problem.theta_scale[n:]
         errors = problem.assembly.errors() + self.theta[:, :n] @ problem.columns.T
+        self._unknowns = problem.setting(errors) + self.theta[:, n:] * problem.theta_scale[n:]
         super().__init__(problem.robot, errors, problem.drives, problem.reference_passive)
 
     def predict(self) -> Array:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.error_map import right_jacobian
-from orthocal.measurement.sensing import SensorGroup
+from orthocal.measurement.sensor_groups import SensorGroup
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -77,8 +77,10 @@ class FleetSlopes:
         self._pattern = compiled.sparse_slopes.pattern(compiled.expressions.name_out(3))
         self._inverse = _inverse(by_passive)
         self.correction = -(self._inverse @ opening[..., None])[..., 0]
+        own = theta[:, problem.n_machine :] * problem.theta_scale[problem.n_machine :]
+        unknowns = problem.setting(at) + own
         self._rows = [
-            self._read(group, theta, actuated, passive, placements)
+            self._read(group, unknowns, actuated, passive, placements)
             for group in problem.sensor_groups
         ]
         self.reading = np.empty((self._size, problem.observations.size))
@@ -119,6 +121,7 @@ class FleetSlopes:
         machine = turned.reshape(self._size, -1) @ errors.twists_of(self._columns.T).T
         machine += offsets @ errors.offsets(self._columns.T).T
         machine += gains @ errors.scales(self._columns.T).T
+        machine += unknowns @ problem.set_by
         return np.hstack([machine, unknowns * problem.theta_scale[problem.n_machine :]])
 
     def follow(self, change: Array) -> Array:
@@ -160,7 +163,7 @@ class FleetSlopes:
         offsets, gains = errors.offsets(moved)[:, None], errors.scales(moved)[:, None]
         drives = offsets + gains * problem.drives
         passive = self.follow(change) - self.correction
-        of_sensors = change[:, n:] * problem.theta_scale[n:]
+        of_sensors = change[:, n:] * problem.theta_scale[n:] + change[:, :n] @ problem.set_by.T
         result = np.empty_like(self.reading)
         for rows in self._rows:
             _, columns = rows.group.reading.slopes.pattern("by_twists")
@@ -185,12 +188,16 @@ class FleetSlopes:
         return np.asarray(self._gains.reshape(shape) * commanded + self._offsets.reshape(shape))
 
     def _read(
-        self, group: SensorGroup, theta: Array, actuated: Array, passive: Array, placements: Array
+        self,
+        group: SensorGroup,
+        unknowns: Array,
+        actuated: Array,
+        passive: Array,
+        placements: Array,
     ) -> _Rows:
         problem, s = self._problem, self._size
         posture = problem.observations.posture[group.entries]
         zero, n = self._actuated(problem.session.zero_drives), posture.size
-        unknowns = theta[:, problem.n_machine :] * problem.theta_scale[problem.n_machine :]
         h, h_a, h_q, h_t, h_z, h_u = group.reading.slopes.unshared(
             actuated[:, posture].reshape(s * n, -1),
             passive[:, posture].reshape(s * n, -1),

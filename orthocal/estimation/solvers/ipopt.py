@@ -55,12 +55,13 @@ class Expressions:
     """A nonlinear program as expressions."""
 
     variables: ca.MX
-    """x: θ̂, gauge zeros and the passive coordinates of every posture, scaled."""
+    """x: θ̂, gauge zeros, the passive coordinates of every posture and where gauges stand that were
+    set by the machine, scaled."""
     parameters: ca.MX
     """p: readings, their weights and noise."""
     objective: ca.MX
     constraints: ca.MX
-    """0 where all loops are closed."""
+    """0 where all loops are closed, and gauges stand as they were set."""
     errors: dict[str, ca.MX]
     """Free parameter to its value, [SI]."""
 
@@ -183,11 +184,12 @@ class NonlinearProgram:
         x = np.asarray(answer["x"].full()).reshape(-1)
         closures = np.abs(np.asarray(answer["g"].full())).max(initial=0.0)
         pull = np.asarray(answer["lam_x"].full()).reshape(-1)[: self._n_theta]
+        first = self._n_theta + self._n_zeros
+        passive = slice(first, first + problem.n_postures * self._n_passive)
         return Solution(
             theta=x[: self._n_theta] * problem.theta_scale,
             zeros=x[self._n_theta : self._n_theta + self._n_zeros] * LENGTH_SCALE,
-            passive=x[self._n_theta + self._n_zeros :].reshape(-1, self._n_passive)
-            * problem.passive_scale,
+            passive=x[passive].reshape(-1, self._n_passive) * problem.passive_scale,
             objective=float(answer["f"]) / _weighting(sigma)[1],
             status=status,
             iterations=iterations,
@@ -226,12 +228,14 @@ class NonlinearProgram:
         y = problem.values if values is None else values
         residual = (y - problem.predict(at, closed)) / sigma
         wide = replace(loss, width=loss.width * widening)
+        follows = problem.setting.follows
         zeros = sigma * wide.centres(residual, o.zero, o.n_zeros, weights=np.ones(o.size))
         return np.concatenate(
             [
                 at / problem.theta_scale,
                 zeros / LENGTH_SCALE,
                 (closed / problem.passive_scale).reshape(-1),
+                problem.standing(at)[follows] / problem.theta_scale[problem.n_machine :][follows],
             ]
         )
 
@@ -314,6 +318,7 @@ class NonlinearProgram:
         """Bounds of all variables, scaled: only parameters have any."""
         problem = self.problem
         k = problem.n_postures * self._n_passive + self._n_zeros
+        k += int(problem.setting.follows.sum())
         own = getattr(problem.selection, side) / problem.theta_scale
         for i, value in held.items():
             own[i] = value / problem.theta_scale[i]

@@ -29,8 +29,9 @@ Indices = NDArray[np.int64]
 class ProgramFunctions:
     """Builds the functions of a problem's program.
 
-    Variables x are θ̂, gauge zeros and the passive coordinates of every posture, scaled; parameters
-    p are readings, weights and noise of each entry, then σ, the prior's scale and the loss's width.
+    Variables x are θ̂, gauge zeros, the passive coordinates of every posture and where gauges stand
+    that were set by the machine, scaled; parameters p are readings, weights and noise of each
+    entry, then σ, the prior's scale and the loss's width.
 
     Args:
         problem: The problem.
@@ -43,18 +44,24 @@ class ProgramFunctions:
         self._n_theta = problem.n_free
         self._n_zeros = problem.observations.n_zeros
         self._n_passive = problem.robot.passive_index.size
+        first = self._n_theta + self._n_zeros + problem.n_postures * self._n_passive
+        self._standing = np.arange(self._n_theta)
+        set_by_machine = problem.n_machine + np.flatnonzero(problem.setting.follows)
+        self._standing[set_by_machine] = first + np.arange(set_by_machine.size)
+        """Where in x it is how a sensor stands, of each free parameter that is a sensor's."""
+        self._set = set_by_machine
 
     def build(self) -> dict[str, ca.Function]:
         """Objective and constraints, gradient, Jacobian and Hessian, of (x, p[, lam_f, lam_g])."""
         problem = self.problem
         k = problem.n_postures
-        n_fixed = self._n_theta + self._n_zeros
-        n = n_fixed + k * self._n_passive
+        n_passive = k * self._n_passive
+        n = self._n_theta + self._n_zeros + n_passive + self._set.size
         x = ca.MX.sym("x", n)
         entries = problem.observations.size
         p = ca.MX.sym("p", 3 * entries + 3)
         lam_f = ca.MX.sym("lam_f")
-        lam_g = ca.MX.sym("lam_g", k * problem.robot.closure_rows)
+        lam_g = ca.MX.sym("lam_g", k * problem.robot.closure_rows + self._set.size)
         theta = x[: self._n_theta]
         prior = p[3 * entries + 1] * ca.DM(problem.prior_precision)
         from_mean = theta - ca.DM(problem.prior_mean / problem.theta_scale)
@@ -115,7 +122,7 @@ class ProgramFunctions:
         variables = np.hstack(
             [
                 np.tile(piece.theta_index, (count, 1)),
-                piece.unknown_index,
+                self._standing[piece.unknown_index],
                 (self._n_theta + o.zero[piece.entries])[:, None],
                 self._passive_variables(postures, piece.passive_index),
             ]
@@ -253,7 +260,7 @@ class ProgramFunctions:
         """Closures of all postures and their Jacobian; their curvature goes into the Hessian."""
         problem = self.problem
         k, n_p = problem.n_postures, self._n_passive
-        n_g = problem.robot.closure_rows
+        n_g, first = problem.robot.closure_rows, self._n_theta + self._n_zeros
         piece = problem.posture_piece
         slope = ca.sparsify(ca.horzcat(piece.by_theta, piece.by_passive))
         pattern_rows, pattern_columns = (np.array(v) for v in slope.sparsity().get_triplet())
@@ -263,7 +270,7 @@ class ProgramFunctions:
             for name, values in (("closure", piece.closure), ("closure_slope", slope.nz[:]))
         )
         arguments = [
-            ca.reshape(x[self._n_theta + self._n_zeros :], n_p, k),
+            ca.reshape(x[first : first + k * n_p], n_p, k),
             ca.MX(ca.DM(problem.drives.T)),
             *shared,
         ]
@@ -279,11 +286,32 @@ class ProgramFunctions:
             ]
         )
         rows = postures[:, None] * n_g + pattern_rows[None, :]
-        jacobian = SparseSum(k * n_g, x.numel())
+        jacobian = SparseSum(k * n_g + self._set.size, x.numel())
         jacobian.add(rows, variables[:, pattern_columns], ca.vec(nonzeros))
         if self.hessian == "exact":
-            self._add_closure_curvature(arguments[:3], lam_g, variables, hessian)
+            self._add_closure_curvature(arguments[:3], lam_g[: k * n_g], variables, hessian)
+        if self._set.size:
+            slopes, start = self._set_by_machine()
+            constraints = ca.vertcat(constraints, slopes @ x + start)
+            of_rows, columns = (np.array(v) for v in slopes.sparsity().get_triplet())
+            jacobian.add(k * n_g + of_rows, columns, ca.MX(ca.DM(slopes.nonzeros())))
         return constraints, jacobian.build()
+
+    def _set_by_machine(self) -> tuple[ca.DM, ca.DM]:
+        """Slopes by x, and constants, of what is 0 where gauges stand as they were set.
+
+        That is how much the tolerance of a parameter has of: set by the machine, and beside that,
+        less where it stands.
+        """
+        problem, n = self.problem, self.problem.n_machine
+        own, scale = self._set - n, problem.theta_scale[self._set]
+        rows = np.arange(self._set.size)
+        slopes = np.zeros((rows.size, int(self._standing.max()) + 1))
+        slopes[:, :n] = problem.set_by[own] / scale[:, None]
+        slopes[rows, self._set] = 1.0
+        slopes[rows, self._standing[self._set]] = -1.0
+        start = problem.setting(problem.assembly.errors())[own] / scale
+        return ca.sparsify(ca.DM(slopes)), ca.DM(start)
 
     def _add_closure_curvature(
         self, arguments: list[ca.MX], lam_g: ca.MX, variables: Indices, hessian: SparseSum

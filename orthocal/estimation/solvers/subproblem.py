@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import SolverError
-from orthocal.estimation.expansion import Expansion
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.program import LEFT_OUT
+from orthocal.measurement.expansion import Expansion
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from orthocal.kinematics.compiled import CompiledRobot
 from orthocal.kinematics.continuation import MachineNumbers
 from orthocal.kinematics.error_map import Slopes
 from orthocal.measurement.observations import Observations
-from orthocal.measurement.sensing import SensorGroup
+from orthocal.measurement.sensor_groups import SensorGroup
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -168,7 +168,12 @@ class Expander:
         self._reading = [_Scatter.of(g.reading.slopes.pattern("by_twists"), place) for g in groups]
 
     def __call__(
-        self, machine: MachineNumbers, slopes: Slopes, passive: Array, unknowns: Array
+        self,
+        machine: MachineNumbers,
+        slopes: Slopes,
+        passive: Array,
+        unknowns: Array,
+        set_by: Array | None = None,
     ) -> Expansion:
         """Expand about a machine, with what errors do to it, and passive coordinates.
 
@@ -177,6 +182,7 @@ class Expander:
             slopes: What tolerances of the free errors do to it.
             passive: Shape (n_postures, n_passive), [m, rad].
             unknowns: Those of the sensors, shape (n_unknowns,), [SI].
+            set_by: What tolerances of free errors do to these, shape (n_unknowns, n_free), [SI].
 
         Raises:
             LinAlgError: If a posture is singular.
@@ -212,6 +218,9 @@ class Expander:
                 jacobian[flat] += by_twists(twists.reshape(k * m, -1))
             reading[part.entries] = rows.reading.reshape(k, m)
             opening[part.entries] = (pull @ g[..., None])[..., 0]
+        if set_by is not None:
+            moved = np.flatnonzero(set_by.any(axis=1))
+            jacobian += by_unknowns[:, moved] @ set_by[moved]
         pattern = self._closing.rows, self._used[self._closing.columns]
         return Expansion(
             reading,
