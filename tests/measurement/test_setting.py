@@ -64,7 +64,7 @@ def test_sessions_that_are_joined_keep_what_was_active_in_each(plan):
     entered = plan.with_controller([1.1 * MM, -0.7 * MM, 0.4 * MM])
     joined = join_sessions([plan, entered])
     found = laterals(joined, truth)
-    for label, session in (("session-1", plan), ("session-2", entered)):
+    for label, session in (("workshop-1", plan), ("workshop-2", entered)):
         for name, value in laterals(session, truth).items():
             assert found[f"{label}/{name}"] == pytest.approx(value, abs=1e-15)
 
