@@ -8,6 +8,7 @@ tolerance.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +19,7 @@ from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.kinematics.compiled import compiled_robot
 from orthocal.measurement.expansion import Expander
 from orthocal.measurement.observations import build_observations, drive_table
-from orthocal.measurement.sensor_groups import group_sensors, sensor_unknowns
+from orthocal.measurement.sensor_groups import SensorUnknowns, group_sensors, sensor_unknowns
 from orthocal.measurement.session import Posture, Reading, Session, Setup
 
 Array = NDArray[np.float64]
@@ -43,6 +44,19 @@ class Setting:
         return np.asarray(self.slopes.any(axis=1))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Look:
+    """What a hand sees while it sets one unknown."""
+
+    unknown: int
+    setup: Setup
+    """With the sensor that shows it."""
+    posture: Posture
+    """As drawn: offsets that the controller corrects are in it."""
+    corrected: Array
+    """Those, shape (n_drives,), [m, rad]."""
+
+
 def find_setting(session: Session) -> Setting:
     """How the gauges of a session were set.
 
@@ -52,57 +66,62 @@ def find_setting(session: Session) -> Setting:
     known, errors = sensor_unknowns(session), compiled_robot(session.robot).errors
     slopes = np.zeros((len(known.parameters), len(errors.names)))
     start = np.zeros(len(known.parameters))
-    first = {r.setup: r.posture for r in reversed(session.readings)}
-    active = session.robot.drive_zero - session.zero_drives
-    setups: dict[str, Setup] = {}
-    postures: dict[str, Posture] = {}
-    places: list[int] = []
-    corrected: list[Array] = []
-    for setup, of_setup, offsets in zip(
-        session.setups.values(), known.of_setup, active, strict=True
-    ):
-        by = setup.sensor.set_by(session.robot) if of_setup else {}
-        for place, unknown in zip(of_setup, setup.sensor.unknowns, strict=bool(of_setup)):
-            if unknown.name in by:
-                name, posture = str(len(places)), session.postures[first[setup.name]]
-                setups[name] = replace(setup, name=name, sensor=by[unknown.name], active=None)
-                postures[name] = replace(posture, name=name, drives=posture.drives + offsets)
-                places.append(place)
-                corrected.append(offsets)
-    if places:
-        seen = replace(
-            session,
-            setups=setups,
-            postures=postures,
-            readings=tuple(Reading(n, n, None, 1, 0.0, None) for n in setups),
-            controller_offsets=None,
-        )
-        found = _slopes(seen)
-        slopes[places] = found
-        # by an offset as by all errors that move its drive alike
+    looks = list(_list_looks(session, known))
+    if looks:
+        index = [look.unknown for look in looks]
+        slopes[index] = found = _slopes(session, looks)
         by_offsets = found @ errors.columns([f"{d.name}.offset" for d in session.robot.drives])
-        start[places] = -(by_offsets * np.array(corrected)).sum(axis=1)
+        start[index] = -(by_offsets * [look.corrected for look in looks]).sum(axis=1)
     return Setting(read_only(slopes), read_only(start))
 
 
-def _slopes(session: Session) -> Array:
-    """What errors do to readings on the nominal machine, shape (n_readings, n_errors), [m/SI]."""
-    robot, observations = session.robot, build_observations(session)
-    assembly, errors = nominal_assembly(robot), compiled_robot(robot).errors
-    every = np.eye(len(errors.names))
-    drives = drive_table(session)
-    expander = Expander(
-        compiled_robot(robot),
-        observations,
-        group_sensors(session, observations),
-        drives=drives,
-        zero_drives=session.zero_drives,
-        used=np.ones(6 * len(errors.moved), dtype=np.bool_),
+def _list_looks(session: Session, known: SensorUnknowns) -> Iterator[_Look]:
+    first = {r.setup: r.posture for r in reversed(session.readings)}
+    active = session.robot.drive_zero - session.zero_drives
+    for i, setup in enumerate(session.setups.values()):
+        if setup.name not in first:
+            continue
+        seen = setup.sensor.set_by(session.robot)
+        for index, unknown in zip(known.of_setup[i], setup.sensor.unknowns, strict=True):
+            if unknown.name in seen:
+                posture = session.postures[first[setup.name]]
+                yield _Look(
+                    unknown=index,
+                    setup=replace(setup, sensor=seen[unknown.name], active=None),
+                    posture=replace(posture, drives=posture.drives + active[i]),
+                    corrected=active[i],
+                )
+
+
+def _slopes(session: Session, looks: Sequence[_Look]) -> Array:
+    """What errors do to what is seen on the nominal machine, shape (n_looks, n_errors), [m/SI]."""
+    names = [str(i) for i in range(len(looks))]
+    of_looks = replace(
+        session,
+        setups={n: replace(k.setup, name=n) for n, k in zip(names, looks, strict=True)},
+        postures={n: k.posture for n, k in zip(names, looks, strict=True)},
+        readings=tuple(Reading(n, n, None, 1, 0.0, None) for n in names),
+        controller_offsets=None,
     )
+    robot, observations = session.robot, build_observations(of_looks)
+    compiled, assembly, drives = (
+        compiled_robot(robot),
+        nominal_assembly(robot),
+        drive_table(of_looks),
+    )
+    expander = Expander(
+        compiled,
+        observations,
+        group_sensors(of_looks, observations),
+        drives=drives,
+        zero_drives=of_looks.zero_drives,
+        used=np.ones(6 * len(compiled.errors.moved), dtype=np.bool_),
+    )
+    every = np.eye(len(compiled.errors.names))
     found = expander(
         assembly.machine(),
-        errors.slopes(assembly.errors(), every),
-        assembly.close(drives, names=list(session.postures)),
+        compiled.errors.slopes(assembly.errors(), every),
+        assembly.close(drives, names=[look.posture.name for look in looks]),
         np.zeros(0),
     )
     return found.jacobian
