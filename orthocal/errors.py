@@ -25,6 +25,19 @@ class OrthocalError(Exception):
         self.problem = _shorten(printable(problem))
         super().__init__(self.problem if where is None else f"{self.where}: {self.problem}")
 
+    def __reduce__(self) -> tuple[object, ...]:
+        # as it is: what it was made of, another process cannot tell
+        return _again, (type(self), self.args, self.__dict__)
+
+
+def _again(
+    kind: type[OrthocalError], told: tuple[object, ...], state: dict[str, object]
+) -> OrthocalError:
+    """An error as another process has raised it."""
+    error = kind.__new__(kind, *told)
+    error.__dict__.update(state)
+    return error
+
 
 def _shorten(problem: str) -> str:
     """A message that nobody has to scroll for, whatever a file holds."""

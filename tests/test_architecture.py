@@ -12,7 +12,7 @@ from conftest import ROOT
 import orthocal
 
 EDGES = (
-    "characters arguments errors units interrupts streams files journal cache strict_yaml "
+    "characters arguments errors units interrupts cores streams files journal cache strict_yaml "
     "documents fields"
 )
 
@@ -23,6 +23,7 @@ ALLOWED = {
     "cache": "",
     "arguments": "",
     "errors": "characters",
+    "cores": "characters errors",
     "strict_yaml": "characters",
     "markup": "characters",
     "streams": "characters errors",

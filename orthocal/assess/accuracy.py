@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,7 +160,7 @@ def measure_deviations(deviations: Array, workspace: Workspace, positions: Array
         return ErrorSize(
             rms=float(np.sqrt(workspace.weights @ lengths**2)),
             largest=float(lengths.max()),
-            find_percentile=lambda: _weighted_percentile(lengths, workspace.weights),
+            find_percentile=partial(_weighted_percentile, lengths, workspace.weights),
         )
 
     few = len(positions) < FEWEST_ALIGNED
@@ -310,7 +310,7 @@ def _spread_size(covariances: Array, weights: Array) -> ErrorSize:
     return ErrorSize(
         rms=float(np.sqrt(weights @ mean_square)),
         largest=float(np.sqrt(mean_square.max())),
-        find_percentile=lambda: _drawn_percentile(covariances, weights),
+        find_percentile=partial(_drawn_percentile, covariances, weights),
     )
 
 

@@ -96,6 +96,9 @@ def plan(
     starts: Annotated[
         int | None, typer.Option(min=1, max=100, help="How often the search begins anew.")
     ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=1024, help="Processes; by default all cores.")
+    ] = None,
     json: Json = False,
     details: Annotated[
         bool, typer.Option("--details", help="Say what it still cannot tell apart, too.")
@@ -105,6 +108,7 @@ def plan(
     ] = False,
 ) -> None:
     """Which setups and readings tell most, and what they will be worth, before any is taken."""
+    from orthocal.cores import available_cores
     from orthocal.estimation.choice import Choice
     from orthocal.estimation.selection import read_tolerances
     from orthocal.files import exists, require_writable
@@ -157,6 +161,7 @@ def plan(
         seed=seed,
         starts=starts,
         reference=reference,
+        workers=workers or available_cores(),
         report=lambda text: put_note(f"orthocal: {text}"),
     )
     if json:

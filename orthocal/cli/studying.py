@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -314,6 +313,7 @@ def _finish(
     force: bool,
 ) -> None:
     """Run a study, print its answer, and write what was asked for."""
+    from orthocal.cores import available_cores
     from orthocal.files import require_writable, write_files
     from orthocal.interrupts import raised_interrupt
     from orthocal.show.layout import print_rich
@@ -332,7 +332,7 @@ def _finish(
             table = run_study(
                 study,
                 folder=out,
-                workers=workers or _cores(),
+                workers=workers or available_cores(),
                 dask=dask,
                 anew=force,
                 report=report,
@@ -351,10 +351,6 @@ def _finish(
         contents = (document, to_parquet(table), draw_study(table, summary))
         write_files(out, dict(zip(FILES, contents, strict=True)))
         put_note(f"Wrote {', '.join(str(out / name) for name in FILES)}")
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager

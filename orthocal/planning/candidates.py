@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +87,12 @@ class Candidates:
     """Parameters that more than one setup tells: the machine's, and what setups share."""
     taken_range: float
     """What machines within their tolerances may take of the gauge's range to either side, [m]."""
+
+    @property
+    def bare(self) -> Candidates:
+        """What a choice needs of them, without the session and its problem: what can be pickled."""
+        nothing: Any = None
+        return replace(self, session=nothing, problem=nothing)
 
     def readings(self, kind: int, chosen: Indices) -> list[Reading]:
         """Candidates of a kind."""

@@ -14,14 +14,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
+from orthocal.cores import run_on_cores
 from orthocal.errors import ParameterError
-from orthocal.planning.candidates import FEWEST, Candidates, Kind
+from orthocal.planning.candidates import FEWEST, Candidates
+from orthocal.planning.taking import Taking, beginnings
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
@@ -47,6 +50,11 @@ FEWEST_STARTS, MOST_STARTS = 3, 30
 
 CANDIDATES_A_START = 20_000
 """A small choice is begun more often: candidates times starts are no fewer, up to MOST_STARTS."""
+
+KILLED = "a process that chose readings was killed"
+
+ROUGH = 1e-6
+"""Part of the error by which it may be off where it is found without an inverse."""
 
 Weigh = Callable[[Array], Array]
 """R with T = R Rᵀ for a covariance of the state, shape (n_state, p): constant for mean squares."""
@@ -81,6 +89,7 @@ def choose_setups(
     weigh: Weigh,
     seed: int = 0,
     starts: int | None = None,
+    workers: int = 1,
     report: Callable[[int, float], None] | None = None,
 ) -> Chosen:
     """Setups with so many readings each that leave the least.
@@ -93,25 +102,26 @@ def choose_setups(
         seed: Of the setups that starts but the first begin with.
         starts: How often to begin anew; the best is taken. By default 3 times, and more often where
             there is little to choose from.
+        workers: Processes; they choose the same, however many there are.
         report: Told after each start: how many there were, and the least error left.
     """
-    rng = np.random.default_rng(seed)
     if starts is None:
         size = sum(len(k.rows) for k in candidates.kinds)
         starts = int(np.clip(CANDIDATES_A_START // size, FEWEST_STARTS, MOST_STARTS))
-    best: Chosen | None = None
-    for start in range(starts):
-        order = rng.permutation(len(counts)) if start else np.arange(len(counts))
-        own = [counts[i] for i in order]
-        found = _open_all(candidates, own, prior, weigh, rng if start else None)
-        found = _exchange(candidates, found, weigh)
-        if best is None or found.left < best.left:
-            best = found
-        if report is not None:
-            report(start + 1, best.left)
-    if best is None:
+    if starts < 1:
         raise ValueError("expected at least one start")
-    return best
+    search = _Search(candidates.bare, prior, weigh, _draw_starts(candidates, counts, seed, starts))
+    found: dict[int, Chosen] = {}
+    told, best = 0, None
+    for start, chosen in run_on_cores(search, range(starts), workers, killed=KILLED):
+        found[start] = chosen
+        while told in found:
+            if best is None or found[told].left < best.left:
+                best = found[told]
+            told += 1
+            if report is not None:
+                report(told, best.left)
+    return cast(Chosen, best)
 
 
 def open_setups(
@@ -130,19 +140,50 @@ def information_of(candidates: Candidates, setups: Sequence[Opened]) -> Array:
     return np.asarray(np.sum([_says(candidates, s) for s in setups], axis=0))
 
 
-def _open_all(
-    candidates: Candidates,
-    counts: Sequence[int],
-    prior: Array,
-    weigh: Weigh,
-    rng: np.random.Generator | None,
-) -> Chosen:
-    """Setups opened one after the other; with random numbers the first half anywhere."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Start:
+    """What a start begins with."""
+
+    counts: tuple[int, ...]
+    """Readings of each setup."""
+    begun: tuple[Opened | None, ...]
+    """The first setups, drawn at random; None where the best is taken, as for all others."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Search:
+    """A search from each of some starts, none of which depends on another."""
+
+    candidates: Candidates
+    prior: Array
+    weigh: Weigh
+    starts: tuple[_Start, ...]
+
+    def __call__(self, start: int) -> Chosen:
+        """Setups opened one after the other, then exchanged."""
+        with threadpool_limits(1):  # on several threads sums may come out otherwise
+            own = self.starts[start]
+            found = _open_all(self.candidates, own, self.prior, self.weigh)
+            return _exchange(self.candidates, found, self.weigh)
+
+
+def _draw_starts(
+    candidates: Candidates, counts: Sequence[int], seed: int, starts: int
+) -> tuple[_Start, ...]:
+    """The first start without random numbers; of all others the first half of setups anywhere."""
+    rng, found = np.random.default_rng(seed), [_Start(tuple(counts), ())]
+    for _ in range(1, starts):
+        own = tuple(counts[i] for i in rng.permutation(len(counts)))
+        half = own[: (len(own) + 1) // 2]
+        found.append(_Start(own, tuple(_open_anywhere(candidates, n, rng) for n in half)))
+    return tuple(found)
+
+
+def _open_all(candidates: Candidates, start: _Start, prior: Array, weigh: Weigh) -> Chosen:
+    """Setups opened one after the other."""
     information, setups = np.array(prior), []
-    for k, count in enumerate(counts):
-        opened = None
-        if rng is not None and k < (len(counts) + 1) // 2:
-            opened = _open_anywhere(candidates, count, rng)
+    for k, count in enumerate(start.counts):
+        opened = start.begun[k] if k < len(start.begun) else None
         if opened is None:
             opened = _open_best(candidates, information, count, weigh)
         setups.append(opened)
@@ -168,6 +209,8 @@ def _exchange_one(candidates: Candidates, chosen: Chosen, k: int, weigh: Weigh) 
     ranked = beside.rank(len(old.chosen))[:MOST_REFINED]
     for opened in (old, *(s for r in ranked for s in beside.begun_otherwise(r))):
         new = beside.better_readings(opened)
+        if beside.left_roughly(new) > best.left * (1.0 + ROUGH):
+            continue
         information = others + _says(candidates, new)
         left = error_left(information, weigh)
         if left < best.left:
@@ -212,45 +255,59 @@ class _Beside:
     """C, shape (n_state, n_state)."""
     root: Array
     """R, shape (n_state, p)."""
+    whole: float | None
+    """tr(T C); None where T depends on C."""
+    seen: dict[int, Taking] = field(default_factory=dict)
+    """What was looked at, by kind."""
 
     @staticmethod
     def of(candidates: Candidates, information: Array, weigh: Weigh) -> _Beside:
         covariance = _inverse(information)
-        return _Beside(candidates, covariance, weigh(covariance))
+        root = weigh(covariance)
+        steady = weigh(covariance) is root
+        whole = float(np.vdot(root, covariance @ root)) if steady else None
+        return _Beside(candidates, covariance, root, whole)
 
-    def taking(self, which: int) -> _Taking:
-        """The candidates of a kind, none of which is taken."""
-        kind = self.candidates.kinds[which]
-        known = kind.slopes @ self.covariance
-        spread = known @ kind.slopes.T + kind.own
-        noise = self.candidates.sigma**2
-        return _Taking(spread, known @ self.root, spread.diagonal().copy(), noise)
+    def taking(self, which: int) -> Taking:
+        """The candidates of a kind."""
+        if which not in self.seen:
+            c = self.candidates
+            found = Taking.beside(c.kinds[which], self.covariance, self.root, c.sigma)
+            self.seen[which] = found
+        return self.seen[which]
+
+    def left_roughly(self, opened: Opened) -> float:
+        """What a setup leaves, but for rounding; 0 where that cannot be said at once."""
+        if self.whole is None:
+            return 0.0
+        gain = self.taking(opened.kind).gain(list(opened.chosen))
+        return math.sqrt(max(self.whole - gain, 0.0))
 
     def rank(self, count: int) -> list[Opened]:
         """Setups with so many readings, one of a kind, greedily; those first that take most.
 
         Of many kinds only those are looked at whose best pair of readings takes most.
         """
-        begun = []
-        for which, kind in enumerate(self.candidates.kinds):
-            taking = self.taking(which)
-            for gain, pair in taking.pairs(_able(kind, count), 1):
-                begun.append((gain, which, pair, taking))
+        begun = [
+            (gain, which, pair)
+            for which, kind in enumerate(self.candidates.kinds)
+            if beginnings(kind, count).flat.size
+            for gain, pair in self.taking(which).pairs(count, 1)
+        ]
         begun.sort(key=lambda f: -f[0])
         found = []
-        for _, which, pair, taking in begun[:MOST_COMPLETED]:
-            chosen = _complete(self.candidates.kinds[which], taking, pair, count)
-            found.append((taking.gain, Opened(which, chosen)))
+        for _, which, pair in begun[:MOST_COMPLETED]:
+            gain, chosen = self.taking(which).complete(pair, count)
+            found.append((gain, Opened(which, chosen)))
         return [opened for _, opened in sorted(found, key=lambda f: -f[0])]
 
     def begun_otherwise(self, opened: Opened) -> list[Opened]:
         """The same setup, its readings greedily from each of the best pairs."""
         which, count = opened.kind, len(opened.chosen)
-        kind = self.candidates.kinds[which]
-        whole = self.taking(which)
+        taking = self.taking(which)
         return [
-            Opened(which, _complete(kind, whole.again(), pair, count))
-            for _, pair in whole.pairs(_able(kind, count), MOST_PAIRS)
+            Opened(which, taking.complete(pair, count)[1])
+            for _, pair in taking.pairs(count, MOST_PAIRS)
         ]
 
     def better_readings(self, opened: Opened) -> Opened:
@@ -272,100 +329,6 @@ class _Beside:
             if chosen == before:
                 break
         return Opened(opened.kind, tuple(chosen))
-
-
-@dataclass(slots=True, eq=False)
-class _Taking:
-    """Candidates of a kind beside what others say, and readings as they are taken."""
-
-    spread: Array
-    """V, shape (m, m), [m²]."""
-    effect: Array
-    """A C R less what readings that were taken say of it, shape (m, p)."""
-    variance: Array
-    """V's diagonal, likewise, shape (m,)."""
-    noise: float
-    """σ²."""
-    steps: tuple[Array, ...] = ()
-    """Columns of V's Cholesky factor, of the readings that were taken."""
-    gain: float = 0.0
-
-    def again(self) -> _Taking:
-        """The same with no reading taken, where none was."""
-        return _Taking(self.spread, self.effect, self.variance, self.noise)
-
-    def take(self, row: int) -> None:
-        """Take a reading."""
-        column = self.spread[row]
-        if self.steps:
-            taken = np.array(self.steps)
-            column = column - taken[:, row] @ taken
-        size = math.sqrt(column[row] + self.noise)
-        step, share = column / size, self.effect[row] / size
-        self.gain += float(share @ share)
-        self.effect = self.effect - np.outer(step, share)
-        self.variance = self.variance - step**2
-        self.steps = (*self.steps, step)
-
-    @property
-    def gains(self) -> Array:
-        """What one more reading would take, shape (m,)."""
-        return self._gains(self.effect, self.variance)
-
-    def gains_beside(self, rows: list[int]) -> Array:
-        """What one more reading would take where these are taken, and no others, shape (m,)."""
-        rest = self.spread[rows]
-        own = rest[:, rows]
-        own[np.diag_indices(len(rows))] += self.noise
-        solved = np.linalg.solve(own, rest)
-        effect = self.effect - solved.T @ self.effect[rows]
-        return self._gains(effect, self.variance - (rest * solved).sum(axis=0))
-
-    def _gains(self, effect: Array, variance: Array) -> Array:
-        return np.asarray(np.vecdot(effect, effect) / (np.maximum(variance, 0.0) + self.noise))
-
-    def pairs(self, together: NDArray[np.bool_], most: int) -> list[tuple[float, tuple[int, int]]]:
-        """What two readings take that take most together, and which; the gauge is set in the first.
-
-        And the next best, each of which shares no reading with those before it.
-        """
-        product = self.effect @ self.effect.T
-        q, v = product.diagonal(), self.variance
-        # beside a zero of which nothing is known two readings are worth their difference
-        square = q[:, None] + q[None] - 2.0 * product
-        gains = square / (v[:, None] + (v + 2.0 * self.noise) - 2.0 * self.spread)
-        gains[~together] = -1.0
-        np.fill_diagonal(gains, -1.0)
-        found: list[tuple[float, tuple[int, int]]] = []
-        while len(found) < most:
-            first, second = divmod(int(gains.argmax()), len(v))
-            gain = float(gains[first, second])
-            if gain < 0.0:
-                break
-            found.append((gain, (first, second)))
-            gains[[first, second]] = -1.0
-            gains[:, [first, second]] = -1.0
-        return found
-
-
-@lru_cache(maxsize=512)
-def _able(kind: Kind, count: int) -> NDArray[np.bool_]:
-    """Which readings a gauge reaches from one (row) from which it reaches enough of them."""
-    return np.asarray(kind.together & (kind.together.sum(axis=1) >= count)[:, None])
-
-
-def _complete(kind: Kind, taking: _Taking, pair: tuple[int, int], count: int) -> tuple[int, ...]:
-    """Readings greedily on top of two."""
-    chosen = list(pair)
-    for row in chosen:
-        taking.take(row)
-    allowed = np.array(kind.together[pair[0]])
-    while len(chosen) < count:
-        allowed[chosen] = False
-        row = int(np.where(allowed, taking.gains, -1.0).argmax())
-        taking.take(row)
-        chosen.append(row)
-    return tuple(chosen)
 
 
 def _says(candidates: Candidates, opened: Opened) -> Array:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.assess.remaining import RemainingError, rank_errors
+from orthocal.cores import call_on_cores, run_on_cores
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, choose
 from orthocal.estimation.problem import CalibrationProblem
@@ -27,6 +30,7 @@ from orthocal.planning.candidates import (
     replace_beside,
 )
 from orthocal.planning.choosing import (
+    KILLED,
     Chosen,
     Opened,
     Weigh,
@@ -121,6 +125,7 @@ def plan_readings(
     seed: int = 0,
     starts: int | None = None,
     reference: str = "",
+    workers: int = 1,
     report: Callable[[str], None] | None = None,
 ) -> MeasuringPlan:
     """Choose setups and readings that leave the least unknown at the tool.
@@ -140,6 +145,7 @@ def plan_readings(
         seed: Of random starts; the same plan comes from the same seed.
         starts: How often the search begins anew; by default 3 times, or more for a small choice.
         reference: How the session names the robot; its name by default.
+        workers: Processes; the same plan comes from any number of them.
         report: Told how the search goes on.
 
     Raises:
@@ -161,7 +167,11 @@ def plan_readings(
     prior = _prior(candidates, forecast, measured)
     weigh = forecast.weigh(criterion, len(candidates.state))
     counts = _counts(
-        setups, readings, hours, means, lambda c: _trial(candidates, c, prior, weigh, seed)
+        setups,
+        readings,
+        hours,
+        means,
+        _Trials(candidates.bare, prior, weigh, seed, workers),
     )
 
     in_metres, least = criterion not in ("A", "D", "E"), math.inf
@@ -174,17 +184,33 @@ def plan_readings(
             report(f"start {start}: {size}")
 
     found = choose_setups(
-        candidates, counts, prior=prior, weigh=weigh, seed=seed, starts=starts, report=told
+        candidates,
+        counts,
+        prior=prior,
+        weigh=weigh,
+        seed=seed,
+        starts=starts,
+        workers=workers,
+        report=told,
     )
     found = _simplify(candidates, found, weigh)
     found = replace(found, setups=order_by_worth(candidates, found, prior, weigh))
     plan = build_session(candidates, found.setups, measured)
     plan = replace(plan, purpose=Purpose(chosen.model, tuple(chosen.free)))
     whole = plan if measured is None else join_sessions([measured, plan])
-    known = forecast.before if measured is None else forecast.after(measured)
-    curve = find_curve(candidates, found, counts, means, prior, weigh)
-    expected = forecast.after(whole)
-    here = forecast.about_nominal(whole)
+    curve, helps, compared, expected, first_round, here, known = call_on_cores(
+        [
+            lambda: find_curve(candidates, found, counts, means, prior, weigh),
+            lambda: list_alternatives(plan, means, forecast, measured),
+            lambda: list_usual_plans(candidates, plan, means, forecast, measured),
+            lambda: forecast.after(whole),
+            lambda: forecast.after(whole, entered=False),
+            lambda: forecast.about_nominal(whole),
+            lambda: forecast.before if measured is None else forecast.after(measured),
+        ],
+        workers,
+        killed=KILLED,
+    )
     return MeasuringPlan(
         session=plan,
         forecast=forecast,
@@ -192,9 +218,9 @@ def plan_readings(
         minutes=means.minutes(len(plan.setups), len(plan.readings)),
         known=known,
         expected=expected,
-        first_round=forecast.after(whole, entered=False),
-        compared=list_usual_plans(candidates, plan, means, forecast, measured),
-        helps=list_alternatives(plan, means, forecast, measured),
+        first_round=first_round,
+        compared=compared,
+        helps=helps,
         curve=add_rest(curve, len(found.setups), expected, here, criterion),
         means=means,
         candidates=len(candidates.session.readings),
@@ -284,7 +310,7 @@ def _counts(
     readings: int | None,
     hours: float | None,
     means: Means,
-    trial: Callable[[list[int]], float],
+    trials: _Trials,
 ) -> list[int]:
     """Readings of each setup."""
     if hours is not None:
@@ -302,7 +328,7 @@ def _counts(
                 f"{READINGS_A_SETUP[0]} readings, and at most {MOST_SETUPS} setups",
                 where="--hours",
             )
-        return min(options, key=trial)
+        return trials.best(options)
     count = 6 if setups is None else setups
     total = 3 * count if readings is None else readings
     if not 1 <= count <= MOST_SETUPS:
@@ -316,15 +342,34 @@ def _counts(
     return [total // count + (i < total % count) for i in range(count)]
 
 
-def _trial(
-    candidates: Candidates, counts: list[int], prior: Array, weigh: Weigh, seed: int
-) -> float:
-    """What a quick plan with so many readings of each setup leaves; infinite where none can be."""
-    try:
-        found = choose_setups(candidates, counts, prior=prior, weigh=weigh, seed=seed, starts=1)
-    except ParameterError:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trials:
+    """Quick plans."""
+
+    candidates: Candidates
+    prior: Array
+    weigh: Weigh
+    seed: int
+    workers: int
+
+    def best(self, options: Sequence[list[int]]) -> list[int]:
+        """The numbers of readings of each setup that leave least."""
+        work = partial(self.left, options)
+        left = dict(run_on_cores(work, range(len(options)), self.workers, killed=KILLED))
+        return options[min(range(len(options)), key=left.__getitem__)]
+
+    def left(self, options: Sequence[list[int]], which: int) -> float:
+        """What a plan with so many readings leaves; infinite where none can be."""
+        with suppress(ParameterError):
+            return choose_setups(
+                self.candidates,
+                options[which],
+                prior=self.prior,
+                weigh=self.weigh,
+                seed=self.seed,
+                starts=1,
+            ).left
         return math.inf
-    return found.left
 
 
 def _simplify(candidates: Candidates, found: Chosen, weigh: Weigh) -> Chosen:

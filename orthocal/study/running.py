@@ -5,18 +5,23 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from orthocal.cores import can_fork, run_on_cores
 from orthocal.errors import OrthocalError
 from orthocal.study.journal import Found, open_journal
-from orthocal.study.study import Cell, Study, run_task
-from orthocal.study.workers import Done, run_on_cores
+from orthocal.study.study import Cell, Study, prepare_once, run_task
 
 JOURNAL = "results.jsonl"
 """In a study's folder."""
 
 CONNECTING = 10.0
 """How long a cluster may take to answer, [s]."""
+
+KILLED = "a process of the study was killed; with --out the same command goes on where it was"
+
+Done = tuple[int, dict[str, list[Cell]]]
 
 RETRIES = 3
 """How often a task is begun anew whose worker is gone."""
@@ -93,9 +98,9 @@ def _run(study: Study, todo: Sequence[int], workers: int, dask: str | None) -> I
         return ()
     if dask is not None:
         return _on_cluster(study, todo, dask)
-    if min(workers, len(todo)) == 1:
-        return ((task, run_task(study, task)) for task in todo)
-    return run_on_cores(study, todo, min(workers, len(todo)))
+    if can_fork():
+        prepare_once(study)  # every worker has it when it begins
+    return run_on_cores(partial(run_task, study), todo, workers, killed=KILLED)
 
 
 def _one(study: Study, task: int) -> Done:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import combinations, permutations
 
 import numpy as np
 import pytest
 
+from orthocal import cores
 from orthocal.planning.candidates import Candidates, Kind
-from orthocal.planning.choosing import Opened, choose_setups, information_of
+from orthocal.planning.choosing import Opened, choose_setups, error_left, information_of
 from orthocal.planning.ordering import order_postures
 
 SIGMA = 0.5
@@ -100,6 +102,61 @@ def test_the_same_seed_gives_the_same_plan():
         for _ in range(2)
     )
     assert first.setups == second.setups
+
+
+@pytest.mark.parametrize("forked", [True, False])
+def test_any_number_of_processes_chooses_the_same_to_the_last_bit(monkeypatch, forked):
+    monkeypatch.setattr(cores, "can_fork", lambda: forked)
+    rng = np.random.default_rng(5)
+    candidates, _ = draw_candidates(rng, kinds=6, readings=8)
+    root, told = rng.normal(size=(STATE, STATE)), {}
+
+    def choose(workers):
+        told[workers] = []
+        return choose_setups(
+            candidates,
+            [3, 3],
+            prior=np.eye(STATE),
+            weigh=Always(root),
+            seed=7,
+            starts=5,
+            workers=workers,
+            report=lambda *words: told[workers].append(words),
+        )
+
+    alone, together = choose(1), choose(2)
+    assert together.setups == alone.setups
+    assert together.left == alone.left
+    assert together.information.tobytes() == alone.information.tobytes()
+    assert [start for start, _ in told[1]] == [1, 2, 3, 4, 5]
+    assert told[2] == told[1]
+
+
+@dataclass
+class Always:
+    """What the state does, whatever is known of it."""
+
+    root: np.ndarray
+
+    def __call__(self, covariance):
+        return self.root
+
+
+def test_what_depends_on_the_covariance_is_never_found_roughly():
+    """The error of the worst point, say: how much of it is left only the whole of it tells."""
+    rng = np.random.default_rng(2)
+    candidates, _ = draw_candidates(rng, kinds=5, readings=8)
+    roots = rng.normal(size=(6, STATE, 2))
+
+    def worst(covariance):
+        return max(roots, key=lambda r: np.vdot(r, covariance @ r)).copy()
+
+    found = choose_setups(candidates, [3, 3], prior=np.eye(STATE), weigh=worst)
+    assert found.left == error_left(found.information, worst)
+    for others in every_setup(candidates, 3):  # no other one in a setup's place is better
+        for kept in found.setups:
+            said = np.eye(STATE) + information_of(candidates, [kept, others])
+            assert error_left(said, worst) > 0.97 * found.left
 
 
 @pytest.mark.parametrize("seed", range(5))

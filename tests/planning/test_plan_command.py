@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
 
 import pytest
+from processes import children_of, is_running, until
 
-from orthocal import MeasuringPlan, load_plan, plan_readings, summarize
+from orthocal import MeasuringPlan, cores, load_plan, plan_readings, summarize
 from orthocal.cli.run import main
+from orthocal.interrupts import INTERRUPTED
 from orthocal.measurement.purpose import Purpose
 from orthocal.planning.means import Means
 
@@ -60,6 +66,48 @@ def test_a_plan_is_written_ready_to_measure(monkeypatch, capsys, tmp_path):
     code, _, err = run(monkeypatch, capsys, *words)
     assert code == 2
     assert f"orthocal: {out / 'session.yaml'}: is there already; --force writes over it" in err
+
+
+@pytest.mark.parametrize("much", [["--setups", "4"], ["--hours", "1"]])
+def test_one_process_plans_what_two_do(monkeypatch, capsys, tmp_path, much):
+    monkeypatch.setattr(cores, "can_fork", lambda: True)
+    found = []
+    for workers in (1, 2):
+        out = tmp_path / str(workers)
+        words = ["plan", "orthoglide", *QUICK[:-1], 3, *much, "--workers", workers, "--out", out]
+        code, text, err = run(monkeypatch, capsys, *words)
+        assert code == 0
+        told = err.replace(str(out), "")
+        found.append((text, told, {p.name: p.read_bytes() for p in out.iterdir()}))
+    assert found[0] == found[1]
+
+
+def test_what_a_process_of_a_plan_finds_wrong_is_told(monkeypatch, capsys):
+    monkeypatch.setattr(cores, "can_fork", lambda: True)
+    words = ["orthoglide", *QUICK[:-1], 2, "--tolerance", "*.offset_mm=40", "--workers", 2]
+    code, out, err = run(monkeypatch, capsys, "plan", *words)
+    assert (code, out) == (2, "")
+    assert err.startswith("orthocal: plan: no setup can take 3 readings within the gauge's range")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="where processes are doubled")
+def test_a_plan_that_is_stopped_leaves_no_process(tmp_path):
+    out = tmp_path / "monday"
+    words = ["plan", "orthoglide", "--starts", "20", "--workers", "2", "--out", str(out)]
+    run = subprocess.Popen(
+        [sys.executable, "-m", "orthocal", *words],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    until(lambda: len(children_of(run.pid)) == 2)
+    children = [int(p) for p in children_of(run.pid)]
+    os.kill(run.pid, signal.SIGINT)  # to it alone: what it began is told by nobody else
+    assert run.wait() == INTERRUPTED
+    until(lambda: not any(is_running(p) for p in children))
+    assert b"bug" not in run.stderr.read()
+    run.stderr.close()
+    assert not out.exists()
 
 
 def test_a_dial_without_a_tip_is_told(monkeypatch, capsys, tmp_path):

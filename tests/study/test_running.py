@@ -10,15 +10,17 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import numpy as np
 import pytest
 from gauges import exact
+from processes import children_of, is_running, until
 
-from orthocal import load_session
+from orthocal import cores, load_session
 from orthocal.errors import OrthocalError
 from orthocal.show.study.views import study_json, summarise_study
-from orthocal.study import workers as workers_module
+from orthocal.study import running
 from orthocal.study.bootstrap import build_bootstrap_study
 from orthocal.study.journal import open_journal
 from orthocal.study.linearisation import build_linearisation_study
@@ -86,25 +88,25 @@ def test_a_line_without_an_end_is_done_again(study, undisturbed, tmp_path):
 @pytest.mark.parametrize("forked", [True, False])
 @pytest.mark.parametrize("workers", [2, 3])
 def test_any_number_of_workers_finds_the_same(study, undisturbed, workers, forked, monkeypatch):
-    monkeypatch.setattr(workers_module, "_can_fork", lambda: forked)
+    monkeypatch.setattr(cores, "can_fork", lambda: forked)
     assert results(run_study(study, workers=workers)) == results(undisturbed)
 
 
 def test_a_process_with_threads_is_not_doubled():
     code = (
-        "import threading, time\nfrom orthocal.study.workers import _can_fork\n"
-        "assert _can_fork()\n"
+        "import threading, time\nfrom orthocal.cores import can_fork\n"
+        "assert can_fork()\n"
         "threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
-        "assert not _can_fork()\n"
+        "assert not can_fork()\n"
     )
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)
 
 
 def test_a_worker_that_is_killed_is_told(study, tmp_path, monkeypatch):
-    monkeypatch.setattr(workers_module, "_can_fork", lambda: True)
+    monkeypatch.setattr(cores, "can_fork", lambda: True)
     here = os.getpid()
-    run = workers_module.run_task
+    run = running.run_task
 
     def kill_itself(study, task):
         if task == 5:
@@ -112,7 +114,7 @@ def test_a_worker_that_is_killed_is_told(study, tmp_path, monkeypatch):
             os.kill(os.getpid(), signal.SIGKILL)
         return run(study, task)
 
-    monkeypatch.setattr(workers_module, "run_task", kill_itself)
+    monkeypatch.setattr(running, "run_task", kill_itself)
     with pytest.raises(OrthocalError, match="a process of the study was killed"):
         run_study(study, workers=2, folder=tmp_path)
     assert not doubled()
@@ -126,24 +128,24 @@ def test_what_a_worker_raises_is_raised(study, monkeypatch, sendable):
     class OwnError(Exception):
         """Of no module: it cannot be sent."""
 
-    monkeypatch.setattr(workers_module, "_can_fork", lambda: True)
+    monkeypatch.setattr(cores, "can_fork", lambda: True)
     error = ValueError("found nothing") if sendable else OwnError("found nothing")
 
     def fail(study, task):
         raise error
 
-    monkeypatch.setattr(workers_module, "run_task", fail)
+    monkeypatch.setattr(running, "run_task", fail)
     with pytest.raises(ValueError if sendable else RuntimeError, match="found nothing"):
         run_study(study, workers=2)
 
 
 def test_workers_hold_no_lock(study, tmp_path, monkeypatch):
     """Whoever goes on after a kill need not wait until the last worker has noticed it."""
-    monkeypatch.setattr(workers_module, "_can_fork", lambda: True)
+    monkeypatch.setattr(cores, "can_fork", lambda: True)
     locked = tmp_path / "held"
     descriptor = os.open(locked, os.O_RDWR | os.O_CREAT)
     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    tasks = workers_module.run_on_cores(study, range(6), 2)
+    tasks = cores.run_on_cores(partial(run_task, study), range(6), 2, killed="")
     next(tasks)
     os.close(descriptor)
     other = os.open(locked, os.O_RDWR)
@@ -312,26 +314,6 @@ def test_workers_end_when_nobody_wants_them_any_more(root, tmp_path):
     run.kill()
     run.wait()
     until(lambda: not any(is_running(p) for p in children))
-
-
-def children_of(pid):
-    with open(f"/proc/{pid}/task/{pid}/children") as stream:
-        return stream.read().split()
-
-
-def is_running(pid):
-    try:
-        with open(f"/proc/{pid}/stat") as stream:
-            return stream.read().rpartition(")")[2].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
-def until(condition, seconds=60.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not come to that"
-        time.sleep(0.05)
 
 
 def test_a_robot_that_is_not_there_any_more_is_made_of_its_files(orthoglide, tmp_path):

@@ -1,4 +1,4 @@
-"""A study's tasks on the cores of this machine, in processes that end with the one that asked.
+"""Work on the cores of this machine, in processes that end with the one that asked.
 
 Where a process has but one thread it is doubled (fork): each worker then has all that was loaded
 and prepared before, and begins at once. Elsewhere workers begin from nothing (joblib).
@@ -13,37 +13,72 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cache
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkProcess
-from typing import Any
+from typing import Any, TypeVar
 
 from orthocal.errors import OrthocalError
-from orthocal.study.study import Cell, Study, prepare_once, run_task
 
 WATCHING = 0.5
 """How often a worker looks whether it is still wanted, [s]."""
 
-Done = tuple[int, dict[str, list[Cell]]]
+T = TypeVar("T")
+
+Work = Callable[[int], T]
+"""What is done of a task, by its number. Where no process can be doubled it is pickled."""
 
 
-def run_on_cores(study: Study, todo: Sequence[int], workers: int) -> Iterator[Done]:
-    """The rows of tasks as they are found, in whichever order.
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def run_on_cores(
+    work: Work[T], todo: Sequence[int], workers: int, *, killed: str
+) -> Iterator[tuple[int, T]]:
+    """What comes out of tasks as they end, in whichever order.
 
     Args:
-        study: The study.
+        work: What is done of each.
         todo: Numbers of the tasks.
-        workers: How many processes.
+        workers: How many processes; with one, or one task, this one does all, in order.
+        killed: What is said if one of them is killed.
 
     Raises:
         OrthocalError: If a worker is killed.
     """
-    return (_forked if _can_fork() else _spawned)(study, todo, workers)
+    count = min(workers, len(todo))
+    if count <= 1:
+        return ((task, work(task)) for task in todo)
+    if can_fork():
+        return _forked(work, todo, count, killed)
+    return _spawned(work, todo, count)
 
 
-def _can_fork() -> bool:
+def call_on_cores(
+    calls: Sequence[Callable[[], Any]], workers: int, *, killed: str
+) -> tuple[Any, ...]:
+    """What functions return, called side by side where processes can be doubled.
+
+    Args:
+        calls: The functions, those first that take longest; what they return is pickled.
+        workers: How many processes.
+        killed: What is said if one of them is killed.
+
+    Raises:
+        OrthocalError: If a worker is killed.
+    """
+    count = min(workers, len(calls))
+    if count <= 1 or not can_fork():
+        return tuple(call() for call in calls)
+    found = dict(_forked(lambda k: calls[k](), range(len(calls)), count, killed))
+    return tuple(found[k] for k in range(len(calls)))
+
+
+def can_fork() -> bool:
     """Whether this process may be doubled: what another thread holds would stay held for ever."""
     if sys.platform != "linux" or threading.active_count() > 1:
         return False
@@ -53,14 +88,15 @@ def _can_fork() -> bool:
         return False
 
 
-def _forked(study: Study, todo: Sequence[int], workers: int) -> Iterator[Done]:
-    prepare_once(study)
+def _forked(
+    work: Work[T], todo: Sequence[int], workers: int, killed: str
+) -> Iterator[tuple[int, T]]:
     context, rest = multiprocessing.get_context("fork"), list(reversed(todo))
     running: dict[Connection[Any, Any], ForkProcess] = {}
     try:
         for _ in range(workers):
             ours, theirs = context.Pipe()
-            asked = (study, theirs, os.getpid())
+            asked = (work, theirs, os.getpid())
             process = context.Process(target=_serve, args=asked, daemon=True)
             process.start()
             theirs.close()
@@ -69,7 +105,7 @@ def _forked(study: Study, todo: Sequence[int], workers: int) -> Iterator[Done]:
         while running:
             ready = wait(list(running))
             for ours in [c for c in running if c in ready]:
-                yield _answer(ours)
+                yield _answer(ours, killed)
                 if rest:
                     ours.send(rest.pop())
                 else:
@@ -82,19 +118,17 @@ def _forked(study: Study, todo: Sequence[int], workers: int) -> Iterator[Done]:
             ours.close()
 
 
-def _answer(ours: Connection[Any, Any]) -> Done:
+def _answer(ours: Connection[Any, Any], killed: str) -> Any:  # noqa: ANN401 - what work makes
     try:
-        done: Done | BaseException = ours.recv()
+        done = ours.recv()
     except (EOFError, ConnectionError):
-        raise OrthocalError(
-            "a process of the study was killed; with --out the same command goes on where it was"
-        ) from None
+        raise OrthocalError(killed) from None
     if isinstance(done, BaseException):
         raise done
     return done
 
 
-def _serve(study: Study, theirs: Connection[Any, Any], parent: int) -> None:
+def _serve(work: Work[Any], theirs: Connection[Any, Any], parent: int) -> None:
     """Do what is asked for until there is no more of it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     for descriptor in map(int, os.listdir("/proc/self/fd")):
@@ -108,7 +142,7 @@ def _serve(study: Study, theirs: Connection[Any, Any], parent: int) -> None:
         except EOFError:
             os._exit(0)
         try:
-            theirs.send((task, run_task(study, task)))
+            theirs.send((task, work(task)))
         except Exception as e:  # whatever it is, it is raised where it was asked for
             theirs.send(_sendable(e))
 
@@ -122,17 +156,17 @@ def _sendable(error: Exception) -> Exception:
     return error
 
 
-def _spawned(study: Study, todo: Sequence[int], workers: int) -> Iterator[Done]:
+def _spawned(work: Work[T], todo: Sequence[int], workers: int) -> Iterator[tuple[int, T]]:
     from joblib import Parallel, delayed, parallel_config
 
     with parallel_config(backend="loky", inner_max_num_threads=1):
         parallel = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)
-        yield from parallel(delayed(_in_worker)(study, task, os.getpid()) for task in todo)
+        yield from parallel(delayed(_in_worker)(work, task, os.getpid()) for task in todo)
 
 
-def _in_worker(study: Study, task: int, parent: int) -> Done:
+def _in_worker(work: Work[T], task: int, parent: int) -> tuple[int, T]:
     _end_with(parent)
-    return task, run_task(study, task)
+    return task, work(task)
 
 
 @cache

@@ -1,0 +1,96 @@
+"""What readings take off what others leave: against posteriors of all that is said."""
+
+from __future__ import annotations
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from orthocal.planning.candidates import Kind
+from orthocal.planning.taking import Taking
+
+SIGMA, STATE, READINGS = 0.5, 5, 7
+
+
+def draw(seed):
+    """A kind of setup, what others say of the state, and what the state does."""
+    rng = np.random.default_rng(seed)
+    slopes, own = rng.normal(size=(READINGS, STATE)), rng.normal(size=(READINGS, 2))
+    h = rng.uniform(0.0, 3.0, READINGS)
+    together = np.abs(h[:, None] - h[None]) < 1.2
+    spread = own @ own.T + 1.0
+    kind = Kind("k", np.arange(READINGS), slopes, spread, together)
+    says = rng.normal(size=(STATE, STATE))
+    return kind, says @ says.T + np.eye(STATE), rng.normal(size=(STATE, 2))
+
+
+def left(kind, information, root, rows):
+    """tr(T C) with these readings, by the inverse of all that is said."""
+    rows = list(rows)
+    spread = kind.own[np.ix_(rows, rows)] + SIGMA**2 * np.eye(len(rows))
+    slopes = kind.slopes[rows]
+    whole = information + slopes.T @ np.linalg.inv(spread) @ slopes
+    return np.trace(root.T @ np.linalg.inv(whole) @ root)
+
+
+@pytest.fixture(params=range(6))
+def drawn(request):
+    kind, information, root = draw(request.param)
+    taking = Taking.beside(kind, np.linalg.inv(information), root, SIGMA)
+    return kind, information, root, taking
+
+
+def test_a_gain_is_what_readings_take_off(drawn):
+    kind, information, root, taking = drawn
+    for rows in ([2], [0, 3], [1, 4, 6, 2]):
+        taken = left(kind, information, root, []) - left(kind, information, root, rows)
+        assert taking.gain(rows) == pytest.approx(taken, rel=1e-9)
+
+
+def test_one_more_reading_takes_what_is_said(drawn):
+    kind, information, root, taking = drawn
+    rows = [5, 1]
+    gains = taking.gains_beside(rows)
+    for more in set(range(READINGS)) - set(rows):
+        taken = left(kind, information, root, rows) - left(kind, information, root, [*rows, more])
+        assert gains[more] == pytest.approx(taken, rel=1e-9)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_readings_are_completed_greedily(drawn, count):
+    kind, information, root, taking = drawn
+    for _, pair in taking.pairs(count, 3):
+        gain, chosen = taking.complete(pair, count)
+        expected = list(pair)
+        while len(expected) < count:
+            rest = [r for r in np.flatnonzero(kind.together[pair[0]]) if r not in expected]
+            expected.append(min(rest, key=lambda r: left(kind, information, root, [*expected, r])))
+        assert list(chosen) == expected
+        taken = left(kind, information, root, []) - left(kind, information, root, chosen)
+        assert gain == pytest.approx(taken, rel=1e-9)
+
+
+@pytest.mark.parametrize("count", [2, 4, 6])
+def test_the_best_pairs_differ_most_and_share_no_reading(drawn, count):
+    """Two readings beside a zero of which nothing is known are worth their difference."""
+    kind, _, _, taking = drawn
+
+    def worth(pair):
+        i, j = pair
+        across = taking.effect[i] - taking.effect[j]
+        spread = taking.spread
+        scatter = spread[i, i] + spread[j, j] - 2.0 * spread[i, j] + 2.0 * SIGMA**2
+        return float(across @ across) / scatter
+
+    left = [
+        p
+        for p in permutations(range(READINGS), 2)
+        if kind.together[p] and kind.together[p[0]].sum() >= count
+    ]
+    found = taking.pairs(count, 3)
+    for gain, pair in found:
+        assert gain == pytest.approx(max(map(worth, left)), rel=1e-12)
+        assert pair in left
+        left = [p for p in left if not set(p) & set(pair)]
+    assert len(found) == 3 or not left
