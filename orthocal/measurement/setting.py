@@ -69,7 +69,7 @@ def find_setting(session: Session) -> Setting:
     looks = list(_list_looks(session, known))
     if looks:
         index = [look.unknown for look in looks]
-        slopes[index] = found = _slopes(session, looks)
+        slopes[index] = found = slopes_by_errors(_seen(session, looks))
         by_offsets = found @ errors.columns([f"{d.name}.offset" for d in session.robot.drives])
         start[index] = -(by_offsets * [look.corrected for look in looks]).sum(axis=1)
     return Setting(read_only(slopes), read_only(start))
@@ -93,35 +93,41 @@ def _list_looks(session: Session, known: SensorUnknowns) -> Iterator[_Look]:
                 )
 
 
-def _slopes(session: Session, looks: Sequence[_Look]) -> Array:
-    """What errors do to what is seen on the nominal machine, shape (n_looks, n_errors), [m/SI]."""
-    names = [str(i) for i in range(len(looks))]
-    of_looks = replace(
-        session,
-        setups={n: replace(k.setup, name=n) for n, k in zip(names, looks, strict=True)},
-        postures={n: k.posture for n, k in zip(names, looks, strict=True)},
-        readings=tuple(Reading(n, n, None, 1, 0.0, None) for n in names),
-        controller_offsets=None,
-    )
-    robot, observations = session.robot, build_observations(of_looks)
-    compiled, assembly, drives = (
-        compiled_robot(robot),
-        nominal_assembly(robot),
-        drive_table(of_looks),
-    )
+def slopes_by_errors(session: Session) -> Array:
+    """What errors do to a session's readings on the nominal machine, its gauges as they are said.
+
+    Shape (n_entries, n_errors), [m/SI].
+
+    Raises:
+        ClosureError: If the nominal machine cannot reach a posture.
+    """
+    robot, observations, drives = session.robot, build_observations(session), drive_table(session)
+    compiled, assembly = compiled_robot(robot), nominal_assembly(robot)
     expander = Expander(
         compiled,
         observations,
-        group_sensors(of_looks, observations),
+        group_sensors(session, observations),
         drives=drives,
-        zero_drives=of_looks.zero_drives,
+        zero_drives=session.zero_drives,
         used=np.ones(6 * len(compiled.errors.moved), dtype=np.bool_),
     )
     every = np.eye(len(compiled.errors.names))
     found = expander(
         assembly.machine(),
         compiled.errors.slopes(assembly.errors(), every),
-        assembly.close(drives, names=[look.posture.name for look in looks]),
-        np.zeros(0),
+        assembly.close(drives, names=[p.name for p in session.postures.values()]),
+        np.zeros(len(sensor_unknowns(session).parameters)),
     )
-    return found.jacobian
+    return found.jacobian[:, : len(every)]
+
+
+def _seen(session: Session, looks: Sequence[_Look]) -> Session:
+    """What is seen as readings, one a setup."""
+    names = [str(i) for i in range(len(looks))]
+    return replace(
+        session,
+        setups={n: replace(k.setup, name=n) for n, k in zip(names, looks, strict=True)},
+        postures={n: k.posture for n, k in zip(names, looks, strict=True)},
+        readings=tuple(Reading(n, n, None, 1, 0.0, None) for n in names),
+        controller_offsets=None,
+    )

@@ -6,7 +6,7 @@ holds for them: where they touch, what they show, how they answer to what is not
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,8 +17,10 @@ from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.measurement.observations import build_observations
 from orthocal.measurement.sensing import locate_contacts
 from orthocal.measurement.session import Posture, Reading, Session, Setup
+from orthocal.measurement.setting import slopes_by_errors
 from orthocal.planning.means import Means, find_box, reachable
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.leg_indicator import Direction, LegIndicator, Section
@@ -59,6 +61,16 @@ MOST_CANDIDATES = 60_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class HandSet:
+    """Something of a gauge that a hand sets by the machine, where the setup begins."""
+
+    answers: Array
+    """How readings answer to it, shape (m,), [m/SI]."""
+    slopes: Array
+    """How it answers to the state in each posture, less the mean, shape (m, n_state), [SI]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Kind:
     """A setup that could stand, and the readings that it could take."""
 
@@ -67,11 +79,35 @@ class Kind:
     rows: Indices
     """Its candidates, shape (m,)."""
     slopes: Array
-    """How they answer to the state, shape (m, n_state), [m per tolerance]."""
+    """How they answer to the state, shape (m, n_state), [m per tolerance]; where a hand sets the
+    gauge by the machine, as on the mean of their postures."""
     own: Array
     """Covariance that the setup's own unknowns and its zero give them, shape (m, m), [m²]."""
     together: NDArray[np.bool_]
     """Whether the gauge that begins in one (row) reaches another (column), shape (m, m)."""
+    by_hand: tuple[HandSet, ...] = ()
+
+    def begun(self, first: int) -> Kind:
+        """The same with its gauge set in the posture of one of them."""
+        if not self.by_hand:
+            return self
+        slopes = self.slopes
+        for hand in self.by_hand:
+            slopes = slopes + np.outer(hand.answers, hand.slopes[first])
+        return replace(self, slopes=slopes, by_hand=())
+
+    def only(self, chosen: Sequence[int]) -> Kind:
+        """Some of its readings alone."""
+        at = np.array(chosen)
+        square = np.ix_(at, at)
+        return Kind(
+            self.name,
+            self.rows[at],
+            self.slopes[at],
+            self.own[square],
+            self.together[square],
+            tuple(HandSet(h.answers[at], h.slopes[at]) for h in self.by_hand),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,21 +194,54 @@ def measure_candidates(
     private = {f"setup.{name}" for name in session.setups}
     owners = [name.rpartition(".")[0] for name in problem.free]
     common = [i for i, owner in enumerate(owners) if i < n or owner not in private]
-    kinds, taken = [], []
+    kinds, taken, set_by = [], [], _list_set_by(session, problem)
     for k, name in enumerate(session.setups):
         rows = np.flatnonzero(o.setup == k)
         if rows.size < FEWEST:
             continue
         own = [i for i in range(n, len(owners)) if owners[i] == f"setup.{name}"]
         slopes, mine = jacobian[rows][:, common], jacobian[rows][:, own]
+        by_hand = []
+        for index, seen in set_by.get(name, ()):
+            answers = jacobian[rows, index] / problem.theta_scale[index]
+            moves = np.zeros_like(slopes)
+            moves[:, :n] = seen - seen.mean(axis=0)
+            slopes -= np.outer(answers, moves[0])  # the first is where the session begins it
+            by_hand.append(HandSet(answers, moves))
         spread = mine @ mine.T
         unknown = spare_range * _unknown_differences(slopes, spread)
         taken.append(float(unknown.max()))
         reaches = _reach_each_other(session, h[rows], unknown)
-        kinds.append(Kind(name, rows, slopes, spread + ZERO_PRIOR**2, reaches))
+        own_spread = spread + ZERO_PRIOR**2
+        kinds.append(Kind(name, rows, slopes, own_spread, reaches, tuple(by_hand)))
     state = tuple(problem.free[i] for i in common)
     typical = float(np.median(taken)) if taken else 0.0
     return Candidates(session, problem, tuple(kinds), sigma, state, typical)
+
+
+def _list_set_by(
+    session: Session, problem: CalibrationProblem
+) -> dict[str, list[tuple[int, Array]]]:
+    """Setup to what of its gauge a hand sets by the machine.
+
+    That is which free parameter it is, and how it answers to the machine's in each of the setup's
+    candidates, shape (m, n_machine), [SI per tolerance].
+    """
+    seen: dict[str, dict[str, Setup]] = {}
+    for name, setup in session.setups.items():
+        for unknown, sensor in setup.sensor.set_by(session.robot).items():
+            if unknown in {u.name for u in setup.sensor.unknowns}:
+                seen.setdefault(unknown, {})[name] = replace(setup, sensor=sensor)
+    found: dict[str, list[tuple[int, Array]]] = {}
+    for unknown, setups in seen.items():
+        readings = tuple(r for r in session.readings if r.setup in setups)
+        looks = replace(session, setups=setups, readings=readings)
+        slopes = slopes_by_errors(looks) @ problem.columns
+        setup_of = build_observations(looks).setup
+        for k, name in enumerate(setups):
+            index = problem.free.index(f"setup.{name}.{unknown}")
+            found.setdefault(name, []).append((index, slopes[setup_of == k]))
+    return found
 
 
 def _unknown_differences(slopes: Array, spread: Array) -> Array:

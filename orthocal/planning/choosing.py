@@ -208,7 +208,7 @@ def _exchange_one(candidates: Candidates, chosen: Chosen, k: int, weigh: Weigh) 
     beside = _Beside.of(candidates, others, weigh)
     ranked = beside.rank(len(old.chosen))[:MOST_REFINED]
     for opened in (old, *(s for r in ranked for s in beside.begun_otherwise(r))):
-        new = beside.better_readings(opened)
+        new = beside.begun_best(beside.better_readings(opened))
         if beside.left_roughly(new) > best.left * (1.0 + ROUGH):
             continue
         information = others + _says(candidates, new)
@@ -257,8 +257,8 @@ class _Beside:
     """R, shape (n_state, p)."""
     whole: float | None
     """tr(T C); None where T depends on C."""
-    seen: dict[int, Taking] = field(default_factory=dict)
-    """What was looked at, by kind."""
+    seen: dict[tuple[int, int | None], Taking] = field(default_factory=dict)
+    """What was looked at, by kind and where it is begun."""
 
     @staticmethod
     def of(candidates: Candidates, information: Array, weigh: Weigh) -> _Beside:
@@ -268,20 +268,40 @@ class _Beside:
         whole = float(np.vdot(root, covariance @ root)) if steady else None
         return _Beside(candidates, covariance, root, whole)
 
-    def taking(self, which: int) -> Taking:
-        """The candidates of a kind."""
-        if which not in self.seen:
-            c = self.candidates
-            found = Taking.beside(c.kinds[which], self.covariance, self.root, c.sigma)
-            self.seen[which] = found
-        return self.seen[which]
+    def taking(self, which: int, first: int | None = None) -> Taking:
+        """The candidates of a kind, begun with one of them, or on the mean of them."""
+        c = self.candidates
+        kind = c.kinds[which]
+        key = which, first if kind.by_hand else None
+        if key not in self.seen:
+            kind = kind if first is None else kind.begun(first)
+            self.seen[key] = Taking.beside(kind, self.covariance, self.root, c.sigma)
+        return self.seen[key]
 
     def left_roughly(self, opened: Opened) -> float:
         """What a setup leaves, but for rounding; 0 where that cannot be said at once."""
         if self.whole is None:
             return 0.0
-        gain = self.taking(opened.kind).gain(list(opened.chosen))
+        gain = self.taking(opened.kind, opened.chosen[0]).gain(list(opened.chosen))
         return math.sqrt(max(self.whole - gain, 0.0))
+
+    def gain(self, opened: Opened) -> float:
+        """What a setup takes, its gauge set where it begins."""
+        c, rows = self.candidates, list(range(len(opened.chosen)))
+        kind = c.kinds[opened.kind].only(opened.chosen).begun(0)
+        return Taking.beside(kind, self.covariance, self.root, c.sigma).gain(rows)
+
+    def begun_best(self, opened: Opened) -> Opened:
+        """The same readings, begun where that takes most; where it does not matter, as they are."""
+        kind = self.candidates.kinds[opened.kind]
+        if not kind.by_hand:
+            return opened
+        found = [opened]
+        for k, first in enumerate(opened.chosen[1:], start=1):
+            others = opened.chosen[:k] + opened.chosen[k + 1 :]
+            if kind.together[first, list(others)].all():
+                found.append(Opened(opened.kind, (first, *others)))
+        return max(found, key=self.gain)
 
     def rank(self, count: int) -> list[Opened]:
         """Setups with so many readings, one of a kind, greedily; those first that take most.
@@ -297,25 +317,24 @@ class _Beside:
         begun.sort(key=lambda f: -f[0])
         found = []
         for _, which, pair in begun[:MOST_COMPLETED]:
-            gain, chosen = self.taking(which).complete(pair, count)
+            gain, chosen = self.taking(which, pair[0]).complete(pair, count)
             found.append((gain, Opened(which, chosen)))
         return [opened for _, opened in sorted(found, key=lambda f: -f[0])]
 
     def begun_otherwise(self, opened: Opened) -> list[Opened]:
         """The same setup, its readings greedily from each of the best pairs."""
         which, count = opened.kind, len(opened.chosen)
-        taking = self.taking(which)
         return [
-            Opened(which, taking.complete(pair, count)[1])
-            for _, pair in taking.pairs(count, MOST_PAIRS)
+            Opened(which, self.taking(which, pair[0]).complete(pair, count)[1])
+            for _, pair in self.taking(which).pairs(count, MOST_PAIRS)
         ]
 
     def better_readings(self, opened: Opened) -> Opened:
         """The same setup with each reading in turn exchanged for the best beside its others."""
         kind, chosen = self.candidates.kinds[opened.kind], list(opened.chosen)
-        whole = self.taking(opened.kind)
         for _ in range(MOST_PASSES):
             before = list(chosen)
+            whole = self.taking(opened.kind, chosen[0])
             for place in range(len(chosen)):
                 others = chosen[:place] + chosen[place + 1 :]
                 # another first reading must be one from which the gauge reaches all others
@@ -333,12 +352,11 @@ class _Beside:
 
 def _says(candidates: Candidates, opened: Opened) -> Array:
     """What the readings of a setup say of the state."""
-    kind, rows = candidates.kinds[opened.kind], list(opened.chosen)
-    if len(rows) < FEWEST:
-        raise ValueError(f"found {len(rows)} readings; expected at least {FEWEST}")
-    spread = kind.own[np.ix_(rows, rows)] + candidates.sigma**2 * np.eye(len(rows))
-    slopes = kind.slopes[rows]
-    return np.asarray(slopes.T @ np.linalg.solve(spread, slopes))
+    if len(opened.chosen) < FEWEST:
+        raise ValueError(f"found {len(opened.chosen)} readings; expected at least {FEWEST}")
+    kind = candidates.kinds[opened.kind].only(opened.chosen).begun(0)
+    spread = kind.own + candidates.sigma**2 * np.eye(len(kind.rows))
+    return np.asarray(kind.slopes.T @ np.linalg.solve(spread, kind.slopes))
 
 
 def error_left(information: Array, weigh: Weigh) -> float:

@@ -34,6 +34,22 @@ class Pairs:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Set:
+    """Something that a hand sets where a setup begins, beside what others say."""
+
+    answers: Array
+    """How readings answer to it, shape (m,)."""
+    slopes: Array
+    """S: how it answers to the state where the setup begins, shape (m, n_state)."""
+    known: Array
+    """S C, shape (m, n_state)."""
+    spread: Array
+    """S C Aᵀ, shape (m, m)."""
+    effect: Array
+    """S C R, shape (m, p)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Taking:
     """Candidates of a kind beside what others say, none of which is taken."""
 
@@ -46,6 +62,7 @@ class Taking:
     """V's diagonal, shape (m,)."""
     noise: float
     """σ²."""
+    by_hand: tuple[_Set, ...] = ()
 
     @staticmethod
     def beside(kind: Kind, covariance: Array, root: Array, sigma: float) -> Taking:
@@ -60,7 +77,13 @@ class Taking:
         known = kind.slopes @ covariance
         spread = known @ kind.slopes.T
         spread += kind.own
-        return Taking(kind, spread, known @ root, spread.diagonal().copy(), sigma**2)
+        by_hand = []
+        for hand in kind.by_hand:
+            moved = hand.slopes @ covariance
+            answers, across = hand.answers, moved @ kind.slopes.T
+            by_hand.append(_Set(answers, hand.slopes, moved, across, moved @ root))
+        variance = spread.diagonal().copy()
+        return Taking(kind, spread, known @ root, variance, sigma**2, tuple(by_hand))
 
     def gain(self, rows: list[int]) -> float:
         """What readings take together."""
@@ -95,7 +118,19 @@ class Taking:
         q, v = product.diagonal(), self.variance
         # beside a zero of which nothing is known two readings are worth their difference
         gains = q[i] + q[j] - 2.0 * product.reshape(-1)[flat]
-        gains /= v[i] + (v + 2.0 * self.noise)[j] - 2.0 * self.spread.reshape(-1)[flat]
+        spread = v[i] + (v + 2.0 * self.noise)[j] - 2.0 * self.spread.reshape(-1)[flat]
+        for hand in self.by_hand:
+            change, rows = (
+                hand.answers[j] - hand.answers[i],
+                (hand.effect @ self.effect.T, hand.spread),
+            )
+            for total, own in zip((gains, spread), rows, strict=True):
+                total += 2.0 * change * (own.reshape(-1)[flat] - own.diagonal()[i])
+            for other in self.by_hand:
+                both = change * (other.answers[j] - other.answers[i])
+                gains += both * np.vecdot(hand.effect, other.effect)[i]
+                spread += both * np.vecdot(hand.known, other.slopes)[i]
+        gains /= spread
         found: list[tuple[float, tuple[int, int]]] = []
         while True:
             best = int(gains.argmax())

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
 import pytest
 
-from orthocal.planning.candidates import Kind
+from orthocal.planning.candidates import HandSet, Kind
 from orthocal.planning.taking import Taking
 
 SIGMA, STATE, READINGS = 0.5, 5, 7
@@ -94,3 +95,24 @@ def test_the_best_pairs_differ_most_and_share_no_reading(drawn, count):
         assert pair in left
         left = [p for p in left if not set(p) & set(pair)]
     assert len(found) == 3 or not left
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_pairs_are_worth_what_they_are_with_the_gauge_set_in_the_first(seed):
+    """What a hand sets by the machine is elsewhere with each beginning: low rank against anew."""
+    kind, information, root = draw(seed)
+    rng = np.random.default_rng(seed)
+    by_hand = tuple(
+        HandSet(rng.normal(size=READINGS), rng.normal(size=(READINGS, STATE))) for _ in range(2)
+    )
+    kind, covariance = replace(kind, by_hand=by_hand), np.linalg.inv(information)
+    found = Taking.beside(kind, covariance, root, SIGMA).pairs(3, 3)
+    assert found
+    for gain, (first, second) in found:
+        begun = Taking.beside(kind.begun(first), covariance, root, SIGMA)
+        across = begun.effect[first] - begun.effect[second]
+        ends = begun.spread[[first, second]][:, [first, second]]
+        scatter = ends[0, 0] + ends[1, 1] - 2.0 * ends[0, 1] + 2.0 * SIGMA**2
+        assert gain == pytest.approx(float(across @ across) / scatter, rel=1e-10)
+        alone = kind.only([first, second]).begun(0)
+        assert alone.slopes == pytest.approx(kind.begun(first).slopes[[first, second]], abs=1e-14)
