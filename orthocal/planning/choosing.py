@@ -285,23 +285,19 @@ class _Beside:
         gain = self.taking(opened.kind, opened.chosen[0]).gain(list(opened.chosen))
         return math.sqrt(max(self.whole - gain, 0.0))
 
-    def gain(self, opened: Opened) -> float:
-        """What a setup takes, its gauge set where it begins."""
-        c, rows = self.candidates, list(range(len(opened.chosen)))
-        kind = c.kinds[opened.kind].only(opened.chosen).begun(0)
-        return Taking.beside(kind, self.covariance, self.root, c.sigma).gain(rows)
-
     def begun_best(self, opened: Opened) -> Opened:
-        """The same readings, begun where that takes most; where it does not matter, as they are."""
-        kind = self.candidates.kinds[opened.kind]
+        """The same setup begun with another reading, of its own or not, if that takes more."""
+        kind, chosen = self.candidates.kinds[opened.kind], opened.chosen
         if not kind.by_hand:
             return opened
-        found = [opened]
-        for k, first in enumerate(opened.chosen[1:], start=1):
-            others = opened.chosen[:k] + opened.chosen[k + 1 :]
-            if kind.together[first, list(others)].all():
-                found.append(Opened(opened.kind, (first, *others)))
-        return max(found, key=self.gain)
+        sets = [chosen]
+        for k, first in enumerate(chosen[1:], start=1):
+            sets.append((first, *chosen[:k], *chosen[k + 1 :]))
+        rest = chosen[1:]
+        sets += [(f, *rest) for f in range(len(kind.rows)) if f not in chosen]
+        able = np.array([s for s in sets if kind.together[s[0], list(s)].all()])
+        best = int(self.taking(opened.kind).gains(able).argmax())
+        return Opened(opened.kind, tuple(able[best].tolist()))
 
     def rank(self, count: int) -> list[Opened]:
         """Setups with so many readings, one of a kind, greedily; those first that take most.

@@ -92,6 +92,26 @@ class Taking:
             np.vdot(effect, np.linalg.solve(self._between(self.spread[rows], rows), effect))
         )
 
+    def gains(self, sets: Indices) -> Array:
+        """What sets of readings take, the gauge set in the first of each, shape (n_sets,).
+
+        Args:
+            sets: Readings of each, shape (n_sets, k).
+        """
+        first, effect = sets[:, 0], self.effect[sets]
+        spread = self.spread[sets[:, :, None], sets[:, None, :]]
+        spread += self.noise * np.eye(sets.shape[1])
+        for hand in self.by_hand:
+            own = hand.answers[sets]
+            effect += own[:, :, None] * hand.effect[first][:, None, :]
+            across = own[:, :, None] * hand.spread[first[:, None], sets][:, None, :]
+            spread += across + np.swapaxes(across, 1, 2)
+            for other in self.by_hand:
+                both = np.vecdot(hand.known, other.slopes)[first]
+                outer = own[:, :, None] * other.answers[sets][:, None, :]
+                spread += both[:, None, None] * outer
+        return np.asarray((effect * np.linalg.solve(spread, effect)).sum(axis=(1, 2)))
+
     def gains_beside(self, rows: list[int]) -> Array:
         """What one more reading would take where these are taken, shape (m,)."""
         rest = self.spread[rows]
@@ -104,7 +124,8 @@ class Taking:
     def pairs(self, count: int, most: int) -> list[tuple[float, tuple[int, int]]]:
         """What two readings take that take most together, and which; the gauge is set in the first.
 
-        And the next best, each of which shares no reading with those before it.
+        And the next best, each of which shares no reading with those before it, or begins
+        elsewhere where a hand sets the gauge by the machine.
 
         Args:
             count: Readings that the setup is to take.
@@ -140,6 +161,9 @@ class Taking:
             found.append((gain, pair))
             if len(found) == most:
                 return found
+            if self.by_hand:  # where it begins is what makes the difference
+                gains[i == pair[0]] = -1.0
+                continue
             for row in pair:
                 gains[(i == row) | (j == row)] = -1.0
 

@@ -107,12 +107,16 @@ def test_pairs_are_worth_what_they_are_with_the_gauge_set_in_the_first(seed):
     )
     kind, covariance = replace(kind, by_hand=by_hand), np.linalg.inv(information)
     found = Taking.beside(kind, covariance, root, SIGMA).pairs(3, 3)
-    assert found
+    assert len({first for _, (first, _) in found}) == len(found) > 0
     for gain, (first, second) in found:
         begun = Taking.beside(kind.begun(first), covariance, root, SIGMA)
         across = begun.effect[first] - begun.effect[second]
         ends = begun.spread[[first, second]][:, [first, second]]
         scatter = ends[0, 0] + ends[1, 1] - 2.0 * ends[0, 1] + 2.0 * SIGMA**2
         assert gain == pytest.approx(float(across @ across) / scatter, rel=1e-10)
+        for rows in ([first, second], [first, (second + 1) % READINGS, second]):
+            exact = begun.gain(rows)
+            (whole,) = Taking.beside(kind, covariance, root, SIGMA).gains(np.array([rows]))
+            assert whole == pytest.approx(exact, rel=1e-10)
         alone = kind.only([first, second]).begun(0)
         assert alone.slopes == pytest.approx(kind.begun(first).slopes[[first, second]], abs=1e-14)
