@@ -184,8 +184,8 @@ def test_what_is_said_of_the_papers_readings_is_what_the_example_prints(run_exam
         f"{kept['offsets entered, full']:.3f} mm"
     ) in text
     promised, left = rows["as of a line, exactly"]
-    assert f"the first 18 leave {left:.2f} mm and promise half of that" in text
-    assert promised == pytest.approx(0.5 * left, rel=0.1)
+    assert f"the first 18 leave {left:.2f} mm and promise two thirds of that" in text
+    assert promised == pytest.approx(2.0 / 3.0 * left, rel=0.1)
     for label in ("first round, full", "offsets entered, full"):
         promised, left = rows[label]
         assert left < 1.15 * promised  # as promised

@@ -61,7 +61,7 @@ READINGS_A_SETUP = (3, 5, 9, 16)
 
 MOST_SETUPS = 40
 
-SIMPLER = 1e-2
+SIMPLER = 3e-2
 """Part of the error that may be lost in all for tips that stand on the crests of their rods."""
 
 TOLD = 1e-3
