@@ -110,7 +110,7 @@ def plan(
     ] = False,
 ) -> None:
     """Which setups and readings tell most, and what they will be worth, before any is taken."""
-    from orthocal.cores import available_cores, call_on_cores
+    from orthocal.cores import available_cores, call_on_cores, lent
     from orthocal.estimation.choice import Choice
     from orthocal.estimation.selection import read_tolerances
     from orthocal.files import exists, require_writable
@@ -187,7 +187,8 @@ def plan(
             "posture again."
         )
         calls = [lambda: sheet_or_problem(found.session), lambda: draw_plan(found)]
-        (sheet, problem), picture = call_on_cores(calls, count, killed=KILLED)
+        with lent(count):
+            (sheet, problem), picture = call_on_cores(calls, killed=KILLED)
         if problem:
             put_note(problem)
         extra = {"plan.json": document, "plan.svg": picture} | sheet
