@@ -6,6 +6,7 @@ and prepared before, and begins at once. Elsewhere workers begin from nothing (j
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import pickle
@@ -14,7 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import cache
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkProcess
@@ -24,6 +25,16 @@ from orthocal.errors import OrthocalError
 
 WATCHING = 0.5
 """How often a worker looks whether it is still wanted, [s]."""
+
+KEPT_MEMORY = 2**30
+"""Freed memory that a process keeps, [bytes]."""
+
+LARGEST_KEPT = 2**25
+"""Of one array; the C library takes no more."""
+
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+
+_lent = 1
 
 T = TypeVar("T")
 
@@ -58,20 +69,48 @@ def run_on_cores(
     return _spawned(work, todo, count)
 
 
+def keep_memory() -> None:
+    """Have freed memory stay with this process: getting it back page by page takes time.
+
+    For work in arrays of some megabytes, made again and again. Only the C library of GNU knows it.
+    """
+    with suppress(OSError, AttributeError):
+        change = ctypes.CDLL(None).mallopt
+        change(_TRIM_THRESHOLD, KEPT_MEMORY)
+        change(_MMAP_THRESHOLD, LARGEST_KEPT)
+
+
+@contextmanager
+def lent(count: int) -> Iterator[None]:
+    """Let what is computed within the block use so many cores, where it can."""
+    global _lent
+    before, _lent = _lent, count
+    try:
+        yield
+    finally:
+        _lent = before
+
+
+def lent_cores() -> int:
+    """How many cores may be used here: one, unless somebody lends more."""
+    return _lent
+
+
 def call_on_cores(
-    calls: Sequence[Callable[[], Any]], workers: int, *, killed: str
+    calls: Sequence[Callable[[], Any]], *, killed: str = "a process was killed"
 ) -> tuple[Any, ...]:
-    """What functions return, called side by side where processes can be doubled.
+    """What functions return, called side by side on the cores that are lent.
+
+    Where processes cannot be doubled they are called one after the other.
 
     Args:
         calls: The functions, those first that take longest; what they return is pickled.
-        workers: How many processes.
-        killed: What is said if one of them is killed.
+        killed: What is said if one of the processes is killed.
 
     Raises:
         OrthocalError: If a worker is killed.
     """
-    count = min(workers, len(calls))
+    count = min(_lent, len(calls))
     if count <= 1 or not can_fork():
         return tuple(call() for call in calls)
     found = dict(_forked(lambda k: calls[k](), range(len(calls)), count, killed))
@@ -130,6 +169,8 @@ def _answer(ours: Connection[Any, Any], killed: str) -> Any:  # noqa: ANN401 - w
 
 def _serve(work: Work[Any], theirs: Connection[Any, Any], parent: int) -> None:
     """Do what is asked for until there is no more of it."""
+    global _lent
+    _lent = 1  # the others are busy
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     for descriptor in map(int, os.listdir("/proc/self/fd")):
         if descriptor > 2 and descriptor != theirs.fileno():

@@ -16,7 +16,7 @@ from orthocal.cli.options import (
     split_globs,
 )
 from orthocal.cli.printing import put_note, put_out
-from orthocal.cli.sheets import sheet_or_nothing
+from orthocal.cli.sheets import sheet_or_problem
 from orthocal.errors import ParameterError, SessionError
 
 if TYPE_CHECKING:
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from orthocal.measurement.session import Session
     from orthocal.planning.means import Means
     from orthocal.robot.model import Robot
+
+KILLED = "a process that drew the plan was killed"
 
 FILES = ("session.yaml", "readings.csv", "plan.json", "plan.svg", "sheet.html")
 
@@ -108,7 +110,7 @@ def plan(
     ] = False,
 ) -> None:
     """Which setups and readings tell most, and what they will be worth, before any is taken."""
-    from orthocal.cores import available_cores
+    from orthocal.cores import available_cores, call_on_cores, lent
     from orthocal.estimation.choice import Choice
     from orthocal.estimation.selection import read_tolerances
     from orthocal.files import exists, require_writable
@@ -148,6 +150,7 @@ def plan(
     )
     tolerances = read_tolerances(tolerance or [], robot.parameters, where="--tolerance")
     workspace = None if half_side_mm is None else require_cube(robot, half_side_mm)
+    count = workers or available_cores()
     found = plan_readings(
         robot,
         Choice(model, tolerances=tolerances),
@@ -161,11 +164,12 @@ def plan(
         seed=seed,
         starts=starts,
         reference=reference,
-        workers=workers or available_cores(),
+        workers=count,
         report=lambda text: put_note(f"orthocal: {text}"),
     )
+    document = plan_json(found)
     if json:
-        put_out(plan_json(found).rstrip("\n"))
+        put_out(document.rstrip("\n"))
     else:
         print_summary(found, details=details)
     if gauge is not None and means.tip is None:
@@ -182,8 +186,12 @@ def plan(
             "Approach every posture from the same side; the last reading of a setup is its first\n"
             "posture again."
         )
-        extra = {"plan.json": plan_json(found), "plan.svg": draw_plan(found)}
-        extra |= sheet_or_nothing(found.session)
+        calls = [lambda: sheet_or_problem(found.session), lambda: draw_plan(found)]
+        with lent(count):
+            (sheet, problem), picture = call_on_cores(calls, killed=KILLED)
+        if problem:
+            put_note(problem)
+        extra = {"plan.json": document, "plan.svg": picture} | sheet
         path = write_session(found.session, out, comment=comment, extra=extra, blank=True)
         paper = ", sheet.html and its programs" if "sheet.html" in extra else ""
         put_note(f"Wrote {path}, readings.csv to fill in, plan.json, plan.svg{paper}")

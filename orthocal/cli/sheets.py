@@ -71,10 +71,17 @@ def sheet(
 
 def sheet_or_nothing(session: Session) -> dict[str, str]:
     """The measuring sheet and its programs; nothing, and why, where there cannot be one."""
+    files, problem = sheet_or_problem(session)
+    if problem:
+        put_note(problem)
+    return files
+
+
+def sheet_or_problem(session: Session) -> tuple[dict[str, str], str]:
+    """The same, and what is to be told where there cannot be one."""
     from orthocal.show.sheet.page import sheet_files
 
     try:
-        return sheet_files(session)
+        return sheet_files(session), ""
     except OrthocalError as e:
-        put_note(f"orthocal: no measuring sheet: {e}")
-        return {}
+        return {}, f"orthocal: no measuring sheet: {e}"

@@ -313,7 +313,7 @@ def _finish(
     force: bool,
 ) -> None:
     """Run a study, print its answer, and write what was asked for."""
-    from orthocal.cores import available_cores
+    from orthocal.cores import available_cores, lent
     from orthocal.files import require_writable, write_files
     from orthocal.interrupts import raised_interrupt
     from orthocal.show.layout import print_rich
@@ -327,12 +327,13 @@ def _finish(
         )
     if out is not None:
         require_writable(out, [JOURNAL, *FILES])
+    count = workers or available_cores()
     try:
         with raised_interrupt(), told(study) as report:
             table = run_study(
                 study,
                 folder=out,
-                workers=workers or available_cores(),
+                workers=count,
                 dask=dask,
                 anew=force,
                 report=report,
@@ -341,7 +342,8 @@ def _finish(
         kept = "with --out it could go on later" if out is None else "the same command goes on"
         put_note(f"orthocal: stopped; {kept}")
         raise
-    summary = summarise_study(table)
+    with lent(count if dask is None else 1):
+        summary = summarise_study(table)
     document = study_json(table, summary)
     if json:
         put_out(document.rstrip("\n"))

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.kinematics.lanes import Listing, list_instructions, pays, run_in_lanes
+from orthocal.kinematics.lanes import Listing, find_listing, pays, run_in_lanes
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -99,7 +99,7 @@ class BatchFunction:
     @cached_property
     def _listing(self) -> Listing | None:
         """Its instructions; None where one of them is not known."""
-        return list_instructions(self._function) if self._same is None else self._same._listing
+        return find_listing(self._function) if self._same is None else self._same._listing
 
     def _by_casadi(self, arrays: list[Array], count: int) -> list[Array]:
         """Nonzeros of each output, shape (count, nnz)."""

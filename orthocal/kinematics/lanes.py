@@ -10,6 +10,7 @@ once as much has been spent in CasADi's machine (`Way.AUTO`), or once somebody e
 from __future__ import annotations
 
 import enum
+import hashlib
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal import cache
 from orthocal.kinematics.interpreter import LANE, OPERATIONS, interpreter, is_installed
 
 Array = NDArray[np.float64]
@@ -32,6 +34,9 @@ PATIENCE = 60e6
 
 POINTS = 500
 """Of one function, which take CasADi's machine as long as its instructions to list."""
+
+FEWEST_KEPT = 1000
+"""Instructions of a function for which they are kept on disk: fewer are listed as soon."""
 
 _CODE = {getattr(ca, f"OP_{name}"): code for code, name in enumerate(OPERATIONS)}
 
@@ -96,6 +101,40 @@ class Listing:
     n_work: int
     first_out: Indices
     """Where each output begins among all, shape (n_out + 1,)."""
+
+
+def find_listing(function: ca.Function) -> Listing | None:
+    """The instructions of a function: as kept on disk, or listed and kept.
+
+    None where one of them is not known here.
+    """
+    if function.n_instructions() < FEWEST_KEPT:
+        return list_instructions(function)
+    try:
+        digest = hashlib.sha256(function.serialize().encode()).hexdigest()
+    except RuntimeError:  # some cannot be written
+        return list_instructions(function)
+    key = f"listing {digest}\n{_CODE}"
+    found = _read(cache.recall(key), function)
+    if found is None and (found := list_instructions(function)) is not None:
+        arrays = found.table, found.constants, np.array(found.n_work), found.first_out
+        cache.keep(key, b"".join(a.tobytes() for a in arrays))
+    return found
+
+
+def _read(content: bytes | None, function: ca.Function) -> Listing | None:
+    """What was kept of a function's instructions."""
+    n, outputs = function.n_instructions(), function.n_out()
+    if content is None or len(content) != 24 * n + 8 * (outputs + 2):
+        return None
+    table, constants, rest = np.split(np.frombuffer(content, np.uint8), [16 * n, 24 * n])
+    n_work, *first_out = rest.view(np.int64)
+    return Listing(
+        table.view(np.int32).reshape(n, 4),
+        constants.view(np.float64),
+        int(n_work),
+        np.array(first_out, dtype=np.int64),
+    )
 
 
 def list_instructions(function: ca.Function) -> Listing | None:

@@ -188,8 +188,9 @@ class Expander:
             LinAlgError: If a posture is singular.
         """
         n, n_free = self._observations.size, slopes.offsets.shape[1]
-        reading, opening, by_unknowns = np.empty(n), np.empty(n), np.zeros((n, unknowns.size))
-        jacobian, correction = np.empty((n, n_free)), np.zeros_like(passive)
+        reading, opening, correction = np.empty(n), np.empty(n), np.zeros_like(passive)
+        whole = np.empty((n, n_free + unknowns.size))
+        jacobian, by_unknowns = whole[:, :n_free], whole[:, n_free:]
         by_twists = _Chain.of(slopes.twists[self._used], n)
         zero = machine.drives(self._zero_drives)
         closings = []
@@ -212,10 +213,10 @@ class Expander:
             stood = self._zero_drives[self._observations.setup[part.entries]]
             commanded = by_drives * drives[:, None, :] + at_zero * stood
             found = (by_drives + at_zero) @ slopes.offsets + commanded @ slopes.gains
-            jacobian[part.entries] = found
+            found = found.reshape(k * m, -1)
             if self._used.size:
-                flat = part.entries.reshape(-1)
-                jacobian[flat] += by_twists(twists.reshape(k * m, -1))
+                found += by_twists(twists.reshape(k * m, -1))
+            jacobian[part.entries.reshape(-1)] = found
             reading[part.entries] = rows.reading.reshape(k, m)
             opening[part.entries] = (pull @ g[..., None])[..., 0]
         if set_by is not None:
@@ -225,7 +226,7 @@ class Expander:
         return Expansion(
             reading,
             opening,
-            np.hstack([jacobian, by_unknowns]),
+            whole,
             correction,
             tuple(closings),
             pattern,

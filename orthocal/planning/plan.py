@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.assess.remaining import RemainingError, rank_errors
-from orthocal.cores import call_on_cores, run_on_cores
+from orthocal.cores import call_on_cores, lent, run_on_cores
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, choose
 from orthocal.estimation.problem import CalibrationProblem
@@ -198,19 +198,18 @@ def plan_readings(
     plan = build_session(candidates, found.setups, measured)
     plan = replace(plan, purpose=Purpose(chosen.model, tuple(chosen.free)))
     whole = plan if measured is None else join_sessions([measured, plan])
-    curve, helps, compared, expected, first_round, here, known = call_on_cores(
-        [
-            lambda: find_curve(candidates, found, counts, means, prior, weigh),
-            lambda: list_alternatives(plan, means, forecast, measured),
-            lambda: list_usual_plans(candidates, plan, means, forecast, measured),
-            lambda: forecast.after(whole),
-            lambda: forecast.after(whole, entered=False),
-            lambda: forecast.about_nominal(whole),
-            lambda: forecast.before if measured is None else forecast.after(measured),
-        ],
-        workers,
-        killed=KILLED,
+    calls = (
+        lambda: find_curve(candidates, found, counts, means, prior, weigh),
+        lambda: list_alternatives(plan, means, forecast, measured),
+        lambda: list_usual_plans(candidates, plan, means, forecast, measured),
+        lambda: forecast.after(whole),
+        lambda: forecast.after(whole, entered=False),
+        lambda: forecast.about_nominal(whole),
+        lambda: forecast.before if measured is None else forecast.after(measured),
     )
+    with lent(workers):
+        found_out = call_on_cores(calls, killed=KILLED)
+    curve, helps, compared, expected, first_round, here, known = found_out
     return MeasuringPlan(
         session=plan,
         forecast=forecast,

@@ -7,14 +7,16 @@ identified, and what errors that are not identified do to it and by themselves (
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.assess.accuracy import ErrorSize, ErrorSizes, ToolUncertainty, measure_uncertainty
+from orthocal.cores import call_on_cores, lent_cores
 from orthocal.diagnosis.unmodelled import machine_errors
 from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.estimation.problem import CalibrationProblem, build_problem
@@ -179,15 +181,19 @@ class ToolForecast:
         others = self._slopes_of_others(session)
         noise = noise_of(session) if sigma is None else sigma
         drawn = list(self._draw(problem, entered=entered)) if machines is None else machines
-        found, lost = [], 0.0
         fleet = Fleet(problem, np.array(drawn) / problem.theta_scale)
         closed = fleet.close()
-        for i, theta in enumerate(drawn):
-            passive = fleet.passive[i] if closed[i] else None
-            covariance, share = self._posterior(problem, others, theta, noise, weight, passive)
-            if covariance is not None:
-                found.append(covariance)
-            lost += share / len(drawn)
+
+        def posteriors(part: Iterable[int]) -> list[tuple[Array | None, float]]:
+            passive = [fleet.passive[i] if closed[i] else None for i in range(len(drawn))]
+            return [
+                self._posterior(problem, others, drawn[i], noise, weight, passive[i]) for i in part
+            ]
+
+        parts = np.array_split(np.arange(len(drawn)), lent_cores())
+        each = [f for part in call_on_cores([partial(posteriors, p) for p in parts]) for f in part]
+        found = [covariance for covariance, _ in each if covariance is not None]
+        lost = sum(share / len(drawn) for _, share in each)
         if not found:
             raise ClosureError(
                 "cannot be read on machines within their tolerances", posture="the planned ones"

@@ -271,12 +271,14 @@ class _Calibrated:
         names = p.problem.machine_selection.names
         n, columns = len(names), p.problem.compiled.errors.columns(names)
         errors = p.problem.assembly.errors() + theta[:, :n] @ columns.T
-        good = status == GOOD
-        tools = []
-        for machines in (true, np.where(good[:, None], errors, 0.0)):
-            own = Machines(p.robot, machines, p.drives, p.passive)
-            _mark(status, ~own.close(), NO_MACHINE)
-            tools.append(np.moveaxis(own.tool(), 0, -1))
+        good = np.flatnonzero(status == GOOD)
+        tools = np.full((2, *p.positions.shape, len(status)), np.nan)
+        for tool, machines in zip(tools, (true, errors), strict=True):
+            if not good.size:
+                break
+            own = Machines(p.robot, machines[good], p.drives, p.passive)
+            _mark(status, np.isin(np.arange(len(status)), good[~own.close()]), NO_MACHINE)
+            tool[..., good] = np.moveaxis(own.tool(), 0, -1)
         bad = status != GOOD
         before, after = tools[0] - p.positions[..., None], tools[0] - tools[1]
         for values in (before, after):

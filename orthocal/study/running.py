@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from orthocal.cores import can_fork, run_on_cores
+from orthocal.cores import can_fork, lent, run_on_cores
 from orthocal.errors import OrthocalError
 from orthocal.study.journal import Found, open_journal
 from orthocal.study.study import Cell, Study, prepare_once, run_task
@@ -99,7 +99,8 @@ def _run(study: Study, todo: Sequence[int], workers: int, dask: str | None) -> I
     if dask is not None:
         return _on_cluster(study, todo, dask)
     if can_fork():
-        prepare_once(study)  # every worker has it when it begins
+        with lent(workers):
+            prepare_once(study)  # every worker has it when it begins
     return run_on_cores(partial(run_task, study), todo, workers, killed=KILLED)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from orthocal import __version__
+from orthocal.cores import keep_memory
 from orthocal.kinematics.lanes import expect_many
 
 Cell = float | int | str | bool | None
@@ -78,13 +79,17 @@ def run_task(study: Study, task: int) -> dict[str, list[Cell]]:
 def prepare_once(study: Study) -> Any:  # noqa: ANN401 - as `prepare`
     """What all tasks of a study share, made once in this process."""
     expect_many()
+    keep_memory()
     return study.prepare()
 
 
 def _tidy(cells: Sequence[Cell]) -> list[Cell]:
-    # NumPy's own numbers take several times as long
-    plain = np.asarray(cells).tolist() if len(cells) and type(cells[0]) is np.float64 else cells
-    return [tidy_cell(v) for v in plain]
+    values = np.asarray(cells) if len(cells) and type(cells[0]) is np.float64 else None
+    if values is None or values.dtype != np.float64:
+        return [tidy_cell(v) for v in cells]
+    # all at once: one by one they take twice as long
+    told = f"%.{DIGITS - 1}e " * len(values) % tuple(values.tolist())
+    return [None if text == "nan" else float(text) + 0.0 for text in told.split()]
 
 
 def tidy_cell(value: object) -> Cell:

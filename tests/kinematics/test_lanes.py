@@ -128,3 +128,30 @@ def test_where_there_is_no_interpreter_casadi_does_it(orthoglide, monkeypatch):
         monkeypatch.setattr(lanes, "interpreter", lambda: None)
         for a, b in zip(function(*where), expected, strict=True):
             assert np.array_equal(a, b)
+
+
+def test_instructions_are_kept_on_disk(orthoglide, tmp_path, monkeypatch):
+    monkeypatch.setenv("ORTHOCAL_CACHE", str(tmp_path / "kept"))
+    function = compiled_robot(orthoglide).closing._function
+    assert function.n_instructions() > lanes.FEWEST_KEPT
+    expected = list_instructions(function)
+    made = []
+
+    def counted(function):
+        made.append(function)
+        return list_instructions(function)
+
+    monkeypatch.setattr(lanes, "list_instructions", counted)
+    for _ in range(3):
+        found = lanes.find_listing(function)
+        assert len(made) == 1
+        assert found.n_work == expected.n_work
+        for name in ("table", "constants", "first_out"):
+            ours, theirs = getattr(found, name), getattr(expected, name)
+            assert ours.dtype == theirs.dtype
+            assert np.array_equal(ours, theirs)
+    # what is of another length is not taken, whatever its checksum says
+    content = lanes.cache.recall
+    monkeypatch.setattr(lanes.cache, "recall", lambda key: content(key)[:-8])
+    assert np.array_equal(lanes.find_listing(function).table, expected.table)
+    assert len(made) == 2

@@ -221,7 +221,9 @@ class BatchProgram:
             settled = _settled(sizes[:, left])
             done[left] = settled
             on = ~settled & (sizes[0, left] < FAR)
-            left, inverses, before = left[on], inverses[on], (step[on], pull[on])
+            before = step[on], pull[on]
+            if not on.all():
+                left, inverses = left[on], inverses[on]
             if not left.size:
                 break
         reading += about.sigma * (jacobian @ last[..., None])[..., 0]

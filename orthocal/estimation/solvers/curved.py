@@ -8,14 +8,18 @@ hundredth couples the two. To second order what is left is a hundredth of that.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.cores import call_on_cores, lent_cores
+from orthocal.estimation.expansion import Expansion
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.fleet_slopes import FleetSlopes
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 STEP = 0.01
 """Over which slopes are compared, [tolerances]."""
@@ -65,17 +69,14 @@ def find_curvature(problem: CalibrationProblem) -> CurvedReadings | None:
 
 def _find_curvature(problem: CalibrationProblem) -> CurvedReadings:
     n, m = problem.n_free, problem.observations.size
-    scale = problem.theta_scale
     about = problem.expand(problem.reference, problem.reference_passive)
-    curvature = np.empty((n, m, n), dtype=np.float32)
-    for k, moved in enumerate(STEP * np.eye(n)):
-        passive = problem.reference_passive + about.follow(moved)
-        found = problem.expand(problem.reference + moved * scale, passive)
-        curvature[k] = (found.jacobian - about.jacobian) / STEP
+    parts = np.array_split(np.arange(n), lent_cores())
+    found = call_on_cores([partial(_differences, problem, about, part) for part in parts])
+    curvature = np.concatenate(found)
     for k in range(n):  # by either parameter first
         half = 0.5 * (curvature[k, :, k:] + curvature[k:, :, k].T)
         curvature[k, :, k:], curvature[k:, :, k] = half, half.T
-    there = problem.reference / scale
+    there = problem.reference / problem.theta_scale
     return CurvedReadings(
         reference=there,
         reading=about.reading + about.opening,
@@ -83,3 +84,16 @@ def _find_curvature(problem: CalibrationProblem) -> CurvedReadings:
         curvature=curvature.reshape(n, m * n),
         machine=FleetSlopes(problem, there[None], problem.reference_passive[None]),
     )
+
+
+def _differences(
+    problem: CalibrationProblem, about: Expansion, parts: Indices
+) -> NDArray[np.float32]:
+    """How slopes change with some parameters, shape (n_parts, n_entries, n_free)."""
+    moves, scale = STEP * np.eye(problem.n_free), problem.theta_scale
+    result = np.empty((len(parts), *about.jacobian.shape), dtype=np.float32)
+    for change, moved in zip(result, moves[parts], strict=True):
+        passive = problem.reference_passive + about.follow(moved)
+        found = problem.expand(problem.reference + moved * scale, passive)
+        change[...] = (found.jacobian - about.jacobian) / STEP
+    return result

@@ -86,7 +86,7 @@ class EliminatedProgram:
         try:
             found = self._descend(task, begin, follow=True)
         except (ClosureError, SolverError):  # on the way the loops were not looked at
-            found = self._descend(task, begin, follow=False)
+            found = self._descend(task, task.begin(start, start_passive), follow=False)
         state, jacobian, iterations = found
         return Solution(
             theta=state.theta * self.problem.theta_scale,
@@ -120,7 +120,8 @@ class EliminatedProgram:
         sizes: list[float] = []
         state, expansion = begin
         for iterations in range(1, most + 1):
-            jacobian = expansion.jacobian / task.sigma
+            jacobian = expansion.jacobian
+            jacobian /= task.sigma  # in its place: it may be large, and is of no more use as it was
             step = task.step(state, jacobian)
             sizes.append(float(np.abs(step).max(initial=0.0)))
             if follow and _settled(sizes):

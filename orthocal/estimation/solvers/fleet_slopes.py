@@ -38,6 +38,45 @@ class _Rows:
     by_unknowns: Array
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _TwistSlopes:
+    """How twists open the loops: the nonzeros of twists that free errors make, row by row."""
+
+    slopes: Array
+    """∂g by twists, shape (n_sets, n_postures, n)."""
+    rows: tuple[tuple[int, slice, Indices], ...]
+    """Each row of g, where its slopes are, and by which twists; none comes twice in a row."""
+
+    @staticmethod
+    def of(problem: CalibrationProblem, slopes: Array) -> _TwistSlopes:
+        """Of all nonzeros, shape (n_sets, n_postures, nnz), in the order of their pattern."""
+        compiled = problem.compiled
+        rows, columns = compiled.sparse_slopes.pattern(compiled.expressions.name_out(3))
+        moved = compiled.errors.twists_of(problem.columns.T).any(axis=0).reshape(-1, 6).any(axis=1)
+        chosen = np.flatnonzero(np.repeat(moved, 6)[columns])
+        order = chosen[np.argsort(rows[chosen], kind="stable")]
+        there, starts = np.unique(rows[order], return_index=True)
+        ends = np.append(starts[1:], order.size)
+        parts = tuple(
+            (int(row), slice(a, b), columns[order[a:b]])
+            for row, a, b in zip(there, starts, ends, strict=True)
+        )
+        # clipped, as nothing is: checking each place would take as long as all else
+        own = slopes.reshape(-1, rows.size).take(order, axis=1, mode="clip")
+        return _TwistSlopes(own.reshape(*slopes.shape[:2], order.size), parts)
+
+    def take_pull(self, pull: Array, forces: Array) -> None:
+        """Take forces on g, (n_sets, n_postures, n), off the pull at twists, (…, n_twists)."""
+        for row, part, columns in self.rows:
+            own = forces[:, None, :, row] @ self.slopes[..., part]
+            pull[:, columns] -= own[:, 0]
+
+    def add_opening(self, opening: Array, twists: Array) -> None:
+        """Add to openings, (n_sets, n_postures, n), those by twists, (n_sets, n_twists)."""
+        for row, part, columns in self.rows:
+            opening[..., row] += (self.slopes[..., part] @ twists[:, columns, None])[..., 0]
+
+
 class FleetSlopes:
     """Machines near closed loops, to first order.
 
@@ -71,10 +110,10 @@ class FleetSlopes:
             passive.reshape(self._size * k, -1),
             placements,
         )
-        opening, self._by_actuated, by_passive, self._by_twists = (
+        opening, self._by_actuated, by_passive, by_twists = (
             v.reshape(self._size, k, *v.shape[1:]) for v in found
         )
-        self._pattern = compiled.sparse_slopes.pattern(compiled.expressions.name_out(3))
+        self._twists = _TwistSlopes.of(problem, by_twists)
         self._inverse = _inverse(by_passive)
         self.correction = -(self._inverse @ opening[..., None])[..., 0]
         own = theta[:, problem.n_machine :] * problem.theta_scale[problem.n_machine :]
@@ -115,8 +154,7 @@ class FleetSlopes:
         on_drives -= (held[:, :, None] @ self._by_actuated)[:, :, 0]
         offsets += on_drives.sum(axis=1)
         gains += (on_drives * problem.drives).sum(axis=1)
-        of_rows, columns = self._pattern
-        np.subtract.at(twists.T, columns, (held[..., of_rows] * self._by_twists).sum(axis=1).T)
+        self._twists.take_pull(twists, held)
         turned = twists.reshape(self._size, -1, 1, 6) @ self._turned
         machine = turned.reshape(self._size, -1) @ errors.twists_of(self._columns.T).T
         machine += offsets @ errors.offsets(self._columns.T).T
@@ -138,12 +176,9 @@ class FleetSlopes:
         inner = errors.twists_of(moved).reshape(len(change), -1, 6, 1)
         twists = (self._turned @ inner).reshape(len(change), -1)
         drives = errors.offsets(moved)[:, None] + errors.scales(moved)[:, None] * problem.drives
-        rows, columns = self._pattern
         opened = (self._by_actuated @ drives[..., None])[..., 0]
         if twists.any():
-            by_row = np.zeros((rows.size, self._inverse.shape[3]))
-            by_row[np.arange(rows.size), rows] = 1.0
-            opened += (self._by_twists * twists[:, None, columns]) @ by_row
+            self._twists.add_opening(opened, twists)
         return np.asarray(self.correction - (self._inverse @ opened[..., None])[..., 0])
 
     def along(self, change: Array) -> Array:

@@ -25,6 +25,9 @@ SETTLED_WITHIN = 1e-11
 
 MOST_STEPS_WITHIN = 100
 
+ROWS_AT_ONCE = 2048
+"""Of the Jacobian, while they are squared: what stays near the processor."""
+
 FEW = 50
 """Unknowns up to which an elimination takes less than SciPy's triangular one takes to import."""
 
@@ -171,10 +174,7 @@ class Task:
 
     def _change(self, at: State, jacobian: Array, weights: Array) -> Array:
         """Newton's step with given weights, within the bounds, shape (n_free,)."""
-        centred = self._centre(jacobian, weights)
-        if (weights != 1.0).any():
-            centred *= np.sqrt(weights)[:, None]
-        square = centred.T @ centred
+        square = self._square(jacobian, weights)
         square[np.diag_indices_from(square)] += self.problem.prior_precision
         return self._solve(square, -self.slope(at, jacobian), at.theta)
 
@@ -227,12 +227,33 @@ class Task:
         """How far θ̂ is from its prior's mean, shape (n_free,)."""
         return np.asarray(theta - self.problem.prior_mean / self.problem.theta_scale)
 
-    def _centre(self, values: Array, weights: Array) -> Array:
-        """Rows less the weighted mean of those that share their zero, shape as given."""
-        o = self.problem.observations
-        totals = o.sum_by_zero(values, weights)
-        sums = np.bincount(o.zero, weights, minlength=o.n_zeros)
-        return np.asarray(values - (totals / sums[:, None])[o.zero])
+    def _square(self, jacobian: Array, weights: Array) -> Array:
+        """Jᵀ W J, rows less the weighted mean of those that share their zero, some zeros at a time.
+
+        A large Jacobian is read once, and never copied as a whole.
+        """
+        zero = self.problem.observations.zero
+        order = np.argsort(zero, kind="stable")
+        starts = np.flatnonzero(np.diff(zero[order], prepend=-1))
+        ends = np.append(starts[1:], zero.size)
+        result = np.zeros((jacobian.shape[1], jacobian.shape[1]))
+        first = 0
+        while first < starts.size:
+            last = max(first + 1, int(np.searchsorted(ends, starts[first] + ROWS_AT_ONCE, "right")))
+            rows, own = order[starts[first] : ends[last - 1]], starts[first:last] - starts[first]
+            counts = ends[first:last] - starts[first:last]
+            part, weight = jacobian[rows], weights[rows]
+            if (weight != 1.0).any():
+                means = np.add.reduceat(part * weight[:, None], own, axis=0)
+                means /= np.add.reduceat(weight, own)[:, None]
+                part -= np.repeat(means, counts, axis=0)
+                part *= np.sqrt(weight)[:, None]
+            else:
+                means = np.add.reduceat(part, own, axis=0) / counts[:, None]
+                part -= np.repeat(means, counts, axis=0)
+            result += part.T @ part
+            first = last
+        return result
 
 
 def _solve_triangular(factor: Array, target: Array, *, transposed: bool = False) -> Array:

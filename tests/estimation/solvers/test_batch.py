@@ -7,7 +7,7 @@ import pytest
 from gauges import exact
 from tool_coordinate import ToolCoordinate
 
-from orthocal import load_plan, load_session
+from orthocal import cores, load_plan, load_session
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
@@ -180,6 +180,14 @@ def test_curved_readings_leave_the_third_order(sweep):
     (reading, slope), (reading_half, slope_half) = left
     assert 7.0 < reading / reading_half < 9.0
     assert 3.5 < slope / slope_half < 4.5
+
+
+def test_curvature_is_the_same_from_any_number_of_processes(sweep, monkeypatch):
+    monkeypatch.setattr(cores, "can_fork", lambda: True)
+    alone = find_curvature(sweep)
+    with cores.lent(3):
+        together = find_curvature(sweep)
+    assert np.array_equal(together.curvature, alone.curvature)
 
 
 def test_a_set_far_from_the_others_is_solved_alone(root):
