@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.cores import call_on_cores, lent_cores
-from orthocal.estimation.expansion import Expansion
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.fleet_slopes import FleetSlopes
+from orthocal.measurement.expansion import Expansion
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
