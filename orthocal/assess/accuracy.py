@@ -25,6 +25,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
 from orthocal.fields import read_only
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
+from orthocal.statistics.distributions import chi_square_tail
 
 Array = NDArray[np.float64]
 
@@ -33,6 +34,9 @@ ROUNDING = 1e-9
 
 EXCESS = 1.5
 """Residuals by which errors must exceed their tolerances for the machine to be called worse."""
+
+RARE = 0.01
+"""Share of the machines within their tolerances that are called worse."""
 
 MOST_POINTS = 5_000
 """Points that are assessed together; each takes 40 kB. `rows.accuracy_rows` takes any number."""
@@ -248,20 +252,23 @@ def find_excess(calibration: Calibration) -> float:
     repeated cycles or the gauge's own σ and u what errors at their tolerances would leave.
 
     Returns:
-        e; 1 where that is no more than EXCESS, where noise explains what remains (99 %), where
-        nothing tells the noise but the residuals themselves, or where no errors were left out: the
-        machine may be as good as its tolerances.
+        e; 1 where that is no more than EXCESS, where one in a hundred machines within tolerances
+        leaves as much, where noise explains what remains (99 %), where nothing tells the noise but
+        the residuals themselves, or where no errors were left out: the machine may be as good as
+        its tolerances.
     """
     noise, gauge = calibration.noise, calibration.session.gauge_sigma
     known = noise.cycles_sigma if noise.cycles_dof > 0 else gauge
-    foretold = calibration.unmodelled.residual_rms
+    foretold, parts = calibration.unmodelled.residual_rms, calibration.unmodelled.residual_dof
     if known is None or foretold < ROUNDING or not noise.leaves_more(gauge):
         return 1.0
     # residuals keep the noise that parameters and gauge zeros have not taken up
     kept = noise.residual_dof / len(calibration.residuals)
     variance = (known * calibration.row_factor) ** 2 * kept
     ratio = math.sqrt(max(calibration.rms_after**2 - variance, 0.0)) / foretold
-    return ratio if ratio > EXCESS else 1.0
+    if ratio <= EXCESS or chi_square_tail(parts, parts * ratio**2) > RARE:
+        return 1.0
+    return ratio
 
 
 def assess_excess(

@@ -46,6 +46,8 @@ class Unmodelled:
     """L: what the free parameters take on, shape (n_free, n_unmodelled), [SI per SI]."""
     residual_rms: Number
     """What they alone would leave of the readings' rows after the fit, r.m.s., [m]."""
+    residual_dof: Number
+    """Independent parts of that: its square scatters as that of so many (Satterthwaite, 1946)."""
 
     @property
     def bias_covariance(self) -> Array:
@@ -143,7 +145,7 @@ def measure_unmodelled(fit: Fit, others: OtherErrors) -> tuple[Unmodelled, Array
     problem = fit.problem
     n = problem.n_machine
     if not others.names:
-        none = Unmodelled((), read_only([]), read_only(np.zeros((n, 0))), 0.0)
+        none = Unmodelled((), read_only([]), read_only(np.zeros((n, 0))), 0.0, 0.0)
         return none, np.zeros(problem.n_free - n)
     o, sigma = problem.observations, max(fit.sigma, SMALLEST_SIGMA)
     slopes = project_out_zeros(fit.jacobian, o)
@@ -158,5 +160,13 @@ def measure_unmodelled(fit: Fit, others: OtherErrors) -> tuple[Unmodelled, Array
         tolerances=others.tolerances,
         leakage=read_only((taken / others.tolerances)[:n]),
         residual_rms=float(np.sqrt((left**2).sum() / len(left))),
+        residual_dof=_independent_parts(left),
     )
     return found, np.asarray(np.linalg.norm(taken[n:], axis=1))
+
+
+def _independent_parts(spread: Array) -> float:
+    """ν with which |S t|², t standard normal, scatters as χ² does: (tr SᵀS)²/tr (SᵀS)²."""
+    square = spread.T @ spread
+    total = float(np.trace(square)) ** 2
+    return total / float((square**2).sum()) if total > 0.0 else 0.0
