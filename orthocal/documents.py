@@ -24,7 +24,7 @@ from pydantic_core import PydanticCustomError
 from orthocal.characters import composed, shorten, text_problem
 from orthocal.errors import OrthocalError
 from orthocal.files import read_file
-from orthocal.strict_yaml import DEEPEST, LARGEST_YAML, LONGEST_NUMBER, StrictLoader
+from orthocal.strict_yaml import DEEPEST, LARGEST_YAML, LONGEST_NUMBER, load_yaml
 
 Record = TypeVar("Record")
 
@@ -144,7 +144,7 @@ def read_yaml(path: Path, *, error: type[OrthocalError], content: bytes | None =
     """
     text = read_text(path, error=error, content=content, largest=LARGEST_YAML)
     try:
-        return yaml.load(text, Loader=StrictLoader)
+        return load_yaml(text)
     except yaml.MarkedYAMLError as e:
         mark = e.problem_mark or e.context_mark
         line = "" if mark is None else f":{mark.line + 1}"

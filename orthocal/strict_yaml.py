@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import re
+from functools import cache
 from typing import Any
 
 import yaml
+from yaml.composer import Composer
+from yaml.constructor import SafeConstructor
+from yaml.resolver import Resolver
 
 from orthocal.characters import composed, shorten, text_problem
 
@@ -20,6 +25,10 @@ DEEPEST = 20
 LONGEST_NUMBER = 100
 """Characters of a number; a float needs 25."""
 
+_READ_OTHERWISE = re.compile(r"[^\n\x20-\x3e\x40-\x7e\xa1-\u2027\u202a-\ud7ff\ue000-\ufdff]")
+"""A question mark, blanks and ends of lines but the usual ones, and what cannot be printed: libyaml
+takes them within brackets, or for the ends of lines, where PyYAML does not."""
+
 _YAML = "tag:yaml.org,2002:"
 
 _TAGS: dict[type[yaml.Event], frozenset[str]] = {
@@ -32,29 +41,17 @@ _TAGS: dict[type[yaml.Event], frozenset[str]] = {
 """Tags that a value of each kind may be given: those that it would have without any."""
 
 
-class StrictLoader(yaml.SafeLoader):
-    """SafeLoader for documents of a sane size: text, numbers, lists and mappings with text as keys.
+class _Strict(Composer, SafeConstructor):
+    """What makes a loader one for documents of a sane size: text, numbers, lists and mappings.
 
     It also refuses duplicate keys, aliases, keys that are no scalars and tags of other kinds.
     """
 
-    def __init__(self, stream: str) -> None:
-        super().__init__(stream)
-        self._count = self._depth = 0
-
-    def scan_flow_scalar(self, style: str) -> Any:  # noqa: ANN401 - a token of PyYAML
-        """A quoted text; its escapes are characters."""
-        mark = self.get_mark()
-        try:
-            return super().scan_flow_scalar(style)
-        except (ValueError, OverflowError):
-            raise yaml.MarkedYAMLError(
-                problem="an escape in a quoted text is no character", problem_mark=mark
-            ) from None
+    _count = _depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         """The next node, where it is one that is meant."""
-        event: Any = self.peek_event()  # type: ignore[no-untyped-call] # PyYAML's stub
+        event: Any = self.peek_event()  # type: ignore[attr-defined] # of the parser beside it
         problem = None
         if isinstance(event, yaml.AliasEvent):
             problem = "aliases (*name) are not allowed here"
@@ -110,3 +107,49 @@ class StrictLoader(yaml.SafeLoader):
                 )
             seen.add(key.value)
         return dict(super().construct_mapping(node, deep))
+
+
+class StrictLoader(_Strict, yaml.SafeLoader):
+    """PyYAML's own SafeLoader, strict: what is wrong with a document it tells best."""
+
+    def scan_flow_scalar(self, style: str) -> Any:  # noqa: ANN401 - a token of PyYAML
+        """A quoted text; its escapes are characters."""
+        mark = self.get_mark()
+        try:
+            return super().scan_flow_scalar(style)
+        except (ValueError, OverflowError):
+            raise yaml.MarkedYAMLError(
+                problem="an escape in a quoted text is no character", problem_mark=mark
+            ) from None
+
+
+def load_yaml(text: str) -> Any:  # noqa: ANN401 - any document
+    """The value of a document.
+
+    It is parsed by libyaml where PyYAML has it, in a fraction of the time. What that refuses, and
+    what holds a character that it reads otherwise, is left to PyYAML's own parser, which says why.
+
+    Raises:
+        yaml.YAMLError, ValueError, RecursionError: If it is not valid.
+    """
+    if yaml.__with_libyaml__ and not _READ_OTHERWISE.search(text):
+        try:
+            return yaml.load(text, Loader=_swift_loader())
+        except (yaml.YAMLError, ValueError, RecursionError):
+            pass
+    return yaml.load(text, Loader=StrictLoader)
+
+
+@cache
+def _swift_loader() -> type[Any]:
+    """The same on libyaml's parser."""
+    from yaml._yaml import CParser
+
+    class SwiftLoader(_Strict, CParser, Resolver):
+        def __init__(self, stream: str) -> None:
+            CParser.__init__(self, stream)
+            Composer.__init__(self)
+            SafeConstructor.__init__(self)
+            Resolver.__init__(self)
+
+    return SwiftLoader
