@@ -502,8 +502,15 @@ def mutate_structure(rng: random.Random, kind: str, data: bytes) -> bytes:
     change(rng, document)
     if kind == "calibration":
         return json.dumps(document).encode()
-    text = str(yaml.safe_dump(document, sort_keys=False, allow_unicode=rng.random() < 0.5))
-    return text.encode(errors="surrogatepass")
+    return dump(document, allow_unicode=rng.random() < 0.5).encode(errors="surrogatepass")
+
+
+def dump(document: Any, *, allow_unicode: bool) -> str:
+    """A document as PyYAML's own dumper writes it; where libyaml's writes the same, by that."""
+    shown = repr(document)
+    same = shown.isascii() and "\\" not in shown and "'': " not in shown
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper) if same else yaml.SafeDumper
+    return str(yaml.dump(document, Dumper=dumper, sort_keys=False, allow_unicode=allow_unicode))
 
 
 def make_case(seed: int, index: int, good: dict[str, bytes]) -> tuple[str, bytes, random.Random]:
