@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
+from conftest import ROOT
 from gauges import exact
 
 from orthocal import calibrate, load_calibration, load_session
@@ -43,6 +46,17 @@ SOLVERS = ("eliminated",)
 """Held against Ipopt."""
 
 
+@cache
+def session_of(example):
+    return load_session(ROOT / "examples" / example)
+
+
+@cache
+def problem_of(example, model, choice):
+    """A problem; whoever solves it leaves it as it is."""
+    return build_problem(session_of(example), model=model, **CHOICES[choice])
+
+
 def both(problem, *, loss, sigma, solver=SOLVERS[0], **given):
     options = (SolverOptions(solver=kind, loss=Loss(loss)) for kind in (solver, "ipopt"))
     return [build_program(problem, o).solve(sigma=sigma, **given) for o in options]
@@ -53,9 +67,8 @@ def both(problem, *, loss, sigma, solver=SOLVERS[0], **given):
 @pytest.mark.parametrize("loss", ["squares", "huber"])
 @pytest.mark.parametrize("choice", CHOICES)
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_two_solvers_find_one_optimum(root, example, model, loss, choice, solver):
-    session = load_session(root / "examples" / example)
-    problem = build_problem(session, model=model, **CHOICES[choice])
+def test_two_solvers_find_one_optimum(example, model, loss, choice, solver):
+    problem = problem_of(example, model, choice)
     ours, ipopts = both(problem, loss=loss, sigma=20e-6, solver=solver)
     difference = np.abs(ours.theta - ipopts.theta) / problem.theta_scale
     assert difference.max() < AGREED
@@ -71,11 +84,10 @@ def test_two_solvers_find_one_optimum(root, example, model, loss, choice, solver
 @pytest.mark.parametrize("model", ["lengths", "full"])
 @pytest.mark.parametrize("choice", CHOICES)
 def test_the_linearised_solver_is_least_squares_about_what_the_controller_corrects(
-    root, example, model, choice
+    example, model, choice
 ):
     """As SciPy's bounded least squares on stacked rows has it."""
-    session = load_session(root / "examples" / example)
-    problem = build_problem(session, model=model, **CHOICES[choice])
+    problem = problem_of(example, model, choice)
     found = LinearisedProgram(problem).solve(sigma=20e-6)
     expected = linearise_at_reference(problem).solve(sigma=20e-6)
     assert np.abs(found.theta - expected).max() < 1e-9 * problem.theta_scale.max()

@@ -17,7 +17,7 @@ from orthocal.assess.entering import find_entries
 from orthocal.calibration.file import write_calibration
 from orthocal.markup import items, paragraph, table
 from orthocal.show.layout import add_row, bullets, section, table_of
-from orthocal.show.report.page import build_report
+from orthocal.show.report.page import _provenance, build_report
 from orthocal.show.report.rich_markup import to_markup
 
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & $x_{$'
@@ -116,7 +116,8 @@ def test_provenance_names_files_by_their_sums(calibration, page):
     assert "Pashkevich, Chablat, Wenger (2006)" in page
 
 
-def test_provenance_says_what_was_given_beside_the_readings(root, read):
+def test_provenance_says_what_was_given_beside_the_readings(root, read, calibration, page):
+    assert _provenance(calibration) in page
     assert ["Given beside the readings", "nothing: the robot's own tolerances hold"] in read.rows
     found = calibrate(
         root / "examples/raw-cycles",
@@ -127,7 +128,7 @@ def test_provenance_says_what_was_given_beside_the_readings(root, read):
             bounds={"z_slide.offset_m": (-1e-3, 2e-3)},
         ),
     )
-    rows = Reader(build_report(found)).rows
+    rows = Reader(_provenance(found)).rows
     offsets = [f"{leg}_slide.offset 2 mm instead of 5" for leg in "xyz"]
     assert ["Tolerances", "; ".join(offsets)] in rows
     assert ["Known values", "y_leg.length 0.05 ± 0.02 mm; x_leg.length 0.12 mm"] in rows
