@@ -46,6 +46,15 @@ def pytest_sessionstart(session):
         session.config.add_cleanup(process.wait)
 
 
+LONGEST = ("test_examples.py", "test_fuzz.py", "test_whole_walk.py")
+"""Files with tests that take as long as a hundred others."""
+
+
+def pytest_collection_modifyitems(items):
+    """What takes longest begins first: at the end others would wait for it."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
 @pytest.fixture(scope="session")
 def root() -> Path:
     return ROOT

@@ -47,6 +47,7 @@ class BatchFunction:
             (function.nnz_out(i), 1) if name in self._sparse else function.size_out(i)
             for i, name in enumerate(function.name_out())
         ]
+        self._sizes = [rows * columns for rows, columns in self._shapes]
         self._matrices = [function.index_out(name) for name in matrices]
         self._local = threading.local()
         self._points = 0
@@ -62,6 +63,10 @@ class BatchFunction:
         found = BatchFunction(self._function, matrices=names, sparse=tuple(self._sparse))
         found._same = self
         return found
+
+    @cached_property
+    def _instructions(self) -> int:
+        return int(self._function.n_instructions())
 
     def pattern(self, name: str) -> tuple[Indices, Indices]:
         """Rows and columns of the nonzeros of a sparse output, shape (nnz,) each."""
@@ -82,7 +87,7 @@ class BatchFunction:
         arrays = [np.asarray(a, dtype=np.float64) for a in inputs]
         count = max(len(a) for i, a in enumerate(arrays) if i not in self._shared)
         flat = None
-        if pays(self._function.n_instructions(), count, self._points):
+        if pays(self._instructions, count, self._points):
             listing = self._listing
             flat = None if listing is None else run_in_lanes(listing, arrays, self._shared, count)
         self._points += count
@@ -103,7 +108,7 @@ class BatchFunction:
 
     def _by_casadi(self, arrays: list[Array], count: int) -> list[Array]:
         """Nonzeros of each output, shape (count, nnz)."""
-        flat = [np.empty((count, self._function.nnz_out(i))) for i in range(len(self._shapes))]
+        flat = [np.empty((count, size)) for size in self._sizes]
         first = 0
         for size in SIZES:
             if count - first < size:
