@@ -56,14 +56,17 @@ class _TwistSlopes:
         chosen = np.flatnonzero(np.repeat(moved, 6)[columns])
         order = chosen[np.argsort(rows[chosen], kind="stable")]
         there, starts = np.unique(rows[order], return_index=True)
-        ends = np.append(starts[1:], order.size)
+        ends = np.append(starts, order.size)[1:]
         parts = tuple(
             (int(row), slice(a, b), columns[order[a:b]])
             for row, a, b in zip(there, starts, ends, strict=True)
         )
-        # clipped, as nothing is: checking each place would take as long as all else
-        own = slopes.reshape(-1, rows.size).take(order, axis=1, mode="clip")
-        return _TwistSlopes(own.reshape(*slopes.shape[:2], order.size), parts)
+        n_sets, n_postures, _ = slopes.shape
+        own = np.empty((n_sets, n_postures, order.size))
+        if own.size:  # clipped, as nothing is: checking each place would take as long as all else
+            flat = slopes.reshape(n_sets * n_postures, rows.size)
+            own = flat.take(order, axis=1, mode="clip").reshape(own.shape)
+        return _TwistSlopes(own, parts)
 
     def take_pull(self, pull: Array, forces: Array) -> None:
         """Take forces on g, (n_sets, n_postures, n), off the pull at twists, (…, n_twists)."""
