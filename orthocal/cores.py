@@ -6,7 +6,6 @@ and prepared before, and begins at once. Elsewhere workers begin from nothing (j
 
 from __future__ import annotations
 
-import ctypes
 import multiprocessing
 import os
 import pickle
@@ -26,13 +25,6 @@ from orthocal.errors import OrthocalError
 WATCHING = 0.5
 """How often a worker looks whether it is still wanted, [s]."""
 
-KEPT_MEMORY = 2**30
-"""Freed memory that a process keeps, [bytes]."""
-
-LARGEST_KEPT = 2**25
-"""Of one array; the C library takes no more."""
-
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 
 _lent = 1
 
@@ -67,17 +59,6 @@ def run_on_cores(
     if can_fork():
         return _forked(work, todo, count, killed)
     return _spawned(work, todo, count)
-
-
-def keep_memory() -> None:
-    """Have freed memory stay with this process: getting it back page by page takes time.
-
-    For work in arrays of some megabytes, made again and again. Only the C library of GNU knows it.
-    """
-    with suppress(OSError, AttributeError):
-        change = ctypes.CDLL(None).mallopt
-        change(_TRIM_THRESHOLD, KEPT_MEMORY)
-        change(_MMAP_THRESHOLD, LARGEST_KEPT)
 
 
 @contextmanager

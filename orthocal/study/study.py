@@ -14,7 +14,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from orthocal import __version__
-from orthocal.cores import keep_memory
 from orthocal.kinematics.lanes import expect_many
 
 Cell = float | int | str | bool | None
@@ -79,7 +78,6 @@ def run_task(study: Study, task: int) -> dict[str, list[Cell]]:
 def prepare_once(study: Study) -> Any:  # noqa: ANN401 - as `prepare`
     """What all tasks of a study share, made once in this process."""
     expect_many()
-    keep_memory()
     return study.prepare()
 
 
