@@ -9,6 +9,7 @@ from gauges import exact
 from models import JOINTS
 
 from orthocal import Choice, calibrate, load_plan, simulate_session
+from orthocal.assess.accuracy import RARE
 from orthocal.calibration import recording
 from orthocal.diagnosis.unmodelled import (
     find_other_errors,
@@ -20,6 +21,7 @@ from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchProgram
 from orthocal.estimation.solvers.fleet import Fleet as Machines
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.statistics.distributions import chi_square_tail
 from orthocal.statistics.zeros import project_out_zeros
 
 
@@ -48,12 +50,12 @@ def test_an_unmodelled_error_moves_the_estimate_by_its_leakage(plan, name, model
 
 @pytest.fixture(scope="module")
 def machines(plan):
-    """Offsets and residuals found on 200 machines with all other errors, perfect readings."""
+    """Offsets and residuals found on 1,000 machines with all other errors, perfect readings."""
     offsets = build_problem(plan)
     errors = [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
     others = build_problem(plan, free=errors)
     rng = np.random.default_rng(0)
-    drawn = Machines(others, rng.normal(size=(200, others.n_free)))
+    drawn = Machines(others, rng.normal(size=(1000, others.n_free)))
     assert drawn.close().all()
     values = drawn.predict()
     theta = BatchProgram(offsets).solve(values, sigma=1e-5).theta
@@ -67,6 +69,16 @@ def test_residuals_of_machines_with_all_errors_are_as_large_as_foretold(plan, ma
     result = calibrate(simulate_session(plan, {}, exact=True).session)
     rms = np.sqrt(np.mean(machines[1] ** 2))
     assert rms == pytest.approx(result.unmodelled.residual_rms, rel=0.06)
+
+
+def test_one_machine_in_a_hundred_leaves_as_much_as_is_called_worse(plan, machines):
+    """Residuals' squares scatter as χ² of so many parts does; few machines are beyond its 99 %."""
+    result = calibrate(simulate_session(plan, {}, exact=True).session)
+    parts = result.unmodelled.residual_dof
+    squares = np.mean(machines[1] ** 2, axis=1) / result.unmodelled.residual_rms**2
+    assert 2.0 / squares.var() == pytest.approx(parts, rel=0.25)
+    beyond = np.mean([chi_square_tail(parts, parts * s) < RARE for s in squares])
+    assert 0.0 < beyond < 0.025  # 10 of 1,000, and three standard deviations
 
 
 def test_the_offsets_of_machines_with_all_errors_scatter_as_foretold(plan, machines):
