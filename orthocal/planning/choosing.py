@@ -270,12 +270,13 @@ class _Beside:
 
     def taking(self, which: int, first: int | None = None) -> Taking:
         """The candidates of a kind, begun with one of them, or on the mean of them."""
-        c = self.candidates
-        kind = c.kinds[which]
+        kind = self.candidates.kinds[which]
         key = which, first if kind.by_hand else None
-        if key not in self.seen:
-            kind = kind if first is None else kind.begun(first)
-            self.seen[key] = Taking.beside(kind, self.covariance, self.root, c.sigma)
+        if key not in self.seen and key[1] is not None:
+            self.seen[key] = self.taking(which).begun(key[1])
+        elif key not in self.seen:
+            sigma = self.candidates.sigma
+            self.seen[key] = Taking.beside(kind, self.covariance, self.root, sigma)
         return self.seen[key]
 
     def left_roughly(self, opened: Opened) -> float:

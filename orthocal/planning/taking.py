@@ -85,6 +85,20 @@ class Taking:
         variance = spread.diagonal().copy()
         return Taking(kind, spread, known @ root, variance, sigma**2, tuple(by_hand))
 
+    def begun(self, first: int) -> Taking:
+        """The same with the gauge set in the posture of one of them."""
+        if not self.by_hand:
+            return self
+        spread, effect = self.spread.copy(), self.effect.copy()
+        for hand in self.by_hand:
+            across = np.outer(hand.answers, hand.spread[first])
+            spread += across + across.T
+            effect += np.outer(hand.answers, hand.effect[first])
+            for other in self.by_hand:
+                both = float(hand.known[first] @ other.slopes[first])
+                spread += both * np.outer(hand.answers, other.answers)
+        return Taking(self.kind, spread, effect, spread.diagonal().copy(), self.noise)
+
     def gain(self, rows: list[int]) -> float:
         """What readings take together."""
         effect = self.effect[rows]

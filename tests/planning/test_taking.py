@@ -110,6 +110,10 @@ def test_pairs_are_worth_what_they_are_with_the_gauge_set_in_the_first(seed):
     assert len({first for _, (first, _) in found}) == len(found) > 0
     for gain, (first, second) in found:
         begun = Taking.beside(kind.begun(first), covariance, root, SIGMA)
+        again = Taking.beside(kind, covariance, root, SIGMA).begun(first)
+        assert again.spread == pytest.approx(begun.spread, abs=1e-10)
+        assert again.effect == pytest.approx(begun.effect, abs=1e-10)
+        assert again.variance == pytest.approx(begun.variance, abs=1e-10)
         across = begun.effect[first] - begun.effect[second]
         ends = begun.spread[[first, second]][:, [first, second]]
         scatter = ends[0, 0] + ends[1, 1] - 2.0 * ends[0, 1] + 2.0 * SIGMA**2
