@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Iterable, Sequence
 
 from orthocal.characters import printable
+
+TYPED = re.compile("`([^`\n]+)`")
 
 
 def escape(text: str) -> str:
@@ -13,9 +16,14 @@ def escape(text: str) -> str:
     return html.escape(printable(text, keep="\n"))
 
 
+def prose(text: str) -> str:
+    """A text as HTML; what is between `s is what one types."""
+    return TYPED.sub(r"<code>\1</code>", escape(text))
+
+
 def paragraph(text: str, *, kind: str = "") -> str:
-    """A paragraph; `kind` is a class."""
-    return f"<p{_class(kind)}>{escape(text)}</p>"
+    """A paragraph of prose; `kind` is a class."""
+    return f"<p{_class(kind)}>{prose(text)}</p>"
 
 
 def heading(text: str, *, level: int = 2) -> str:
@@ -24,8 +32,8 @@ def heading(text: str, *, level: int = 2) -> str:
 
 
 def items(texts: Iterable[str]) -> str:
-    """A list with bullets."""
-    return "<ul>" + "".join(f"<li>{escape(t)}</li>" for t in texts) + "</ul>"
+    """A list of prose, with bullets."""
+    return "<ul>" + "".join(f"<li>{prose(t)}</li>" for t in texts) + "</ul>"
 
 
 def table(headers: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 1) -> str:

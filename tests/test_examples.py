@@ -143,6 +143,11 @@ CALIBRATE = f"calibrate {EXPERIMENT}"
         ("docs/results.md", "Verdict", f"compare {EXPERIMENT}"),
         (
             "docs/planning.md",
+            "at the tool are to be expected",
+            "plan orthoglide --tolerance '*.offset_mm=2' --out out/monday",
+        ),
+        (
+            "docs/planning.md",
             "The paper's six equations",
             "study linearisation orthoglide --out out/linearisation",
         ),
