@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import cast
 
 import numpy as np
@@ -23,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 from orthocal.cores import run_on_cores
 from orthocal.errors import ParameterError
-from orthocal.planning.candidates import FEWEST, Candidates
+from orthocal.planning.candidates import FEWEST, Candidates, HandSet, Kind
 from orthocal.planning.taking import Taking, beginnings
 from orthocal.units import MM
 
@@ -55,6 +56,9 @@ KILLED = "a process that chose readings was killed"
 
 ROUGH = 1e-6
 """Part of the error by which it may be off where it is found without an inverse."""
+
+UNTOLD = 1e-12
+"""How much of the state a direction tells that tells nothing, beside the one that tells most."""
 
 Weigh = Callable[[Array], Array]
 """R with T = R Rᵀ for a covariance of the state, shape (n_state, p): constant for mean squares."""
@@ -252,9 +256,9 @@ class _Beside:
 
     candidates: Candidates
     covariance: Array
-    """C, shape (n_state, n_state)."""
-    root: Array
-    """R, shape (n_state, p)."""
+    """B C Bᵀ, B being what candidates tell of the state, shape (n_told, n_told)."""
+    worth: Array
+    """B C R, shape (n_told, p)."""
     whole: float | None
     """tr(T C); None where T depends on C."""
     seen: dict[tuple[int, int | None], Taking] = field(default_factory=dict)
@@ -266,7 +270,9 @@ class _Beside:
         root = weigh(covariance)
         steady = weigh(covariance) is root
         whole = float(np.vdot(root, covariance @ root)) if steady else None
-        return _Beside(candidates, covariance, root, whole)
+        told, _ = _narrow(candidates)
+        known = told @ covariance
+        return _Beside(candidates, known @ told.T, known @ root, whole)
 
     def taking(self, which: int, first: int | None = None) -> Taking:
         """The candidates of a kind, begun with one of them, or on the mean of them."""
@@ -275,8 +281,8 @@ class _Beside:
         if key not in self.seen and key[1] is not None:
             self.seen[key] = self.taking(which).begun(key[1])
         elif key not in self.seen:
-            sigma = self.candidates.sigma
-            self.seen[key] = Taking.beside(kind, self.covariance, self.root, sigma)
+            own, sigma = _narrow(self.candidates)[1][which], self.candidates.sigma
+            self.seen[key] = Taking.beside(own, self.covariance, self.worth, sigma)
         return self.seen[key]
 
     def left_roughly(self, opened: Opened) -> float:
@@ -345,6 +351,30 @@ class _Beside:
             if chosen == before:
                 break
         return Opened(opened.kind, tuple(chosen))
+
+
+@lru_cache(maxsize=4)
+def _narrow(candidates: Candidates) -> tuple[Array, tuple[Kind, ...]]:
+    """What candidates tell of the state at all, and how they answer to that.
+
+    The state has directions that none of them tells of, often as many as the others.
+
+    Returns:
+        B, directions that are square to each other, shape (n_told, n_state), and the kinds with
+        slopes by these, A Bᵀ.
+    """
+    slopes = [s for k in candidates.kinds for s in (k.slopes, *(h.slopes for h in k.by_hand))]
+    _, sizes, directions = np.linalg.svd(np.vstack(slopes), full_matrices=False)
+    told = directions[sizes > UNTOLD * sizes.max(initial=0.0)]
+    kinds = tuple(
+        replace(
+            k,
+            slopes=k.slopes @ told.T,
+            by_hand=tuple(HandSet(h.answers, h.slopes @ told.T) for h in k.by_hand),
+        )
+        for k in candidates.kinds
+    )
+    return told, kinds
 
 
 def _says(candidates: Candidates, opened: Opened) -> Array:

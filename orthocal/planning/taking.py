@@ -16,10 +16,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.planning.candidates import Kind
+from orthocal.planning.candidates import HandSet, Kind
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+LEAST_PART = 1e-4
+"""Of what a hand sets, beside its largest part; what is chosen is weighed with all of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,18 +38,30 @@ class Pairs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Set:
-    """Something that a hand sets where a setup begins, beside what others say."""
+    """Something that a hand sets where a setup begins, beside what others say.
+
+    How it answers to the state is nearly the same in postures that are near: it has few parts, of
+    which each posture has more or less, S = U W.
+    """
 
     answers: Array
     """How readings answer to it, shape (m,)."""
-    slopes: Array
-    """S: how it answers to the state where the setup begins, shape (m, n_state)."""
+    parts: Array
+    """U, shape (m, r)."""
+    basis: Array
+    """W, shape (r, n_state)."""
     known: Array
-    """S C, shape (m, n_state)."""
+    """W C, shape (r, n_state)."""
     spread: Array
-    """S C Aᵀ, shape (m, m)."""
+    """W C Aᵀ, shape (r, m)."""
     effect: Array
-    """S C R, shape (m, p)."""
+    """W C R, shape (r, p)."""
+
+    def beside(self, other: _Set, first: Indices) -> Array:
+        """S C S'ᵀ of it and another one where setups begin, shape (n,)."""
+        return np.asarray(
+            ((self.parts @ (self.known @ other.basis.T)) * other.parts).sum(axis=1)[first]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,13 +80,13 @@ class Taking:
     by_hand: tuple[_Set, ...] = ()
 
     @staticmethod
-    def beside(kind: Kind, covariance: Array, root: Array, sigma: float) -> Taking:
+    def beside(kind: Kind, covariance: Array, worth: Array, sigma: float) -> Taking:
         """Candidates beside others that leave such a covariance of the state.
 
         Args:
             kind: The setup that could stand.
             covariance: C, shape (n_state, n_state).
-            root: R with T = R Rᵀ, shape (n_state, p).
+            worth: C R with T = R Rᵀ, shape (n_state, p).
             sigma: Standard deviation of a reading, [m].
         """
         known = kind.slopes @ covariance
@@ -79,24 +94,25 @@ class Taking:
         spread += kind.own
         by_hand = []
         for hand in kind.by_hand:
-            moved = hand.slopes @ covariance
-            answers, across = hand.answers, moved @ kind.slopes.T
-            by_hand.append(_Set(answers, hand.slopes, moved, across, moved @ root))
+            parts, basis = _split(hand)
+            moved = basis @ covariance
+            across = moved @ kind.slopes.T
+            by_hand.append(_Set(hand.answers, parts, basis, moved, across, basis @ worth))
         variance = spread.diagonal().copy()
-        return Taking(kind, spread, known @ root, variance, sigma**2, tuple(by_hand))
+        return Taking(kind, spread, kind.slopes @ worth, variance, sigma**2, tuple(by_hand))
 
     def begun(self, first: int) -> Taking:
         """The same with the gauge set in the posture of one of them."""
         if not self.by_hand:
             return self
         spread, effect = self.spread.copy(), self.effect.copy()
+        where = np.array([first])
         for hand in self.by_hand:
-            across = np.outer(hand.answers, hand.spread[first])
+            across = np.outer(hand.answers, hand.parts[first] @ hand.spread)
             spread += across + across.T
-            effect += np.outer(hand.answers, hand.effect[first])
+            effect += np.outer(hand.answers, hand.parts[first] @ hand.effect)
             for other in self.by_hand:
-                both = float(hand.known[first] @ other.slopes[first])
-                spread += both * np.outer(hand.answers, other.answers)
+                spread += hand.beside(other, where) * np.outer(hand.answers, other.answers)
         return Taking(self.kind, spread, effect, spread.diagonal().copy(), self.noise)
 
     def gain(self, rows: list[int]) -> float:
@@ -117,11 +133,12 @@ class Taking:
         spread += self.noise * np.eye(sets.shape[1])
         for hand in self.by_hand:
             own = hand.answers[sets]
-            effect += own[:, :, None] * hand.effect[first][:, None, :]
-            across = own[:, :, None] * hand.spread[first[:, None], sets][:, None, :]
+            effect += own[:, :, None] * (hand.parts[first] @ hand.effect)[:, None, :]
+            seen = np.take_along_axis(hand.parts[first] @ hand.spread, sets, axis=1)
+            across = own[:, :, None] * seen[:, None, :]
             spread += across + np.swapaxes(across, 1, 2)
             for other in self.by_hand:
-                both = np.vecdot(hand.known, other.slopes)[first]
+                both = hand.beside(other, first)
                 outer = own[:, :, None] * other.answers[sets][:, None, :]
                 spread += both[:, None, None] * outer
         return np.asarray((effect * np.linalg.solve(spread, effect)).sum(axis=(1, 2)))
@@ -149,23 +166,7 @@ class Taking:
         i, j, flat = pairs.first, pairs.second, pairs.flat
         if not flat.size:
             return []
-        product = self.effect @ self.effect.T
-        q, v = product.diagonal(), self.variance
-        # beside a zero of which nothing is known two readings are worth their difference
-        gains = q[i] + q[j] - 2.0 * product.reshape(-1)[flat]
-        spread = v[i] + (v + 2.0 * self.noise)[j] - 2.0 * self.spread.reshape(-1)[flat]
-        for hand in self.by_hand:
-            change, rows = (
-                hand.answers[j] - hand.answers[i],
-                (hand.effect @ self.effect.T, hand.spread),
-            )
-            for total, own in zip((gains, spread), rows, strict=True):
-                total += 2.0 * change * (own.reshape(-1)[flat] - own.diagonal()[i])
-            for other in self.by_hand:
-                both = change * (other.answers[j] - other.answers[i])
-                gains += both * np.vecdot(hand.effect, other.effect)[i]
-                spread += both * np.vecdot(hand.known, other.slopes)[i]
-        gains /= spread
+        gains = self._differences()[i, j] if self.by_hand else self._differences_at(pairs)
         found: list[tuple[float, tuple[int, int]]] = []
         while True:
             best = int(gains.argmax())
@@ -180,6 +181,37 @@ class Taking:
                 continue
             for row in pair:
                 gains[(i == row) | (j == row)] = -1.0
+
+    def _differences_at(self, pairs: Pairs) -> Array:
+        """What two readings take, shape (n_pairs,).
+
+        Beside a zero of which nothing is known they are worth their difference.
+        """
+        i, j, flat = pairs.first, pairs.second, pairs.flat
+        product = self.effect @ self.effect.T
+        q, v = product.diagonal(), self.variance
+        gains = q[i] + q[j] - 2.0 * product.reshape(-1)[flat]
+        gains /= v[i] + (v + 2.0 * self.noise)[j] - 2.0 * self.spread.reshape(-1)[flat]
+        return np.asarray(gains)
+
+    def _differences(self) -> Array:
+        """The same of all, the gauge set in the first (row), shape (m, m)."""
+        taken, spread = self.effect @ self.effect.T, self.spread
+        gains, spreads = (
+            np.add.outer(s.diagonal(), s.diagonal()) - 2.0 * s for s in (taken, spread)
+        )
+        spreads += 2.0 * self.noise
+        for hand in self.by_hand:
+            change = hand.answers - hand.answers[:, None]
+            for total, small in ((gains, hand.effect @ self.effect.T), (spreads, hand.spread)):
+                own = hand.parts @ small
+                total += 2.0 * change * (own - own.diagonal()[:, None])
+            for other in self.by_hand:
+                both = change * (other.answers - other.answers[:, None])
+                again = ((hand.parts @ (hand.effect @ other.effect.T)) * other.parts).sum(axis=1)
+                gains += both * again[:, None]
+                spreads += both * hand.beside(other, np.arange(len(spread)))[:, None]
+        return np.asarray(gains / spreads)
 
     def complete(self, pair: tuple[int, int], count: int) -> tuple[float, tuple[int, ...]]:
         """Readings greedily on top of two, and what all of them take.
@@ -228,3 +260,11 @@ def beginnings(kind: Kind, count: int) -> Pairs:
     flat = np.flatnonzero(able)
     first, second = np.divmod(flat, len(able))
     return Pairs(first, second, flat)
+
+
+@lru_cache(maxsize=8192)
+def _split(hand: HandSet) -> tuple[Array, Array]:
+    """U and W with S = U W, as few parts as leave nothing, shape (m, r) and (r, n_state)."""
+    left, sizes, right = np.linalg.svd(hand.slopes, full_matrices=False)
+    kept = sizes > LEAST_PART * sizes.max(initial=0.0)
+    return left[:, kept] * sizes[kept], right[kept]

@@ -38,7 +38,9 @@ def left(kind, information, root, rows):
 @pytest.fixture(params=range(6))
 def drawn(request):
     kind, information, root = draw(request.param)
-    taking = Taking.beside(kind, np.linalg.inv(information), root, SIGMA)
+    taking = Taking.beside(
+        kind, np.linalg.inv(information), np.linalg.inv(information) @ root, SIGMA
+    )
     return kind, information, root, taking
 
 
@@ -106,11 +108,11 @@ def test_pairs_are_worth_what_they_are_with_the_gauge_set_in_the_first(seed):
         HandSet(rng.normal(size=READINGS), rng.normal(size=(READINGS, STATE))) for _ in range(2)
     )
     kind, covariance = replace(kind, by_hand=by_hand), np.linalg.inv(information)
-    found = Taking.beside(kind, covariance, root, SIGMA).pairs(3, 3)
+    found = Taking.beside(kind, covariance, covariance @ root, SIGMA).pairs(3, 3)
     assert len({first for _, (first, _) in found}) == len(found) > 0
     for gain, (first, second) in found:
-        begun = Taking.beside(kind.begun(first), covariance, root, SIGMA)
-        again = Taking.beside(kind, covariance, root, SIGMA).begun(first)
+        begun = Taking.beside(kind.begun(first), covariance, covariance @ root, SIGMA)
+        again = Taking.beside(kind, covariance, covariance @ root, SIGMA).begun(first)
         assert again.spread == pytest.approx(begun.spread, abs=1e-10)
         assert again.effect == pytest.approx(begun.effect, abs=1e-10)
         assert again.variance == pytest.approx(begun.variance, abs=1e-10)
@@ -120,7 +122,9 @@ def test_pairs_are_worth_what_they_are_with_the_gauge_set_in_the_first(seed):
         assert gain == pytest.approx(float(across @ across) / scatter, rel=1e-10)
         for rows in ([first, second], [first, (second + 1) % READINGS, second]):
             exact = begun.gain(rows)
-            (whole,) = Taking.beside(kind, covariance, root, SIGMA).gains(np.array([rows]))
+            (whole,) = Taking.beside(kind, covariance, covariance @ root, SIGMA).gains(
+                np.array([rows])
+            )
             assert whole == pytest.approx(exact, rel=1e-10)
         alone = kind.only([first, second]).begun(0)
         assert alone.slopes == pytest.approx(kind.begun(first).slopes[[first, second]], abs=1e-14)
