@@ -57,6 +57,9 @@ KILLED = "a process that chose readings was killed"
 ROUGH = 1e-6
 """Part of the error by which it may be off where it is found without an inverse."""
 
+FEW = 2_000
+"""Candidates up to which kinds are ranked with their gauges set where each pair begins."""
+
 UNTOLD = 1e-12
 """How much of the state a direction tells that tells nothing, beside the one that tells most."""
 
@@ -263,6 +266,8 @@ class _Beside:
     """tr(T C); None where T depends on C."""
     seen: dict[tuple[int, int | None], Taking] = field(default_factory=dict)
     """What was looked at, by kind and where it is begun."""
+    on_mean: dict[int, Taking] = field(default_factory=dict)
+    """The same with gauges that are set on the mean of all postures."""
 
     @staticmethod
     def of(candidates: Candidates, information: Array, weigh: Weigh) -> _Beside:
@@ -270,7 +275,7 @@ class _Beside:
         root = weigh(covariance)
         steady = weigh(covariance) is root
         whole = float(np.vdot(root, covariance @ root)) if steady else None
-        told, _ = _narrow(candidates)
+        told, _, _ = _narrow(candidates)
         known = told @ covariance
         return _Beside(candidates, known @ told.T, known @ root, whole)
 
@@ -284,6 +289,19 @@ class _Beside:
             own, sigma = _narrow(self.candidates)[1][which], self.candidates.sigma
             self.seen[key] = Taking.beside(own, self.covariance, self.worth, sigma)
         return self.seen[key]
+
+    def taking_on_mean(self, which: int) -> Taking:
+        """The candidates of a kind, its gauge set on the mean of all postures: half the work.
+
+        Where there are few, as they are.
+        """
+        if sum(len(k.rows) for k in self.candidates.kinds) <= FEW:
+            return self.taking(which)
+        if which not in self.on_mean:
+            own = _narrow(self.candidates)[2][which]
+            found = Taking.beside(own, self.covariance, self.worth, self.candidates.sigma)
+            self.on_mean[which] = found
+        return self.on_mean[which]
 
     def left_roughly(self, opened: Opened) -> float:
         """What a setup leaves, but for rounding; 0 where that cannot be said at once."""
@@ -315,7 +333,7 @@ class _Beside:
             (gain, which, pair)
             for which, kind in enumerate(self.candidates.kinds)
             if beginnings(kind, count).flat.size
-            for gain, pair in self.taking(which).pairs(count, 1)
+            for gain, pair in self.taking_on_mean(which).pairs(count, 1)
         ]
         begun.sort(key=lambda f: -f[0])
         found = []
@@ -354,14 +372,14 @@ class _Beside:
 
 
 @lru_cache(maxsize=4)
-def _narrow(candidates: Candidates) -> tuple[Array, tuple[Kind, ...]]:
+def _narrow(candidates: Candidates) -> tuple[Array, tuple[Kind, ...], tuple[Kind, ...]]:
     """What candidates tell of the state at all, and how they answer to that.
 
     The state has directions that none of them tells of, often as many as the others.
 
     Returns:
-        B, directions that are square to each other, shape (n_told, n_state), and the kinds with
-        slopes by these, A Bᵀ.
+        B, directions that are square to each other, shape (n_told, n_state); the kinds with slopes
+        by these, A Bᵀ; and the same with gauges that are set on the mean of all postures.
     """
     slopes = [s for k in candidates.kinds for s in (k.slopes, *(h.slopes for h in k.by_hand))]
     _, sizes, directions = np.linalg.svd(np.vstack(slopes), full_matrices=False)
@@ -374,7 +392,7 @@ def _narrow(candidates: Candidates) -> tuple[Array, tuple[Kind, ...]]:
         )
         for k in candidates.kinds
     )
-    return told, kinds
+    return told, kinds, tuple(replace(k, by_hand=()) if k.by_hand else k for k in kinds)
 
 
 def _says(candidates: Candidates, opened: Opened) -> Array:

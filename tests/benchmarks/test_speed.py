@@ -66,10 +66,9 @@ AT_ONCE = 100.0
 FULL_AT_ONCE = 1.5
 """The same of all errors. 2.2 to 3.8 were measured in lanes, 2.0 to 2.2 without."""
 
-PLANNED = 40.0
+PLANNED = 30.0
 """Adding readings one by one, each tried by an inverse of its own, over the whole search of a plan
-of as many, its exchanges and starts among it, on one core. 60 to 76 were measured on a busy
-machine."""
+of as many, its exchanges and starts among it, on one core."""
 
 STUDIED = 4.0
 """Machines of a study a second, on one core, over calibrations by Ipopt one by one, which find
