@@ -125,6 +125,11 @@ class Candidates:
     """What machines within their tolerances may take of the gauge's range to either side, [m]."""
 
     @property
+    def count(self) -> int:
+        """How many readings there are to choose from."""
+        return sum(len(k.rows) for k in self.kinds)
+
+    @property
     def bare(self) -> Candidates:
         """What a choice needs of them, without the session and its problem: what can be pickled."""
         nothing: Any = None

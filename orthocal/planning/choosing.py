@@ -38,7 +38,7 @@ MOST_ROUNDS = 8
 MOST_REFINED = 4
 """Kinds of setup whose readings are exchanged for better ones, to find the best of them."""
 
-MOST_COMPLETED = 40
+MOST_COMPLETED = 12
 """Kinds of setup of which more than the best pair of readings is looked at."""
 
 MOST_PAIRS = 3
@@ -113,8 +113,8 @@ def choose_setups(
         report: Told after each start: how many there were, and the least error left.
     """
     if starts is None:
-        size = sum(len(k.rows) for k in candidates.kinds)
-        starts = int(np.clip(CANDIDATES_A_START // size, FEWEST_STARTS, MOST_STARTS))
+        wanted = CANDIDATES_A_START // candidates.count
+        starts = int(np.clip(wanted, FEWEST_STARTS, MOST_STARTS))
     if starts < 1:
         raise ValueError("expected at least one start")
     search = _Search(candidates.bare, prior, weigh, _draw_starts(candidates, counts, seed, starts))
@@ -214,8 +214,9 @@ def _exchange_one(candidates: Candidates, chosen: Chosen, k: int, weigh: Weigh) 
     others = chosen.information - _says(candidates, old)
     beside = _Beside.of(candidates, others, weigh)
     ranked = beside.rank(len(old.chosen))[:MOST_REFINED]
-    for opened in (old, *(s for r in ranked for s in beside.begun_otherwise(r))):
-        new = beside.begun_best(beside.better_readings(opened))
+    others_begun = (s for r in ranked for s in beside.begun_otherwise(r))
+    for new in dict.fromkeys(beside.better_readings(s) for s in (old, *others_begun)):
+        new = beside.begun_best(new)
         if beside.left_roughly(new) > best.left * (1.0 + ROUGH):
             continue
         information = others + _says(candidates, new)
@@ -264,6 +265,8 @@ class _Beside:
     """B C R, shape (n_told, p)."""
     whole: float | None
     """tr(T C); None where T depends on C."""
+    many: bool
+    """Whether there are too many to rank each pair with its gauge set where it begins."""
     seen: dict[tuple[int, int | None], Taking] = field(default_factory=dict)
     """What was looked at, by kind and where it is begun."""
     on_mean: dict[int, Taking] = field(default_factory=dict)
@@ -277,7 +280,8 @@ class _Beside:
         whole = float(np.vdot(root, covariance @ root)) if steady else None
         told, _, _ = _narrow(candidates)
         known = told @ covariance
-        return _Beside(candidates, known @ told.T, known @ root, whole)
+        many = candidates.count > FEW
+        return _Beside(candidates, known @ told.T, known @ root, whole, many)
 
     def taking(self, which: int, first: int | None = None) -> Taking:
         """The candidates of a kind, begun with one of them, or on the mean of them."""
@@ -295,7 +299,7 @@ class _Beside:
 
         Where there are few, as they are.
         """
-        if sum(len(k.rows) for k in self.candidates.kinds) <= FEW:
+        if not self.many:
             return self.taking(which)
         if which not in self.on_mean:
             own = _narrow(self.candidates)[2][which]
@@ -315,12 +319,11 @@ class _Beside:
         kind, chosen = self.candidates.kinds[opened.kind], opened.chosen
         if not kind.by_hand:
             return opened
-        sets = [chosen]
-        for k, first in enumerate(chosen[1:], start=1):
-            sets.append((first, *chosen[:k], *chosen[k + 1 :]))
-        rest = chosen[1:]
-        sets += [(f, *rest) for f in range(len(kind.rows)) if f not in chosen]
-        able = np.array([s for s in sets if kind.together[s[0], list(s)].all()])
+        own = [(first, *(i for i in chosen if i != first)) for first in chosen]
+        first = np.setdiff1d(np.arange(len(kind.rows)), chosen)
+        rest = np.broadcast_to(chosen[1:], (len(first), len(chosen) - 1))
+        sets = np.vstack([own, np.column_stack([first, rest])])
+        able = sets[kind.together[sets[:, :1], sets].all(axis=1)]
         best = int(self.taking(opened.kind).gains(able).argmax())
         return Opened(opened.kind, tuple(able[best].tolist()))
 

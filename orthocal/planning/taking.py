@@ -16,13 +16,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.planning.candidates import HandSet, Kind
+from orthocal.planning.candidates import Kind
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-LEAST_PART = 1e-4
-"""Of what a hand sets, beside its largest part; what is chosen is weighed with all of it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,28 +37,23 @@ class Pairs:
 class _Set:
     """Something that a hand sets where a setup begins, beside what others say.
 
-    How it answers to the state is nearly the same in postures that are near: it has few parts, of
-    which each posture has more or less, S = U W.
+    S is how it answers to the state in each posture that a setup could begin in.
     """
 
     answers: Array
     """How readings answer to it, shape (m,)."""
-    parts: Array
-    """U, shape (m, r)."""
-    basis: Array
-    """W, shape (r, n_state)."""
+    slopes: Array
+    """S, shape (m, n_state)."""
     known: Array
-    """W C, shape (r, n_state)."""
+    """S C, shape (m, n_state)."""
     spread: Array
-    """W C Aᵀ, shape (r, m)."""
+    """S C Aᵀ, shape (m, m)."""
     effect: Array
-    """W C R, shape (r, p)."""
+    """S C R, shape (m, p)."""
 
-    def beside(self, other: _Set, first: Indices) -> Array:
-        """S C S'ᵀ of it and another one where setups begin, shape (n,)."""
-        return np.asarray(
-            ((self.parts @ (self.known @ other.basis.T)) * other.parts).sum(axis=1)[first]
-        )
+    def beside(self, other: _Set) -> Array:
+        """S C S'ᵀ of it and another one where setups begin, shape (m,)."""
+        return np.asarray(np.vecdot(self.known, other.slopes))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,10 +86,9 @@ class Taking:
         spread += kind.own
         by_hand = []
         for hand in kind.by_hand:
-            parts, basis = _split(hand)
-            moved = basis @ covariance
-            across = moved @ kind.slopes.T
-            by_hand.append(_Set(hand.answers, parts, basis, moved, across, basis @ worth))
+            moved = hand.slopes @ covariance
+            across, does = moved @ kind.slopes.T, hand.slopes @ worth
+            by_hand.append(_Set(hand.answers, hand.slopes, moved, across, does))
         variance = spread.diagonal().copy()
         return Taking(kind, spread, kind.slopes @ worth, variance, sigma**2, tuple(by_hand))
 
@@ -106,13 +97,13 @@ class Taking:
         if not self.by_hand:
             return self
         spread, effect = self.spread.copy(), self.effect.copy()
-        where = np.array([first])
         for hand in self.by_hand:
-            across = np.outer(hand.answers, hand.parts[first] @ hand.spread)
+            across = np.outer(hand.answers, hand.spread[first])
             spread += across + across.T
-            effect += np.outer(hand.answers, hand.parts[first] @ hand.effect)
+            effect += np.outer(hand.answers, hand.effect[first])
             for other in self.by_hand:
-                spread += hand.beside(other, where) * np.outer(hand.answers, other.answers)
+                both = hand.known[first] @ other.slopes[first]
+                spread += both * np.outer(hand.answers, other.answers)
         return Taking(self.kind, spread, effect, spread.diagonal().copy(), self.noise)
 
     def gain(self, rows: list[int]) -> float:
@@ -133,12 +124,11 @@ class Taking:
         spread += self.noise * np.eye(sets.shape[1])
         for hand in self.by_hand:
             own = hand.answers[sets]
-            effect += own[:, :, None] * (hand.parts[first] @ hand.effect)[:, None, :]
-            seen = np.take_along_axis(hand.parts[first] @ hand.spread, sets, axis=1)
-            across = own[:, :, None] * seen[:, None, :]
+            effect += own[:, :, None] * hand.effect[first][:, None, :]
+            across = own[:, :, None] * hand.spread[first[:, None], sets][:, None, :]
             spread += across + np.swapaxes(across, 1, 2)
             for other in self.by_hand:
-                both = hand.beside(other, first)
+                both = hand.beside(other)[first]
                 outer = own[:, :, None] * other.answers[sets][:, None, :]
                 spread += both[:, None, None] * outer
         return np.asarray((effect * np.linalg.solve(spread, effect)).sum(axis=(1, 2)))
@@ -203,14 +193,12 @@ class Taking:
         spreads += 2.0 * self.noise
         for hand in self.by_hand:
             change = hand.answers - hand.answers[:, None]
-            for total, small in ((gains, hand.effect @ self.effect.T), (spreads, hand.spread)):
-                own = hand.parts @ small
+            for total, own in ((gains, hand.effect @ self.effect.T), (spreads, hand.spread)):
                 total += 2.0 * change * (own - own.diagonal()[:, None])
             for other in self.by_hand:
                 both = change * (other.answers - other.answers[:, None])
-                again = ((hand.parts @ (hand.effect @ other.effect.T)) * other.parts).sum(axis=1)
-                gains += both * again[:, None]
-                spreads += both * hand.beside(other, np.arange(len(spread)))[:, None]
+                gains += both * np.vecdot(hand.effect, other.effect)[:, None]
+                spreads += both * hand.beside(other)[:, None]
         return np.asarray(gains / spreads)
 
     def complete(self, pair: tuple[int, int], count: int) -> tuple[float, tuple[int, ...]]:
@@ -260,11 +248,3 @@ def beginnings(kind: Kind, count: int) -> Pairs:
     flat = np.flatnonzero(able)
     first, second = np.divmod(flat, len(able))
     return Pairs(first, second, flat)
-
-
-@lru_cache(maxsize=8192)
-def _split(hand: HandSet) -> tuple[Array, Array]:
-    """U and W with S = U W, as few parts as leave nothing, shape (m, r) and (r, n_state)."""
-    left, sizes, right = np.linalg.svd(hand.slopes, full_matrices=False)
-    kept = sizes > LEAST_PART * sizes.max(initial=0.0)
-    return left[:, kept] * sizes[kept], right[kept]

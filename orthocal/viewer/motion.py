@@ -10,7 +10,6 @@ import pinocchio as pin
 from meshcat.animation import Animation, AnimationClip, AnimationTrack
 from meshcat.path import Path as NodePath
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from orthocal.robot.model import Robot
 
@@ -106,6 +105,8 @@ def exaggerate(nominal: Array, real: Array, factor: float) -> Array:
     """
     if factor == 1.0:
         return real
+    from scipy.spatial.transform import Rotation
+
     shape = nominal.shape
     flat, other = nominal.reshape(-1, 4, 4), real.reshape(-1, 4, 4)
     result = np.array(flat)
@@ -136,6 +137,8 @@ class Film:
 
     def move(self, path: str, times: Array, poses: Array) -> None:
         """Move a node from its first pose through all others, shape (F, 4, 4), [m]."""
+        from scipy.spatial.transform import Rotation
+
         if np.ptp(poses[:, :3, 3], axis=0).max() > STILL:
             self.track(path, "position", "vector3", times, poses[:, :3, 3])
         if np.ptp(poses[:, :3, :3], axis=0).max() > STILL:
