@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from functools import cache
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkProcess
@@ -25,8 +26,7 @@ from orthocal.errors import OrthocalError
 WATCHING = 0.5
 """How often a worker looks whether it is still wanted, [s]."""
 
-
-_lent = 1
+_LENT: ContextVar[int] = ContextVar("cores that may be used", default=1)
 
 T = TypeVar("T")
 
@@ -64,17 +64,16 @@ def run_on_cores(
 @contextmanager
 def lent(count: int) -> Iterator[None]:
     """Let what is computed within the block use so many cores, where it can."""
-    global _lent
-    before, _lent = _lent, count
+    before = _LENT.set(count)
     try:
         yield
     finally:
-        _lent = before
+        _LENT.reset(before)
 
 
 def lent_cores() -> int:
     """How many cores may be used here: one, unless somebody lends more."""
-    return _lent
+    return _LENT.get()
 
 
 def call_on_cores(
@@ -91,7 +90,7 @@ def call_on_cores(
     Raises:
         OrthocalError: If a worker is killed.
     """
-    count = min(_lent, len(calls))
+    count = min(lent_cores(), len(calls))
     if count <= 1 or not can_fork():
         return tuple(call() for call in calls)
     found = dict(_forked(lambda k: calls[k](), range(len(calls)), count, killed))
@@ -150,8 +149,7 @@ def _answer(ours: Connection[Any, Any], killed: str) -> Any:  # noqa: ANN401 - w
 
 def _serve(work: Work[Any], theirs: Connection[Any, Any], parent: int) -> None:
     """Do what is asked for until there is no more of it."""
-    global _lent
-    _lent = 1  # the others are busy
+    _LENT.set(1)  # the others are busy
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     for descriptor in map(int, os.listdir("/proc/self/fd")):
         if descriptor > 2 and descriptor != theirs.fileno():

@@ -45,18 +45,16 @@ class ProgramFunctions:
         self._n_zeros = problem.observations.n_zeros
         self._n_passive = problem.robot.passive_index.size
         first = self._n_theta + self._n_zeros + problem.n_postures * self._n_passive
+        # free parameters that a hand sets by the machine; where they stand is a variable of its own
+        self._set = problem.n_machine + np.flatnonzero(problem.setting.follows)
         self._standing = np.arange(self._n_theta)
-        set_by_machine = problem.n_machine + np.flatnonzero(problem.setting.follows)
-        self._standing[set_by_machine] = first + np.arange(set_by_machine.size)
-        """Where in x it is how a sensor stands, of each free parameter that is a sensor's."""
-        self._set = set_by_machine
+        self._standing[self._set] = first + np.arange(self._set.size)
 
     def build(self) -> dict[str, ca.Function]:
         """Objective and constraints, gradient, Jacobian and Hessian, of (x, p[, lam_f, lam_g])."""
         problem = self.problem
         k = problem.n_postures
-        n_passive = k * self._n_passive
-        n = self._n_theta + self._n_zeros + n_passive + self._set.size
+        n = self._n_theta + self._n_zeros + k * self._n_passive + self._set.size
         x = ca.MX.sym("x", n)
         entries = problem.observations.size
         p = ca.MX.sym("p", 3 * entries + 3)
