@@ -294,7 +294,7 @@ KEPT = re.compile(r"Kept: row \d+, (\S+) (\S+?)(?:, cycle (\d+))?: (-?[0-9.]+) m
 def test_killed_a_hundred_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
     """Killed while lines come in as fast as they are taken, among them corrections and repeats."""
     monkeypatch.setenv("COLUMNS", "100")
-    folder = make_plan(tmp_path / "session", cycles=60)
+    folder = make_plan(tmp_path / "session", cycles=150)  # more than are read before all ends
     monkeypatch.setattr(foresight, "build_foresight", lambda session: None)
     robot = load_plan(folder).robot
     monkeypatch.setattr(session_file, "load_robot", lambda *_, **__: robot)
