@@ -313,7 +313,7 @@ def _finish(
     force: bool,
 ) -> None:
     """Run a study, print its answer, and write what was asked for."""
-    from orthocal.cores import available_cores, lent
+    from orthocal.cores import available_cores, call_on_cores, lent
     from orthocal.files import require_writable, write_files
     from orthocal.interrupts import raised_interrupt
     from orthocal.show.layout import print_rich
@@ -342,7 +342,8 @@ def _finish(
         kept = "with --out it could go on later" if out is None else "the same command goes on"
         put_note(f"orthocal: stopped; {kept}")
         raise
-    with lent(count if dask is None else 1):
+    own = count if dask is None else 1
+    with lent(own):
         summary = summarise_study(table)
     document = study_json(table, summary)
     if json:
@@ -350,8 +351,9 @@ def _finish(
     else:
         print_rich(render_study(table, summary, all_rows=all_rows))
     if out is not None:
-        contents = (document, to_parquet(table), draw_study(table, summary))
-        write_files(out, dict(zip(FILES, contents, strict=True)))
+        with lent(own):
+            rest = call_on_cores([lambda: to_parquet(table), lambda: draw_study(table, summary)])
+        write_files(out, dict(zip(FILES, (document, *rest), strict=True)))
         put_note(f"Wrote {', '.join(str(out / name) for name in FILES)}")
 
 
