@@ -84,6 +84,15 @@ def test_the_examples_readings_typed_over_a_pipe_calibrate_as_they_do(root, run,
     assert values == pytest.approx([r.value for r in load_session(example).readings], abs=1e-12)
 
 
+def test_with_offsets_entered_a_session_is_to_be_validated(folder, run):
+    with (folder / "session.yaml").open("a") as stream:
+        stream.write("controller: {offsets_mm: [1.2, 0, 0]}\n")
+    _, out, _ = run(folder, *["0"] * 6)
+    assert "All 6 readings are there." in out
+    assert f"  orthocal validate CALIBRATION {folder}\n" in out
+    assert out.rstrip().endswith(f"or what to enter now:\n  orthocal calibrate {folder}")
+
+
 def test_what_is_shown_of_a_setup_and_a_posture(folder, run):
     _, out, _ = run(folder)
     text = " ".join(out.split())

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from orthocal.assess.findings.finding import Finding, Place, place_of
 from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.records import PostureRecord
 from orthocal.diagnosis.rows import root_mean_square, rows_by_setup
 from orthocal.units import DRIVE_UNITS, MM, UM
 
@@ -177,7 +178,15 @@ def _coarse(calibration: Calibration) -> Finding | None:
 
 def _tiny(calibration: Calibration) -> Finding | None:
     """Postures hardly away from another one, beside far ones: given in metres."""
-    drives = np.array([p.drives for p in calibration.postures])
+    joined = bool(calibration.session.parts)
+    sessions: dict[str, list[PostureRecord]] = {}
+    for posture in calibration.postures:  # another session's differ by the offsets active in it
+        sessions.setdefault(posture.name.partition("/")[0] if joined else "", []).append(posture)
+    return next(filter(None, map(_tiny_among, sessions.values())), None)
+
+
+def _tiny_among(postures: Sequence[PostureRecord]) -> Finding | None:
+    drives = np.array([p.drives for p in postures])
     places, first = np.unique(drives, axis=0, return_index=True)
     if len(places) < 3:
         return None
@@ -187,7 +196,7 @@ def _tiny(calibration: Calibration) -> Finding | None:
     if not near.size:
         return None
     worst = near[first[near].argmax()]
-    name = calibration.postures[int(first[worst])].name
+    name = postures[int(first[worst])].name
     return Finding(
         "posture too near",
         "warns",

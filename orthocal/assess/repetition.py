@@ -15,6 +15,9 @@ from orthocal.diagnosis.rows import ResidualRow
 from orthocal.measurement.joining import name_within
 from orthocal.statistics.distributions import beta_share
 
+FEWEST = 3
+"""Rows below which there is no correlation."""
+
 CHANCE = 0.05
 """Probability below which a repetition of residuals is not put down to chance."""
 
@@ -43,6 +46,13 @@ class Repetition:
             return None
         return self.chance < CHANCE and self.correlation > 0.0
 
+    @property
+    def untold(self) -> str:
+        """Why it is unknown."""
+        if self.matched < FEWEST:
+            return "too few rows are shared"
+        return f"the fit leaves too little of the {self.matched} rows that are shared"
+
     def to_document(self) -> dict[str, Any]:
         """As plain data."""
         return {
@@ -58,7 +68,7 @@ def measure_repetition(first: Calibration, second: Calibration) -> Repetition:
     matched, correlation, cosine = _correlate(first, second)
     dims = _residual_dimensions(second, matched)
     chance = math.nan
-    if matched >= 3 and dims > 1.0 and not math.isnan(correlation):
+    if matched >= FEWEST and dims > 1.0 and not math.isnan(correlation):
         # directions of noise are spread evenly over the space that the fit leaves to residuals
         tail = 0.5 * (1.0 - beta_share(0.5, 0.5 * (dims - 1.0), cosine**2))
         chance = tail if cosine > 0.0 else 1.0 - tail
@@ -109,7 +119,7 @@ def _correlate(first: Calibration, second: Calibration) -> tuple[int, float, flo
         means.append({key: sum(v) / len(v) for key, v in collected.items()})
     common = [key for key in means[0] if key in means[1]]
     a, b = (np.array([m[key] for key in common]) for m in means)
-    if len(common) < 3 or not np.any(a) or not np.any(b):
+    if len(common) < FEWEST or not np.any(a) or not np.any(b):
         return len(common), math.nan, math.nan
     cosine = float(a @ b / np.sqrt((a @ a) * (b @ b)))
     return len(common), float(np.corrcoef(a, b)[0, 1]), cosine

@@ -295,7 +295,14 @@ def conclude(session: Session, rows: Sequence[Row], path: str, *, width: int) ->
             "them can be told."
         )
     told = "\n".join(wrap(line, width) for line in lines)
-    return f"{told}\nNext:\n  orthocal calibrate {own}"
+    following = f"Next:\n  orthocal calibrate {own}"
+    if session.controller_offsets is not None and any(session.controller_offsets):
+        following = (
+            "Next: whether what was entered is right, by the calibration that it is of,\n"
+            f"  orthocal validate CALIBRATION {own}\n"
+            f"or what to enter now:\n  orthocal calibrate {own}"
+        )
+    return f"{told}\n{following}"
 
 
 def _spans(numbers: Sequence[int]) -> str:

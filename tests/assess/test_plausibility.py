@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -156,3 +157,21 @@ def test_a_posture_in_metres_is_noticed(root):
     words = [d.words for d in find_doubts(moved) if d.kind == "posture too near"]
     assert len(words) == 1
     assert "0.087 mm from another one" in words[0]
+
+
+def test_postures_of_another_round_are_not_too_near(root, tmp_path):
+    """Their drives differ by the offsets that were entered in between, by fractions of a mm."""
+    session = load_session(root / "examples/raw-cycles")
+    copy = tmp_path / "later"
+    shutil.copytree(root / "examples/raw-cycles", copy)
+    text = (copy / "session.yaml").read_text()
+    assert "offsets_mm: [0.0, 0.0, 0.0]" in text
+    (copy / "session.yaml").write_text(text.replace("[0.0, 0.0, 0.0]", "[0.1, -0.1, 0.05]"))
+    rows = (copy / "readings.csv").read_text()
+    (copy / "readings.csv").write_text(rows.replace(",0.19", ",0.18"))
+    both = calibrate([session, load_session(copy)])
+    assert "posture too near" not in {d.kind for d in find_doubts(both)}
+    first, *others = both.postures
+    near = tuple(v + 0.05e-3 for v in others[0].drives)
+    moved = replace(both, postures=(replace(first, drives=near), *others))
+    assert "posture too near" in {d.kind for d in find_doubts(moved)}

@@ -149,6 +149,18 @@ def test_a_calibration_of_all_errors_is_confirmed_with_its_offsets_entered(root)
     assert "z_fork.rz" not in text  # nor is every parameter
 
 
+def test_rows_that_are_shared_are_not_said_to_be_too_few(root):
+    session = load_session(root / "examples/workshop")
+    calibration = calibrate(session, Choice(model="full"))
+    entered = with_offsets(session, np.array([e.enter for e in find_entries(calibration)]))
+    found = validate_calibration(calibration, simulate_session(entered, {}, seed=3).session)
+    assert found.repetition.repeats is None
+    assert found.repetition.matched == len({(r.setup, r.posture) for r in session.readings})
+    text = " ".join(summarize(found).split())
+    assert f"the fit leaves too little of the {found.repetition.matched} rows that are" in text
+    assert "too few rows are shared" not in text
+
+
 def test_several_sessions_validate_together(plan):
     """Two days' readings with the offsets entered: as one, each with zeros of its own."""
     calibration = calibrate(simulate_session(plan, TRUTH, seed=1).session)

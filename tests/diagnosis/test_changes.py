@@ -84,6 +84,7 @@ def test_a_slide_that_moved_is_named_with_its_size_and_since_when(changed, days)
     assert "x_slide moved by +0." in decision.reason
     assert "between tuesday and wednesday" in decision.reason
     assert decision.action.startswith("Calibrate wednesday alone")
+    assert "make sure that wednesday says which offsets were active" in decision.action
     (lead,) = decision.of_kind("machine changed")
     assert lead.places[0].file == str(days / "wednesday/session.yaml")
     assert lead.numbers["x_slide.offset_by_mm"] == pytest.approx(change.size * 1e3)

@@ -52,6 +52,8 @@ def _moved(calibration: Calibration, changes: Changes) -> Finding:
             f"Say which offsets were active (`controller.offsets_mm`) in {joined(unstated)}: if "
             f"others had been entered, it is that. Else: {action[0].lower()}{action[1:]}"
         )
+    else:
+        action += _see_first(changes, last)
     return Finding(
         "machine changed",
         "stops",
@@ -95,7 +97,7 @@ def _otherwise(calibration: Calibration, changes: Changes, other: OtherChange) -
         "machine changed",
         "stops",
         text,
-        _apart(changes, other.since),
+        _apart(changes, other.since) + _see_first(changes, other.since),
         {"chance": other.chance},
         () if file is None else (Place(file=file),),
     )
@@ -109,6 +111,15 @@ def _apart(changes: Changes, since: str) -> str:
     else:
         which = f"{joined(later)} together, without those before"
     return f"Calibrate {which}: what is entered must be of the machine as it is now."
+
+
+def _see_first(changes: Changes, since: str) -> str:
+    """What looks like a change: offsets that were entered, and are not told."""
+    later = changes.sessions[changes.sessions.index(since) :]
+    return (
+        f" But first make sure that {joined(later)} {'says' if len(later) == 1 else 'say'} which "
+        "offsets were active (`controller.offsets_mm`): those that were entered since look alike."
+    )
 
 
 def _nothing(calibration: Calibration, changes: Changes) -> Finding:

@@ -113,7 +113,7 @@ def _repetition(comparison: Comparison) -> list[Finding]:
     sizes = f"correlation {repetition.correlation:.3f} over {repetition.matched} rows"
     numbers = {"correlation": repetition.correlation, "rows": float(repetition.matched)}
     if repetition.repeats is None:
-        text = "Whether what remains repeats cannot be told: too few rows are shared."
+        text = f"Whether what remains repeats cannot be told: {repetition.untold}."
         return [Finding("repetition unknown", "informs", text, numbers=numbers)]
     if repetition.repeats:
         text = (

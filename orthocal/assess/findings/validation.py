@@ -207,7 +207,7 @@ def _repetition(validation: Validation) -> Finding:
     """Whether what remains is the same in both sessions."""
     found = validation.repetition
     if found.repeats is None:
-        text = "Whether what remains repeats cannot be told: too few rows are shared."
+        text = f"Whether what remains repeats cannot be told: {found.untold}."
         return Finding("repetition unknown", "informs", text)
     numbers = {
         "correlation": found.correlation,

@@ -109,11 +109,13 @@ def _front(
         )
     zero = joint_list(robot, robot.drive_zero)
     limits = "; ".join(limit_words(robot))
+    active = session.controller_offsets
+    shifted = "" if active is None or not any(active) else ", and by what was entered beyond"
     before = [
         "Let the machine run until it is warm. Then home it once, and not again until all is read.",
         "In the mechanical zero (legs parallel to their axes, by eye) the controller must show "
-        f"about {zero}. Its joints may go: {limits}. If it shows something else, mend the robot's "
-        "files first.",
+        f"about {zero}: zeros may be off by a few mm, which the calibration finds. Its joints may "
+        f"go: {limits}{shifted}. If a number is another altogether, mend the robot's files first.",
         "Move each slider by hand a little outwards, away from the middle: its number must "
         f"{counting_words(robot)}.",
         active_words(session),
