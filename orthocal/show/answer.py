@@ -160,10 +160,10 @@ def _suspicion(finding: Finding) -> str:
     line = "" if place.line is None else f"line {place.line}: "
     cycle = f", cycle {n['cycle']:.0f}" if n["cycle"] > 1 else ""
     label = short_name(f"{place.setup} {place.posture}", LONGEST_LABEL)
-    return (
-        f"{line}{label}{cycle}: read {signed(n['measured_mm'])} mm, expected "
-        f"{signed(n['expected_mm'])} mm"
-    )
+    read, expected = signed(n["measured_mm"]), signed(n["expected_mm"])
+    if read == expected:
+        return f"{line}{label}{cycle}: read {read} mm; the fit gives way, all others say otherwise"
+    return f"{line}{label}{cycle}: read {read} mm, expected {expected} mm"
 
 
 def _further(calibration: Calibration, decision: Decision) -> list[Finding]:

@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from typer.testing import CliRunner
 
 from orthocal import ParameterError, calibrate, check_session, load_plan, load_session
 from orthocal.assess.findings.calibration import decide
-from orthocal.assess.findings.session import MISTAKES
+from orthocal.assess.findings.session import MISTAKES, _sureness
 from orthocal.checking.edits import Table
 from orthocal.checking.families.exchanged import find_exchanged
 from orthocal.checking.families.scaled import find_scaled
@@ -174,3 +176,10 @@ def test_hardly_a_sound_session_is_accused(root, example):
         if find_mistakes(sound_session(plan, seed, entered=seed % 2 == 1))
     ]
     assert not accused
+
+
+def test_a_mistake_whose_mending_no_machine_shows_says_the_odds_alone(cycles):
+    row = next(i for i, r in enumerate(cycles.readings) if r.value > 0.4e-3 and r.cycle == 2)
+    (found, *_) = find_mistakes(turned(cycles, row))
+    assert "Mended, " in _sureness(found)
+    assert _sureness(replace(found, after=math.inf)).startswith("Odds that something is wrong: ")

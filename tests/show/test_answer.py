@@ -23,7 +23,7 @@ from orthocal import (
     summarize,
 )
 from orthocal.assess.findings.calibration import decide
-from orthocal.show.answer import render_answer
+from orthocal.show.answer import _suspicion, render_answer
 from orthocal.show.layout import to_text
 from orthocal.show.report.page import build_report
 from orthocal.show.summary import render_calibration
@@ -148,6 +148,15 @@ def test_suspicious_readings_are_named_by_file_and_line(answers, root):
     assert lines <= {rows[i].line for i in (4, 11, 20, 31, 40, 47, 52)}
     assert "readings.csv:" in text
     assert "Check before you enter these. 7 readings contradict all others." in text
+
+
+def test_a_reading_that_the_fit_gives_way_to_does_not_contradict_itself(answers):
+    first = decide(answers["huber"]).of_kind("suspicious reading")[0]
+    assert "mm, expected" in _suspicion(first)
+    followed = replace(
+        first, numbers=first.numbers | {"expected_mm": first.numbers["measured_mm"] + 1e-5}
+    )
+    assert _suspicion(followed).endswith("mm; the fit gives way, all others say otherwise")
 
 
 def test_a_turned_setup_accuses_no_single_reading_and_offers_nothing_to_type(answers):

@@ -274,7 +274,7 @@ def _sureness(mistake: Mistake) -> str:
     odds = math.exp(min(mistake.evidence, math.log(LARGEST_ODDS)))
     told = f"more than {LARGEST_ODDS:,.0f}" if odds > 0.999 * LARGEST_ODDS else f"{odds:,.0f}"
     sure = f"dds that something is wrong: {told} to 1."
-    if mistake.kind == "stuck dial" or not math.isfinite(mistake.before):
+    if mistake.kind == "stuck dial" or not math.isfinite(mistake.before + mistake.after):
         return f"O{sure}"
     before, after = um(mistake.before), um(mistake.after)
     if mistake.after < mistake.before:
