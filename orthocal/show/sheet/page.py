@@ -110,7 +110,7 @@ def _front(
     zero = joint_list(robot, robot.drive_zero)
     limits = "; ".join(limit_words(robot))
     active = session.controller_offsets
-    shifted = "" if active is None or not any(active) else ", and by what was entered beyond"
+    shifted = "" if active is None or not any(active) else ", shifted by what was entered"
     before = [
         "Let the machine run until it is warm. Then home it once, and not again until all is read.",
         "In the mechanical zero (legs parallel to their axes, by eye) the controller must show "

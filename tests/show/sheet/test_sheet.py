@@ -168,6 +168,16 @@ def test_what_holds_for_the_machine_is_said(page):
     assert words(page.find(".//code")) == "orthocal calibrate ."
 
 
+def test_offsets_that_were_entered_are_no_fault_of_the_robots_files(small):
+    """Home switches are off by what is to be found; entered, it shifts where joints may go."""
+    for active, told in (([0.0] * 3, " mm. If a number"), ([1e-3, 0.0, 0.0], "what was entered.")):
+        text = sheet_files(small.with_controller(np.array(active)))["sheet.html"]
+        assert "zeros may be off by a few mm, which the calibration finds" in text
+        (limits,) = re.findall(r"Its joints may go: [^<]*", text)
+        assert told in limits
+        assert ("shifted by" in limits) == any(active)
+
+
 def test_odd_names_are_texts(files, page):
     text = files["sheet.html"]
     assert page.xpath("//script") == []
