@@ -15,7 +15,10 @@ def main() -> None:
     gc.set_threshold(FEWEST_OBJECTS, *gc.get_threshold()[1:])
     with ending_at_interrupt():
         from orthocal.cli import main as run
-    run()
+    try:
+        run()
+    finally:
+        gc.freeze()  # of what goes with the process nothing is looked through for garbage first
 
 
 if __name__ == "__main__":

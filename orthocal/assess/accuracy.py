@@ -141,7 +141,7 @@ def measure_uncertainty(
         name: (j.reshape(-1, n) @ covariance).reshape(j.shape) @ j.transpose(0, 2, 1)
         for name, j in fields.items()
     }
-    sizes = {name: _spread_size(c, workspace.weights) for name, c in spread.items()}
+    sizes = {name: _spread_size(c, workspace) for name, c in spread.items()}
     few = len(positions) < FEWEST_ALIGNED
     return ToolUncertainty(
         covariance=spread["absolute"],
@@ -164,7 +164,7 @@ def measure_deviations(deviations: Array, workspace: Workspace, positions: Array
         return ErrorSize(
             rms=float(np.sqrt(workspace.weights @ lengths**2)),
             largest=float(lengths.max()),
-            find_percentile=partial(_weighted_percentile, lengths, workspace.weights),
+            find_percentile=partial(_length_percentile, field, workspace),
         )
 
     few = len(positions) < FEWEST_ALIGNED
@@ -311,19 +311,26 @@ def expect_after_offsets(calibration: Calibration, accuracy: ToolAccuracy) -> fl
     return math.hypot(left.headline.rms, remaining.sizes.headline.rms)
 
 
-def _spread_size(covariances: Array, weights: Array) -> ErrorSize:
+def _spread_size(covariances: Array, workspace: Workspace) -> ErrorSize:
     """Sizes of normal errors with given covariances, shape (K, 3, 3), at the points."""
     mean_square = np.trace(covariances, axis1=1, axis2=2)
     return ErrorSize(
-        rms=float(np.sqrt(weights @ mean_square)),
+        rms=float(np.sqrt(workspace.weights @ mean_square)),
         largest=float(np.sqrt(mean_square.max())),
-        find_percentile=partial(_drawn_percentile, covariances, weights),
+        find_percentile=partial(_drawn_percentile, covariances, workspace),
     )
 
 
-def _drawn_percentile(covariances: Array, weights: Array) -> float:
-    """What 95 % of normal errors stay below, by draws."""
-    values, vectors = np.linalg.eigh(covariances)
+def _length_percentile(field: Array, workspace: Workspace) -> float:
+    """What 95 % of the lengths of a field, shape (K, 3), stay below."""
+    parts, weights = workspace.spread(field)
+    return _weighted_percentile(np.linalg.norm(parts, axis=1), weights)
+
+
+def _drawn_percentile(covariances: Array, workspace: Workspace) -> float:
+    """What 95 % of normal errors stay below, by draws; covariances have the shape (K, 3, 3)."""
+    parts, weights = workspace.spread(covariances)
+    values, vectors = np.linalg.eigh(parts)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     draws = np.random.default_rng(0).normal(size=(3, DRAWS))
     lengths = np.linalg.norm(roots @ draws, axis=1)
@@ -333,6 +340,8 @@ def _drawn_percentile(covariances: Array, weights: Array) -> float:
 
 def _weighted_percentile(lengths: Array, weights: Array) -> float:
     """What 95 % of the weight stays below."""
+    if weights.min() == weights.max():  # without sorting all
+        return float(np.quantile(lengths, 0.95, method="inverted_cdf"))
     order = np.argsort(lengths)
     share = np.cumsum(weights[order])
     return float(lengths[order][min(int(np.searchsorted(share, 0.95)), lengths.size - 1)])

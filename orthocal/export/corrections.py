@@ -16,9 +16,12 @@ from orthocal.assess.tool import find_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ExportError
 from orthocal.kinematics.assembly import nominal_assembly
+from orthocal.kinematics.workspace import even_grid
 from orthocal.units import MM
 
 AXES = "xyz"
+
+POINTS_A_SIDE = 7
 
 
 def export_corrections(calibration: Calibration) -> dict[str, str]:
@@ -30,7 +33,9 @@ def export_corrections(calibration: Calibration) -> dict[str, str]:
     tool, robot = find_tool(calibration), calibration.robot
     if tool is None or robot.tcp is None:
         raise ExportError("the machine has no tool that its drives command over a region")
-    points, nominal = tool.workspace.points, nominal_assembly(robot)
+    half_side = tool.workspace.half_side or 0.0  # find_tool has a cube
+    points = even_grid(robot, half_side=half_side, points_a_side=POINTS_A_SIDE)
+    nominal = nominal_assembly(robot)
     chosen = list(robot.tcp.coordinates)
     try:
         drives = calibration.machine.inverse(points) + entered_offsets(calibration)

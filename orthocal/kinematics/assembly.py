@@ -22,7 +22,6 @@ from orthocal.kinematics.continuation import (
     System,
     as_rows,
     follow,
-    refuse_singular,
 )
 from orthocal.kinematics.kept import once_a_robot
 from orthocal.robot.model import (
@@ -117,10 +116,7 @@ class Assembly:
         allow_free: bool,
     ) -> Array:
         system = replace(self._closing, shortest=allow_free)
-        passive = follow(system, drives, machine, start, names, failures)
-        if not allow_free:
-            refuse_singular(system, drives, passive, machine, names, failures)
-        return passive
+        return follow(system, drives, machine, start, names, failures, allow_singular=allow_free)
 
     def _once(self, key: tuple[object, ...], solve: Callable[[], Array]) -> Array:
         """What was solved for the same numbers a moment ago, or is now."""

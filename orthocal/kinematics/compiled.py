@@ -147,19 +147,21 @@ class CompiledRobot:
 
     @cached_property
     def slopes(self) -> BatchFunction:
-        """(actuated, passive, placements) to g, ∂g by actuated, by passive and by twists."""
-        outputs = [self.expressions.name_out(i) for i in range(1, 4)]
-        return BatchFunction(self.expressions, shared=["placements"], matrices=outputs)
+        """(actuated, passive, placements) to g, ∂g by actuated, by passive, and by twists.
+
+        The last as nonzeros, where `twist_pattern` says.
+        """
+        return self._batch("slopes", self._slope_outputs, matrices=(1, 2), sparse=(3,))
 
     @cached_property
-    def sparse_slopes(self) -> BatchFunction:
-        """The same, of ∂g by twists the nonzeros alone."""
-        return self._batch("sparse_slopes", self._slope_outputs, matrices=(1, 2), sparse=(3,))
+    def twist_pattern(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns of the nonzeros of ∂g by twists, column by column."""
+        return self.slopes.pattern("y3")
 
     @cached_property
     def expressions(self) -> ca.Function:
-        """The same with sparse rows, to be put into other expressions."""
-        return self._kept("slopes", self._slope_outputs, sparse=(0, 1, 2, 3))
+        """The same with all outputs sparse, to be put into other expressions."""
+        return self._kept("expressions", self._slope_outputs, sparse=(0, 1, 2, 3))
 
     def _slope_outputs(self) -> list[ca.SX]:
         joints, twists = self.closure_slopes

@@ -129,6 +129,8 @@ def follow(
     start: ArrayLike | None,
     names: Sequence[str] | None,
     failures: Failures | None,
+    *,
+    allow_singular: bool = True,
 ) -> Array:
     """Newton along the straight path from the origin (or a given start) to each target.
 
@@ -143,12 +145,14 @@ def follow(
         names: Names of the postures, for messages.
         failures: Filled with the postures that cannot be reached, which are NaN then; by default
             the first of them raises.
+        allow_singular: Whether targets may leave motions free.
 
     Returns:
         x, shape (K, n_x).
 
     Raises:
-        ClosureError: If a posture cannot be reached, or is outside the limits of a joint.
+        ClosureError: If a posture cannot be reached, is outside the limits of a joint or, unless
+            that is allowed, singular.
     """
     tolerance = CLOSED * max(1.0, system.length)
     count = len(targets)
@@ -158,6 +162,7 @@ def follow(
         raise ValueError(f"found {len(labels)} names for {count} rows")
 
     lost_for_good = np.zeros(count, dtype=bool)
+    regular = np.full(count, allow_singular)
 
     def refuse(i: int, reason: str, residual: float | None) -> None:
         error = ClosureError(reason, posture=labels[i], residual=residual)
@@ -177,17 +182,19 @@ def follow(
     while pending.size:
         reach = np.minimum(1.0, done[pending] + step[pending])
         way = system.origin + reach[:, None] * (targets[pending] - system.origin)
-        trial, worst = _newton(system, x[pending], way, machine, tolerance)
+        trial, worst, jacobians = _newton(system, x[pending], way, machine, tolerance)
         moved = np.abs((trial - x[pending]) / moves).max(axis=1, initial=0.0)
         good = (worst < tolerance) & (moved < LARGEST_CONTINUATION_MOVE)
         x[pending[good]] = trial[good]
         done[pending[good]] = reach[good]
+        if not allow_singular:
+            regular[pending[good]] = _far_from_singular(jacobians[good] / system.units)
         lost = pending[~good & fresh[pending]]  # the given start was no help: begin at zero
         x[lost], step[lost] = system.start, 2.0
         fresh[pending] = False
         step[pending[~good]] *= 0.5
         for i in pending[~good & (step[pending] < SMALLEST_CONTINUATION_STEP)].tolist():
-            last, final = _newton(system, x[[i]], targets[[i]], machine, tolerance)
+            last, final, _ = _newton(system, x[[i]], targets[[i]], machine, tolerance)
             reason = (
                 "cannot be reached from the mechanical zero without changing the way in "
                 f"which the loops are assembled, {done[i]:.0%} of the way"
@@ -209,53 +216,45 @@ def follow(
         )
         refuse(i, reason, 0.0)
     x[lost_for_good] = np.nan
+    doubtful = np.flatnonzero(~regular & ~lost_for_good)
+    if doubtful.size:
+        _refuse_singular(system, targets, x, machine, labels, failures, doubtful)
     return x
 
 
-def refuse_singular(
+def _refuse_singular(
     system: System,
-    drives: Array,
-    passive: Array,
+    p: Array,
+    x: Array,
     machine: MachineNumbers,
-    names: Sequence[str] | None,
+    names: Sequence[str],
     failures: Failures | None,
+    doubtful: NDArray[np.intp],
 ) -> None:
-    """Refuse solutions in which the drives leave motions free.
-
-    Args:
-        system: What was solved: loops closed by passive coordinates.
-        drives: p of each posture, shape (K, n_drives).
-        passive: x of each, shape (K, n_passive); made NaN where refused into `failures`.
-        machine: The machine.
-        names: Names of the postures, for messages.
-        failures: As for `follow`.
+    """Refuse those of some solutions that leave motions free; NaN where refused into `failures`.
 
     Raises:
         ClosureError: Naming the posture.
     """
     if system.n_x == 0:
         return
-    solved = np.flatnonzero(np.isfinite(passive).all(axis=1))
-    _, jacobians = system.evaluate(passive[solved], drives[solved], machine)
-    scaled = jacobians / system.units
-    doubtful = ~_far_from_singular(scaled)
-    solved, scaled = solved[doubtful], scaled[doubtful]
-    values = np.linalg.svd(scaled, compute_uv=False)
+    _, jacobians = system.evaluate(x[doubtful], p[doubtful], machine)
+    values = np.linalg.svd(jacobians / system.units, compute_uv=False)
     smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
     largest = values.max(axis=1, initial=0.0)  # without closures there are no values
-    ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), solved.shape)
+    ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), doubtful.shape)
     for k in np.argsort(ratio)[: int((ratio < SINGULAR_BELOW).sum())].tolist():
-        i = int(solved[k])
+        i = int(doubtful[k])
         free = int((values[k] > SINGULAR_BELOW * largest[k]).sum())
         error = ClosureError(
             f"is singular: the drives leave {system.n_x - free} of "
             f"{system.n_x} passive motions free",
-            posture=names[i] if names is not None else f"posture {i + 1}",
+            posture=names[i],
         )
         if failures is None:
             raise error
         failures[i] = error
-        passive[i] = np.nan
+        x[i] = np.nan
 
 
 def _far_from_singular(matrices: Array) -> NDArray[np.bool_]:
@@ -275,11 +274,12 @@ def _far_from_singular(matrices: Array) -> NDArray[np.bool_]:
 
 def _newton(
     system: System, x: Array, p: Array, machine: MachineNumbers, tolerance: float
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Damped Newton of many postures at once.
 
     Returns:
-        Solutions, shape (K, n_x), and the largest residual of each, shape (K,), [m].
+        Solutions, shape (K, n_x), the largest residual of each, shape (K,), [m], and Jacobians at
+        them, but for a last step.
     """
     x = np.array(x)
     residuals, jacobians = system.evaluate(x, p, machine)
@@ -315,7 +315,7 @@ def _newton(
         step = system.step(residuals[closed], jacobians[closed])
         small = np.abs(step).max(axis=1) < LAST_STEP
         x[closed[small]] += step[small]
-    return x, worst
+    return x, worst, jacobians
 
 
 def as_rows(values: ArrayLike, n: int, what: str) -> tuple[Array, bool]:

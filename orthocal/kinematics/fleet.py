@@ -91,9 +91,9 @@ class Machines:
         centre = np.median(self._errors, axis=0)
         change = self._errors - centre
         drives = own.drives(centre, self._drives)
-        slopes = self._compiled.sparse_slopes
+        slopes = self._compiled.slopes
         g, g_a, g_q, nonzeros = slopes(drives, self._near, own.placements(centre))
-        rows, columns = slopes.pattern(self._compiled.expressions.name_out(3))
+        rows, columns = self._compiled.twist_pattern
         by_twists = np.zeros((k, g.shape[1], 6 * len(own.moved)))
         by_twists[:, rows, columns] = nonzeros
         twists = change @ own.slopes(centre, np.eye(len(centre))).twists.T

@@ -73,15 +73,26 @@ class ToolSensitivity:
         machine, slopes = self.assembly.machine(), self._slopes
         arguments = machine.drives(d), passive, machine.placements
         _, p_a, p_q, p_t = self._compiled.tool(*arguments)
-        _, g_a, g_q, g_t = self._compiled.slopes(*arguments)
+        _, g_a, g_q, nonzeros = self._compiled.slopes(*arguments)
         if g_q.shape[1] == g_q.shape[2]:
             pull = np.swapaxes(
                 np.linalg.solve(np.swapaxes(g_q, 1, 2), np.swapaxes(p_q, 1, 2)), 1, 2
             )
         else:
             pull = p_q @ np.linalg.pinv(g_q, rcond=1e-10)
-        twists, drives = p_t - pull @ g_t, p_a - pull @ g_a
+        twists = p_t - self._pull_twists(pull, nonzeros)
+        drives = p_a - pull @ g_a
         commanded = drives * d[:, None, :]
         return np.asarray(
             twists @ slopes.twists + drives @ slopes.offsets + commanded @ slopes.gains
         )
+
+    def _pull_twists(self, pull: Array, nonzeros: Array) -> Array:
+        """What rows make of ∂g by twists, shape (K, 3, n_twists) of (K, 3, n_rows) and (K, nnz)."""
+        rows, columns = self._compiled.twist_pattern
+        found = np.zeros((*pull.shape[:2], self._compiled.n_twists))
+        if columns.size:
+            there, starts = np.unique(columns, return_index=True)
+            products = pull[:, :, rows] * nonzeros[:, None, :]
+            found[:, :, there] = np.add.reduceat(products, starts, axis=2)
+        return found

@@ -28,7 +28,10 @@ LARGEST_HALF_SIDE = 0.06
 SMALLEST_HALF_SIDE = 1e-3
 """A machine whose tool cannot move that far has no region, [m]."""
 
-POINTS_A_SIDE = 7
+POINTS_A_SIDE = 5
+
+CELLS_A_SIDE = 12
+"""Of a cube, where parts of it that are alike are asked for."""
 
 FEWEST_ALIGNED = 4
 """Points below which a rigid motion leaves nothing of their errors, whatever they are."""
@@ -44,6 +47,8 @@ class Workspace:
     """Shape (K,), sum 1."""
     half_side: float | None = None
     """Of a cube around the mechanical zero, [m]; None for other points."""
+    line: Array | None = None
+    """Points of a side, shape (n,), from -1 to 1, where the points are the grid of a cube."""
 
     @classmethod
     def even(cls, points: ArrayLike) -> Workspace:
@@ -60,6 +65,28 @@ class Workspace:
             return f"{len(self.points)} points"
         shape = {1: "line", 2: "square"}.get(self.points.shape[1], "cube")
         return f"a {shape} of ±{self.half_side / MM:.3g} mm around the zero"
+
+    def spread(self, field: Array) -> tuple[Array, Array]:
+        """A field where points stand for equal parts of a cube, by the polynomial through it.
+
+        Args:
+            field: Shape (K, ...).
+
+        Returns:
+            The field, shape (M, ...), and weights of its points, shape (M,); for points that are no
+            grid of a cube as they are.
+        """
+        if self.line is None:
+            return field, self.weights
+        n, count = self.line.size, self.points.shape[1]
+        cells = (2.0 * np.arange(CELLS_A_SIDE) + 1.0) / CELLS_A_SIDE - 1.0
+        known, wanted = (np.polynomial.legendre.legvander(x, n - 1) for x in (self.line, cells))
+        between = wanted @ np.linalg.inv(known)
+        found = field.reshape(*[n] * count, -1)
+        for _ in range(count):  # the side that comes first goes last before the field's own
+            found = np.moveaxis(np.tensordot(between, found, axes=1), 0, count - 1)
+        size = CELLS_A_SIDE**count
+        return found.reshape(size, *field.shape[1:]), np.full(size, 1.0 / size)
 
     def remove_shift(self, field: Array) -> Array:
         """A field of position errors less its mean, shape (K, 3, ...)."""
@@ -93,24 +120,50 @@ def cube(
     half_side: float = LARGEST_HALF_SIDE,
     points_a_side: int = POINTS_A_SIDE,
 ) -> Workspace:
-    """A cube around the mechanical zero: a grid with Simpson's weights, faces and corners included.
+    """A cube around the mechanical zero: a grid by Lobatto's rule, faces and corners included.
+
+    Means of polynomials of a degree of 2 n - 3 along each side are exact.
 
     Args:
         robot: The robot; a planar one has a square.
         half_side: Half the side, [m].
-        points_a_side: An odd number of at least 3.
+        points_a_side: n, an odd number of at least 3.
+    """
+    middle, line = tool_at_zero(robot), _lobatto_points(points_a_side)
+    legendre = np.polynomial.legendre.Legendre.basis(points_a_side - 1)
+    own = 1.0 / (points_a_side * (points_a_side - 1) * legendre(line) ** 2)
+    points, weights = _grid(line, middle.size), _grid(own, middle.size).prod(axis=1)
+    return Workspace(
+        read_only(middle + half_side * points), read_only(weights), half_side, read_only(line)
+    )
+
+
+def even_grid(robot: Robot, *, half_side: float, points_a_side: int) -> Array:
+    """Tool positions at even distances over a cube around the mechanical zero, [m].
+
+    Args:
+        robot: The robot; a planar one has a square.
+        half_side: Half the side, [m].
+        points_a_side: n, at least 2.
+
+    Returns:
+        Shape (n^n_coordinates, n_coordinates), the last coordinate changing first.
     """
     middle = tool_at_zero(robot)
     line = np.linspace(-half_side, half_side, points_a_side)
-    simpson = np.where(np.arange(points_a_side) % 2 == 1, 4.0, 2.0)
-    simpson[[0, -1]] = 1.0
-    simpson /= simpson.sum()
-    count = middle.size
-    points = np.stack(np.meshgrid(*[line] * count, indexing="ij"), axis=-1).reshape(-1, count)
-    weights = np.stack(np.meshgrid(*[simpson] * count, indexing="ij"), axis=-1)
-    return Workspace(
-        read_only(middle + points), read_only(weights.prod(axis=-1).reshape(-1)), half_side
-    )
+    return np.asarray(middle + _grid(line, middle.size))
+
+
+def _lobatto_points(count: int) -> Array:
+    """The ends of -1 to 1, and where the Legendre polynomial of degree count - 1 is level."""
+    level = np.polynomial.legendre.Legendre.basis(count - 1).deriv().roots()
+    points = np.r_[-1.0, np.sort(level), 1.0]
+    return np.asarray(0.5 * (points - points[::-1]))  # the same on both sides, without rounding
+
+
+def _grid(line: Array, count: int) -> Array:
+    """All points with coordinates in a line, shape (n^count, count), the last changing first."""
+    return np.stack(np.meshgrid(*[line] * count, indexing="ij"), axis=-1).reshape(-1, count)
 
 
 def gauss_cube(robot: Robot, *, half_side: float) -> Workspace:
@@ -126,10 +179,8 @@ def gauss_cube(robot: Robot, *, half_side: float) -> Workspace:
     middle = tool_at_zero(robot)
     count = middle.size
     nodes, own = np.polynomial.legendre.leggauss(3)
-    grids = [np.stack(np.meshgrid(*[v] * count, indexing="ij"), axis=-1) for v in (nodes, own)]
-    inner, weights = grids[0].reshape(-1, count), grids[1].prod(axis=-1).reshape(-1)
-    corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * count, indexing="ij"), axis=-1)
-    points = np.vstack([inner, corners.reshape(-1, count)])
+    weights = _grid(own, count).prod(axis=1)
+    points = np.vstack([_grid(nodes, count), _grid(np.array([-1.0, 1.0]), count)])
     counted = np.append(weights / weights.sum(), np.zeros(2**count))
     return Workspace(read_only(middle + half_side * points), read_only(counted), half_side)
 

@@ -163,8 +163,7 @@ class Expander:
         place = np.full(used.size, -1)
         place[self._used] = np.arange(self._used.size)
         self._parts = partition(observations, groups)
-        twists = compiled.expressions.name_out(3)
-        self._closing = _Scatter.of(compiled.sparse_slopes.pattern(twists), place)
+        self._closing = _Scatter.of(compiled.twist_pattern, place)
         self._reading = [_Scatter.of(g.reading.slopes.pattern("by_twists"), place) for g in groups]
 
     def __call__(
@@ -198,7 +197,7 @@ class Expander:
             k, m = part.entries.shape
             drives, q = self._drives[part.postures], passive[part.postures]
             actuated = machine.drives(drives)
-            g, g_a, g_q, nonzeros = self._compiled.sparse_slopes(actuated, q, machine.placements)
+            g, g_a, g_q, nonzeros = self._compiled.slopes(actuated, q, machine.placements)
             inverse = -_inverse(g_q)
             correction[part.postures] = (inverse @ g[..., None])[..., 0]
             closings.append((part.postures, inverse, g_a, nonzeros[:, self._closing.chosen]))

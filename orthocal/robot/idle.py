@@ -104,10 +104,10 @@ class _Parts:
             (robot.frame_id(c.frame_a), robot.frame_id(c.frame_b)) for c in robot.closures
         ]
         moved = [*self._owners, *((j, False) for j in self._joints)]
-        self._carried = {
-            frame: np.array([self._carries(frame, *m) for m in moved], dtype=np.float64)
-            for frame in {*self._seen, *(f for pair in self._ends for f in pair)}
-        }
+        self._carried = {}
+        for frame in {*self._seen, *(f for pair in self._ends for f in pair)}:
+            carriers = self._carriers(frame)
+            self._carried[frame] = np.array([m in carriers for m in moved], dtype=np.float64)
 
     def effects(self, coordinates: Array) -> Array:
         """How what is seen moves, passive joints following, (n, n_owners, 6), [m/m, m/rad]."""
@@ -150,11 +150,12 @@ class _Parts:
         followed = np.linalg.lstsq(following[:, :, 0].T, -closing, rcond=1e-10)[0]
         return np.asarray(seen + carried[:, :, 0].T @ followed).reshape(-1, n, 6)
 
-    def _carries(self, frame: int, owner: int, of_frame: bool) -> bool:
+    def _carriers(self, frame: int) -> set[tuple[int, bool]]:
+        """The joints and frames that carry a frame, and whether each is a frame."""
         model = self._robot.model
-        if not of_frame:
-            return owner in list(model.supports[model.frames[frame].parentJoint])
+        found = {(joint, False) for joint in model.supports[model.frames[frame].parentJoint]}
         current: int | None = frame
-        while current is not None and current != owner:
+        while current is not None:
+            found.add((current, True))
             current = hangs_on(model, current)
-        return current is not None
+        return found

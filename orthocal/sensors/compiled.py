@@ -48,8 +48,8 @@ class CompiledReading:
     """The same with sparse rows, to be put into other expressions."""
     words: str
     """What distinguishes it from other readings of the robot."""
-    probe: float
-    """The sensor's own expression at some values."""
+    probe: float | None
+    """The expression of a sensor that is not orthocal's own, at some values."""
 
 
 def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
@@ -60,7 +60,7 @@ def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
     """
     pattern = _Pattern(robot, sensor, sensor.frames(robot))
     found = _compile(pattern)
-    if _source(type(sensor)) and _probe(pattern) != found.probe:
+    if found.probe is not None and _probe(pattern) != found.probe:
         raise OrthocalError(
             f"the expression of a sensor '{sensor.kind}' depends on more than its frames, "
             "constants and unknowns: what differs between setups belongs into `constants`"
@@ -129,7 +129,7 @@ def _compile(pattern: _Pattern) -> CompiledReading:
         slopes=BatchFunction(slopes, shared=["placements"], matrices=rows, sparse=["by_twists"]),
         expression=slopes,
         words=pattern.words,
-        probe=_probe(pattern),
+        probe=_probe(pattern) if _source(type(pattern.sensor)) else None,
     )
 
 

@@ -27,6 +27,7 @@ from orthocal import (
 from orthocal.assess.accuracy import (
     assess_tool,
     find_excess,
+    measure_deviations,
     measure_uncertainty,
 )
 from orthocal.assess.entering import entered_offsets
@@ -128,6 +129,51 @@ def test_a_cube_has_the_mean_square_of_a_cube(orthoglide):
     assert workspace.weights.sum() == pytest.approx(1.0)
     mean = workspace.weights @ workspace.points**2
     assert mean == pytest.approx(np.full(3, 0.06**2 / 3.0))
+
+
+def test_means_over_a_cube_are_those_of_polynomials(orthoglide):
+    """Of the sixth degree along each side by five points: ∫x⁶ is 1/7, ∫x⁶y⁴ is 1/35."""
+    workspace = cube(orthoglide, half_side=0.06)
+    x, y, z = (workspace.points - tool_at_zero(orthoglide)).T / 0.06
+    assert len(x) == 125
+    assert workspace.weights @ x**6 == pytest.approx(1.0 / 7.0, abs=1e-12)
+    assert workspace.weights @ (x**6 * y**4 * z**2) == pytest.approx(1.0 / 105.0, abs=1e-12)
+    assert abs(workspace.weights @ (x**7 * y)) < 1e-12
+    assert {-1.0, 1.0} <= set(x.round(12))  # faces and corners are in it
+
+
+def test_equal_parts_of_a_cube_have_the_polynomial_through_its_points(orthoglide):
+    workspace = cube(orthoglide, half_side=0.06)
+
+    def field(points):
+        x, y, z = (points / 0.06).T
+        return np.stack([x**4 - 2.0 * y * z**3, 3.0 + z, x * y**2], axis=1)
+
+    found, weights = workspace.spread(field(workspace.points))
+    side = (np.arange(12) - 5.5) * 0.01
+    middles = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
+    assert found == pytest.approx(field(middles), abs=1e-12)
+    assert weights == pytest.approx(np.full(1728, 1.0 / 1728.0))
+    some = Workspace.even(middles[:7])
+    assert np.array_equal(some.spread(found[:7])[0], found[:7])
+    assert np.array_equal(some.spread(found[:7])[1], some.weights)
+
+
+def test_what_95_in_100_errors_stay_below_is_that_of_many_points(orthoglide):
+    """Of 125 points, against all of a grid of 27,000."""
+    workspace = cube(orthoglide, half_side=0.06)
+    middle = tool_at_zero(orthoglide)
+
+    def bent(points):
+        x, y, z = (points - middle).T / 0.06
+        return 1e-4 * np.stack([x * y + 0.1, y**2 - z, x**3], axis=1)
+
+    found = measure_deviations(bent(workspace.points), workspace, workspace.points).absolute
+    side = (np.arange(30) - 14.5) / 15.0 * 0.06
+    many = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
+    lengths = np.linalg.norm(bent(many + middle), axis=1)
+    assert found.percentile_95 == pytest.approx(np.quantile(lengths, 0.95), rel=0.02)
+    assert found.rms == pytest.approx(np.sqrt((lengths**2).mean()), rel=0.005)
 
 
 def test_a_rigid_motion_is_taken_out_and_nothing_else(workspace):

@@ -29,7 +29,7 @@ def points(robot, count):
 def test_both_ways_give_the_same_numbers(request, name, count):
     robot = request.getfixturevalue(name)
     compiled, where = compiled_robot(robot), points(robot, count)
-    functions = [compiled.closing, compiled.slopes, compiled.sparse_slopes]
+    functions = [compiled.closing, compiled.slopes]
     if robot.tcp is not None:
         functions += [compiled.inverting, compiled.tool]
     for function in functions:

@@ -51,7 +51,7 @@ class _TwistSlopes:
     def of(problem: CalibrationProblem, slopes: Array) -> _TwistSlopes:
         """Of all nonzeros, shape (n_sets, n_postures, nnz), in the order of their pattern."""
         compiled = problem.compiled
-        rows, columns = compiled.sparse_slopes.pattern(compiled.expressions.name_out(3))
+        rows, columns = compiled.twist_pattern
         moved = compiled.errors.twists_of(problem.columns.T).any(axis=0).reshape(-1, 6).any(axis=1)
         chosen = np.flatnonzero(np.repeat(moved, 6)[columns])
         order = chosen[np.argsort(rows[chosen], kind="stable")]
@@ -108,7 +108,7 @@ class FleetSlopes:
         self._offsets, self._gains = errors.offsets(at), errors.gains(at)
         placements = errors.placements(at)
         actuated = self._actuated(problem.drives)
-        found = compiled.sparse_slopes.unshared(
+        found = compiled.slopes.unshared(
             actuated.reshape(self._size * k, -1),
             passive.reshape(self._size * k, -1),
             placements,

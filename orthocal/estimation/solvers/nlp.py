@@ -259,14 +259,8 @@ class ProgramFunctions:
         problem = self.problem
         k, n_p = problem.n_postures, self._n_passive
         n_g, first = problem.robot.closure_rows, self._n_theta + self._n_zeros
-        piece = problem.posture_piece
-        slope = ca.sparsify(ca.horzcat(piece.by_theta, piece.by_passive))
-        pattern_rows, pattern_columns = (np.array(v) for v in slope.sparsity().get_triplet())
-        inputs = [piece.passive, piece.drives, *problem.machine_map.symbols]
-        closure_f, slope_f = (
-            self._kept(name, partial(ca.Function, name, inputs, [ca.densify(values)]))
-            for name, values in (("closure", piece.closure), ("closure_slope", slope.nz[:]))
-        )
+        closure_f, slope_f = (self._closure_function(name) for name in ("closure", "closure_slope"))
+        pattern_rows, pattern_columns = (np.array(v) for v in slope_f.sparsity_out(0).get_triplet())
         arguments = [
             ca.reshape(x[first : first + k * n_p], n_p, k),
             ca.MX(ca.DM(problem.drives.T)),
@@ -274,7 +268,7 @@ class ProgramFunctions:
         ]
         masks = [False, False, *(True for _ in shared)]
         constraints = ca.vec(closure_f.map(k, masks, [False])(*arguments))
-        nonzeros = slope_f.map(k, masks, [False])(*arguments)
+        nonzeros = slope_f.map(k, masks, [False])(*arguments).nz[:]
 
         postures = np.arange(k)
         variables = np.hstack(
@@ -285,7 +279,7 @@ class ProgramFunctions:
         )
         rows = postures[:, None] * n_g + pattern_rows[None, :]
         jacobian = SparseSum(k * n_g + self._set.size, x.numel())
-        jacobian.add(rows, variables[:, pattern_columns], ca.vec(nonzeros))
+        jacobian.add(rows, variables[:, pattern_columns], nonzeros)
         if self.hessian == "exact":
             self._add_closure_curvature(arguments[:3], lam_g[: k * n_g], variables, hessian)
         if self._set.size:
@@ -294,6 +288,20 @@ class ProgramFunctions:
             of_rows, columns = (np.array(v) for v in slopes.sparsity().get_triplet())
             jacobian.add(k * n_g + of_rows, columns, ca.MX(ca.DM(slopes.nonzeros())))
         return constraints, jacobian.build()
+
+    def _closure_function(self, name: str) -> ca.Function:
+        """The closures of a posture, or their slope by (θ̂, q̂), sparse."""
+
+        def build() -> ca.Function:
+            piece = self.problem.posture_piece
+            inputs = [piece.passive, piece.drives, *self.problem.machine_map.symbols]
+            values = {
+                "closure": ca.densify(piece.closure),
+                "closure_slope": ca.sparsify(ca.horzcat(piece.by_theta, piece.by_passive)),
+            }
+            return ca.Function(name, inputs, [values[name]])
+
+        return self._kept(name, build)
 
     def _set_by_machine(self) -> tuple[ca.DM, ca.DM]:
         """Slopes by x, and constants, of what is 0 where gauges stand as they were set.

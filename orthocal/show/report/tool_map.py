@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations
 from typing import Literal
 
@@ -40,7 +40,13 @@ EVEN = 1e-4
 LEVELS = 8
 
 FINE = 43
-"""Points a side that the map is drawn from; those of a grid of seven are among them."""
+"""Points a side that the map is drawn from."""
+
+ARROWS = np.array([-2.0, 0.0, 2.0]) / 3.0
+"""Where arrows are drawn along a side, from -1 to 1."""
+
+HIGHEST_DEGREE = 4
+"""Of the splines between points: with five a side they are the polynomials through all of them."""
 
 COLOURS = "cividis"
 
@@ -109,20 +115,24 @@ def _draw_tool_map(
     world = tuple(range(len(lines))) if tcp is None else tcp.coordinates
     grid = _error_parts(calibration, accuracy, which).reshape(*(line.size for line in lines), -1)
     cuts = [_cut(grid, plane) for plane in planes]
+    between = [
+        _interpolate([lines[k] for k in plane], cut)
+        for plane, cut in zip(planes, cuts, strict=True)
+    ]
     fine = [
-        _refine([lines[k] for k in plane], cut) for plane, cut in zip(planes, cuts, strict=True)
+        _refine([lines[k] for k in plane], at) for plane, at in zip(planes, between, strict=True)
     ]
     levels = _choose_levels(np.concatenate([size.reshape(-1) for *_, size in fine]))
     figure = open_figure(3.0 if len(planes) > 1 else 5.0, TITLES[which], legend=False)
     panels = np.atleast_1d(figure.subplots(1, len(planes)))
-    for axes, plane, cut, (x, y, size) in zip(panels, planes, cuts, fine, strict=True):
+    for axes, plane, at, (x, y, size) in zip(panels, planes, between, fine, strict=True):
         axes.set(aspect="equal", title=_describe_cut(lines, plane, world))
         axes.set_xlabel(f"{'xyz'[world[plane[0]]]} [mm]")
         axes.set_ylabel(f"{'xyz'[world[plane[1]]]} [mm]", labelpad=0.0)
         taken = np.zeros((0, 2))
         if which != "unknown":
-            at_x, at_y = (lines[k] / MM for k in plane)
-            taken = _draw_arrows(axes, at_x, at_y, cut, [world[k] for k in plane], levels)
+            sides = [lines[k] for k in plane]
+            taken = _draw_arrows(axes, sides, at, [world[k] for k in plane], levels)
         _draw_size(axes, x, y, size, levels, taken)
     label = "size of the error [µm]; arrows: its part in the plane"
     if which == "unknown":
@@ -150,17 +160,25 @@ def _cut(grid: Array, plane: tuple[int, ...]) -> Array:
     return np.asarray(grid[middle])
 
 
-def _refine(lines: list[Array], parts: Array) -> tuple[Array, Array, Array]:
-    """Size of an error between points of its grid, by splines through its parts.
+def _interpolate(lines: list[Array], parts: Array) -> Callable[[Array, Array], Array]:
+    """An error between points of its grid: (x, y) in m to (parts, n_x, n_y), by splines."""
+    degree = {
+        k: min(HIGHEST_DEGREE, line.size - 1) for k, line in zip(("kx", "ky"), lines, strict=True)
+    }
+    splines = [RectBivariateSpline(*lines, p, **degree) for p in np.moveaxis(parts, -1, 0)]
+    return lambda x, y: np.array([spline(x, y) for spline in splines])
+
+
+def _refine(
+    lines: list[Array], between: Callable[[Array, Array], Array]
+) -> tuple[Array, Array, Array]:
+    """Size of an error all over a plane.
 
     Returns:
         x and y, [mm], and the size, shape (n_y, n_x).
     """
     x, y = (np.linspace(line[0], line[-1], FINE) for line in lines)
-    degree = {"kx": min(3, lines[0].size - 1), "ky": min(3, lines[1].size - 1)}
-    splines = [RectBivariateSpline(*lines, p, **degree) for p in np.moveaxis(parts, -1, 0)]
-    size = np.linalg.norm([spline(x, y) for spline in splines], axis=0)
-    return x / MM, y / MM, size.T
+    return x / MM, y / MM, np.linalg.norm(between(x, y), axis=0).T
 
 
 def _describe_cut(lines: list[Array], plane: tuple[int, ...], world: tuple[int, ...]) -> str:
@@ -224,20 +242,25 @@ def _place_labels(
 
 
 def _draw_arrows(
-    axes: Axes, x: Array, y: Array, vectors: Array, within: list[int], levels: Array
+    axes: Axes,
+    lines: list[Array],
+    between: Callable[[Array, Array], Array],
+    within: list[int],
+    levels: Array,
 ) -> Array:
-    """The part of an error, shape (n_x, n_y, 3), in the plane, on every other inner point.
+    """The part of an error in the plane.
 
     Returns:
         Points that the arrows cover, shape (n, 2), [mm].
     """
-    some = vectors[1:-1:2, 1:-1:2].transpose(1, 0, 2).reshape(-1, 3)
+    x, y = (0.5 * (v[0] + v[-1] + (v[-1] - v[0]) * ARROWS) for v in lines)
+    some = between(x, y).transpose(2, 1, 0).reshape(-1, 3)
     parts = some[:, within]
     longest = float(np.linalg.norm(parts, axis=1).max())
     if longest < FINEST:
         return np.zeros((0, 2))
-    drawn = parts * (ARROW * (x[2] - x[0]) / longest)
-    points = np.stack(np.meshgrid(x[1:-1:2], y[1:-1:2]), axis=-1).reshape(-1, 2)
+    drawn = parts * (ARROW * (x[1] - x[0]) / MM / longest)
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / MM
     axes.quiver(
         *points.T,
         *drawn.T,

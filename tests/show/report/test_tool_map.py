@@ -23,6 +23,9 @@ SVG = "{http://www.w3.org/2000/svg}"
 GRID = 1e-9
 """[µm] Splines at the points that they go through."""
 
+BETWEEN = 1e-3
+"""Relative: polynomials of the fourth degree over a region of 120 mm."""
+
 CONTOUR = 0.2
 """[mm] Contours of a length between points of the drawn grid, 3 mm apart."""
 
@@ -149,13 +152,30 @@ def test_a_machine_worse_than_its_tolerances_is_known_less_well(experiment_2):
 
 def test_the_map_goes_through_the_points_of_the_grid(table1, accuracy):
     lines = tool_map._find_grid(accuracy.workspace.points)
-    grid = tool_map._error_parts(table1, accuracy, "now").reshape(7, 7, 7, 3)
+    grid = tool_map._error_parts(table1, accuracy, "now").reshape(5, 5, 5, 3)
     cut = tool_map._cut(grid, (0, 2))
-    np.testing.assert_array_equal(cut, grid[:, 3, :])
-    x, y, size = tool_map._refine([lines[0], lines[2]], cut)
-    np.testing.assert_allclose(x[::7], lines[0] * 1e3, atol=GRID)
-    np.testing.assert_allclose(y[::7], lines[2] * 1e3, atol=GRID)
-    np.testing.assert_allclose(size[::7, ::7].T, np.linalg.norm(cut, axis=-1), atol=GRID)
+    np.testing.assert_array_equal(cut, grid[:, 2, :])
+    sides = [lines[0], lines[2]]
+    between = tool_map._interpolate(sides, cut)
+    np.testing.assert_allclose(np.moveaxis(between(*sides), 0, -1), cut, atol=GRID)
+    x, y, size = tool_map._refine(sides, between)
+    for found, line in ((x, lines[0]), (y, lines[2])):
+        np.testing.assert_allclose(found, np.linspace(line[0], line[-1], 43) * 1e3, atol=GRID)
+    for i, j in ((0, 0), (0, 21), (21, 21), (42, 0)):  # corners and middles are in both
+        at = cut[i * 4 // 42, j * 4 // 42]
+        assert abs(size[j, i] - np.linalg.norm(at)) < GRID
+
+
+def test_the_map_between_its_points_is_that_of_the_machine(table1, accuracy):
+    """Halfway between middle and end, by the machine itself."""
+    robot, half = table1.robot, accuracy.workspace.half_side
+    lines = tool_map._find_grid(accuracy.workspace.points)
+    fine = assess_tool(table1, cube(robot, half_side=half, points_a_side=9))
+    nine = tool_map._find_grid(fine.workspace.points)
+    known = fine.deviation.reshape(9, 9, 9, 3)[:, :, 4] * 1e6
+    cut = accuracy.deviation.reshape(5, 5, 5, 3)[:, :, 2] * 1e6
+    between = tool_map._interpolate(lines[:2], cut)
+    np.testing.assert_allclose(np.moveaxis(between(*nine[:2]), 0, -1), known, rtol=BETWEEN)
 
 
 def test_contours_lie_where_the_error_has_their_size(table1, accuracy):
