@@ -50,6 +50,12 @@ def kept_function(robot: Robot, name: str, build: Callable[[], ca.Function]) -> 
     return _RECENT[key]
 
 
+def known_as(function: ca.Function) -> str | None:
+    """By what a function is kept in this process; None for others."""
+    same = (key for key, kept in _RECENT.items() if kept.__hash__() == function.__hash__())
+    return next(same, None)
+
+
 def _recall(key: str) -> ca.Function | None:
     content = cache.recall(key)
     if content is None:

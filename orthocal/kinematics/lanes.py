@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from orthocal import cache
 from orthocal.kinematics.interpreter import LANE, OPERATIONS, interpreter, is_installed
+from orthocal.kinematics.kept import known_as
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -110,11 +111,13 @@ def find_listing(function: ca.Function) -> Listing | None:
     """
     if function.n_instructions() < FEWEST_KEPT:
         return list_instructions(function)
-    try:
-        digest = hashlib.sha256(function.serialize().encode()).hexdigest()
-    except RuntimeError:  # some cannot be written
-        return list_instructions(function)
-    key = f"listing {digest}\n{_CODE}"
+    name = known_as(function)
+    if name is None:
+        try:
+            name = hashlib.sha256(function.serialize().encode()).hexdigest()
+        except RuntimeError:  # some cannot be written
+            return list_instructions(function)
+    key = f"listing {name}\n{_CODE}"
     found = _read(cache.recall(key), function)
     if found is None and (found := list_instructions(function)) is not None:
         arrays = found.table, found.constants, np.array(found.n_work), found.first_out

@@ -8,6 +8,7 @@ import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.choice import build_program
 from orthocal.estimation.solvers.program import Program, Solution
+from orthocal.kinematics.lanes import expect_many
 from orthocal.measurement.joining import join_sessions
 from orthocal.measurement.session import Gauge, Session
 from orthocal.measurement.synthetic import draw_errors
@@ -187,13 +189,21 @@ def identify(session: Session, other: Session, *, solver: SolverKind = "ipopt") 
     return Identification(program, first, again, timing)
 
 
+def load_libraries() -> None:
+    """Load what is loaded when first needed: SciPy, as for the peer, and LLVM where it is."""
+    for name in ("scipy.linalg", "scipy.sparse"):
+        import_module(name)
+    expect_many()
+
+
 def measure(n_postures: int, solver: SolverKind = "ipopt") -> Timing:
-    """Time one identification.
+    """Time one identification, libraries loaded.
 
     Args:
         n_postures: As for `simulate`.
         solver: Which one.
     """
+    load_libraries()
     session = simulate(n_postures)
     return identify(session, resimulate(session, seed=2), solver=solver).timing
 

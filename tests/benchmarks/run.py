@@ -48,7 +48,7 @@ WIDTH = 100
 
 LEGEND = f"""
 All parameters of model '{MODEL}' with their tolerances as prior, sigma {SIGMA * 1e6:g} µm.
-  build, solve   from a session to its solution, in a fresh process
+  build, solve   from a session to its solution, in a fresh process with its libraries loaded
   again          other readings, same program
   µs a reading   build and solve
   MB             most memory held: before building (libraries, simulation), and until solved
