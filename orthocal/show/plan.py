@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from typing import Any
 
 from rich.console import Group, RenderableType
@@ -33,6 +32,9 @@ SOME_LOST = 0.01
 
 HELPFUL = 0.1
 """Part of the error that a help must take off to be one."""
+
+NOTICEABLE = 0.02
+"""Part of it below which a help is none: the search for a plan leaves as much."""
 
 MOST_LISTED = 24
 """Setups that are listed one by one."""
@@ -245,13 +247,19 @@ def _alternatives(plan: MeasuringPlan, closing: int) -> RenderableType:
 
 
 def _helps(plan: MeasuringPlan) -> list[str]:
+    """What would help, the most first; all that was tried, where nothing does."""
+    mine = plan.expected.headline.rms
     found = sorted(plan.helps, key=lambda a: a.expected.headline.rms)
-    texts = [f"The same readings with {a.name}: {_um(a.expected)} µm." for a in found]
-    best = min((a.expected.headline.rms for a in found), default=math.inf)
-    if best > (1.0 - HELPFUL) * plan.expected.headline.rms:
+    some = [a for a in found if a.expected.headline.rms < (1.0 - NOTICEABLE) * mine]
+    texts = [f"The same readings with {a.name}: {_um(a.expected)} µm." for a in some]
+    if found and found[0].expected.headline.rms > (1.0 - HELPFUL) * mine:
+        tried = "; ".join(a.name for a in found)
+        none = f"None of this takes {HELPFUL:.0%} off"
+        if not some:
+            none = f"Nothing that was tried ({tried}) takes {NOTICEABLE:.0%} off"
         texts.append(
-            f"None of this takes {HELPFUL:.0%} off: what is left asks for another sensor, such as "
-            "an indicator at the tool along a square."
+            f"{none}: what is left asks for another sensor, such as an indicator at the tool along "
+            "a square."
         )
     return texts
 

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 from processes import children_of, is_running, until
@@ -147,6 +148,31 @@ def plan_for(robot, criterion):
 @pytest.fixture(scope="module")
 def for_the_headline(orthoglide):
     return plan_for(orthoglide, "aligned")
+
+
+def test_what_gains_nothing_is_no_help(for_the_headline):
+    """As much as the plan itself leaves, or a trifle less, or more."""
+    plan = for_the_headline
+    assert len(plan.helps) >= 2
+    first, second, *_ = plan.helps
+    name = second.name
+    none = [replace(first, name="a mirror", expected=plan.expected)]
+    text = summarize(replace(plan, helps=tuple(none)))
+    assert "a mirror: " not in text
+    assert "Nothing that was tried (a mirror) takes 2% off" in text
+    much = replace(second, expected=plan_for_half(plan))
+    text = summarize(replace(plan, helps=(*none, much)))
+    assert f"The same readings with {name}: " in text
+    assert "mirror" not in text
+    assert "off: what is left asks" not in text
+
+
+def plan_for_half(plan):
+    """What is expected of a plan, with half of the error."""
+    sizes = plan.expected.tool.sizes
+    half = replace(sizes.aligned, rms=0.5 * sizes.aligned.rms)
+    tool = replace(plan.expected.tool, sizes=replace(sizes, aligned=half))
+    return replace(plan.expected, tool=tool)
 
 
 @pytest.mark.parametrize("criterion", ["relative", "absolute", "worst", "A", "D", "E"])
