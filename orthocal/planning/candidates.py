@@ -21,7 +21,7 @@ from orthocal.measurement.observations import build_observations
 from orthocal.measurement.sensing import locate_contacts
 from orthocal.measurement.session import Posture, Reading, Session, Setup
 from orthocal.measurement.setting import slopes_by_errors
-from orthocal.planning.means import Means, find_box, reachable
+from orthocal.planning.means import Means, choose_box, reachable
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.leg_indicator import Direction, LegIndicator, Section
 from orthocal.sensors.protocol import Sensor
@@ -267,7 +267,7 @@ def _reach_each_other(session: Session, h: Array, unknown: Array) -> NDArray[np.
 
 def _postures(robot: Robot, leg: Leg, means: Means, postures: dict[str, Posture]) -> list[str]:
     """Names of the postures that a leg could be read in; they are added to those there are."""
-    box = find_box(robot) if means.box is None else means.box
+    box = choose_box(robot, means.box)
     middle = tool_at_zero(robot)
     coordinates = () if robot.tcp is None else robot.tcp.coordinates
     own = [k for k, c in enumerate(coordinates) if abs(leg.axis[c]) > ON_AXIS]

@@ -12,7 +12,7 @@ from orthocal.errors import RobotError
 from orthocal.kinematics.assembly import nominal_assembly
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.session import Posture, Reading, Session, Setup
-from orthocal.planning.means import Means, find_box
+from orthocal.planning.means import Means, choose_box
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.leg_indicator import LegIndicator, Section
 from orthocal.sensors.protocol import Sensor
@@ -43,7 +43,7 @@ def first_means(robot: Robot, means: Means) -> Means:
     Raises:
         RobotError: If the tool of the machine hardly moves.
     """
-    box = find_box(robot) if means.box is None else means.box
+    box = choose_box(robot, means.box)
     middle = tool_at_zero(robot)
     low, high = (box - middle[:, None]).T
     if low.max() > -LEAST or high.min() < LEAST:

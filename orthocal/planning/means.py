@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -97,6 +98,43 @@ def find_box(robot: Robot) -> Array:
             for k in range(middle.size)
         ]
     )
+
+
+def choose_box(robot: Robot, asked: Array | None) -> Array:
+    """The box of the tool to choose postures from: `find_box`, or what is reached of another.
+
+    Postures lie evenly between its ends: ends that the tool never gets to would leave few of them.
+
+    Args:
+        robot: The robot.
+        asked: Least and largest tool coordinates, shape (n_coordinates, 2), [m].
+
+    Returns:
+        The same, its ends no farther than the tool gets from the mechanical zero along each
+        coordinate, in whole steps.
+
+    Raises:
+        ParameterError: If the robot's drives do not command its tool.
+    """
+    if asked is None:
+        return find_box(robot)
+    found, middle = np.array(asked, dtype=np.float64), tool_at_zero(robot)
+    for k, way in itertools.product(range(middle.size), (-1.0, 1.0)):
+        end = 0 if way < 0.0 else 1
+        point = np.array(middle)
+        point[k] = found[k, end]
+        if way * (point[k] - middle[k]) <= 0.0 or reachable(robot, point[None])[0]:
+            continue
+        near, far = 0.0, abs(point[k] - middle[k])
+        while far - near > ROOM:
+            point[k] = middle[k] + way * 0.5 * (near + far)
+            reached = reachable(robot, point[None])[0]
+            near, far = (0.5 * (near + far), far) if reached else (near, 0.5 * (near + far))
+        steps = math.floor(max(near - ROOM, 0.0) / STEP + 1e-9)
+        found[k, end] = middle[k] + way * STEP * steps
+    beyond = found[:, 0] > found[:, 1]  # all of it: there will be no postures
+    found[beyond] = asked[beyond]
+    return read_only(found)
 
 
 def _reach(robot: Robot, middle: Array, coordinate: int, way: float) -> float:

@@ -20,7 +20,7 @@ from orthocal.measurement.session import Gauge
 from orthocal.measurement.session_output import write_session
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.choosing import choose_setups
-from orthocal.planning.means import Means, find_box
+from orthocal.planning.means import Means, choose_box, find_box
 from orthocal.planning.plan import plan_readings
 from orthocal.planning.prediction import ToolForecast, default_workspace
 from orthocal.robot.making import Sizes, make_robot
@@ -197,6 +197,17 @@ def test_more_setups_on_top_of_a_session_are_worth_what_both_say(orthoglide, roo
     known = forecast.about_nominal(measured).headline.rms
     assert plan.curve[0].error == pytest.approx(more * known, rel=1e-3)
     assert set(plan.session.setups).isdisjoint(measured.setups)
+
+
+def test_a_box_ends_where_the_tool_still_gets(orthoglide):
+    """Drives go from 120 to 390 mm and are at 310 in the zero: -190 to 79 mm, less some room."""
+    whole = np.array([[-0.12, 0.07], [-0.12, 0.07], [0.0, 0.06]])
+    assert np.array_equal(choose_box(orthoglide, whole), whole)
+    assert np.array_equal(choose_box(orthoglide, None), find_box(orthoglide))
+    large = choose_box(orthoglide, np.array([[-0.5, 0.5], [-0.5, 0.02], [-9.0, 9.0]]))
+    assert large == pytest.approx(np.array([[-0.18, 0.07], [-0.18, 0.02], [-0.18, 0.07]]))
+    beside = np.array([[0.3, 0.5]] * 3)
+    assert np.array_equal(choose_box(orthoglide, beside), beside)
 
 
 def test_the_box_is_what_the_tool_reaches(orthoglide):
