@@ -19,6 +19,7 @@ from orthocal.cli import asking
 from orthocal.cli.run import main
 from orthocal.errors import ParameterError
 from orthocal.measurement.purpose import Purpose
+from orthocal.robot.making import remake_robot
 
 SIZES = {
     "--leg-mm": "250",
@@ -310,4 +311,8 @@ def test_without_the_papers_plan_one_is_chosen(capsys, tmp_path):
     assert session.purpose == Purpose("full")
     assert session.robot.parameters.stated == {"*.offset_mm": 2.0}
     assert session.robot.parameters["y_slide.offset"].tolerance == 2e-3
+    machine = load_robot(tmp_path / "mill")  # what is planned for it later goes by them, too
+    assert machine.parameters["y_slide.offset"].tolerance == 2e-3
+    assert machine.parameters["x_leg.length"].tolerance == 1e-4
+    assert remake_robot(tmp_path / "mill").parameters["y_slide.offset"].tolerance == 2e-3
     assert "hinge: look" not in (first / "sheet.html").read_text()

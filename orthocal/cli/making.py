@@ -116,8 +116,16 @@ def new(
         robot = load_robot(Path(trial) / name)
         plan, session = _plan(robot, means, paper=paper, hours=hours, model=model, given=tolerance)
         extra = _extra(plan, session)
+    stated = session.robot.parameters.stated
+    files = describe_machine(
+        answers.sizes,
+        name=name,
+        counting=answers.counting,
+        where=str(folder),
+        tolerances=stated,
+    )
     write_files(folder, files)
-    own = load_robot(folder).with_tolerances(session.robot.parameters.stated)
+    own = load_robot(folder).with_tolerances(stated)
     session = replace(session, robot=own, robot_reference=str(folder.resolve()))
     _write(session, folder / FIRST, extra)
     _tell(folder, answers.sizes.words, plan, session, extra)

@@ -6,9 +6,10 @@ else, joints, loops, legs, error parameters and models, is as there.
 
 from __future__ import annotations
 
+import json
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lxml import etree
@@ -37,6 +38,7 @@ RAIL = 0.09
 _HEAD = re.compile(r"\A(?:# (?:A machine of the Orthoglide's kind|Made from).*\n)+")
 _DRIVE = r"(?m)^(?P<name> *{axis}_slide: )\{{[^#\n]*zero_mm: [^#\n]*\}}(?P<rest> *(?:#.*)?)$"
 _RADIUS = re.compile(r"radius_mm: [-+.0-9e]+")
+_TOLERANCES = re.compile(r"(?m)^( *tolerances: \{[^{}\n]*)\}")
 
 
 def describe_machine(
@@ -46,6 +48,7 @@ def describe_machine(
     counting: Sequence[Counting] = (AS_DRIVE,) * 3,
     where: str = "sizes",
     description: str | None = None,
+    tolerances: Mapping[str, float] | None = None,
 ) -> dict[str, str]:
     """The files of a machine: name to text.
 
@@ -55,6 +58,8 @@ def describe_machine(
         counting: How the controller's joints of x, y and z count.
         where: For messages.
         description: The robot's YAML to put the sizes into; the packaged one's by default.
+        tolerances: Names or globs with their unit, such as *.offset_mm, to tolerances that hold
+            instead of the packaged ones; none beside a description, which has its own.
 
     Raises:
         RobotError: If the sizes make no machine, or the YAML has no place for them.
@@ -68,6 +73,8 @@ def describe_machine(
         read_file(folder / f"{PATTERN}.{kind}", error=RobotError) for kind in ("urdf", "yaml")
     )
     pattern = packaged.decode() if description is None else description
+    if tolerances:
+        pattern = _override(pattern, tolerances, f"{name}.yaml")
     return {
         f"{name}.yaml": _describe(pattern, sizes, counting, f"{name}.yaml"),
         f"{name}.urdf": _draw(urdf, sizes),
@@ -204,6 +211,19 @@ def _describe(pattern: str, sizes: Sizes, counting: Sequence[Counting], file: st
                 where=file,
             )
     return f"# {_words(sizes)}\n# Made from {MACHINE}: change sizes there.\n{text}"
+
+
+def _override(pattern: str, tolerances: Mapping[str, float], file: str) -> str:
+    """The YAML with other tolerances of some errors.
+
+    Raises:
+        RobotError: If there is no place for them.
+    """
+    given = ", ".join(f"{json.dumps(name)}: {_number(v)}" for name, v in tolerances.items())
+    text, found = _TOLERANCES.subn(lambda m: f"{m[1]}, overrides: {{{given}}}}}", pattern)
+    if found != 1:
+        raise RobotError("has no line 'tolerances: {...}', where others would stand", where=file)
+    return text
 
 
 def _words(sizes: Sizes) -> str:
