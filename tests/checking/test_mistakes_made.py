@@ -14,15 +14,23 @@ import pytest
 from made_mistakes import Sheet, is_named, make_mistakes, plain_mistakes, sound_session
 from typer.testing import CliRunner
 
-from orthocal import ParameterError, calibrate, check_session, load_plan, load_session
+from orthocal import (
+    ParameterError,
+    calibrate,
+    check_session,
+    load_plan,
+    load_session,
+    simulate_session,
+)
 from orthocal.assess.findings.calibration import decide
-from orthocal.assess.findings.session import MISTAKES, _sureness
+from orthocal.assess.findings.session import MISTAKES, _sureness, decide_session
 from orthocal.checking.edits import Table
 from orthocal.checking.families.exchanged import find_exchanged
 from orthocal.checking.families.scaled import find_scaled
 from orthocal.checking.families.single import find_single
 from orthocal.checking.search import find_mistakes
 from orthocal.cli.run import app
+from orthocal.measurement.synthetic import draw_errors
 
 TOLD = 40
 """Kinds of mistake that are made here at least."""
@@ -173,7 +181,7 @@ def test_hardly_a_sound_session_is_accused(root, example):
     accused = [
         seed
         for seed in range(1000, 1030)
-        if find_mistakes(sound_session(plan, seed, entered=seed % 2 == 1))
+        if check_session(sound_session(plan, seed, entered=seed % 2 == 1))
     ]
     assert not accused
 
@@ -183,3 +191,23 @@ def test_a_mistake_whose_mending_no_machine_shows_says_the_odds_alone(cycles):
     (found, *_) = find_mistakes(turned(cycles, row))
     assert "Mended, " in _sureness(found)
     assert _sureness(replace(found, after=math.inf)).startswith("Odds that something is wrong: ")
+
+
+def test_what_a_calibration_stops_at_a_check_has_named(root):
+    """A turned setup within the tolerances of offsets, which a check alone takes for theirs."""
+    plan = load_plan(root / "examples/workshop/plan.yaml")
+    offsets = dict.fromkeys((f"{axis}_slide.offset_m" for axis in "xyz"), 1e-3)
+    patterns = plan.robot.parameters.patterns("full")
+    errors = draw_errors(plan.robot, patterns, seed=5, tolerances=offsets)
+    session = simulate_session(plan, errors, seed=5).session
+    assert check_session(session) == ()
+    signs = [-1.0 if r.setup == "zy" else 1.0 for r in session.readings]
+    other = session.with_values(np.array(signs) * session.values)
+    assert list(find_mistakes(other)) == []
+    decision = decide(calibrate(other))
+    assert decision.exit_code == 3
+    (found,) = check_session(other)
+    assert (found.kind, found.severity) == ("turned setup", "stops")
+    assert [p.setup for p in found.places] == ["zy"]
+    assert decide_session(other).exit_code == 3
+    assert found.text in {f.text for f in decision.findings}

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 
 from orthocal.arguments import require_kind
 from orthocal.assess.findings.decision import Decision
 from orthocal.assess.findings.finding import Finding, Kind, Place, Severity
+from orthocal.assess.findings.readings import find_turned
 from orthocal.assess.plausibility import MOST_PLACES, find_finer
 from orthocal.assess.wording import mm, signed, um
+from orthocal.calibration.calibrate import calibrate
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.repeating import restore_session
 from orthocal.checking.mistake import Mistake
@@ -66,7 +69,9 @@ def check_session(session: Session, model: str | None = None) -> tuple[Finding, 
 
     Readings are held against a machine of which the tolerances alone are known, so that no fit is
     needed, and against each other where they were repeated. A mistake is named where it makes
-    readings far likelier than none does, and than any other; else it is one of several.
+    readings far likelier than none does, and than any other; else it is one of several. Where there
+    is none, a calibration is asked whether a setup was read with the wrong sign: it takes offsets
+    to be anything, and may see what lies within their tolerances.
 
     Args:
         session: The session.
@@ -86,8 +91,19 @@ def check_session(session: Session, model: str | None = None) -> tuple[Finding, 
         return tuple(found)
     every = [_find_finer(session, gauge) for gauge in session.gauges]
     if not found:
+        every += _find_turned_by_fit(session, model)
         every += [_find_scattered(session, gauge) for gauge in session.gauges]
     return (*found, *(f for f in every if f is not None))
+
+
+def _find_turned_by_fit(session: Session, model: str | None) -> list[Finding]:
+    """Setups of each session by itself that a calibration of it takes to be turned."""
+    found: list[Finding] = []
+    for part in split_sessions(session):
+        # a session that cannot be calibrated, as one that is half measured, tells nothing here
+        with suppress(OrthocalError):
+            found += find_turned(calibrate(part, model, solver="eliminated"))
+    return found
 
 
 def _find_finer(session: Session, gauge: str) -> Finding | None:
