@@ -76,7 +76,7 @@ def swap(file: str, old: str, new: str) -> Edit:
 
 def write(file: str, content: str | bytes) -> Edit:
     def edit(folder: Path) -> None:
-        (folder / file).parent.mkdir(exist_ok=True)
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
         (folder / file).write_bytes(content if isinstance(content, bytes) else content.encode())
 
     return edit
@@ -474,6 +474,21 @@ SESSION_FILE_CASES = [
         "{tmp}/above/session.yaml: there is no such file; sessions in it: {tmp}/above/first",
         (write("above/x", ""), write("above/first/session.yaml", "")),
         command="calibrate {tmp}/above --out {tmp}/out",
+    ),
+    Case(
+        "session-folder-above-many",
+        "{tmp}/above/session.yaml: there is no such file; sessions in it: "
+        + ", ".join(f"{{tmp}}/above/{k}" for k in range(1, 6))
+        + ", ...",
+        tuple(write(f"above/{k}/session.yaml", "") for k in range(1, 8)),
+        command="calibrate {tmp}/above --out {tmp}/out",
+    ),
+    Case(
+        "session-folder-of-a-calibration",
+        "{tmp}/one/session.yaml: there is no such file; the folder holds a calibration: name the "
+        "session that it was made from",
+        (write("one/calibration.json", "{{}}"),),
+        command="calibrate {tmp}/one --out {tmp}/out",
     ),
     Case(
         "session-name-too-long",

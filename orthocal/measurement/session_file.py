@@ -38,6 +38,9 @@ Array = NDArray[np.float64]
 
 SESSION = "session.yaml"
 
+MOST_LOOKED_AT = 200
+"""Folders in which a session is looked for, where one was not found."""
+
 MOST_NAMED = 5
 """Sessions of a folder that are named where it is none itself."""
 
@@ -174,12 +177,21 @@ def _read_keys(path: Path) -> tuple[Path, bytes, SessionKeys]:
     if file.suffix.lower() in OTHER_KINDS:
         raise SessionError("is no session.yaml", where=str(file))
     if file is not path and not exists(file):
-        own = sorted(f.parent for f in islice(path.glob(f"*/{SESSION}"), MOST_NAMED))
-        there = f"; sessions in it: {', '.join(map(str, own))}" if own else ""
-        raise SessionError(f"there is no such file{there}", where=str(file))
+        raise SessionError(f"there is no such file{_what_is_there(path)}", where=str(file))
     content = read_file(file, error=SessionError)
     data = read_yaml(file, error=SessionError, content=content)
     return file, content, validate(SessionKeys, data, where=str(file), error=SessionError)
+
+
+def _what_is_there(folder: Path) -> str:
+    """What a folder without a session holds instead, as the end of a message."""
+    if exists(folder / "calibration.json"):
+        return "; the folder holds a calibration: name the session that it was made from"
+    own = sorted(f.parent for f in islice(folder.glob(f"*/{SESSION}"), MOST_LOOKED_AT))
+    if not own:
+        return ""
+    more = ", ..." if len(own) > MOST_NAMED else ""
+    return f"; sessions in it: {', '.join(map(str, own[:MOST_NAMED]))}{more}"
 
 
 _Setups = Mapping[str, tuple[SetupKeys, Sensor]]
