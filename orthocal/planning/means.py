@@ -61,7 +61,8 @@ class Means:
     sections: tuple[float, ...] = SECTIONS
     """As parts of a leg's length, from its root."""
     box: Array | None = None
-    """Least and largest tool coordinates, shape (n_coordinates, 2), [m]; `find_box` by default."""
+    """Least and largest tool coordinates, shape (n_coordinates, 2), [m]; `choose_box` cuts it off
+    where the tool does not get, and has one of its own where none is given."""
     along: int = 9
     """Places on a leg's way."""
     across: float = ACROSS
