@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import os
 import shutil
 import subprocess
@@ -46,6 +47,9 @@ def pytest_sessionstart(session):
         session.config.add_cleanup(process.wait)
 
 
+MORE_GARBAGE = (20_000, 20, 20)
+"""Objects, and passes, after which garbage is looked for."""
+
 LONGEST = ("test_examples.py", "test_fuzz.py", "test_whole_walk.py")
 """Files with tests that take as long as a hundred others."""
 
@@ -53,6 +57,13 @@ LONGEST = ("test_examples.py", "test_fuzz.py", "test_whole_walk.py")
 def pytest_collection_modifyitems(items):
     """What takes longest begins first: at the end others would wait for it."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
+def pytest_collection_finish():
+    """What is there now stays: to look through it for garbage again and again takes its time."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(*MORE_GARBAGE)
 
 
 @pytest.fixture(scope="session")

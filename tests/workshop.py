@@ -7,6 +7,7 @@ none: nothing here is a formula of orthocal's.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import pinocchio as pin
@@ -101,6 +102,12 @@ class Workshop:
 
 def _place(machine, drives):
     """Positions of all frames, loops closed by Pinocchio."""
+    return _place_once(machine, tuple(drives.tolist()))
+
+
+@lru_cache(maxsize=256)
+def _place_once(machine, coordinates):
+    drives = np.array(coordinates)
     passive = machine.close_with_pinocchio(drives, machine.zero[machine.passive_index])
     data = machine.model.createData()
     q = machine.configuration(machine.joint_coordinates(drives, passive))

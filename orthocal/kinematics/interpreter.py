@@ -2,7 +2,7 @@
 
 LLVM (llvmlite) makes it for the processor that it runs on, in some hundredths of a second. It does
 what CasADi's machine does, in the same order: operations that are correctly rounded, and functions
-of the C library, so that the numbers are the same. Work is in rows of LANE numbers, a row a place.
+of the C library, so that the numbers are the same. Work is in rows as long as the lane, a row a place.
 """
 
 from __future__ import annotations
@@ -13,10 +13,8 @@ from contextlib import contextmanager
 from functools import lru_cache
 from importlib.util import find_spec
 
-LANE = 32
-"""Points that an instruction is taken for at once."""
-
-_ROW = f"<{LANE} x double>"
+SHORT, LONG = 8, 32
+"""Lanes that there are: points that an instruction is taken for at once."""
 
 _COMPUTED = {
     "ASSIGN": "{y} = select i1 true, {row} {a}, {row} {a}",
@@ -64,9 +62,9 @@ def is_installed() -> bool:
     return find_spec("llvmlite") is not None
 
 
-@lru_cache(maxsize=1)
-def interpreter() -> Interpreter | None:
-    """The interpreter; None where it cannot be made.
+@lru_cache(maxsize=2)
+def interpreter(lane: int) -> Interpreter | None:
+    """The interpreter for a lane of so many points; None where it cannot be made.
 
     Its arguments are addresses of arrays, and numbers:
 
@@ -82,7 +80,7 @@ def interpreter() -> Interpreter | None:
         points     how many
         outputs    shape (points, n_out)
         n_out
-        work       shape (n_work, LANE)
+        work       shape (n_work, lane)
     """
     from llvmlite import binding as llvm
 
@@ -96,7 +94,7 @@ def interpreter() -> Interpreter | None:
         target = llvm.Target.from_default_triple().create_target_machine(
             cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2
         )
-        module = llvm.parse_assembly(_Source().text())
+        module = llvm.parse_assembly(_Source(lane).text())
         module.verify()
         engine = llvm.create_mcjit_compiler(module, target)
         engine.finalize_object()
@@ -113,15 +111,16 @@ def interpreter() -> Interpreter | None:
 class _Source:
     """Its source, in LLVM's language."""
 
-    def __init__(self) -> None:
+    def __init__(self, lane: int) -> None:
+        self._lane, self._row = lane, f"<{lane} x double>"
         self._lines: list[str] = []
         self._names = 0
 
     def text(self) -> str:
         """All of it."""
-        row = _ROW
+        row, size = self._row, self._lane
         declared = [
-            f"declare {row} @llvm.{name}.v{LANE}f64({row})\n" for name in ("sqrt", "fabs")
+            f"declare {row} @llvm.{name}.v{size}f64({row})\n" for name in ("sqrt", "fabs")
         ] + [
             f"declare double @{name.lower()}({', '.join(['double'] * count)})\n"
             for name, count in _CALLED.items()
@@ -129,13 +128,13 @@ class _Source:
         self._put("define void @run(ptr %table, i64 %n, ptr %constants, ptr %inputs, ptr %strides,")
         self._put("ptr %shares, i64 %n_in, i64 %points, ptr %outputs, i64 %n_out, ptr %work) {")
         self._put("entry:")
-        begins = self._new(f"alloca ptr, i64 {self._new(f'mul i64 %n_in, {LANE}')}")
-        ends = self._new(f"alloca ptr, i64 {LANE}")
+        begins = self._new(f"alloca ptr, i64 {self._new(f'mul i64 %n_in, {size}')}")
+        ends = self._new(f"alloca ptr, i64 {size}")
         last = self._new("sub i64 %points, 1")
-        blocks = self._new(f"udiv i64 {self._new(f'add i64 %points, {LANE - 1}')}, {LANE}")
+        blocks = self._new(f"udiv i64 {self._new(f'add i64 %points, {size - 1}')}, {size}")
         with self._loop(blocks) as block:
-            first = self._new(f"mul i64 {block}, {LANE}")
-            with self._loop(str(LANE)) as lane:
+            first = self._new(f"mul i64 {block}, {size}")
+            with self._loop(str(size)) as lane:
                 self._find_point(first, lane, last, begins, ends)
             with self._loop("%n") as k:
                 self._take(k, begins, ends)
@@ -156,7 +155,7 @@ class _Source:
             row = self._new(f"udiv i64 {point}, {share}")
             array = self._load("ptr", self._at("%inputs", i, "ptr"))
             begin = self._at(array, self._new(f"mul i64 {row}, {stride}"), "double")
-            place = self._new(f"add i64 {self._new(f'mul i64 {i}, {LANE}')}, {lane}")
+            place = self._new(f"add i64 {self._new(f'mul i64 {i}, {self._lane}')}, {lane}")
             self._store("ptr", begin, self._at(begins, place, "ptr"))
 
     def _take(self, k: str, begins: str, ends: str) -> None:
@@ -168,7 +167,7 @@ class _Source:
         )
         to, a, b = (self._new(f"sext i32 {v} to i64") for v in places)
         to_row, a_row, b_row = (
-            self._at("%work", self._new(f"mul i64 {v}, {LANE}"), "double") for v in (to, a, b)
+            self._at("%work", self._new(f"mul i64 {v}, {self._lane}"), "double") for v in (to, a, b)
         )
         done, labels = self._label(), [self._label() for _ in OPERATIONS]
         cases = " ".join(f"i32 {i}, label %{label}" for i, label in enumerate(labels))
@@ -176,22 +175,22 @@ class _Source:
         for name, label in zip(OPERATIONS, labels, strict=True):
             self._put(f"{label}:")
             if name == "INPUT":
-                first = self._new(f"mul i64 {a}, {LANE}")
-                for lane in range(LANE):
+                first = self._new(f"mul i64 {a}, {self._lane}")
+                for lane in range(self._lane):
                     place = self._at(begins, self._new(f"add i64 {first}, {lane}"), "ptr")
                     value = self._load("double", self._at(self._load("ptr", place), b, "double"))
                     self._store("double", value, self._at(to_row, str(lane), "double"))
             elif name == "OUTPUT":
-                for lane in range(LANE):
+                for lane in range(self._lane):
                     value = self._load("double", self._at(a_row, str(lane), "double"))
                     end = self._load("ptr", self._at(ends, str(lane), "ptr"))
                     self._store("double", value, self._at(end, to, "double"))
             elif name == "CONST":
                 value = self._load("double", self._at("%constants", k, "double"))
-                one = self._new(f"insertelement {_ROW} poison, double {value}, i32 0")
-                same = f"<{LANE} x i32> zeroinitializer"
-                row = self._new(f"shufflevector {_ROW} {one}, {_ROW} poison, {same}")
-                self._store(_ROW, row, to_row)
+                one = self._new(f"insertelement {self._row} poison, double {value}, i32 0")
+                same = f"<{self._lane} x i32> zeroinitializer"
+                row = self._new(f"shufflevector {self._row} {one}, {self._row} poison, {same}")
+                self._store(self._row, row, to_row)
             elif name in _CALLED:
                 rows = [a_row, b_row][: _CALLED[name]]
                 self._call(name.lower(), to_row, rows)
@@ -202,22 +201,22 @@ class _Source:
 
     def _compute(self, name: str, to_row: str, a_row: str, b_row: str) -> None:
         form = _COMPUTED.get(name) or _COMPARED[name]
-        given = {"a": self._load(_ROW, a_row)}
+        given = {"a": self._load(self._row, a_row)}
         if "{b}" in form:
-            given["b"] = self._load(_ROW, b_row)
+            given["b"] = self._load(self._row, b_row)
         names = {v: self._name() for v in "ypqr"}
         same = {
-            v: f"<{', '.join([f'double {number}'] * LANE)}>"
+            v: f"<{', '.join([f'double {number}'] * self._lane)}>"
             for v, number in (("zero", "0.0"), ("one", "1.0"), ("minus", "-1.0"))
         }
-        fixed = {"row": _ROW, "flags": f"<{LANE} x i1>", "lane": LANE}
+        fixed = {"row": self._row, "flags": f"<{self._lane} x i1>", "lane": self._lane}
         self._put(form.format(**names, **given, **same, **fixed))
         if name in _COMPARED:
-            self._put(f"{names['y']} = uitofp <{LANE} x i1> {names['p']} to {_ROW}")
-        self._store(_ROW, names["y"], to_row)
+            self._put(f"{names['y']} = uitofp <{self._lane} x i1> {names['p']} to {self._row}")
+        self._store(self._row, names["y"], to_row)
 
     def _call(self, function: str, to_row: str, rows: Sequence[str]) -> None:
-        with self._loop(str(LANE)) as lane:
+        with self._loop(str(self._lane)) as lane:
             values = [self._load("double", self._at(row, lane, "double")) for row in rows]
             told = ", ".join(f"double {v}" for v in values)
             found = self._new(f"call double @{function}({told})")
@@ -241,11 +240,11 @@ class _Source:
         return self._new(f"getelementptr {kind}, ptr {array}, i64 {index}")
 
     def _load(self, kind: str, place: str) -> str:
-        align = ", align 8" if kind == _ROW else ""
+        align = ", align 8" if kind == self._row else ""
         return self._new(f"load {kind}, ptr {place}{align}")
 
     def _store(self, kind: str, value: str, place: str) -> None:
-        align = ", align 8" if kind == _ROW else ""
+        align = ", align 8" if kind == self._row else ""
         self._put(f"store {kind} {value}, ptr {place}{align}")
 
     def _new(self, what: str) -> str:

@@ -15,19 +15,20 @@ import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocal import cache
-from orthocal.kinematics.interpreter import LANE, OPERATIONS, interpreter, is_installed
+from orthocal.kinematics.interpreter import LONG, OPERATIONS, SHORT, interpreter, is_installed
 from orthocal.kinematics.kept import known_as
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-FEWEST = 8
+FEWEST = 3
 """Points below which a lane is not worth filling."""
 
 PATIENCE = 60e6
@@ -70,7 +71,7 @@ def running(way: Way) -> Iterator[None]:
 def expect_many() -> None:
     """Have the interpreter ready: many points are to come."""
     global _spent
-    if _chosen is Way.AUTO and is_installed() and interpreter() is not None:
+    if _chosen is Way.AUTO and is_installed() and interpreter(LONG) is not None:
         _spent = max(_spent, PATIENCE)
 
 
@@ -91,7 +92,7 @@ def pays(instructions: int, points: int, before: int) -> bool:
     return _spent > PATIENCE and before + points > POINTS
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Listing:
     """The instructions of a function."""
 
@@ -102,6 +103,16 @@ class Listing:
     n_work: int
     first_out: Indices
     """Where each output begins among all, shape (n_out + 1,)."""
+
+    @cached_property
+    def addresses(self) -> tuple[int, int]:
+        """Of table and constants."""
+        return self.table.ctypes.data, self.constants.ctypes.data
+
+    @cached_property
+    def ends(self) -> list[int]:
+        """As `first_out`."""
+        return list(self.first_out.tolist())
 
 
 def find_listing(function: ca.Function) -> Listing | None:
@@ -180,20 +191,23 @@ def run_in_lanes(
     Returns:
         Nonzeros of each output, shape (count, nnz); None where there is no interpreter.
     """
-    run = interpreter()
+    lane = SHORT if count <= SHORT else LONG
+    run = interpreter(lane)
     if run is None:
         return None
     arrays = [np.ascontiguousarray(a) for a in inputs]
     rows = [(0, 1) if i in shared else (a.shape[1], len(a)) for i, a in enumerate(arrays)]
-    where = np.array([a.ctypes.data for a in arrays], dtype=np.uint64)
-    strides = np.array([stride for stride, _ in rows], dtype=np.int64)
-    shares = np.array([max(count, 1) // max(size, 1) for _, size in rows], dtype=np.int64)
-    ends = listing.first_out.tolist()
-    result, work = np.empty((count, ends[-1])), np.empty((listing.n_work, LANE))
+    points = max(count, 1)
+    # where each input is, how far it is from row to row, and how many points share one
+    told = [a.ctypes.data for a in arrays]
+    told += [stride for stride, _ in rows] + [points // max(size, 1) for _, size in rows]
+    given, size = np.array(told, dtype=np.int64), 8 * len(arrays)
+    ends = listing.ends
+    result, work = np.empty((count, ends[-1])), np.empty((listing.n_work, lane))
     if count:
-        given = (listing.constants, where, strides, shares)
+        table, constants = listing.addresses
+        where = given.ctypes.data
+        of_inputs = (where, where + size, where + 2 * size, len(arrays))
         own = (result.ctypes.data, ends[-1], work.ctypes.data)
-        addresses = (a.ctypes.data for a in given)
-        size = len(listing.table)
-        run(listing.table.ctypes.data, size, *addresses, len(arrays), count, *own)
+        run(table, len(listing.table), constants, *of_inputs, count, *own)
     return [result[:, a:b] for a, b in itertools.pairwise(ends)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from importlib import resources
 from pathlib import Path
 
@@ -54,6 +54,9 @@ Array = NDArray[np.float64]
 LONGEST_LEG = 20.0
 """A leg beyond this has its length in mm, [m]."""
 
+LOADED = 8
+"""Robots that a process keeps: sessions and calibrations load the same ones again and again."""
+
 
 def packaged_robots() -> dict[str, Path]:
     """Name to folder of the robots that come with orthocal."""
@@ -66,6 +69,8 @@ def packaged_robots() -> dict[str, Path]:
 
 def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
     """Load a robot: URDF and YAML, checked against each other, with its loops closed.
+
+    A robot is never changed: the same files give the same one again.
 
     Args:
         robot: Name of a robot that comes with orthocal, or path to a robot folder.
@@ -90,6 +95,14 @@ def _load_folder(folder: Path) -> Robot:
     require_plain_name(folder.resolve(), error=RobotError)
     yaml_path, urdf_path = _find_files(folder)
     urdf, description = (read_file(p, error=RobotError) for p in (urdf_path, yaml_path))
+    return _build_robot(folder, yaml_path, urdf_path, urdf, description)
+
+
+@lru_cache(maxsize=LOADED)
+def _build_robot(
+    folder: Path, yaml_path: Path, urdf_path: Path, urdf: bytes, description: bytes
+) -> Robot:
+    """The robot of these files, with this content."""
     keys = load_description(yaml_path, content=description)
     where = str(yaml_path)
     model = load_urdf(urdf_path, content=urdf, joint_types=keys.joint_types, declared_in=where)
