@@ -15,6 +15,7 @@ import pytest
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from orthocal import load_robot, load_session
 from orthocal.measurement.session import Session
+from orthocal.robot import loading
 from orthocal.robot.model import Robot
 
 # nothing that tests keep outlives them; the workers of one run share it
@@ -64,6 +65,12 @@ def pytest_collection_finish():
     gc.collect()
     gc.freeze()
     gc.set_threshold(*MORE_GARBAGE)
+
+
+def load_afresh(robot):
+    """A robot as a new process loads it."""
+    loading._build_robot.cache_clear()
+    return load_robot(robot)
 
 
 @pytest.fixture(scope="session")

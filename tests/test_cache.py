@@ -7,8 +7,9 @@ import stat
 
 import numpy as np
 import pytest
+from conftest import load_afresh
 
-from orthocal import cache, load_robot
+from orthocal import cache
 from orthocal.kinematics.compiled import CompiledRobot
 from orthocal.robot import urdf
 
@@ -154,18 +155,18 @@ def test_a_folder_that_cannot_be_made_stops_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file/kept"))
     cache.keep(KEY, b"content")
     assert cache.recall(KEY) is None
-    assert load_robot("orthoglide").name == "orthoglide"
+    assert load_afresh("orthoglide").name == "orthoglide"
 
 
 def test_functions_that_were_kept_are_those_that_are_built(folder):
-    built = CompiledRobot(load_robot("orthoglide"))
+    built = CompiledRobot(load_afresh("orthoglide"))
     where = built.robot.drive_zero[None], built.robot.zero[built.robot.passive_index][None]
     where = (*where, built.errors.placements(np.full(len(built.errors.names), 1e-3)))
     expected = built.slopes(*where)
     assert list(folder.glob("*.kept"))
     for path in folder.glob("*.kept"):
         path.touch()
-    kept = CompiledRobot(load_robot("orthoglide"))
+    kept = CompiledRobot(load_afresh("orthoglide"))
     kept.tree.frame_pose = None  # nothing is built: no expression is made
     for ours, theirs in zip(kept.slopes(*where), expected, strict=True):
         assert np.array_equal(ours, theirs)
@@ -183,11 +184,11 @@ def test_yourdfpy_is_asked_once_for_the_same_bytes(folder, monkeypatch):
     asked = []
     ask = urdf._ask_yourdfpy
     monkeypatch.setattr(urdf, "_ask_yourdfpy", lambda text, path: asked.append(ask(text, path)))
-    load_robot("orthoglide")
+    load_afresh("orthoglide")
     assert len(asked) == 1
-    load_robot("orthoglide")
+    load_afresh("orthoglide")
     assert len(asked) == 1
     for path in folder.glob("*.kept"):
         path.write_bytes(path.read_bytes() + b" ")
-    load_robot("orthoglide")
+    load_afresh("orthoglide")
     assert len(asked) == 2

@@ -6,9 +6,9 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
+from conftest import load_afresh
 from tolerances import KINEMATICS
 
-from orthocal import load_robot
 from orthocal.kinematics.assembly import Assembly
 from orthocal.kinematics.compiled import compiled_robot, log6_jacobian
 from orthocal.kinematics.error_map import right_jacobian as right_jacobians
@@ -144,7 +144,7 @@ def test_jacobians_of_exp6_and_log6_equal_pinocchios(angle):
 
 def test_robots_share_functions_only_where_they_are_the_same(orthoglide):
     """One that was moved, though from the same file, has functions of its own."""
-    again, moved = load_robot("orthoglide"), orthoglide.with_errors({"x_bar_a.x": 1e-3})
+    again, moved = load_afresh("orthoglide"), orthoglide.with_errors({"x_bar_a.x": 1e-3})
     assert again is not orthoglide
     assert compiled_robot(again) is compiled_robot(orthoglide)
     assert moved.yaml == orthoglide.yaml

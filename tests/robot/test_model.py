@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -115,3 +117,17 @@ def test_an_offset_moves_the_slider_by_itself(orthoglide):
 def test_read_only_arrays_cannot_be_written_to(orthoglide):
     with pytest.raises(ValueError, match="read-only"):
         orthoglide.zero[0] = 1.0
+
+
+def test_the_same_files_give_the_same_robot_until_one_is_changed(root, tmp_path):
+    folder = tmp_path / "biglide"
+    shutil.copytree(root / "tests/robots/biglide", folder)
+    first = load_robot(folder)
+    assert load_robot(folder) is first
+    path = folder / "biglide.yaml"
+    text = path.read_text()
+    assert "zero_mm: 200" in text
+    path.write_text(text.replace("zero_mm: 200", "zero_mm: 210"))
+    assert load_robot(folder).drive_zero == pytest.approx([0.21, 0.21])
+    path.write_text(text)
+    assert load_robot(folder) is first
