@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.kinematics.lanes import Listing, find_listing, pays, run_in_lanes
+from orthocal.kinematics.lanes import Listing, find_listing, pays, recall_listing, run_in_lanes
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -87,7 +87,7 @@ class BatchFunction:
         arrays = [np.asarray(a, dtype=np.float64) for a in inputs]
         count = max(len(a) for i, a in enumerate(arrays) if i not in self._shared)
         flat = None
-        if pays(self._instructions, count, self._points):
+        if pays(self._instructions, count, self._points, lambda: self._kept is not None):
             listing = self._listing
             flat = None if listing is None else run_in_lanes(listing, arrays, self._shared, count)
         self._points += count
@@ -102,9 +102,16 @@ class BatchFunction:
         )
 
     @cached_property
+    def _kept(self) -> Listing | None:
+        """Its instructions, where they are kept on disk."""
+        return recall_listing(self._function) if self._same is None else self._same._kept
+
+    @cached_property
     def _listing(self) -> Listing | None:
         """Its instructions; None where one of them is not known."""
-        return find_listing(self._function) if self._same is None else self._same._listing
+        if self._same is not None:
+            return self._same._listing
+        return self._kept or find_listing(self._function)
 
     def _by_casadi(self, arrays: list[Array], count: int) -> list[Array]:
         """Nonzeros of each output, shape (count, nnz)."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import enum
 import hashlib
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,7 +35,8 @@ PATIENCE = 60e6
 """Instructions, each for a point, that CasADi's machine does first, where no more are expected."""
 
 POINTS = 500
-"""Of one function, which take CasADi's machine as long as its instructions to list."""
+"""Of one function, which take CasADi's machine as long as its instructions to list, where nobody has
+listed them before."""
 
 FEWEST_KEPT = 1000
 """Instructions of a function for which they are kept on disk: fewer are listed as soon."""
@@ -75,13 +76,16 @@ def expect_many() -> None:
         _spent = max(_spent, PATIENCE)
 
 
-def pays(instructions: int, points: int, before: int) -> bool:
+def pays(
+    instructions: int, points: int, before: int, is_listed: Callable[[], bool] = lambda: False
+) -> bool:
     """Whether a function should be run in lanes; keeps count of what CasADi's machine does.
 
     Args:
         instructions: Of the function.
         points: How many it is to be evaluated at.
         before: At how many it was before.
+        is_listed: Whether its instructions were listed before.
     """
     global _spent
     if _chosen is not Way.AUTO:
@@ -89,7 +93,7 @@ def pays(instructions: int, points: int, before: int) -> bool:
     if points < FEWEST or not is_installed():
         return False
     _spent += float(instructions) * points
-    return _spent > PATIENCE and before + points > POINTS
+    return _spent > PATIENCE and (before + points > POINTS or is_listed())
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,20 +124,32 @@ def find_listing(function: ca.Function) -> Listing | None:
 
     None where one of them is not known here.
     """
+    found = recall_listing(function)
+    if found is None and (found := list_instructions(function)) is not None:
+        key = _key_of(function)
+        if key is not None:
+            arrays = found.table, found.constants, np.array(found.n_work), found.first_out
+            cache.keep(key, b"".join(a.tobytes() for a in arrays))
+    return found
+
+
+def recall_listing(function: ca.Function) -> Listing | None:
+    """The instructions of a function as kept on disk; None where they are not."""
+    key = _key_of(function)
+    return None if key is None else _read(cache.recall(key), function)
+
+
+def _key_of(function: ca.Function) -> str | None:
+    """By what its instructions are kept; None for what is not."""
     if function.n_instructions() < FEWEST_KEPT:
-        return list_instructions(function)
+        return None
     name = known_as(function)
     if name is None:
         try:
             name = hashlib.sha256(function.serialize().encode()).hexdigest()
         except RuntimeError:  # some cannot be written
-            return list_instructions(function)
-    key = f"listing {name}\n{_CODE}"
-    found = _read(cache.recall(key), function)
-    if found is None and (found := list_instructions(function)) is not None:
-        arrays = found.table, found.constants, np.array(found.n_work), found.first_out
-        cache.keep(key, b"".join(a.tobytes() for a in arrays))
-    return found
+            return None
+    return f"listing {name}\n{_CODE}"
 
 
 def _read(content: bytes | None, function: ca.Function) -> Listing | None:

@@ -26,12 +26,11 @@ from orthocal.measurement.sensor_groups import SensorGroup
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-POSTURES_AT_ONCE = 256
+POSTURES_AT_ONCE, READINGS_AT_ONCE = 64, 640
+"""Whose derivatives are held at a time: what they are held in stays in the processor's cache."""
+
 MANY_ROWS = 400
 """From which on a product with a sparse matrix takes less than making it."""
-
-READINGS_AT_ONCE = 2048
-"""Whose derivatives are held at a time, for their memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
