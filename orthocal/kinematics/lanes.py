@@ -35,8 +35,7 @@ PATIENCE = 60e6
 """Instructions, each for a point, that CasADi's machine does first, where no more are expected."""
 
 POINTS = 500
-"""Of one function, which take CasADi's machine as long as its instructions to list, where nobody has
-listed them before."""
+"""Of one function that was never listed, which take CasADi's machine as long as to list it."""
 
 FEWEST_KEPT = 1000
 """Instructions of a function for which they are kept on disk: fewer are listed as soon."""
