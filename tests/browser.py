@@ -28,6 +28,9 @@ SIZES = ((1400, 900), (800, 600))
 SMALL = (480, 360)
 """Where no size is asked about: a page is drawn by software here, a pixel at a time."""
 
+COARSE = "--disable_chromium_framebuffer_multisample"
+"""Edges need not be smooth here: each pixel would be drawn four times."""
+
 
 @dataclass
 class Visit:
@@ -85,7 +88,7 @@ def open_browser():
 
     with sync_playwright() as play:
         browser = play.chromium.launch(
-            executable_path=executable, args=list(chromium_flags()), headless=True
+            executable_path=executable, args=[*chromium_flags(), COARSE], headless=True
         )
         try:
             yield browser
