@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.errors import RobotError
+from orthocal.errors import ClosureError, RobotError
 from orthocal.estimation.pieces import (
     DirectExpressions,
     PosturePiece,
@@ -175,12 +175,27 @@ class CalibrationProblem:
     def close(self, theta: ArrayLike, *, start: Array | None = None) -> Array:
         """Passive coordinates of every posture, shape (n_postures, n_passive), [m, rad].
 
+        Args:
+            theta: Shape (n_free,), [SI], or those of the machine.
+            start: Where to start from, of the same shape; the reference by default.
+
         Raises:
             ClosureError: If the machine with these errors cannot reach a posture.
         """
+        return self._close(theta, self._near_reference if start is None else start)
+
+    def _close(self, theta: ArrayLike, start: Array | None) -> Array:
         names = list(self.session.postures)
         machine = self._of_machine(theta)
         return self.assembly.close(self.drives, theta=machine, start=start, names=names)
+
+    @cached_property
+    def _near_reference(self) -> Array | None:
+        """The reference, where it reaches all postures."""
+        try:
+            return self.reference_passive
+        except ClosureError:
+            return None
 
     @cached_property
     def reference_passive(self) -> Array:
@@ -189,7 +204,7 @@ class CalibrationProblem:
         Raises:
             ClosureError: If the reference machine cannot reach a posture.
         """
-        return self.close(self.reference)
+        return self._close(self.reference, None)
 
     @cached_property
     def machine_map(self) -> MachineMap:
