@@ -149,6 +149,7 @@ class LiveScene:
         if port is not None and not (isinstance(port, int) and 0 <= port < 2**16):
             raise ValueError(f"the port is {port!r}; expected 0 to 65535")
         self.scene = scene
+        self._parent = os.getppid()  # it may have ended before anybody waits
         self._socket = _listen(port)
         self.port = int(self._socket.getsockname()[1])
         self._ready = threading.Event()
@@ -164,13 +165,13 @@ class LiveScene:
 
     def wait(self) -> None:
         """Serve until Ctrl-C, until the process is asked to end, or what started it has ended."""
-        ended, parent = threading.Event(), os.getppid()
+        ended = threading.Event()
         previous = {
             number: signal.signal(number, lambda *_: ended.set())
             for number in (signal.SIGINT, signal.SIGTERM)
         }
         try:
-            while not ended.wait(0.2) and os.getppid() == parent:
+            while not ended.wait(0.2) and os.getppid() == self._parent:
                 pass
         finally:
             for number, handler in previous.items():

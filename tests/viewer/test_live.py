@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import http.client
 import os
 import re
@@ -270,22 +271,40 @@ def test_nothing_is_left_after_a_kill():
     wait_until(lambda: not is_open(port), "the port's end")
 
 
-def test_nothing_is_left_after_a_kill_of_its_parent():
+BUSY = """
+import os, time
+from orthocal import LiveScene, draw_scene, load_robot
+parent = os.getppid()
+with LiveScene(draw_scene(load_robot('orthoglide'))) as live:
+    print(live.url, flush=True)
+    while os.getppid() == parent:
+        time.sleep(0.05)
+    live.wait()
+"""
+"""A view that does not wait yet when its parent ends."""
+
+
+@pytest.mark.parametrize("view", [VIEW, [sys.executable, "-c", BUSY]], ids=["waiting", "busy"])
+def test_nothing_is_left_after_a_kill_of_its_parent(view):
     """As where a shell or a script that started the view is killed: the view ends, too."""
     code = (
         "import subprocess, sys\n"
-        f"view = subprocess.Popen({VIEW!r}, stdout=subprocess.PIPE, text=True)\n"
+        f"view = subprocess.Popen({view!r}, stdout=subprocess.PIPE, text=True)\n"
         "print(view.stdout.readline(), end='', flush=True)\n"
         "view.wait()\n"
     )
     process, port = start(code=code)
-    (view,) = children(process.pid)
-    assert [p for _, p in listening(view)] == [port]
+    (child,) = children(process.pid)
+    assert [p for _, p in listening(child)] == [port]
     process.kill()
     process.wait(PATIENCE)
     process.stdout.close()
     process.stderr.close()
-    wait_until(lambda: not alive(view), "the view's end")  # its port may be another's by then
+    try:
+        wait_until(lambda: not alive(child), "the view's end")  # its port may be another's by then
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
 
 
 def test_nothing_is_left_after_an_exception():
