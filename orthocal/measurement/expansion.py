@@ -199,7 +199,8 @@ class Expander:
             g, g_a, g_q, nonzeros = self._compiled.slopes(actuated, q, machine.placements)
             inverse = -_inverse(g_q)
             correction[part.postures] = (inverse @ g[..., None])[..., 0]
-            closings.append((part.postures, inverse, g_a, nonzeros[:, self._closing.chosen]))
+            nonzeros = nonzeros[:, self._closing.chosen]
+            closings.append((part.postures, inverse, g_a, nonzeros))
             rows = self._read(part, actuated, q, machine.placements, zero, unknowns)
             by_unknowns[part.entries.reshape(-1)] = rows.by_unknowns
             pull = rows.by_passive.reshape(k, m, -1) @ inverse
@@ -298,9 +299,9 @@ class _Scatter:
         )
 
     def dense(self, nonzeros: Array, n_rows: int) -> Array:
-        """Matrices of nonzeros, shape (k, n_rows, n_columns) of (k, nnz)."""
+        """Matrices of the chosen nonzeros, shape (k, n_rows, n_columns) of (k, n_chosen)."""
         result = np.zeros((len(nonzeros), n_rows * self.n_columns))
-        result[:, self.rows * self.n_columns + self.columns] = nonzeros[:, self.chosen]
+        result[:, self.rows * self.n_columns + self.columns] = nonzeros
         return result.reshape(len(nonzeros), n_rows, self.n_columns)
 
 
