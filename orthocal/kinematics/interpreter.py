@@ -2,8 +2,8 @@
 
 LLVM (llvmlite) makes it for the processor that it runs on, in some hundredths of a second. It does
 what CasADi's machine does, in the same order: operations that are correctly rounded, and functions
-of the C library, so that the numbers are the same. Work is in rows of a lane, a row a
-place.
+of the C library, so that the numbers are the same. Work is in rows of a lane, a row
+a place.
 """
 
 from __future__ import annotations

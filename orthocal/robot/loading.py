@@ -95,12 +95,13 @@ def _load_folder(folder: Path) -> Robot:
     require_plain_name(folder.resolve(), error=RobotError)
     yaml_path, urdf_path = _find_files(folder)
     urdf, description = (read_file(p, error=RobotError) for p in (urdf_path, yaml_path))
-    return _build_robot(folder, yaml_path, urdf_path, urdf, description)
+    name = folder.resolve().name  # of a relative one it depends on where we are
+    return _build_robot(name, folder, yaml_path, urdf_path, urdf, description)
 
 
 @lru_cache(maxsize=LOADED)
 def _build_robot(
-    folder: Path, yaml_path: Path, urdf_path: Path, urdf: bytes, description: bytes
+    name: str, folder: Path, yaml_path: Path, urdf_path: Path, urdf: bytes, description: bytes
 ) -> Robot:
     """The robot of these files, with this content."""
     keys = load_description(yaml_path, content=description)
@@ -116,7 +117,6 @@ def _build_robot(
         parameters = _build_parameter_set(model, keys, drives, closures, where)
     except ParameterError as e:
         raise RobotError(e.problem, where=f"{where}: orthocal") from None
-    name = folder.resolve().name
     robot = Robot(
         name=name,
         folder=folder,

@@ -131,3 +131,13 @@ def test_the_same_files_give_the_same_robot_until_one_is_changed(root, tmp_path)
     assert load_robot(folder).drive_zero == pytest.approx([0.21, 0.21])
     path.write_text(text)
     assert load_robot(folder) is first
+
+
+def test_a_folder_of_another_name_is_another_robot(root, tmp_path, monkeypatch):
+    for name in ("one", "two"):
+        folder = tmp_path / name
+        folder.mkdir()
+        for suffix in (".yaml", ".urdf"):
+            shutil.copy(root / f"tests/robots/biglide/biglide{suffix}", folder)
+        monkeypatch.chdir(folder)
+        assert load_robot(".").name == name
