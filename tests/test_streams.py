@@ -164,7 +164,7 @@ def test_ctrl_c_ends_whatever_is_being_done(options, root, tmp_path):
     out = tmp_path / "out"
     words = ["calibrate", root / "examples/raw-cycles", *options, "--out", out]
     interrupted = 0
-    for delay in (0.0, 0.15, 0.35, 0.6, 1.0, 1.6, 2.6):
+    for delay in (0.0, 0.15, 0.35, 0.6, 1.0, 1.6, 2.2, 2.8):
         code, seconds, err = interrupt(words, delay, tmp_path)
         if code is None:
             break

@@ -123,12 +123,11 @@ def find_listing(function: ca.Function) -> Listing | None:
 
     None where one of them is not known here.
     """
-    found = recall_listing(function)
-    if found is None and (found := list_instructions(function)) is not None:
-        key = _key_of(function)
-        if key is not None:
-            arrays = found.table, found.constants, np.array(found.n_work), found.first_out
-            cache.keep(key, b"".join(a.tobytes() for a in arrays))
+    key = _key_of(function)
+    found = None if key is None else _read(cache.recall(key), function)
+    if found is None and (found := list_instructions(function)) is not None and key is not None:
+        arrays = found.table, found.constants, np.array(found.n_work), found.first_out
+        cache.keep(key, b"".join(a.tobytes() for a in arrays))
     return found
 
 

@@ -117,6 +117,9 @@ def test_nothing_is_made_for_little(monkeypatch):
     much = int(lanes.PATIENCE / 400)
     assert not lanes.pays(much - 1, 400, before=101)  # in all
     assert not lanes.pays(much, 400, before=50)  # of this function
+    assert not lanes.pays(much, 400, before=50, is_listed=lambda: False)
+    assert lanes.pays(much, 400, before=50, is_listed=lambda: True)
+    assert not lanes.pays(much, lanes.FEWEST - 1, before=50, is_listed=lambda: True)
     assert lanes.pays(1, 400, before=101)
     assert not lanes.pays(much, lanes.FEWEST - 1, before=10**6)
     monkeypatch.setattr(lanes, "is_installed", lambda: False)
@@ -157,3 +160,23 @@ def test_instructions_are_kept_on_disk(orthoglide, tmp_path, monkeypatch):
     monkeypatch.setattr(lanes.cache, "recall", lambda key: content(key)[:-8])
     assert np.array_equal(lanes.find_listing(function).table, expected.table)
     assert len(made) == 2
+
+
+def test_what_was_listed_before_is_run_in_lanes_at_once(orthoglide, tmp_path, monkeypatch):
+    monkeypatch.setenv("ORTHOCAL_CACHE", str(tmp_path / "kept"))
+    monkeypatch.setattr(lanes, "_spent", 2.0 * lanes.PATIENCE)
+    kept, where = compiled_robot(orthoglide).closing._function, points(orthoglide, 5)
+    shared = (kept.name_in(2),)
+
+    def runs_in_lanes():
+        function = BatchFunction(kept, shared=shared)
+        monkeypatch.setattr(function, "_by_casadi", lambda *_: pytest.fail("by CasADi"))
+        try:
+            function(*where)
+        except pytest.fail.Exception:
+            return False
+        return True
+
+    assert not runs_in_lanes()
+    lanes.find_listing(kept)
+    assert runs_in_lanes()
