@@ -1,6 +1,7 @@
 # Everything a fresh machine with Python 3.11 or newer and make needs.
 #   make calibrate   set up, and calibrate the paper's Experiment 2
 #   make test        set up with the test tools, and run all checks
+#   make smoke       a few tests on other Pythons and with the lowest versions of dependencies
 #   make docs        set up with the tools for pages, and write them to out/docs
 
 PYTHON ?= python3
@@ -13,7 +14,7 @@ INSTALLED = $(VENV)/.installed
 TESTED = $(VENV)/.installed-test
 DOCUMENTED = $(VENV)/.installed-docs
 
-.PHONY: calibrate test check docs clean
+.PHONY: calibrate test smoke check docs clean
 
 calibrate: $(INSTALLED)
 	$(VENV)/bin/orthocal calibrate $(SESSION) --out out/$(notdir $(SESSION))
@@ -26,6 +27,9 @@ check: $(TESTED)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+
+smoke: $(TESTED)
+	$(VENV)/bin/python .ci/smoke.py
 
 docs: $(DOCUMENTED)
 	$(VENV)/bin/python -m sphinx -E -W -q --keep-going -b html docs out/docs

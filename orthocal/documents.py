@@ -53,10 +53,13 @@ SMALLEST_IN_SI = 1e-16
 numbers."""
 
 
-def _refuse_tiny(value: float, smallest: float = SMALLEST_POSITIVE) -> float:
-    if value < smallest:
-        raise PydanticCustomError("tiny", f"Input should be at least {smallest:g}")
-    return value
+def _at_least(smallest: float) -> AfterValidator:
+    def refuse_smaller(value: float) -> float:
+        if value < smallest:
+            raise PydanticCustomError("tiny", f"Input should be at least {smallest:g}")
+        return value
+
+    return AfterValidator(refuse_smaller)
 
 
 Number = Annotated[
@@ -73,7 +76,7 @@ Count = Annotated[int, Field(ge=0, le=10**9)]
 Finite = Annotated[float, BeforeValidator(_refuse_truth_values), Field(allow_inf_nan=False)]
 """A number of any size: one that follows from others and is not computed with."""
 
-PositiveNumber = Annotated[Number, Field(gt=0.0), AfterValidator(_refuse_tiny)]
+PositiveNumber = Annotated[Number, Field(gt=0.0), _at_least(SMALLEST_POSITIVE)]
 """A number of sane size above 0."""
 
 Name = Annotated[
@@ -83,9 +86,7 @@ Name = Annotated[
 ]
 """A name that can stand in a CSV."""
 
-PositiveInSI = Annotated[
-    Number, Field(gt=0.0), AfterValidator(lambda v: _refuse_tiny(v, SMALLEST_IN_SI))
-]
+PositiveInSI = Annotated[Number, Field(gt=0.0), _at_least(SMALLEST_IN_SI)]
 """The same in SI units, where it was one in mm, mrad or ppm."""
 
 MOST_JSON_VALUES = 2_000_000

@@ -56,15 +56,21 @@ def raised_interrupt() -> Iterator[None]:
 
 @contextmanager
 def noticed_interrupt() -> Iterator[None]:
-    """Raise the KeyboardInterrupt of a Ctrl-C within, though the code there has swallowed it.
+    """Raise the KeyboardInterrupt of a Ctrl-C within, even if the code there swallowed it.
 
-    CasADi stops its solver at one, then returns as if that had not converged, or goes on.
+    CasADi stops its solver at one. It then returns as if the solver had not converged, goes on, or
+    (Python 3.13) raises a SystemError because the interrupt is still pending.
 
     Raises:
-        KeyboardInterrupt: At the end, if there was one and nothing else was raised for it.
+        KeyboardInterrupt: At the end, if there was a Ctrl-C.
     """
     with _watched(pass_on=True) as seen:
-        yield
+        try:
+            yield
+        except Exception:
+            if seen:
+                raise KeyboardInterrupt from None
+            raise
         if seen:
             raise KeyboardInterrupt
 

@@ -155,9 +155,11 @@ def even_grid(robot: Robot, *, half_side: float, points_a_side: int) -> Array:
 
 
 def _lobatto_points(count: int) -> Array:
-    """The ends of -1 to 1, and where the Legendre polynomial of degree count - 1 is level."""
-    level = np.polynomial.legendre.Legendre.basis(count - 1).deriv().roots()
-    points = np.r_[-1.0, np.sort(level), 1.0]
+    """Nodes of Lobatto's rule: ±1 and the roots of the Jacobi polynomial P(1,1) of degree n-2."""
+    from scipy.special import roots_jacobi
+
+    inner = roots_jacobi(count - 2, 1.0, 1.0)[0] if count > 2 else np.zeros(0)
+    points = np.r_[-1.0, inner, 1.0]
     return np.asarray(0.5 * (points - points[::-1]))  # the same on both sides, without rounding
 
 

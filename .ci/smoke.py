@@ -1,0 +1,76 @@
+"""Smoke tests on other Pythons and other versions of what orthocal depends on.
+
+Runs `tests/test_smoke.py` and the symbolic kinematics in environments of their own: on the oldest
+and the newest Python of this machine that orthocal supports with the newest releases (except the
+Python that runs this file, on which the whole suite runs), and on the oldest with the lowest
+versions that pyproject.toml allows.
+
+Needs `uv`, which is installed into the environment of the Python that runs this file.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+OLDEST = (3, 11)
+TESTS = ["tests/test_smoke.py", "tests/kinematics/test_symbolic.py"]
+ASK_VERSION = "import sys; print(*sys.version_info[:2])"
+
+
+def find_pythons() -> dict[tuple[int, int], Path]:
+    """Interpreters on the PATH and of pyenv that start and that orthocal supports, by version."""
+    versions = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
+    directories = [Path(p) for p in os.environ["PATH"].split(os.pathsep)]
+    directories += [p / "bin" for p in sorted(versions.glob("*"))]
+    pythons: dict[tuple[int, int], Path] = {}
+    for directory in directories:
+        for file in sorted(directory.glob("python3.*")):
+            if not re.fullmatch(r"python3\.\d+", file.name):
+                continue
+            asked = subprocess.run([file, "-c", ASK_VERSION], capture_output=True, text=True)
+            if asked.returncode == 0:
+                major, minor = map(int, asked.stdout.split())
+                if (major, minor) >= OLDEST:
+                    pythons.setdefault((major, minor), file)
+    return pythons
+
+
+def run_lane(python: Path, *, resolution: str) -> None:
+    """Install orthocal into a new environment and run the smoke tests there."""
+    uv = [sys.executable, "-m", "uv", "--quiet"]
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="orthocal-smoke-") as directory:
+        environment = Path(directory) / "environment"
+        inside = environment / "bin/python"
+        subprocess.run([*uv, "venv", "--python", python, environment], check=True)
+        install = [*uv, "pip", "install", "--python", inside, "--resolution", resolution]
+        subprocess.run([*install, "--editable", ROOT, "pytest>=8.0"], check=True)
+        cache = {**os.environ, "ORTHOCAL_CACHE": str(Path(directory) / "cache")}
+        tests = [inside, "-m", "pytest", "-q", "-p", "no:cacheprovider", *TESTS]
+        subprocess.run(tests, check=True, cwd=ROOT, env=cache)
+    print(f"{python} with {resolution} versions: {time.monotonic() - began:.0f} s", flush=True)
+
+
+def main() -> None:
+    """Run all lanes; the exit code is that of the first that fails."""
+    pythons = find_pythons()
+    lanes = [(min(pythons), "lowest-direct")]
+    tested = sys.version_info[:2]
+    lanes += [(v, "highest") for v in sorted({min(pythons), max(pythons)} - {tested})]
+    for version, resolution in lanes:
+        run_lane(pythons[version], resolution=resolution)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except subprocess.CalledProcessError as error:
+        print(error, file=sys.stderr)
+        sys.exit(error.returncode)

@@ -1,0 +1,72 @@
+"""One command of each group, as a user runs it: exit code 0 and no warning.
+
+Continuous integration runs this file and the tests of the symbolic kinematics on the oldest and
+newest Python and with the lowest versions that pyproject.toml allows (`.ci/smoke.py`). A warning of
+a library is printed on stderr, so it fails here although it is no error for the user's process.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.smoke
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    return tmp_path_factory.mktemp("smoke")
+
+
+def run(*words, cwd):
+    done = subprocess.run(
+        [sys.executable, "-m", "orthocal", *map(str, words)],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
+    return done.stdout
+
+
+def test_main_job(root, workplace):
+    text = run("calibrate", root / "examples/table1/experiment-2", "--out", "main", cwd=workplace)
+    for offset in ("-0.527", "+0.592", "-1.761"):  # DESIGN: exact offsets of Experiment 2
+        assert offset in text
+    assert (workplace / "main/report.html").is_file()
+
+
+def test_prepare(workplace):
+    words = ["--leg-mm", 250, "--travel-mm", "100:325", "--attachment-mm", 30]
+    words += ["--rods-apart-mm", 60, "--rod-radius-mm", 4, "--counts", "up,up,up"]
+    run("new", "mill", *words, "--at-zero-mm", 0, "--tolerance", "*.offset_mm=2", cwd=workplace)
+    assert (workplace / "mill/first/sheet.html").is_file()
+    run("view", "mill", "--html", "mill.html", cwd=workplace)
+
+
+def test_measure_and_calibrate(root, workplace):
+    draw = ["--draw", "*", "--seed", 3]
+    run("simulate", "mill/first", *draw, "--out", "readings", cwd=workplace)
+    run("check", "readings", cwd=workplace)
+    run("calibrate", "readings", "--out", "calibrated", cwd=workplace)
+    run("compare", root / "examples/raw-cycles", cwd=workplace)
+    assert json.loads((workplace / "calibrated/calibration.json").read_text("utf-8"))["schema"]
+
+
+def test_use(workplace):
+    run("accuracy", "calibrated", cwd=workplace)
+    out = ["--to", "linuxcnc", "--out", "linuxcnc"]
+    run("export", "calibrated", *out, cwd=workplace)
+    (workplace / "part.ngc").write_text("G21 G90\nG0 X0 Y0 Z0\nG1 X10 Y-10 F600\nM2\n")
+    run("correct", "calibrated", "part.ngc", "--out", "corrected.ngc", cwd=workplace)
+    assert (workplace / "corrected.ngc").is_file()
+
+
+def test_study(root, workplace):
+    words = ["study", "bootstrap", root / "examples/workshop", "--draws", 20, "--seed", 1]
+    run(*words, "--out", "study", cwd=workplace)
