@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from orthocal import calibrate, draw_scene, load_session
-from orthocal.show.report.page import build_report
+from orthocal.output.report.page import build_report
 from orthocal.viewer.browser import take_picture
 
 ROOT = Path(__file__).parents[1]

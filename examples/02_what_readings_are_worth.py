@@ -15,12 +15,12 @@ import numpy as np
 
 import orthocal
 from orthocal import Calibration, Choice, Session
-from orthocal.assess.accuracy import assess_tool
-from orthocal.assess.entering import entered_offsets
-from orthocal.kinematics.assembly import Assembly
+from orthocal.assessment.controller_entries import entered_offsets
+from orthocal.assessment.tool_error import assess_tool
+from orthocal.kinematics.loop_closure import Assembly
 from orthocal.kinematics.workspace import cube
 from orthocal.sensors.leg_indicator import LegIndicator
-from orthocal.sensors.standing import EXACT
+from orthocal.sensors.mounting import EXACT
 
 MACHINES = 4
 FIRST = {"*.offset_mm": 2.0}  # the workshop's word for its offsets, one sigma

@@ -22,79 +22,79 @@ _HOMES = {
     "CalibrationProblem": "orthocal.estimation.problem",
     "Choice": "orthocal.estimation.choice",
     "ClosureError": "orthocal.errors",
-    "Comparison": "orthocal.assess.comparison",
-    "Decision": "orthocal.assess.findings.decision",
+    "Comparison": "orthocal.assessment.comparison",
+    "Decision": "orthocal.assessment.findings.decision",
     "ExportError": "orthocal.errors",
     "ExportOptions": "orthocal.export.options",
-    "Finding": "orthocal.assess.findings.finding",
-    "Gauge": "orthocal.measurement.session",
+    "Finding": "orthocal.assessment.findings.finding",
+    "Gauge": "orthocal.session.session",
     "GcodeError": "orthocal.errors",
     "LiveScene": "orthocal.viewer.live",
     "Loss": "orthocal.estimation.loss",
     "Machine": "orthocal.calibration.machine",
-    "Means": "orthocal.planning.means",
+    "Means": "orthocal.planning.equipment",
     "MeasuringPlan": "orthocal.planning.plan",
     "NonlinearProgram": "orthocal.estimation.solvers.ipopt",
     "NotIdentifiableError": "orthocal.errors",
     "OrthocalError": "orthocal.errors",
     "OutputError": "orthocal.errors",
     "ParameterError": "orthocal.errors",
-    "Posture": "orthocal.measurement.session",
-    "Reading": "orthocal.measurement.session",
+    "Posture": "orthocal.session.session",
+    "Reading": "orthocal.session.session",
     "Robot": "orthocal.robot.model",
     "RobotError": "orthocal.errors",
     "Scene": "orthocal.viewer.scene",
     "Sensor": "orthocal.sensors.protocol",
-    "Session": "orthocal.measurement.session",
+    "Session": "orthocal.session.session",
     "SessionError": "orthocal.errors",
-    "Setup": "orthocal.measurement.session",
-    "Sizes": "orthocal.robot.sizes",
+    "Setup": "orthocal.session.session",
+    "Sizes": "orthocal.robot.builder.dimensions",
     "SolverError": "orthocal.errors",
     "SolverOptions": "orthocal.estimation.options",
     "Study": "orthocal.study.study",
-    "StudyTable": "orthocal.study.running",
-    "TableImport": "orthocal.measurement.importing",
-    "TableOptions": "orthocal.measurement.importing",
-    "ToolAccuracy": "orthocal.assess.accuracy",
+    "StudyTable": "orthocal.study.runner",
+    "TableImport": "orthocal.measurement.importing.import_readings",
+    "TableOptions": "orthocal.measurement.importing.import_readings",
+    "ToolAccuracy": "orthocal.assessment.tool_error",
     "UnreachableError": "orthocal.errors",
-    "Validation": "orthocal.assess.validation",
+    "Validation": "orthocal.assessment.validation",
     "Workspace": "orthocal.kinematics.workspace",
-    "assess_tool": "orthocal.assess.accuracy",
-    "build_accuracy_study": "orthocal.study.accuracy_choice",
+    "assess_tool": "orthocal.assessment.tool_error",
+    "build_accuracy_study": "orthocal.study.accuracy_options",
     "build_bootstrap_study": "orthocal.study.bootstrap",
     "build_linearisation_study": "orthocal.study.linearisation",
     "build_sensitivity_study": "orthocal.study.sensitivity",
     "calibrate": "orthocal.calibration.calibrate",
-    "check_session": "orthocal.assess.findings.session",
-    "compare_models": "orthocal.assess.comparison",
-    "decide": "orthocal.assess.findings.calibration",
-    "decide_comparison": "orthocal.assess.findings.comparison",
-    "decide_validation": "orthocal.assess.findings.validation",
-    "draw_errors": "orthocal.measurement.synthetic",
-    "draw_scene": "orthocal.show.scene.drawing",
+    "check_session": "orthocal.assessment.findings.session",
+    "compare_models": "orthocal.assessment.comparison",
+    "decide": "orthocal.assessment.findings.calibration",
+    "decide_comparison": "orthocal.assessment.findings.comparison",
+    "decide_validation": "orthocal.assessment.findings.validation",
+    "draw_errors": "orthocal.observation.simulate",
+    "draw_scene": "orthocal.output.scene.drawing",
     "export_calibration": "orthocal.export.formats",
-    "find_changes": "orthocal.calibration.repeating",
-    "import_readings": "orthocal.measurement.importing",
+    "find_changes": "orthocal.calibration.refit",
+    "import_readings": "orthocal.measurement.importing.import_readings",
     "join_sessions": "orthocal.measurement.joining",
     "load_calibration": "orthocal.calibration.file",
-    "load_plan": "orthocal.measurement.session_file",
+    "load_plan": "orthocal.measurement.files.session_file",
     "load_robot": "orthocal.robot.loading",
-    "load_session": "orthocal.measurement.session_file",
-    "make_robot": "orthocal.robot.making",
+    "load_session": "orthocal.measurement.files.session_file",
+    "make_robot": "orthocal.robot.builder.build",
     "parameter_table": "orthocal.calibration.tables",
     "reading_table": "orthocal.calibration.tables",
     "plan_readings": "orthocal.planning.plan",
     "register_sensor": "orthocal.sensors.registry",
-    "repeat_calibration": "orthocal.calibration.repeating",
-    "restore_session": "orthocal.calibration.repeating",
-    "run_study": "orthocal.study.running",
-    "simulate_session": "orthocal.measurement.synthetic",
-    "summarize": "orthocal.show.summary",
-    "validate_calibration": "orthocal.assess.validation",
+    "repeat_calibration": "orthocal.calibration.refit",
+    "restore_session": "orthocal.calibration.refit",
+    "run_study": "orthocal.study.runner",
+    "simulate_session": "orthocal.observation.simulate",
+    "summarize": "orthocal.output.text.summary",
+    "validate_calibration": "orthocal.assessment.validation",
     "write_calibration": "orthocal.calibration.file",
-    "write_import": "orthocal.measurement.importing",
-    "write_report": "orthocal.show.report.page",
-    "write_session": "orthocal.measurement.session_output",
+    "write_import": "orthocal.measurement.importing.import_readings",
+    "write_report": "orthocal.output.report.page",
+    "write_session": "orthocal.measurement.files.write_session",
 }
 
 __all__ = [
@@ -179,20 +179,20 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from orthocal.assess.accuracy import ToolAccuracy, assess_tool
-    from orthocal.assess.comparison import Comparison, compare_models
-    from orthocal.assess.findings.calibration import decide
-    from orthocal.assess.findings.comparison import decide_comparison
-    from orthocal.assess.findings.decision import Decision
-    from orthocal.assess.findings.finding import Finding
-    from orthocal.assess.findings.session import check_session
-    from orthocal.assess.findings.validation import decide_validation
-    from orthocal.assess.validation import Validation, validate_calibration
+    from orthocal.assessment.comparison import Comparison, compare_models
+    from orthocal.assessment.findings.calibration import decide
+    from orthocal.assessment.findings.comparison import decide_comparison
+    from orthocal.assessment.findings.decision import Decision
+    from orthocal.assessment.findings.finding import Finding
+    from orthocal.assessment.findings.session import check_session
+    from orthocal.assessment.findings.validation import decide_validation
+    from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
+    from orthocal.assessment.validation import Validation, validate_calibration
     from orthocal.calibration.calibrate import calibrate
     from orthocal.calibration.calibration import Calibration
     from orthocal.calibration.file import load_calibration, write_calibration
     from orthocal.calibration.machine import Machine
-    from orthocal.calibration.repeating import find_changes, repeat_calibration, restore_session
+    from orthocal.calibration.refit import find_changes, repeat_calibration, restore_session
     from orthocal.calibration.tables import parameter_table, reading_table
     from orthocal.errors import (
         CalibrationFileError,
@@ -216,32 +216,32 @@ if TYPE_CHECKING:
     from orthocal.export.formats import export_calibration
     from orthocal.export.options import ExportOptions
     from orthocal.kinematics.workspace import Workspace
-    from orthocal.measurement.importing import (
+    from orthocal.measurement.files.session_file import load_plan, load_session
+    from orthocal.measurement.files.write_session import write_session
+    from orthocal.measurement.importing.import_readings import (
         TableImport,
         TableOptions,
         import_readings,
         write_import,
     )
     from orthocal.measurement.joining import join_sessions
-    from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
-    from orthocal.measurement.session_file import load_plan, load_session
-    from orthocal.measurement.session_output import write_session
-    from orthocal.measurement.synthetic import draw_errors, simulate_session
-    from orthocal.planning.means import Means
+    from orthocal.observation.simulate import draw_errors, simulate_session
+    from orthocal.output.report.page import write_report
+    from orthocal.output.scene.drawing import draw_scene
+    from orthocal.output.text.summary import summarize
+    from orthocal.planning.equipment import Means
     from orthocal.planning.plan import MeasuringPlan, plan_readings
+    from orthocal.robot.builder.build import make_robot
+    from orthocal.robot.builder.dimensions import Sizes
     from orthocal.robot.loading import load_robot
-    from orthocal.robot.making import make_robot
     from orthocal.robot.model import Robot
-    from orthocal.robot.sizes import Sizes
     from orthocal.sensors.protocol import Sensor
     from orthocal.sensors.registry import register_sensor
-    from orthocal.show.report.page import write_report
-    from orthocal.show.scene.drawing import draw_scene
-    from orthocal.show.summary import summarize
-    from orthocal.study.accuracy_choice import build_accuracy_study
+    from orthocal.session.session import Gauge, Posture, Reading, Session, Setup
+    from orthocal.study.accuracy_options import build_accuracy_study
     from orthocal.study.bootstrap import build_bootstrap_study
     from orthocal.study.linearisation import build_linearisation_study
-    from orthocal.study.running import StudyTable, run_study
+    from orthocal.study.runner import StudyTable, run_study
     from orthocal.study.sensitivity import build_sensitivity_study
     from orthocal.study.study import Study
     from orthocal.viewer.live import LiveScene

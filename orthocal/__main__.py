@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 
-from orthocal.interrupts import ending_at_interrupt
+from orthocal.runtime.interrupts import ending_at_interrupt
 
 FEWEST_OBJECTS = 100_000
 """New ones before garbage is looked for: loading libraries makes many, all of which stay."""

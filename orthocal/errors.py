@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from orthocal.characters import printable
+from orthocal.text import printable
 
 LONGEST_MESSAGE = 2000
 """Characters of an error's message; the middle of a longer one is left out."""

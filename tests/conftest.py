@@ -14,9 +14,9 @@ import pytest
 # as the command line does it: threads of small matrices get in each other's way
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from orthocal import load_robot, load_session
-from orthocal.measurement.session import Session
 from orthocal.robot import loading
 from orthocal.robot.model import Robot
+from orthocal.session.session import Session
 
 # nothing that tests keep outlives them; the workers of one run share it
 if "PYTEST_XDIST_WORKER" not in os.environ:
@@ -29,8 +29,8 @@ ROOT = Path(__file__).parents[1]
 
 WANTED_BY_ALL = """
 from orthocal import load_robot
-from orthocal.kinematics.assembly import nominal_assembly
-from orthocal.kinematics.lanes import Way, is_installed, running
+from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.backend.lanes import Way, is_installed, running
 
 robot = load_robot("orthoglide")
 with running(Way.LLVM if is_installed() else Way.CASADI):

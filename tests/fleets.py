@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from orthocal.diagnosis.unmodelled import find_other_errors, machine_errors
+from orthocal.estimation.diagnostics.unmodelled import find_other_errors, machine_errors
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
-from orthocal.kinematics.lanes import expect_many
+from orthocal.kinematics.backend.lanes import expect_many
 
 
 class Fleet:

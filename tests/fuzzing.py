@@ -141,9 +141,9 @@ KINDS = {
 def lay_out(folder: Path) -> None:
     """Good files of every kind."""
     from orthocal import Sizes, calibrate, load_session, make_robot
-    from orthocal.measurement.session_file import load_plan
-    from orthocal.measurement.session_output import write_session
-    from orthocal.measurement.synthetic import simulate_session
+    from orthocal.measurement.files.session_file import load_plan
+    from orthocal.measurement.files.write_session import write_session
+    from orthocal.observation.simulate import simulate_session
 
     shutil.copytree(ROOT / "tests/robots/biglide", folder / "machine")
     for suffix in ("yaml", "urdf"):
@@ -171,7 +171,7 @@ def lay_out(folder: Path) -> None:
 
 def lay_out_journals(folder: Path) -> None:
     """A recording and a study that were killed, the recording before its CSV was written."""
-    from orthocal.measurement.recording import open_recording
+    from orthocal.measurement.recording.recording import open_recording
     from orthocal.study.journal import open_journal
 
     recorded = folder / "recorded"
@@ -536,20 +536,25 @@ def make_case(seed: int, index: int, good: dict[str, bytes]) -> tuple[str, bytes
 def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None:
     """Do with a file what the command line does; slow things with a probability of `thorough`."""
     from orthocal import calibrate, load_calibration, load_robot, load_session, summarize
-    from orthocal.assess.entering import find_entries
-    from orthocal.assess.rows import accuracy_rows, forward_blocks, forward_rows, inverse_rows
-    from orthocal.kinematics.assembly import nominal_assembly
-    from orthocal.measurement.importing import TableOptions, import_readings
-    from orthocal.measurement.recording import open_recording
-    from orthocal.measurement.session_file import load_plan
-    from orthocal.measurement.session_output import write_session
-    from orthocal.measurement.synthetic import load_errors, simulate_session, truth_document
-    from orthocal.measurement.table import read_points, stream_joints
-    from orthocal.planning.dial import load_dial
-    from orthocal.planning.means import Means
-    from orthocal.show.accuracy import format_points
-    from orthocal.show.imported import format_import, printed_import
-    from orthocal.show.scene.drawing import draw_scene
+    from orthocal.assessment.controller_entries import find_entries
+    from orthocal.assessment.tool_tables import (
+        accuracy_rows,
+        forward_blocks,
+        forward_rows,
+        inverse_rows,
+    )
+    from orthocal.kinematics.loop_closure import nominal_assembly
+    from orthocal.measurement.files.readings_table import read_points, stream_joints
+    from orthocal.measurement.files.session_file import load_plan
+    from orthocal.measurement.files.write_session import write_session
+    from orthocal.measurement.importing.import_readings import TableOptions, import_readings
+    from orthocal.measurement.recording.recording import open_recording
+    from orthocal.observation.simulate import load_errors, simulate_session, truth_document
+    from orthocal.output.scene.drawing import draw_scene
+    from orthocal.output.text.accuracy import format_points
+    from orthocal.output.text.import_report import format_import, printed_import
+    from orthocal.planning.equipment import Means
+    from orthocal.planning.gauge_range import load_dial
     from orthocal.study.journal import open_journal
 
     deep = rng.random() < thorough
@@ -658,7 +663,7 @@ class Shifted:
 @functools.cache
 def correction_of(file: Path) -> Any:
     from orthocal import load_calibration
-    from orthocal.assess.entering import entered_offsets
+    from orthocal.assessment.controller_entries import entered_offsets
     from orthocal.export.correction_field import CorrectionField
 
     calibration = load_calibration(file)
@@ -667,7 +672,7 @@ def correction_of(file: Path) -> Any:
 
 def use_program(folder: Path, *, deep: bool) -> None:
     """Correct a program; what comes out has lines that are read, and is a program of G0 and G1."""
-    from orthocal.cli.correcting import _lines
+    from orthocal.cli.correct import _lines
     from orthocal.gcode.program import ProgramCorrector
     from orthocal.gcode.state import Interpreter
 
@@ -688,8 +693,8 @@ def use_program(folder: Path, *, deep: bool) -> None:
 
 def use_machine(folder: Path, *, deep: bool) -> None:
     """Make a machine again from its sizes."""
-    from orthocal.robot.machine_file import read_machine
-    from orthocal.robot.making import remake_robot
+    from orthocal.robot.builder.build import remake_robot
+    from orthocal.robot.builder.machine_file import read_machine
 
     read_machine(folder / "machine.yaml")
     if deep:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from orthocal.sensors.standing import EXACT
+from orthocal.sensors.mounting import EXACT
 
 
 def exact(session):

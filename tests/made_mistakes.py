@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal import draw_errors, simulate_session
-from orthocal.diagnosis.unmodelled import machine_errors
 from orthocal.errors import OrthocalError
+from orthocal.estimation.diagnostics.unmodelled import machine_errors
 
 MM = 1e-3
 SIZES = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)

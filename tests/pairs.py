@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from orthocal import SolverOptions, join_sessions, simulate_session
-from orthocal.diagnosis.changes import find_session_changes
-from orthocal.diagnosis.together import label_sessions
-from orthocal.diagnosis.unmodelled import find_other_errors, machine_errors
+from orthocal.estimation.diagnostics.unmodelled import find_other_errors, machine_errors
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
+from orthocal.hypotheses.sessions.changes import find_session_changes
+from orthocal.hypotheses.sessions.joint_readings import label_sessions
 
 
 class Several:

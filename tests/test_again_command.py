@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from orthocal import load_calibration, load_plan
-from orthocal.assess.entering import entered_offsets
+from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.cli import main
 
 

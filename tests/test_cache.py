@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from conftest import load_afresh
 
-from orthocal import cache
 from orthocal.kinematics.compiled import CompiledRobot
 from orthocal.robot import urdf
+from orthocal.runtime import disk_cache as cache
 
 KEY = "a key"
 

@@ -16,11 +16,11 @@ from orthocal import (
     summarize,
 )
 from orthocal.calibration.file import write_calibration
-from orthocal.characters import printable
 from orthocal.errors import ClosureError, OrthocalError
-from orthocal.markup import paragraph, table
-from orthocal.show.layout import short_name, to_text
-from orthocal.show.report.page import build_report
+from orthocal.io.html import paragraph, table
+from orthocal.output.report.page import build_report
+from orthocal.output.text.layout import short_name, to_text
+from orthocal.text import printable
 
 EVIL = "a\x1b[31mb\x9b2Jc\u202ed\u2066e\u2028f\udcff\r\n\x07"
 SHOWN = r"a\x1b[31mb\x9b2Jc\u202ed\u2066e\u2028f\xff\r\n\x07"

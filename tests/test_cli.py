@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from orthocal import __version__, cli, load_calibration, load_session
-from orthocal.show.report import parameter_plots, reading_plots, tool_map
+from orthocal.output.report import parameter_plots, reading_plots, tool_map
 
 
 def run(monkeypatch, capsys, *words):

@@ -6,8 +6,8 @@ import os
 
 import pytest
 
-from orthocal import cores
 from orthocal.errors import ParameterError
+from orthocal.runtime import worker_pool as cores
 
 
 @pytest.fixture

@@ -10,17 +10,17 @@ from dataclasses import replace
 import pytest
 
 from orthocal import Choice, calibrate, load_calibration, load_session
-from orthocal.assess.entering import find_entries
+from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.file import calibration_document, write_calibration
-from orthocal.documents import (
+from orthocal.errors import OrthocalError, SessionError, SolverError
+from orthocal.io.documents import (
     MOST_CSV_ROWS,
     MOST_JSON_VALUES,
     read_csv_rows,
     read_json,
     read_yaml,
 )
-from orthocal.errors import OrthocalError, SessionError, SolverError
-from orthocal.strict_yaml import LARGEST_YAML
+from orthocal.io.strict_yaml import LARGEST_YAML
 
 PROMPT = 5.0
 """Processor time that no refusal may take, [s]."""
@@ -224,7 +224,7 @@ def test_the_smallest_numbers_that_a_session_takes_are_read_again(root, tmp_path
 
 
 def test_a_result_that_makes_no_sense_is_refused_before_it_is_written(raw_cycles, monkeypatch):
-    module = sys.modules["orthocal.calibration.recording"]
+    module = sys.modules["orthocal.calibration.build_record"]
     original = module._estimates
 
     def absurd(*args, **kwargs):

@@ -14,7 +14,7 @@ from conftest import ROOT
 import orthocal
 from orthocal import calibrate, draw_scene, load_session
 from orthocal.errors import NotIdentifiableError
-from orthocal.measurement.purpose import Purpose
+from orthocal.session.session import Purpose
 
 SCRIPTS = sorted((ROOT / "examples").glob("[0-9]*.py"))
 

@@ -15,7 +15,7 @@ import pytest
 
 from orthocal import load_calibration, load_robot, load_session
 from orthocal.errors import OrthocalError, OutputError, SessionError
-from orthocal.files import (
+from orthocal.io.files import (
     read_file,
     require_writable,
     require_writable_file,
@@ -219,7 +219,7 @@ def test_old_files_stay_where_the_first_cannot_be_replaced(tmp_path, monkeypatch
 WRITE = """
 import sys
 from pathlib import Path
-from orthocal.files import write_files
+from orthocal.io.files import write_files
 n = 0
 while True:
     n += 1
@@ -254,7 +254,7 @@ def test_whenever_it_is_killed_no_two_generations_stand_side_by_side(tmp_path):
 STOP = """
 import os, signal, sys
 from pathlib import Path
-import orthocal.files as files
+import orthocal.io.files as files
 steps, original = int(sys.argv[2]), os.replace
 def replace(source, target):
     global steps

@@ -18,7 +18,7 @@ from fuzzing import KINDS, lay_out, make_case, run
 from orthocal import calibrate, load_calibration, load_robot
 from orthocal.calibration.file import calibration_document
 from orthocal.errors import CalibrationFileError
-from orthocal.kinematics.assembly import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_assembly
 
 COUNT = 2000
 
@@ -59,7 +59,7 @@ def test_what_must_not_be_is_seen(spoil, seen, good, tmp_path, monkeypatch):
     """A watchdog that sees nothing is none: a module of ours is spoilt for the workers."""
     lines = "\n".join(f"    {line}" for line in spoil.splitlines())
     code = (
-        "import orthocal.measurement.synthetic as module\n"
+        "import orthocal.observation.simulate as module\n"
         f"def load_errors(*_):\n{lines}\n"
         "module.load_errors = load_errors\n"
     )

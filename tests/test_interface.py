@@ -25,10 +25,10 @@ from orthocal import (
     validate_calibration,
     write_report,
 )
-from orthocal.assess.accuracy import Workspace
+from orthocal.assessment.tool_error import Workspace
 from orthocal.calibration.file import write_calibration
 from orthocal.errors import OrthocalError, ParameterError
-from orthocal.kinematics.assembly import Assembly
+from orthocal.kinematics.loop_closure import Assembly
 
 
 @pytest.fixture(scope="module")

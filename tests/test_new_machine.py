@@ -15,11 +15,11 @@ import pytest
 from lxml import etree
 
 from orthocal import load_plan, load_robot
-from orthocal.cli import asking
+from orthocal.cli import dialogue as asking
 from orthocal.cli.run import main
 from orthocal.errors import ParameterError
-from orthocal.measurement.purpose import Purpose
-from orthocal.robot.making import remake_robot
+from orthocal.robot.builder.build import remake_robot
+from orthocal.session.session import Purpose
 
 SIZES = {
     "--leg-mm": "250",

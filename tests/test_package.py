@@ -43,7 +43,7 @@ def test_the_wheel_holds_robots_and_types(wheel):
     assert "orthocal/py.typed" in names
     for name in ("web/scene.html", "web/scene.css", "web/scene.js"):
         assert f"orthocal/viewer/{name}" in names
-    assert "orthocal/show/report/report.css" in names
+    assert "orthocal/output/report/report.css" in names
     assert not [n for n in names if n.startswith(("tests", "examples"))]
 
 

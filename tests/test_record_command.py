@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 from orthocal import load_session
-from orthocal.assess import foresight
 from orthocal.cli.run import main
-from orthocal.measurement.guidance import guide
-from orthocal.measurement.recording import SUFFIX, open_recording
-from orthocal.measurement.session_file import load_plan
+from orthocal.hypotheses import prediction as foresight
+from orthocal.measurement.files.session_file import load_plan
+from orthocal.measurement.motion.guidance import guide
+from orthocal.measurement.recording.recording import SUFFIX, open_recording
 from orthocal.robot.loading import packaged_robots
 from orthocal.units import MM
 

@@ -210,8 +210,8 @@ def test_ctrl_c_while_files_are_staged_leaves_none(tmp_path):
     code = (
         "import os, signal, sys\n"
         "from pathlib import Path\n"
-        "import orthocal.files as files\n"
-        "from orthocal.interrupts import ending_at_interrupt\n"
+        "import orthocal.io.files as files\n"
+        "from orthocal.runtime.interrupts import ending_at_interrupt\n"
         "def fsync(_): os.kill(os.getpid(), signal.SIGINT)\n"
         "os.fsync = fsync\n"
         "with ending_at_interrupt():\n"

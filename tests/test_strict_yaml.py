@@ -8,8 +8,8 @@ import pytest
 import yaml
 from fuzzing import DIAL, ERRORS, PLAN, SESSION
 
-from orthocal import strict_yaml
-from orthocal.strict_yaml import StrictLoader, load_yaml
+from orthocal.io import strict_yaml
+from orthocal.io.strict_yaml import StrictLoader, load_yaml
 
 FOREIGN = 'title: "a \\u00e9 – 机器"\nkeys: [~, yes, 1e3]\n'
 

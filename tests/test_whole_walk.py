@@ -23,7 +23,7 @@ from orthocal import (
     load_robot,
     simulate_session,
 )
-from orthocal.assess.entering import find_entries
+from orthocal.assessment.controller_entries import find_entries
 from orthocal.units import MM
 
 SIZES = """--leg-mm 250 --travel-mm 100:325 --attachment-mm 30 --rods-apart-mm 60 --rod-radius-mm 4

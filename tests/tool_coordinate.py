@@ -12,8 +12,8 @@ from typing import ClassVar, Literal
 import casadi as ca
 import numpy as np
 
-from orthocal.documents import Name, PositiveNumber
 from orthocal.errors import SessionError
+from orthocal.io.documents import Name, PositiveNumber
 from orthocal.sensors.protocol import Contact, Frames, SetupKeys, Unknown
 
 

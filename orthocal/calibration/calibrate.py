@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.arguments import require_kind, require_names
+from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
-from orthocal.calibration.recording import assemble_calibration
-from orthocal.diagnosis.profile import profile_interval
 from orthocal.errors import NotIdentifiableError, ParameterError
 from orthocal.estimation.choice import Choice, choose
+from orthocal.estimation.diagnostics.profile_likelihood import profile_interval
 from orthocal.estimation.fit import Fit, first_sigma, fit_problem
 from orthocal.estimation.linear import linearise_at_reference
 from orthocal.estimation.loss import Loss, LossKind

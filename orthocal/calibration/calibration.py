@@ -22,7 +22,7 @@ from orthocal.calibration.recorded_robot import (
     require_rows,
 )
 from orthocal.calibration.records import CalibrationRecord, ParameterEstimate
-from orthocal.diagnosis.rows import ResidualRow, root_mean_square
+from orthocal.estimation.diagnostics.residual_rows import ResidualRow, root_mean_square
 from orthocal.robot.model import Robot
 from orthocal.statistics.chance import confidence_factor
 

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import CalibrationRecord
-from orthocal.characters import shorten
-from orthocal.documents import read_json, validate, write_plain
 from orthocal.errors import CalibrationFileError, SolverError
-from orthocal.files import exists, is_folder, write_file
+from orthocal.io.documents import read_json, validate, write_plain
+from orthocal.io.files import exists, is_folder, write_file
 from orthocal.statistics.identifiability import Identifiability
+from orthocal.text import shorten
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from orthocal.calibration.records import ParameterEstimate, PostureRecord, RobotRecord, SetupRecord
-from orthocal.diagnosis.rows import ResidualRow
 from orthocal.errors import CalibrationFileError, ParameterError, RobotError, SessionError
-from orthocal.files import is_folder
+from orthocal.estimation.diagnostics.residual_rows import ResidualRow
+from orthocal.io.files import is_folder
 from orthocal.robot.loading import load_robot, packaged_robots
 from orthocal.robot.model import Robot
 

@@ -8,14 +8,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from orthocal.diagnosis.change_records import Changes
-from orthocal.diagnosis.rows import ResidualRow
-from orthocal.diagnosis.turned import TurnedSetup
-from orthocal.diagnosis.unmodelled import Unmodelled
-from orthocal.documents import Count, Number, PositiveInSI, PositiveNumber
+from orthocal.estimation.diagnostics.residual_rows import ResidualRow
+from orthocal.estimation.diagnostics.unmodelled import Unmodelled
 from orthocal.estimation.loss import LossKind
 from orthocal.estimation.options import SolverKind
-from orthocal.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN, Sizes
+from orthocal.hypotheses.reversed_setup import TurnedSetup
+from orthocal.hypotheses.sessions.change_records import Changes
+from orthocal.io.documents import Count, Number, PositiveInSI, PositiveNumber
+from orthocal.io.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN, Sizes
 from orthocal.sensors.protocol import Sensor
 from orthocal.sensors.registry import RECORDED
 from orthocal.statistics.identifiability import Identifiability

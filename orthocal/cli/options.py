@@ -12,8 +12,8 @@ from orthocal.errors import ClosureError, ParameterError, SessionError
 
 if TYPE_CHECKING:
     from orthocal.kinematics.workspace import Workspace
-    from orthocal.measurement.session import Session
     from orthocal.robot.model import Robot
+    from orthocal.session.session import Session
 
 SIMULATED = "Simulated"
 """What the source of a session begins with that was not measured."""
@@ -59,7 +59,7 @@ def load_each_once(paths: Sequence[Path]) -> list[Session]:
     Raises:
         SessionError: If one is the same as another.
     """
-    from orthocal.measurement.session_file import load_session
+    from orthocal.measurement.files.session_file import load_session
 
     found: list[Session] = []
     for path in paths:
@@ -99,8 +99,8 @@ def require_no_readings(folder: Path) -> None:
         SessionError: If there are any.
     """
     from orthocal.errors import OrthocalError
-    from orthocal.files import exists
-    from orthocal.measurement.session_file import SESSION, load_rows
+    from orthocal.io.files import exists
+    from orthocal.measurement.files.session_file import SESSION, load_rows
 
     if not exists(folder / SESSION):
         return
@@ -122,7 +122,7 @@ def require_cube(robot: Robot, half_side_mm: float) -> Workspace:
     Raises:
         ParameterError: If it is none, or not reached.
     """
-    from orthocal.kinematics.assembly import nominal_assembly
+    from orthocal.kinematics.loop_closure import nominal_assembly
     from orthocal.kinematics.workspace import cube
     from orthocal.units import MM
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from orthocal.characters import printable
 from orthocal.errors import SessionError
+from orthocal.text import printable
 
 if TYPE_CHECKING:
-    from orthocal.assess.rows import Chunk
+    from orthocal.assessment.tool_tables import Chunk
 
 
 def put_out(text: str) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from orthocal.cli.printing import put_note
 
 if TYPE_CHECKING:
-    from orthocal.study.running import Progress
+    from orthocal.study.runner import Progress
     from orthocal.study.study import Study
 
 STEP = 0.1

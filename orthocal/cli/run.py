@@ -11,30 +11,30 @@ from typing import Annotated
 import typer
 
 import orthocal
-from orthocal.characters import printable
 
 # what registers the commands, in the order in which help lists them
 from orthocal.cli import (  # noqa: F401
-    calibrating,
-    checking,
-    correcting,
-    exporting,
-    importing,
-    looking,
-    making,
-    planning,
-    recording,
-    repeating,
-    sheets,
-    studying,
-    trying,
-    using,
+    again,
+    calibrate,
+    check,
+    correct,
+    export,
+    import_,
+    machine,
+    new,
+    plan,
+    record,
+    sheet,
+    simulate,
+    study,
+    view,
 )
 from orthocal.cli.options import app
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import OrthocalError
-from orthocal.interrupts import INTERRUPTED, ending_at_interrupt
-from orthocal.streams import ReaderGoneError, guarded_streams
+from orthocal.runtime.interrupts import INTERRUPTED, ending_at_interrupt
+from orthocal.runtime.streams import ReaderGoneError, guarded_streams
+from orthocal.text import printable
 
 
 def main() -> None:

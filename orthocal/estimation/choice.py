@@ -9,9 +9,8 @@ from typing import Any
 from orthocal.arguments import require_kind, require_names, require_numbers
 from orthocal.errors import ParameterError
 from orthocal.estimation.selection import DEFAULT_MODEL, Known, Selection, select_parameters
-from orthocal.measurement.purpose import Purpose
-from orthocal.measurement.session import Session
 from orthocal.robot.parameters import ParameterSet
+from orthocal.session.session import Purpose, Session
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ from orthocal.estimation.weighting import (
     stated_sigma,
     weigh_gauges,
 )
-from orthocal.measurement.session import Session
+from orthocal.session.session import Session
 from orthocal.statistics.information import (
     Information,
     decompose,

@@ -26,26 +26,26 @@ from orthocal.estimation.pieces import (
     ReadingPiece,
 )
 from orthocal.estimation.selection import Known, Selection, select_parameters
-from orthocal.kinematics.assembly import Assembly
 from orthocal.kinematics.compiled import CompiledRobot, compiled_robot
 from orthocal.kinematics.continuation import MachineNumbers
 from orthocal.kinematics.error_map import Slopes
-from orthocal.kinematics.kept import once_a_robot
+from orthocal.kinematics.function_cache import once_a_robot
+from orthocal.kinematics.loop_closure import Assembly
 from orthocal.kinematics.machine_map import MachineMap
 from orthocal.kinematics.symbolic import SymbolicRobot
-from orthocal.measurement.expansion import Expander, Expansion
-from orthocal.measurement.observations import Observations, build_observations, drive_table
-from orthocal.measurement.sensor_groups import (
+from orthocal.observation.expansion import Expander, Expansion
+from orthocal.observation.manual_alignment import Setting, find_setting
+from orthocal.observation.observations import Observations, build_observations, drive_table
+from orthocal.observation.sensor_groups import (
     SensorGroup,
     SensorUnknowns,
     group_sensors,
     sensor_unknowns,
 )
-from orthocal.measurement.session import Session
-from orthocal.measurement.setting import Setting, find_setting
 from orthocal.robot.model import Robot, closure_row_units, coordinate_units
 from orthocal.robot.parameters import AXES
 from orthocal.sensors.protocol import View
+from orthocal.session.session import Session
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

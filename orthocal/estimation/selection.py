@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.characters import composed
-from orthocal.documents import parse_number
 from orthocal.errors import ParameterError
-from orthocal.fields import read_only
+from orthocal.io.documents import parse_number
+from orthocal.io.fields import read_only
 from orthocal.robot.parameters import Parameter, ParameterSet, require_tolerance
+from orthocal.text import composed
 from orthocal.units import Unit
 
 Array = NDArray[np.float64]

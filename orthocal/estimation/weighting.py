@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.measurement.observations import Observations
-from orthocal.measurement.session import Gauge, Session
+from orthocal.observation.observations import Observations
+from orthocal.session.session import Gauge, Session
 from orthocal.statistics.noise import estimate_noise, estimate_repeatability, noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 

@@ -11,11 +11,11 @@ from __future__ import annotations
 import csv
 import io
 
-from orthocal.assess.entering import entered_offsets
-from orthocal.assess.tool import find_tool
+from orthocal.assessment.calibrated_tool import find_tool
+from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ExportError
-from orthocal.kinematics.assembly import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.workspace import even_grid
 from orthocal.units import MM
 

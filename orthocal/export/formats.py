@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from orthocal.assess.findings.calibration import decide
+from orthocal.assessment.findings.calibration import decide
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError, ParameterError
 from orthocal.export.corrections import export_corrections

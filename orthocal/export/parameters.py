@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import yaml
 
-from orthocal.assess.entering import find_entries
+from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.calibration import Calibration
 from orthocal.units import tidy
 

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError
-from orthocal.kinematics.assembly import Assembly
 from orthocal.kinematics.compiled import compiled_robot, zero_poses
 from orthocal.kinematics.continuation import Failures
+from orthocal.kinematics.loop_closure import Assembly
 
 Array = NDArray[np.float64]
 

@@ -15,13 +15,13 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
-from orthocal.characters import composed
 from orthocal.errors import ExportError, RobotError
-from orthocal.files import read_file
+from orthocal.io.files import read_file
 from orthocal.robot.description import load_description
 from orthocal.robot.frames import find_frame
 from orthocal.robot.model import Robot, joint_axis
 from orthocal.robot.urdf import load_urdf, parse_urdf
+from orthocal.text import composed
 from orthocal.units import PPM, tidy
 
 Array = NDArray[np.float64]

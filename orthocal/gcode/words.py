@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import NamedTuple
 
-from orthocal.characters import shorten
 from orthocal.errors import GcodeError
+from orthocal.text import shorten
 
 LONGEST_LINE = 1000
 """Characters; controllers read 255."""

@@ -17,9 +17,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.kinematics.batch import BatchFunction
+from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.error_map import ErrorMap, error_map
-from orthocal.kinematics.kept import kept_function, once_a_robot
+from orthocal.kinematics.function_cache import kept_function, once_a_robot
 from orthocal.kinematics.symbolic import Pose, SymbolicTree, log6
 from orthocal.robot.frames import hangs_on
 from orthocal.robot.model import Closure, Robot, closure_row_units, joint_axis

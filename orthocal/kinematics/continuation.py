@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError
-from orthocal.robot.closing import describe_opening
+from orthocal.robot.nominal_closure import describe_opening
 from orthocal.units import DRIVE_UNITS
 
 Array = NDArray[np.float64]

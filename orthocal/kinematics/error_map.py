@@ -18,7 +18,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.fields import read_only
+from orthocal.io.fields import read_only
 from orthocal.kinematics.symbolic import SERIES_BELOW, nominal_frame_placement
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import RobotError
-from orthocal.kinematics.assembly import Assembly
 from orthocal.kinematics.compiled import compiled_robot
+from orthocal.kinematics.loop_closure import Assembly
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]

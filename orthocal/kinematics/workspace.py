@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError
-from orthocal.fields import read_only
-from orthocal.kinematics.assembly import nominal_assembly
+from orthocal.io.fields import read_only
+from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.robot.model import Robot
 from orthocal.units import MM
 

@@ -1,1 +1,1 @@
-"""What was seen: sessions of gauge readings, the observation model, synthetic readings."""
+"""Session files, import of tables, recording, motion between postures, joined sessions."""

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TypeVar
 
 from orthocal.arguments import require_kind
-from orthocal.characters import composed
 from orthocal.errors import SessionError
-from orthocal.measurement.session import Posture, Session, Setup
-from orthocal.measurement.session_file import load_session
+from orthocal.measurement.files.session_file import load_session
+from orthocal.session.session import Posture, Session, Setup
+from orthocal.text import composed
 
 Value = TypeVar("Value")
 

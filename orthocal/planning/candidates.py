@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.kinematics.assembly import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.measurement.observations import build_observations
-from orthocal.measurement.sensing import locate_contacts
-from orthocal.measurement.session import Posture, Reading, Session, Setup
-from orthocal.measurement.setting import slopes_by_errors
-from orthocal.planning.means import Means, choose_box, reachable
+from orthocal.observation.manual_alignment import slopes_by_errors
+from orthocal.observation.observations import build_observations
+from orthocal.observation.sensor_frames import locate_contacts
+from orthocal.planning.equipment import Means, choose_box, reachable
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.leg_indicator import Direction, LegIndicator, Section
 from orthocal.sensors.protocol import Sensor
 from orthocal.sensors.rod_indicator import RodByBall, RodByBlade
 from orthocal.sensors.tips import Tip
+from orthocal.session.session import Posture, Reading, Session, Setup
 from orthocal.statistics.noise import noise_floor
 from orthocal.units import MM
 

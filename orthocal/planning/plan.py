@@ -11,16 +11,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.assess.remaining import RemainingError, rank_errors
-from orthocal.cores import call_on_cores, lent, run_on_cores
+from orthocal.assessment.remaining_errors import RemainingError, rank_errors
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, choose
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.kinematics.lanes import expect_many
+from orthocal.kinematics.backend.lanes import expect_many
 from orthocal.kinematics.workspace import Workspace
 from orthocal.measurement.joining import join_sessions
-from orthocal.measurement.purpose import Purpose
-from orthocal.measurement.session import Posture, Reading, Session, Setup
 from orthocal.planning.candidates import (
     FEWEST,
     Candidates,
@@ -29,7 +26,26 @@ from orthocal.planning.candidates import (
     measure_candidates,
     replace_beside,
 )
-from orthocal.planning.choosing import (
+from orthocal.planning.equipment import Means
+from orthocal.planning.expected_error import (
+    VAGUE,
+    Criterion,
+    Expected,
+    ToolForecast,
+    noise_of,
+    state_noise,
+)
+from orthocal.planning.marginal_gain import (
+    HOUR,
+    Stage,
+    add_rest,
+    find_curve,
+    find_enough,
+    order_by_worth,
+)
+from orthocal.planning.ordering import order_postures
+from orthocal.planning.plan_comparison import Alternative, list_alternatives, list_usual_plans
+from orthocal.planning.selection import (
     KILLED,
     Chosen,
     Opened,
@@ -38,19 +54,9 @@ from orthocal.planning.choosing import (
     error_left,
     information_of,
 )
-from orthocal.planning.comparing import Alternative, list_alternatives, list_usual_plans
-from orthocal.planning.means import Means
-from orthocal.planning.ordering import order_postures
-from orthocal.planning.prediction import (
-    VAGUE,
-    Criterion,
-    Expected,
-    ToolForecast,
-    noise_of,
-    state_noise,
-)
-from orthocal.planning.worth import HOUR, Stage, add_rest, find_curve, find_enough, order_by_worth
 from orthocal.robot.model import Robot
+from orthocal.runtime.worker_pool import call_on_cores, lent, run_on_cores
+from orthocal.session.session import Posture, Purpose, Reading, Session, Setup
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import UM
 

@@ -10,10 +10,10 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from orthocal.characters import composed
-from orthocal.documents import Number, PositiveNumber, read_yaml, validate
 from orthocal.errors import RobotError
+from orthocal.io.documents import Number, PositiveNumber, read_yaml, validate
 from orthocal.robot.joint_types import JOINT_TYPES
+from orthocal.text import composed
 
 Row = Literal["x", "y", "z", "rx", "ry", "rz"]
 Coordinate = Literal["x", "y", "z"]

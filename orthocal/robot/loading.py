@@ -14,8 +14,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from orthocal.errors import ParameterError, RobotError
-from orthocal.fields import read_only
-from orthocal.files import is_folder, read_file, require_plain_name
+from orthocal.io.fields import read_only
+from orthocal.io.files import is_folder, read_file, require_plain_name
 from orthocal.robot.description import (
     DriveKeys,
     JointKeys,
@@ -25,7 +25,6 @@ from orthocal.robot.description import (
     load_description,
 )
 from orthocal.robot.frames import find_frame, hangs_on
-from orthocal.robot.idle import find_idle_errors
 from orthocal.robot.model import (
     Closure,
     Drive,
@@ -45,8 +44,9 @@ from orthocal.robot.parameters import (
     build_parameters,
     split_unit,
 )
+from orthocal.robot.redundant import find_idle_errors
+from orthocal.robot.reference_posture import stand_at_zero
 from orthocal.robot.urdf import load_urdf
-from orthocal.robot.zero import stand_at_zero
 from orthocal.units import DEG, DRIVE_UNITS, MM, MRAD, PPM, Unit
 
 Array = NDArray[np.float64]

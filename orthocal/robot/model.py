@@ -11,9 +11,9 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError
-from orthocal.fields import read_only
-from orthocal.robot.closing import close_loops, describe_opening
+from orthocal.io.fields import read_only
 from orthocal.robot.frames import find_frame, place_frames
+from orthocal.robot.nominal_closure import close_loops, describe_opening
 from orthocal.robot.parameters import (
     ParameterSet,
 )

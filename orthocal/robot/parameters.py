@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.arguments import require_numbers
-from orthocal.characters import composed
 from orthocal.errors import ParameterError
+from orthocal.text import composed
 from orthocal.units import UNIT_SUFFIXES, InUnit, Unit
 
 Kind = Literal["offset", "scale", "translation", "rotation"]

@@ -19,11 +19,11 @@ import numpy as np
 import pinocchio as pin
 from lxml import etree
 
-from orthocal import cache
-from orthocal.characters import composed
-from orthocal.documents import LARGEST_NUMBER, read_text
 from orthocal.errors import RobotError
+from orthocal.io.documents import LARGEST_NUMBER, read_text
 from orthocal.robot.joint_types import retype_joints
+from orthocal.runtime import disk_cache as cache
+from orthocal.text import composed
 
 MOVING = ("revolute", "continuous", "prismatic")
 """Joint types that a robot may have besides `fixed`."""

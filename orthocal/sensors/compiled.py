@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import OrthocalError
-from orthocal.kinematics.batch import BatchFunction
+from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.compiled import compiled_robot
-from orthocal.kinematics.kept import identify, kept_function
+from orthocal.kinematics.function_cache import identify, kept_function
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Frames, Sensor, View

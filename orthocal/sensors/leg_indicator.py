@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from orthocal.documents import Name, Number
 from orthocal.errors import SessionError
+from orthocal.io.documents import Name, Number
 from orthocal.robot.model import Leg, Robot
+from orthocal.sensors.mounting import USUAL, Standing, StandingKeys, stand
 from orthocal.sensors.protocol import Contact, Frames, Sensor, SetupKeys, Unknown, View
-from orthocal.sensors.standing import USUAL, Standing, StandingKeys, stand
 from orthocal.sensors.tips import touch_by_blade
 from orthocal.units import MM, to_mm
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from orthocal.documents import validate
 from orthocal.errors import OrthocalError
-from orthocal.fields import As
+from orthocal.io.documents import validate
+from orthocal.io.fields import As
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Sensor, SetupKeys
 from orthocal.sensors.rod_indicator import RodKeys, read_leg

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from orthocal.documents import Number
 from orthocal.errors import SessionError
+from orthocal.io.documents import Number
 from orthocal.robot.model import Robot, Rod
 from orthocal.sensors.leg_indicator import (
     Direction,
@@ -27,6 +27,7 @@ from orthocal.sensors.leg_indicator import (
     direction_vector,
     read_direction,
 )
+from orthocal.sensors.mounting import EXACT, USUAL, Standing, stand
 from orthocal.sensors.protocol import (
     Contact,
     Frames,
@@ -36,7 +37,6 @@ from orthocal.sensors.protocol import (
     Unknown,
     View,
 )
-from orthocal.sensors.standing import EXACT, USUAL, Standing, stand
 from orthocal.sensors.tips import Tip, TipKeys, touch_by_ball, touch_by_blade
 from orthocal.units import MM, to_mm
 

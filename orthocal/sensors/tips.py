@@ -21,7 +21,7 @@ from typing import Annotated, Literal
 import casadi as ca
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from orthocal.documents import Number, PositiveNumber
+from orthocal.io.documents import Number, PositiveNumber
 from orthocal.units import MM, to_mm
 
 LARGEST_TIP_MM = 100.0

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PlainSerializer
 
-from orthocal.documents import Count, Number
-from orthocal.fields import CLOSED, Many, Vector
+from orthocal.io.documents import Count, Number
+from orthocal.io.fields import CLOSED, Many, Vector
 from orthocal.robot.parameters import Parameter
 from orthocal.statistics.information import RANK_THRESHOLD, Information
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import NotIdentifiableError
-from orthocal.measurement.observations import Observations
+from orthocal.observation.observations import Observations
 from orthocal.statistics.zeros import project_out_zeros
 
 Array = NDArray[np.float64]

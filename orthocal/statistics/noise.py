@@ -12,9 +12,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.documents import Count
-from orthocal.fields import CLOSED, Size, SizeOrInf, SizeOrNaN
-from orthocal.measurement.observations import Observations
+from orthocal.io.documents import Count
+from orthocal.io.fields import CLOSED, Size, SizeOrInf, SizeOrNaN
+from orthocal.observation.observations import Observations
 from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.measurement.observations import Observations
+from orthocal.observation.observations import Observations
 
 Array = NDArray[np.float64]
 

@@ -22,20 +22,20 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.estimation.solvers.fleet import Fleet
-from orthocal.kinematics.assembly import Assembly
-from orthocal.kinematics.fleet import Machines
+from orthocal.estimation.solvers.machine_readings import Fleet
+from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.machine_batch import Machines
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace, gauss_cube
-from orthocal.measurement.session import Session
-from orthocal.measurement.synthetic import limits_of, show_readings
-from orthocal.planning.prediction import (
+from orthocal.observation.simulate import limits_of, show_readings
+from orthocal.planning.expected_error import (
     Expected,
     ToolForecast,
     noise_of,
     weigh_readings,
 )
 from orthocal.robot.model import Robot
-from orthocal.study.shipping import ShippedSession
+from orthocal.session.session import Session
+from orthocal.study.shipped_functions import ShippedSession
 from orthocal.study.study import Columns, Study, prepare_once
 from orthocal.units import UM
 

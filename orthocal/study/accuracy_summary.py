@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError
-from orthocal.planning.prediction import Expected
+from orthocal.planning.expected_error import Expected
 from orthocal.robot.parameters import Parameter
 from orthocal.study.accuracy import GOOD, AccuracyStudy
-from orthocal.study.running import StudyTable
+from orthocal.study.runner import StudyTable
 from orthocal.units import UM
 
 Array = NDArray[np.float64]

@@ -20,12 +20,12 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchProgram
 from orthocal.estimation.weighting import leverages
-from orthocal.measurement.observations import Observations
-from orthocal.measurement.session import Session
+from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
+from orthocal.session.session import Session
 from orthocal.statistics.zeros import project_out_zeros
-from orthocal.study.running import StudyTable
-from orthocal.study.shipping import ShippedSession
+from orthocal.study.runner import StudyTable
+from orthocal.study.shipped_functions import ShippedSession
 from orthocal.study.study import Columns, Study, prepare_once
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from orthocal.errors import OrthocalError
-from orthocal.journal import Journal, open_journal_file
+from orthocal.io.journal import Journal, open_journal_file
 from orthocal.study.study import Cell, Study
 
 FORMAT = "orthocal/study/1"

@@ -28,16 +28,16 @@ from orthocal.estimation.linear import (
 )
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
-from orthocal.estimation.solvers.eliminated import EliminatedProgram
-from orthocal.estimation.solvers.fleet import Fleet
-from orthocal.estimation.solvers.fleet_slopes import FleetSlopes
-from orthocal.measurement.session import Gauge, Session
+from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
+from orthocal.estimation.solvers.machine_readings import Fleet
+from orthocal.estimation.solvers.variable_projection import EliminatedProgram
 from orthocal.robot.model import Robot
-from orthocal.sensors.standing import EXACT
+from orthocal.sensors.mounting import EXACT
+from orthocal.session.session import Gauge, Session
 from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.study.paper import PAPER_GAUGE, Displacements, build_paper_plan
-from orthocal.study.shipping import ShippedSession
+from orthocal.study.shipped_functions import ShippedSession
 from orthocal.study.study import Columns, Study, prepare_once
 from orthocal.units import MM
 

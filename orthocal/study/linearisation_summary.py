@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.study.linearisation import IDENTIFIED, METHODS, SOLVED, LinearisationStudy
-from orthocal.study.running import StudyTable
+from orthocal.study.runner import StudyTable
 from orthocal.units import MM
 
 Array = NDArray[np.float64]

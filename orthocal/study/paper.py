@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.errors import ParameterError
-from orthocal.kinematics.assembly import nominal_assembly
-from orthocal.measurement.session import Gauge, Posture, Reading, Session, Setup
+from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.robot.model import Robot
 from orthocal.sensors.leg_indicator import LegIndicator, Section
-from orthocal.sensors.standing import EXACT
+from orthocal.sensors.mounting import EXACT
+from orthocal.session.session import Gauge, Posture, Reading, Session, Setup
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 
-from orthocal.study.running import StudyTable
+from orthocal.study.runner import StudyTable
 
 
 def to_parquet(table: StudyTable) -> bytes:

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.estimation.problem import CalibrationProblem, build_problem
-from orthocal.kinematics.assembly import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.measurement.session import Gauge, Posture, Reading, Session
 from orthocal.robot.model import Robot
+from orthocal.session.session import Gauge, Posture, Reading, Session
 from orthocal.study.paper import Displacements, build_paper_plan
-from orthocal.study.running import StudyTable
-from orthocal.study.shipping import ShippedSession
+from orthocal.study.runner import StudyTable
+from orthocal.study.shipped_functions import ShippedSession
 from orthocal.study.study import Columns, Study
 from orthocal.units import MM, UM
 

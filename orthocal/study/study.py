@@ -14,7 +14,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from orthocal import __version__
-from orthocal.kinematics.lanes import expect_many
+from orthocal.kinematics.backend.lanes import expect_many
 
 Cell = float | int | str | bool | None
 Columns = Mapping[str, Sequence[Cell]]

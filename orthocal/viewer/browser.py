@@ -9,8 +9,8 @@ import tempfile
 from pathlib import Path
 
 from orthocal.errors import OrthocalError, OutputError
-from orthocal.files import write_file
-from orthocal.interrupts import raised_interrupt
+from orthocal.io.files import write_file
+from orthocal.runtime.interrupts import raised_interrupt
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 

@@ -25,8 +25,8 @@ from meshcat.animation import Animation
 from meshcat.geometry import Geometry, Material
 from numpy.typing import NDArray
 
-from orthocal.characters import printable
-from orthocal.files import write_file
+from orthocal.io.files import write_file
+from orthocal.text import printable
 
 Array = NDArray[np.float64]
 Point = tuple[float, float, float]

@@ -15,7 +15,7 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from orthocal.errors import RobotError
-from orthocal.files import exists, read_file, require_file
+from orthocal.io.files import exists, read_file, require_file
 from orthocal.robot.model import Robot
 from orthocal.robot.urdf import LARGEST_PLACE, captured_stderr, parse_urdf
 from orthocal.viewer.shapes import Colour, cylinder, pose_along

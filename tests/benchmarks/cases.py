@@ -20,10 +20,10 @@ from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.choice import build_program
 from orthocal.estimation.solvers.program import Program, Solution
-from orthocal.kinematics.lanes import expect_many
+from orthocal.kinematics.backend.lanes import expect_many
 from orthocal.measurement.joining import join_sessions
-from orthocal.measurement.session import Gauge, Session
-from orthocal.measurement.synthetic import draw_errors
+from orthocal.observation.simulate import draw_errors
+from orthocal.session.session import Gauge, Session
 
 sys.path.append(str(Path(__file__).parents[1]))
 

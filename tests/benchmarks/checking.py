@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from orthocal import load_plan
-from orthocal.checking.search import find_mistakes
+from orthocal.hypotheses.search import find_mistakes
 
 EXAMPLES = ("raw-cycles", "sweep", "workshop")
 ROOT = Path(__file__).parents[2]

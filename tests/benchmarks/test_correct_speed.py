@@ -10,7 +10,7 @@ import numpy as np
 from orthocal.export.correction_field import CorrectionField
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.state import Interpreter
-from orthocal.kinematics.lanes import Way, running
+from orthocal.kinematics.backend.lanes import Way, running
 
 CORRECTED = 9.0
 """Points that are read, corrected and written a second over those that the machine itself corrects

@@ -19,19 +19,19 @@ from orthocal import load_session
 from orthocal.estimation.choice import Choice
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.estimation.solvers.eliminated import EliminatedProgram
-from orthocal.estimation.solvers.fleet import Fleet
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.estimation.solvers.machine_readings import Fleet
 from orthocal.estimation.solvers.nlp import ProgramFunctions
-from orthocal.kinematics import lanes
+from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+from orthocal.kinematics.backend import lanes
 from orthocal.kinematics.compiled import compiled_robot
-from orthocal.measurement.observations import build_observations
-from orthocal.measurement.sensing import predict_entries
+from orthocal.observation.observations import build_observations
+from orthocal.observation.sensor_frames import predict_entries
 from orthocal.planning.candidates import list_candidates, measure_candidates
-from orthocal.planning.choosing import choose_setups, error_left
-from orthocal.planning.means import Means
-from orthocal.planning.prediction import ToolForecast
-from orthocal.study.accuracy_choice import build_accuracy_study
+from orthocal.planning.equipment import Means
+from orthocal.planning.expected_error import ToolForecast
+from orthocal.planning.selection import choose_setups, error_left
+from orthocal.study.accuracy_options import build_accuracy_study
 from orthocal.study.linearisation import build_linearisation_study
 from orthocal.study.study import run_task
 

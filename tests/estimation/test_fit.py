@@ -15,7 +15,7 @@ from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchProgram
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
-from orthocal.show.explanation import explain_fit
+from orthocal.output.text.explanation import explain_fit
 from orthocal.statistics.information import decompose
 from orthocal.statistics.zeros import project_out_zeros
 

@@ -11,8 +11,8 @@ from tolerances import KINEMATICS
 from orthocal import load_plan
 from orthocal.errors import ParameterError, RobotError
 from orthocal.estimation.problem import build_problem
-from orthocal.measurement.observations import build_observations
-from orthocal.measurement.sensing import predict_entries
+from orthocal.observation.observations import build_observations
+from orthocal.observation.sensor_frames import predict_entries
 
 
 @pytest.fixture(scope="module")

@@ -13,12 +13,12 @@ import pytest
 from programs import read_polyline
 
 from orthocal import ExportError, calibrate, draw_errors, write_calibration
-from orthocal.assess.entering import entered_offsets
+from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.cli import main
 from orthocal.export.correction_field import CorrectionField, Unknown
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.state import Interpreter
-from orthocal.kinematics.assembly import Assembly, nominal_assembly
+from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
 
 WITHIN = 1e-6
 

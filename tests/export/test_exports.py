@@ -22,11 +22,11 @@ from orthocal import (
     simulate_session,
     write_calibration,
 )
-from orthocal.assess.entering import entered_offsets
+from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.cli import main
 from orthocal.export.urdf import _correct, _find_twists
-from orthocal.kinematics.assembly import Assembly, nominal_assembly
-from orthocal.measurement.synthetic import load_errors
+from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
+from orthocal.observation.simulate import load_errors
 from orthocal.robot.parameters import ElementaryError
 
 ROUNDED = 0.5e-9 * np.sqrt(3.0) * 1.5

@@ -34,7 +34,7 @@ from orthocal import (
     simulate_session,
     write_calibration,
 )
-from orthocal.assess.entering import entered_offsets
+from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.calibration.machine import Machine
 from orthocal.cli import main
 from orthocal.export.linuxcnc.approximation import approximate
@@ -45,7 +45,7 @@ from orthocal.export.linuxcnc.words import rounded_up
 from orthocal.export.options import ExportOptions
 from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.measurement.synthetic import load_errors
+from orthocal.observation.simulate import load_errors
 from orthocal.robot.loading import packaged_robots
 
 MM = 1e-3

@@ -8,7 +8,7 @@ from tolerances import CLOSED, CLOSED_FORM
 
 from orthocal.errors import ClosureError, RobotError
 from orthocal.kinematics import orthoglide as closed_form
-from orthocal.kinematics.assembly import Assembly, nominal_assembly
+from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
 
 LENGTH = 0.31025
 

@@ -9,9 +9,9 @@ import pytest
 from conftest import load_afresh
 from tolerances import KINEMATICS
 
-from orthocal.kinematics.assembly import Assembly
 from orthocal.kinematics.compiled import compiled_robot, log6_jacobian
 from orthocal.kinematics.error_map import right_jacobian as right_jacobians
+from orthocal.kinematics.loop_closure import Assembly
 from orthocal.kinematics.machine_map import MachineMap, right_jacobian
 from orthocal.kinematics.symbolic import SymbolicRobot, constant_pose
 from orthocal.robot.model import closure_row_units

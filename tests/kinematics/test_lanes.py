@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from orthocal import load_plan
-from orthocal.kinematics import lanes
-from orthocal.kinematics.batch import BatchFunction
+from orthocal.kinematics.backend import lanes
+from orthocal.kinematics.backend.batch_function import BatchFunction
+from orthocal.kinematics.backend.lanes import Way, list_instructions, running
 from orthocal.kinematics.compiled import compiled_robot
-from orthocal.kinematics.lanes import Way, list_instructions, running
-from orthocal.measurement.observations import build_observations
-from orthocal.measurement.sensor_groups import group_sensors
+from orthocal.observation.observations import build_observations
+from orthocal.observation.sensor_groups import group_sensors
 
 
 def points(robot, count):

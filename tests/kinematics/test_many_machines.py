@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from orthocal.kinematics import fleet
-from orthocal.kinematics.assembly import Assembly
+from orthocal.kinematics import machine_batch as fleet
 from orthocal.kinematics.compiled import compiled_robot
-from orthocal.kinematics.fleet import Machines
+from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.machine_batch import Machines
 
 OPEN = 1e-12
 """Loops in metres that count as closed: some hundred roundings of a machine of a third of one."""

@@ -18,7 +18,11 @@ from conftest import ROOT
 from orthocal import load_session
 from orthocal.cli import main
 from orthocal.errors import SessionError
-from orthocal.measurement.importing import TableOptions, import_readings, write_import
+from orthocal.measurement.importing.import_readings import (
+    TableOptions,
+    import_readings,
+    write_import,
+)
 
 SESSION = """
 robot: machine

@@ -13,11 +13,11 @@ from orthocal.calibration.file import calibration_document, write_calibration
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.eliminated import EliminatedProgram
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+from orthocal.measurement.files.session_file import load_session
+from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
-from orthocal.measurement.session_file import load_session
-from orthocal.measurement.session_output import write_session
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 

@@ -15,10 +15,10 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
 from orthocal.errors import SessionError
-from orthocal.measurement.headings import EXPECTED, UNITS, choose_columns, find_header
-from orthocal.measurement.long_table import make_long
-from orthocal.tables.separated import SEPARATORS
-from orthocal.tables.table import read_table
+from orthocal.io.tables.separated import SEPARATORS
+from orthocal.io.tables.table import read_table
+from orthocal.measurement.importing.headings import EXPECTED, UNITS, choose_columns, find_header
+from orthocal.measurement.importing.long_table import make_long
 
 NAMES = {"setup": ["xy", "yx"], "posture": ["zero", "x_max", "x_-40"]}
 PLACES = [(s, p) for s in NAMES["setup"] for p in NAMES["posture"]]

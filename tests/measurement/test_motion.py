@@ -18,11 +18,11 @@ from machines import place
 
 from orthocal import load_plan
 from orthocal.errors import ParameterError, SessionError
-from orthocal.kinematics.assembly import nominal_assembly
-from orthocal.measurement.motion import APPROACH, plan_motion, shown_joints
-from orthocal.measurement.motion_program import ProgramOptions, program_name, write_program
-from orthocal.robot.making import make_robot
-from orthocal.robot.sizes import Counting, Sizes
+from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.measurement.motion.motion import APPROACH, plan_motion, shown_joints
+from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
+from orthocal.robot.builder.build import make_robot
+from orthocal.robot.builder.dimensions import Counting, Sizes
 from orthocal.units import MM
 
 ROUNDED = 1e-4

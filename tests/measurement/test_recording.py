@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 
 from orthocal import load_session
-from orthocal.assess import foresight
-from orthocal.cli.recording import record
+from orthocal.cli.record import record
 from orthocal.errors import OrthocalError, OutputError, SessionError
-from orthocal.interrupts import ending_at_interrupt
-from orthocal.measurement import recording as module
-from orthocal.measurement import session_file
-from orthocal.measurement.recording import SUFFIX, open_recording
-from orthocal.measurement.session_file import load_plan, load_rows
-from orthocal.measurement.typed_numbers import read_typed
+from orthocal.hypotheses import prediction as foresight
+from orthocal.measurement.files import session_file
+from orthocal.measurement.files.session_file import load_plan, load_rows
+from orthocal.measurement.importing.typed_numbers import read_typed
+from orthocal.measurement.recording import recording as module
+from orthocal.measurement.recording.recording import SUFFIX, open_recording
+from orthocal.runtime.interrupts import ending_at_interrupt
 from orthocal.units import MM
 
 KILLS = 100

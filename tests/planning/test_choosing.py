@@ -8,16 +8,16 @@ from itertools import combinations, permutations
 import numpy as np
 import pytest
 
-from orthocal import cores
 from orthocal.planning.candidates import Candidates, HandSet, Kind
-from orthocal.planning.choosing import (
+from orthocal.planning.ordering import order_postures
+from orthocal.planning.selection import (
     Opened,
     _Beside,
     choose_setups,
     error_left,
     information_of,
 )
-from orthocal.planning.ordering import order_postures
+from orthocal.runtime import worker_pool as cores
 
 SIGMA = 0.5
 STATE = 4

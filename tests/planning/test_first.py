@@ -9,11 +9,11 @@ import pytest
 
 from orthocal import load_plan
 from orthocal.errors import RobotError
-from orthocal.measurement.session_file import check_contacts
-from orthocal.planning.first import CLEAR, first_means, paper_plan
-from orthocal.planning.means import Means, reachable
-from orthocal.robot.making import make_robot
-from orthocal.robot.sizes import Sizes
+from orthocal.measurement.files.session_file import check_contacts
+from orthocal.planning.equipment import Means, reachable
+from orthocal.planning.first_plan import CLEAR, first_means, paper_plan
+from orthocal.robot.builder.build import make_robot
+from orthocal.robot.builder.dimensions import Sizes
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.rod_indicator import RodByBlade
 from orthocal.sensors.tips import Tip

@@ -12,20 +12,20 @@ from orthocal import Choice, calibrate, draw_errors, load_plan, load_session, si
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.estimation.solvers.fleet import Fleet
-from orthocal.kinematics.assembly import Assembly
+from orthocal.estimation.solvers.machine_readings import Fleet
+from orthocal.kinematics.loop_closure import Assembly
 from orthocal.kinematics.workspace import cube
+from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
-from orthocal.measurement.session import Gauge
-from orthocal.measurement.session_output import write_session
 from orthocal.planning.candidates import list_candidates, measure_candidates
-from orthocal.planning.choosing import choose_setups
-from orthocal.planning.means import Means, choose_box, find_box
+from orthocal.planning.equipment import Means, choose_box, find_box
+from orthocal.planning.expected_error import ToolForecast, default_workspace
 from orthocal.planning.plan import plan_readings
-from orthocal.planning.prediction import ToolForecast, default_workspace
-from orthocal.robot.making import Sizes, make_robot
-from orthocal.sensors.standing import EXACT, Standing
+from orthocal.planning.selection import choose_setups
+from orthocal.robot.builder.build import Sizes, make_robot
+from orthocal.sensors.mounting import EXACT, Standing
 from orthocal.sensors.tips import Tip
+from orthocal.session.session import Gauge
 
 OFFSETS = {"*.offset_mm": 2.0}
 DIAL = Gauge(5e-6, None, (-5e-3, 5e-3))

@@ -12,11 +12,12 @@ from dataclasses import replace
 import pytest
 from processes import children_of, is_running, until
 
-from orthocal import MeasuringPlan, cores, load_plan, plan_readings, summarize
+from orthocal import MeasuringPlan, load_plan, plan_readings, summarize
 from orthocal.cli.run import main
-from orthocal.interrupts import INTERRUPTED
-from orthocal.measurement.purpose import Purpose
-from orthocal.planning.means import Means
+from orthocal.planning.equipment import Means
+from orthocal.runtime import worker_pool as cores
+from orthocal.runtime.interrupts import INTERRUPTED
+from orthocal.session.session import Purpose
 
 QUICK = ["--along", "3", "--across-mm", "0", "--sections", "0.5", "--starts", "1"]
 DIAL = """sigma_mm: 0.002

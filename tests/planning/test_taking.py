@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from orthocal.planning.candidates import HandSet, Kind
-from orthocal.planning.taking import Taking
+from orthocal.planning.information_gain import Taking
 
 SIGMA, STATE, READINGS = 0.5, 5, 7
 

@@ -7,8 +7,8 @@ import pytest
 from models import JOINTS
 
 from orthocal import load_robot
-from orthocal.kinematics.assembly import Assembly
 from orthocal.kinematics.compiled import compiled_robot
+from orthocal.kinematics.loop_closure import Assembly
 
 STEP = 1e-6
 """[m, rad]"""

@@ -11,11 +11,11 @@ from tolerances import CLOSED_FORM
 
 from orthocal.errors import RobotError
 from orthocal.kinematics import orthoglide as closed_forms
-from orthocal.kinematics.assembly import Assembly
+from orthocal.kinematics.loop_closure import Assembly
+from orthocal.robot.builder.build import describe_machine, make_robot, remake_robot
+from orthocal.robot.builder.dimensions import Counting, Sizes
+from orthocal.robot.builder.machine_file import MACHINE, read_machine
 from orthocal.robot.loading import packaged_robots
-from orthocal.robot.machine_file import MACHINE, read_machine
-from orthocal.robot.making import describe_machine, make_robot, remake_robot
-from orthocal.robot.sizes import Counting, Sizes
 
 SMALL = Sizes(leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004)
 

@@ -18,8 +18,8 @@ from tolerances import CLOSED, KINEMATICS
 
 from orthocal import load_robot
 from orthocal.errors import ClosureError, RobotError
-from orthocal.kinematics.assembly import Assembly
-from orthocal.robot.zero import count_free_motions
+from orthocal.kinematics.loop_closure import Assembly
+from orthocal.robot.reference_posture import count_free_motions
 
 
 def gap(robot, coordinates):

@@ -18,20 +18,20 @@ from tool_coordinate import ToolCoordinate
 from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
 from orthocal.calibration.file import calibration_json, write_calibration
 from orthocal.cli import app
-from orthocal.diagnosis.unmodelled import machine_errors
 from orthocal.errors import OrthocalError, SessionError
+from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.eliminated import EliminatedProgram
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
-from orthocal.measurement.observations import build_observations
-from orthocal.measurement.sensing import predict_entries
-from orthocal.measurement.session_file import load_session
-from orthocal.measurement.session_output import write_session
-from orthocal.measurement.synthetic import draw_errors
+from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+from orthocal.measurement.files.session_file import load_session
+from orthocal.measurement.files.write_session import write_session
+from orthocal.observation.observations import build_observations
+from orthocal.observation.sensor_frames import predict_entries
+from orthocal.observation.simulate import draw_errors
+from orthocal.output.report.page import build_report
 from orthocal.sensors import registry
 from orthocal.sensors.compiled import compile_reading
-from orthocal.show.report.page import build_report
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
@@ -76,7 +76,7 @@ def plan(tmp_path):
 def test_its_readings_are_those_of_the_tool(plan):
     o = build_observations(plan)
     found = predict_entries(plan, o, TRUTH, unknowns=np.array([1e-3, -2e-3]))
-    from orthocal.kinematics.assembly import Assembly
+    from orthocal.kinematics.loop_closure import Assembly
 
     drives = np.array([p.drives for p in plan.postures.values()])
     tool = Assembly(plan.robot, fixed=TRUTH).forward(drives)

@@ -19,10 +19,10 @@ from orthocal import (
 )
 from orthocal.errors import SessionError
 from orthocal.kinematics.error_map import error_map
-from orthocal.measurement.observations import build_observations
-from orthocal.measurement.sensing import locate_contacts, predict_entries
-from orthocal.measurement.sensor_groups import sensor_unknowns
-from orthocal.measurement.setting import find_setting
+from orthocal.observation.manual_alignment import find_setting
+from orthocal.observation.observations import build_observations
+from orthocal.observation.sensor_frames import locate_contacts, predict_entries
+from orthocal.observation.sensor_groups import sensor_unknowns
 
 PLAN = """robot: orthoglide
 gauge: {{sigma_mm: 0.005, resolution_mm: 0.001, range_mm: [-20, 20]}}

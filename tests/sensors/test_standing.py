@@ -20,10 +20,10 @@ from orthocal import (
 from orthocal.errors import SessionError
 from orthocal.kinematics.error_map import error_map
 from orthocal.measurement.joining import join_sessions
-from orthocal.measurement.observations import build_observations
-from orthocal.measurement.sensing import predict_entries
-from orthocal.measurement.sensor_groups import sensor_unknowns
-from orthocal.measurement.setting import find_setting
+from orthocal.observation.manual_alignment import find_setting
+from orthocal.observation.observations import build_observations
+from orthocal.observation.sensor_frames import predict_entries
+from orthocal.observation.sensor_groups import sensor_unknowns
 
 TIPS = {
     "ball": "{ball: {radius_mm: 1.5}}",

@@ -14,9 +14,9 @@ from orthocal import calibrate, load_plan
 from orthocal.errors import NotIdentifiableError
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.estimation.solvers.fleet import Fleet
-from orthocal.measurement.observations import Observations, build_observations
-from orthocal.measurement.sensing import predict_entries
+from orthocal.estimation.solvers.machine_readings import Fleet
+from orthocal.observation.observations import Observations, build_observations
+from orthocal.observation.sensor_frames import predict_entries
 from orthocal.statistics.chance import chance_of_excess, confidence_factor
 from orthocal.statistics.information import Information, decompose, marginalise
 from orthocal.statistics.noise import KnownNoise, Noise, estimate_noise, estimate_repeatability

@@ -10,14 +10,14 @@ from tolerances import TRUTH_BACK
 
 from orthocal import Choice, load_plan, load_robot
 from orthocal.errors import ParameterError, SessionError
-from orthocal.kinematics.assembly import Assembly
+from orthocal.kinematics.loop_closure import Assembly
 from orthocal.kinematics.workspace import cube, gauss_cube
-from orthocal.measurement.session import Gauge
+from orthocal.session.session import Gauge
 from orthocal.study.accuracy import GOOD, OUT_OF_RANGE
-from orthocal.study.accuracy_choice import build_accuracy_study
+from orthocal.study.accuracy_options import build_accuracy_study
 from orthocal.study.accuracy_summary import summarise_accuracy
 from orthocal.study.paper import Displacements, build_paper_plan
-from orthocal.study.running import StudyTable, run_study
+from orthocal.study.runner import StudyTable, run_study
 from orthocal.study.study import run_task
 
 NEAR = {"*.offset_mm": 0.2}
@@ -131,7 +131,7 @@ def test_readings_beyond_the_gauge_are_told_not_counted(workshop):
 
 
 def test_a_table_of_no_good_machine_says_so(workshop):
-    from orthocal.show.study.views import study_json, summarise_study
+    from orthocal.output.study.views import study_json, summarise_study
 
     study = build_accuracy_study(workshop, "offsets", machines=2)
     rows = run_task(study, 0)

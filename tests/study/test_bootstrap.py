@@ -9,7 +9,7 @@ from gauges import exact
 from orthocal import load_plan, load_session, simulate_session
 from orthocal.errors import SessionError
 from orthocal.study.bootstrap import build_bootstrap_study, find_cycles, summarise_bootstrap
-from orthocal.study.running import run_study
+from orthocal.study.runner import run_study
 
 CYCLES = 40
 

@@ -10,14 +10,14 @@ from tolerances import THREE_DECIMALS_MM
 from orthocal import Choice, load_plan
 from orthocal.errors import NotIdentifiableError, ParameterError
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.fleet_slopes import FleetSlopes
+from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.kinematics import orthoglide as closed_forms
-from orthocal.measurement.session import Gauge
-from orthocal.robot.making import Sizes, make_robot
+from orthocal.robot.builder.build import Sizes, make_robot
+from orthocal.session.session import Gauge
 from orthocal.study.linearisation import METHODS, build_linearisation_study
 from orthocal.study.linearisation_summary import summarise_linearisation
-from orthocal.study.running import run_study
+from orthocal.study.runner import run_study
 from orthocal.study.study import run_task
 
 ALONG = (1.0, -0.6, 0.3)

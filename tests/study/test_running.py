@@ -17,15 +17,16 @@ import pytest
 from gauges import exact
 from processes import children_of, is_running, until
 
-from orthocal import cores, load_session
+from orthocal import load_session
 from orthocal.errors import OrthocalError
-from orthocal.show.study.views import study_json, summarise_study
-from orthocal.study import running
+from orthocal.output.study.views import study_json, summarise_study
+from orthocal.runtime import worker_pool as cores
+from orthocal.study import runner as running
 from orthocal.study.bootstrap import build_bootstrap_study
 from orthocal.study.journal import open_journal
 from orthocal.study.linearisation import build_linearisation_study
 from orthocal.study.parquet import to_parquet
-from orthocal.study.running import JOURNAL, run_study
+from orthocal.study.runner import JOURNAL, run_study
 from orthocal.study.study import run_task, tidy_cell
 
 KILLS = 20
@@ -94,7 +95,7 @@ def test_any_number_of_workers_finds_the_same(study, undisturbed, workers, forke
 
 def test_a_process_with_threads_is_not_doubled():
     code = (
-        "import threading, time\nfrom orthocal.cores import can_fork\n"
+        "import threading, time\nfrom orthocal.runtime.worker_pool import can_fork\n"
         "assert can_fork()\n"
         "threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
         "assert not can_fork()\n"
@@ -170,7 +171,7 @@ def doubled():
 
 def test_what_is_there_is_not_done_again(study, tmp_path, monkeypatch):
     run_study(study, folder=tmp_path)
-    monkeypatch.setattr("orthocal.study.running.run_task", None)
+    monkeypatch.setattr("orthocal.study.runner.run_task", None)
     told = []
     run_study(study, folder=tmp_path, report=told.append)
     assert [(p.done, p.kept) for p in told] == [(3000, 3000)]
@@ -294,7 +295,7 @@ def test_a_cluster_one_of_whose_workers_is_killed_finds_the_same(cluster, study,
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere", "", "tcp://["])
 def test_a_cluster_that_does_not_answer_is_told(study, monkeypatch, address):
-    monkeypatch.setattr("orthocal.study.running.CONNECTING", 1.0)
+    monkeypatch.setattr("orthocal.study.runner.CONNECTING", 1.0)
     with pytest.raises(OrthocalError, match="--dask: no Dask scheduler answers at"):
         run_study(study, dask=address)
 
@@ -318,7 +319,7 @@ def test_workers_end_when_nobody_wants_them_any_more(root, tmp_path):
 
 def test_a_robot_that_is_not_there_any_more_is_made_of_its_files(orthoglide, tmp_path):
     """As on another machine, or where its files were changed meanwhile."""
-    from orthocal.robot.making import Sizes, make_robot
+    from orthocal.robot.builder.build import Sizes, make_robot
 
     sizes = Sizes(leg=0.25, lower=0.1, upper=0.32)
     robot = make_robot(sizes, tmp_path / "mine")
@@ -326,7 +327,7 @@ def test_a_robot_that_is_not_there_any_more_is_made_of_its_files(orthoglide, tmp
     expected = run_study(study).columns
     for file in (tmp_path / "mine").iterdir():
         file.write_text("something else")
-    from orthocal.study import shipping
+    from orthocal.study import shipped_functions as shipping
 
     shipping._unpack.cache_clear()
     from orthocal.study.study import prepare_once

@@ -9,7 +9,7 @@ from machines import place
 from orthocal import load_plan
 from orthocal.errors import ClosureError, ParameterError
 from orthocal.study.paper import Displacements
-from orthocal.study.running import run_study
+from orthocal.study.runner import run_study
 from orthocal.study.sensitivity import build_sensitivity_study, summarise_sensitivity
 
 LENGTH = 0.31025

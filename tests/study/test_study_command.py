@@ -87,7 +87,7 @@ def test_ctrl_c_says_how_to_go_on(monkeypatch, capsys, tmp_path):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("orthocal.study.running.run_task", stop)
+    monkeypatch.setattr("orthocal.study.runner.run_task", stop)
     for out, word in (([], "with --out it could go on"), (["--out", tmp_path], "the same command")):
         code, _, err = run(monkeypatch, capsys, "sensitivity", "--free", "offsets", *out)
         assert code == 130

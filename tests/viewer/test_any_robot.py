@@ -18,9 +18,9 @@ from tolerances import CLOSED, KINEMATICS
 
 from orthocal import draw_scene, load_robot
 from orthocal.cli import main
-from orthocal.kinematics.assembly import nominal_assembly
-from orthocal.robot.zero import count_free_motions
-from orthocal.show.scene import drawing
+from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.output.scene import drawing
+from orthocal.robot.reference_posture import count_free_motions
 from orthocal.viewer.visuals import load_visuals
 
 

@@ -14,7 +14,7 @@ from folders import session_folder
 from PIL import Image
 
 from orthocal import LiveScene, calibrate, draw_scene, load_robot, load_session, write_report
-from orthocal.measurement.session_file import load_plan
+from orthocal.measurement.files.session_file import load_plan
 from orthocal.viewer.browser import take_picture
 
 EXPECTED = ("zx −1.140 → −0.130 mm", "x_max − x_min", "Before: measured − nominal", "leg z")

@@ -15,16 +15,16 @@ from gauges import exact
 from tolerances import KINEMATICS
 
 from orthocal import calibrate, draw_scene, load_robot, load_session
-from orthocal.assess.accuracy import assess_tool, find_excess, measure_uncertainty
-from orthocal.assess.entering import find_entries
-from orthocal.assess.tool import error_covariance
+from orthocal.assessment.calibrated_tool import error_covariance
+from orthocal.assessment.controller_entries import find_entries
+from orthocal.assessment.tool_error import assess_tool, find_excess, measure_uncertainty
 from orthocal.calibration.file import load_calibration, write_calibration
 from orthocal.errors import ParameterError
-from orthocal.measurement.session_file import load_plan
-from orthocal.measurement.synthetic import simulate_session
+from orthocal.measurement.files.session_file import load_plan
+from orthocal.observation.simulate import simulate_session
+from orthocal.output.scene import drawing, readings, tool_errors
+from orthocal.output.scene.deviations import measure_deviations
 from orthocal.sensors.leg_indicator import DIRECTIONS
-from orthocal.show.scene import drawing, readings, tool_errors
-from orthocal.show.scene.deviations import measure_deviations
 from orthocal.viewer import stage
 from orthocal.viewer.motion import FRAMES_A_SECOND
 from orthocal.viewer.scene import round_scale
@@ -366,7 +366,7 @@ def test_every_animated_node_is_one_that_is_drawn(scene):
 
 
 def test_many_postures_are_thinned_out_for_the_animation(root, monkeypatch):
-    monkeypatch.setattr("orthocal.show.scene.deviations.MOST_STOPS", 20)
+    monkeypatch.setattr("orthocal.output.scene.deviations.MOST_STOPS", 20)
     scene = draw_scene(load_session(root / "examples/sweep"))
     assert len(scene.steps) == 22
     assert any("stops at 20 of 30 postures" in fact for fact in scene.facts)

@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.curved import CurvedReadings, find_curvature
-from orthocal.estimation.solvers.eliminated import EliminatedProgram
-from orthocal.estimation.solvers.fleet_slopes import FleetSlopes
+from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
+from orthocal.estimation.solvers.second_order import CurvedReadings, find_curvature
 from orthocal.estimation.solvers.surrogate import MOST_PARAMETERS, Surrogate, find_surrogate
+from orthocal.estimation.solvers.variable_projection import EliminatedProgram
 
 Array = NDArray[np.float64]
 

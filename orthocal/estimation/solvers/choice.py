@@ -11,7 +11,7 @@ def build_program(problem: CalibrationProblem, options: SolverOptions | None = N
     """A problem made ready for the solver that is chosen; Ipopt by default."""
     chosen = options or SolverOptions()
     if chosen.solver == "eliminated":
-        from orthocal.estimation.solvers.eliminated import EliminatedProgram
+        from orthocal.estimation.solvers.variable_projection import EliminatedProgram
 
         return EliminatedProgram(problem, options=chosen)
     if chosen.solver == "linearised":

@@ -22,7 +22,7 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.solvers.nlp import ProgramFunctions
 from orthocal.estimation.solvers.program import LEFT_OUT, Solution, no_convergence
-from orthocal.interrupts import noticed_interrupt
+from orthocal.runtime.interrupts import noticed_interrupt
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -20,7 +20,7 @@ from orthocal.estimation.options import Hessian
 from orthocal.estimation.pieces import ReadingPiece
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.sparse import SparseSum
-from orthocal.kinematics.kept import kept_function
+from orthocal.kinematics.function_cache import kept_function
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

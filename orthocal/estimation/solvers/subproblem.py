@@ -16,7 +16,7 @@ from orthocal.errors import SolverError
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.program import LEFT_OUT
-from orthocal.measurement.expansion import Expansion
+from orthocal.observation.expansion import Expansion
 
 Array = NDArray[np.float64]
 

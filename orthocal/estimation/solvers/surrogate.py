@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.fleet import Fleet
+from orthocal.estimation.solvers.machine_readings import Fleet
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.assess.tool import find_tool
+from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ExportError
 from orthocal.export.linuxcnc.nominal_form import Tangent, find_nominal_form
@@ -23,7 +23,7 @@ from orthocal.export.linuxcnc.polynomial import (
 )
 from orthocal.export.linuxcnc.words import region_words, rounded_up
 from orthocal.export.tool_tip import ToolTip
-from orthocal.kinematics.assembly import find_beyond_travel
+from orthocal.kinematics.loop_closure import find_beyond_travel
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.units import MM, UM
 

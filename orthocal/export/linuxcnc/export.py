@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from orthocal.assess.entering import find_entries
+from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError, ParameterError
 from orthocal.export.linuxcnc.approximation import approximate

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.assess.entering import find_entries
+from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ParameterError
 from orthocal.units import DRIVE_UNITS, Unit

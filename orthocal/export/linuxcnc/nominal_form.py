@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError
-from orthocal.fields import read_only
-from orthocal.kinematics.assembly import nominal_assembly
+from orthocal.io.fields import read_only
+from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from orthocal.assess.entering import entered_offsets, find_entries
+from orthocal.assessment.controller_entries import entered_offsets, find_entries
 from orthocal.calibration.calibration import Calibration
 from orthocal.export.linuxcnc.approximation import BEYOND, LEVER, Approximation
 from orthocal.export.linuxcnc.home_offsets import JointHome

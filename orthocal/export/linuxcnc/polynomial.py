@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.export.linuxcnc.nominal_form import NominalForm
-from orthocal.fields import read_only
+from orthocal.io.fields import read_only
 
 Array = NDArray[np.float64]
 

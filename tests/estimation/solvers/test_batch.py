@@ -7,16 +7,17 @@ import pytest
 from gauges import exact
 from tool_coordinate import ToolCoordinate
 
-from orthocal import cores, load_plan, load_session
+from orthocal import load_plan, load_session
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.estimation.solvers.curved import find_curvature
-from orthocal.estimation.solvers.eliminated import EliminatedProgram
-from orthocal.estimation.solvers.fleet import Fleet
-from orthocal.estimation.solvers.fleet_slopes import FleetSlopes
+from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.estimation.solvers.machine_readings import Fleet
+from orthocal.estimation.solvers.second_order import find_curvature
+from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+from orthocal.runtime import worker_pool as cores
 from orthocal.sensors import registry
 
 SIGMA = 10e-6

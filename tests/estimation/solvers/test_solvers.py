@@ -22,8 +22,8 @@ from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.choice import build_program
-from orthocal.estimation.solvers.eliminated import EliminatedProgram
 from orthocal.estimation.solvers.linearised import LinearisedProgram
+from orthocal.estimation.solvers.variable_projection import EliminatedProgram
 
 AGREED = 1e-6
 """Largest difference of two solvers' parameters, [tolerances]."""

@@ -1,0 +1,211 @@
+"""Models of one machine side by side on one session, each linearised and exact."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from orthocal.arguments import require_names
+from orthocal.assessment.model_verdict import Verdict, give_verdict, judge_models
+from orthocal.assessment.repetition import Repetition, measure_repetition
+from orthocal.assessment.scores import ModelResult, Score, Undetermined, score_model
+from orthocal.assessment.tool_error import ErrorSize
+from orthocal.calibration.refit import repeat_calibration
+from orthocal.errors import NotIdentifiableError, SessionError
+from orthocal.estimation.options import SolverOptions
+from orthocal.estimation.problem import build_problem
+from orthocal.measurement.joining import Given, gather_sessions, join_sessions
+from orthocal.session.session import Session
+from orthocal.statistics.noise import KnownNoise, estimate_repeatability
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """Models of one robot side by side on one session."""
+
+    title: str
+    labels: tuple[str, ...]
+    """Of the rows of the session."""
+    noise: KnownNoise
+    """What residuals are held against."""
+    independent: int
+    """Independent readings: distinct ones less gauge zeros."""
+    results: tuple[ModelResult, ...]
+    undetermined: tuple[Undetermined, ...]
+    repetition: Repetition | None
+    """Residuals of the supported model held against those of another session."""
+    repeat_title: str
+    """Of that other session; empty without."""
+    verdict: Verdict
+
+    def __getitem__(self, model: str) -> ModelResult:
+        for result in self.results:
+            if result.model == model:
+                return result
+        raise KeyError(model)
+
+    def to_json(self) -> str:
+        """As JSON, SI units."""
+        document = {
+            "schema": "orthocal/comparison/3",
+            "title": self.title,
+            "noise": _number(self.noise.sigma),
+            "noise_source": self.noise.source,
+            "independent_readings": self.independent,
+            "models": [_result_document(r) for r in self.results],
+            "undetermined": [
+                {"model": u.model, "n_free": u.n_free, "reason": u.reason}
+                for u in self.undetermined
+            ],
+            "repetition": None if self.repetition is None else self.repetition.to_document(),
+            "verdict": {
+                "supported": self.verdict.supported,
+                "model_error": self.verdict.model_error,
+                "models": {
+                    j.model: {"standing": j.standing, "reason": j.reason}
+                    for j in self.verdict.judgements
+                },
+            },
+        }
+        return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def compare_models(
+    sessions: Given | Sequence[Given],
+    *,
+    models: Sequence[str] = (),
+    tolerances: Mapping[str, float] | None = None,
+    repeat: Given | Sequence[Given] | None = None,
+    options: SolverOptions | None = None,
+) -> Comparison:
+    """Identify a session by several models, both ways, and say which one it supports.
+
+    Args:
+        sessions: The session, or several, or paths to them.
+        models: Models of the robot's YAML; all by default.
+        tolerances: Name or glob with its unit, such as `*.offset_mm`, to another standard deviation
+            than the robot's.
+        repeat: Another session of the same rows, or several: whether what remains repeats.
+        options: Which solver, and how it is run.
+
+    Raises:
+        ParameterError: If a model or name is unknown.
+        SessionError: If the other session is of another robot, or the same one.
+        SolverError: If the solver does not converge.
+        ClosureError: If the machine cannot reach a posture.
+    """
+    chosen = gather_sessions(sessions)
+    require_names(models or (), argument="models")
+    session = join_sessions(chosen)
+    others = [] if repeat is None else gather_sessions(repeat)
+    for other in others:
+        _require_another(other, chosen)
+    noise = find_known_noise(session)
+    cycles = len({r.cycle for r in session.readings}) > 1
+    parameters = session.robot.parameters
+    given = parameters.read_tolerances(tolerances or {})
+    results, undetermined = [], []
+    for model in dict.fromkeys(models or parameters.models):
+        free = set(parameters.select_model(model))
+        own = {g: v for g, v in given.items() if free & set(parameters.select([g]))}
+        problem = build_problem(session, model=model, tolerances=own)
+        try:
+            results.append(score_model(problem, noise=noise.sigma, options=options))
+        except NotIdentifiableError:
+            # larger models have a prior: a small one shall not be worse off for having none
+            held = build_problem(session, model=model, tolerances=own, prior=True)
+            try:
+                results.append(
+                    score_model(held, noise=noise.sigma, by_choice=False, options=options)
+                )
+            except NotIdentifiableError as e:
+                undetermined.append(Undetermined(model, problem.n_machine, e.problem))
+    results.sort(key=lambda r: r.n_free)
+    best, _ = judge_models(results, undetermined)
+    repetition = None
+    if best is not None and others:
+        again = repeat_calibration(best.calibration, others)
+        repetition = measure_repetition(best.calibration, again)
+    return Comparison(
+        title=session.title,
+        labels=tuple(r.label + (f", cycle {r.cycle}" if cycles else "") for r in session.readings),
+        noise=noise,
+        independent=results[0].spare + results[0].rank if results else 0,
+        results=tuple(results),
+        undetermined=tuple(undetermined),
+        repetition=repetition,
+        repeat_title=join_sessions(others).title if others else "",
+        verdict=give_verdict(
+            results,
+            undetermined,
+            noise=noise,
+            repetition=repetition,
+        ),
+    )
+
+
+def _require_another(other: Session, sessions: Sequence[Session]) -> None:
+    """Refuse a session to repeat with that is of another robot, or one of those compared."""
+    where = None if other.path is None else str(other.path)
+    for session in sessions:
+        if other.robot.sha256 != session.robot.sha256:
+            raise SessionError(
+                f"is of robot '{other.robot.name}'; the other session is of "
+                f"'{session.robot.name}', or of another version of it",
+                where=where,
+            )
+        if other.sha256 and other.sha256 == session.sha256:
+            raise SessionError("is the same session: what remains repeats by itself", where=where)
+
+
+def find_known_noise(session: Session) -> KnownNoise:
+    """Noise of a reading that no model has a part in: from cycles, else as given for the gauge."""
+    problem = build_problem(session, free=["*.offset"])
+    sigma, dof = estimate_repeatability(problem.values, problem.observations)
+    if dof > 0 and sigma > 0.0:
+        return KnownNoise(sigma, "cycles", float(dof))
+    if session.gauge.sigma is not None:
+        return KnownNoise(session.gauge.sigma, "gauge", math.inf)
+    return KnownNoise(math.nan, "unknown", 0.0)
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _result_document(result: ModelResult) -> dict[str, Any]:
+    def score(s: Score) -> dict[str, Any]:
+        return {
+            "estimates": dict(s.estimates),
+            "residuals": [_number(v) for v in s.residuals.tolist()],
+            "rms": _number(s.rms),
+            "chi_square": _number(s.chi_square),
+            "dof": s.dof,
+            "aicc": _number(s.aicc),
+            "bic": _number(s.bic),
+            "unseen_rms": _number(s.unseen_rms),
+        }
+
+    def size(s: ErrorSize | None) -> dict[str, float] | None:
+        if s is None:
+            return None
+        return {"rms": s.rms, "percentile_95": s.percentile_95, "largest": s.largest}
+
+    after = None if result.tool is None else result.tool.after
+    return {
+        "model": result.model,
+        "n_free": result.n_free,
+        "rank": result.rank,
+        "spare": result.spare,
+        "effective_parameters": result.effective,
+        "linearised": score(result.linearised),
+        "exact": score(result.exact),
+        "standard_deviations": {p.name: _number(p.std) for p in result.calibration.free},
+        "tool_uncertainty": size(None if after is None else after.sizes.aligned),
+        "tool_uncertainty_relative": size(None if after is None else after.sizes.relative),
+        "tool_uncertainty_absolute": size(None if after is None else after.sizes.absolute),
+        "linearisation_at_tool": size(result.linearisation_cost),
+    }

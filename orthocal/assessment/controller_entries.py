@@ -1,0 +1,203 @@
+"""What to enter into a controller that takes nothing but offsets.
+
+A machine whose legs and axes are off as well is not served best by its true offsets: others make up
+for a part of its other errors. Entered is what leaves the least error at the tool, over the region
+that it reaches.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.assessment.calibrated_tool import CalibratedTool, error_covariance, find_tool
+from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.records import ParameterEstimate
+from orthocal.io.fields import read_only
+from orthocal.units import InUnit, Unit
+
+Array = NDArray[np.float64]
+
+DECIDED = 1e-2
+"""Part of what offsets do to the tool that they must do with shift and rotation taken out, for that
+to decide on them: below it they do little but shift and turn the workspace."""
+
+MOST_STEPS = 12
+
+SETTLED = 1e-10
+"""Steps of the offsets that are none, [m, rad]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ControllerEntry(InUnit):
+    """What to enter into the controller for one drive."""
+
+    drive: str
+    unit: Unit
+    active: float | None
+    """Offset now in the controller, [unit]; None where the session does not say."""
+    identified: float
+    """Offset of the identified machine, [unit]."""
+    enter: float
+    """Offset to enter, [unit]; what to add to the present one where that is not known."""
+    change: float
+    """enter − active, [unit]."""
+    std: float
+    """Standard deviation from all that is not known, [unit]; NaN if nothing tells."""
+    scatter: float
+    """What the scatter of the readings has in it, [unit]."""
+    held: Literal["known", "lower bound", "upper bound"] | None
+    """What holds it instead of the readings."""
+
+
+def find_entries(calibration: Calibration) -> tuple[ControllerEntry, ...]:
+    """What to enter into a controller that takes nothing but offsets.
+
+    The offsets that leave the least error at the tool (`choose_offsets`); they are the identified
+    ones where the machine has no other errors, or no tool to judge by. Empty where no offset was
+    identified.
+    """
+    return calibration.remember("entries", lambda: _find_entries(calibration))
+
+
+def entered_offsets(calibration: Calibration) -> Array:
+    """Offsets in the controller once they were entered, shape (n_drives,), [m, rad]."""
+    offsets = calibration.active_offsets
+    names = [d.name for d in calibration.robot.drives]
+    for entry in find_entries(calibration):
+        offsets[names.index(entry.drive)] = entry.enter
+    return offsets
+
+
+def _find_entries(calibration: Calibration) -> tuple[ControllerEntry, ...]:
+    drives, weights = calibration.robot.drives, calibration.offset_weights
+    own = {
+        i: [calibration.parameters[j] for j in np.flatnonzero(row).tolist()]
+        for i, row in enumerate(weights)
+        if row.any()
+    }
+    if not any(p.free for parts in own.values() for p in parts):
+        return ()
+    names = [p.name for p in calibration.free]
+    identified, enter = calibration.offsets, calibration.active_offsets
+    enter[list(own)] = identified[list(own)]
+    of_free = weights[:, [j for j, p in enumerate(calibration.parameters) if p.free]]
+    total, scatter = (
+        np.array([_size(row, covariance) for row in of_free])
+        for covariance in (calibration.total_covariance, calibration.covariance)
+    )
+    tool = None if calibration.only_offsets else find_tool(calibration)
+    if tool is not None:
+        chosen = choose_offsets(tool, enter, drives=list(own))
+        everything = error_covariance(calibration)
+        enter = chosen.offsets
+        total = _spread(chosen.gain[:, : len(everything)], everything)
+        scatter = _spread(chosen.gain[:, : len(names)], calibration.covariance)
+    active = calibration.session.controller_offsets
+    return tuple(
+        ControllerEntry(
+            drive=drives[i].name,
+            unit=drives[i].unit,
+            active=None if active is None else active[i],
+            identified=float(identified[i]),
+            enter=float(enter[i]),
+            change=float(enter[i]) - (0.0 if active is None else active[i]),
+            std=float(total[i]),
+            scatter=float(scatter[i]),
+            held=_hold(parts[0]) if tool is None and len(parts) == 1 else None,
+        )
+        for i, parts in own.items()
+    )
+
+
+def _hold(p: ParameterEstimate) -> Literal["known", "lower bound", "upper bound"] | None:
+    if not p.free:
+        return "known"
+    if p.at_bound is None:
+        return None
+    return "lower bound" if p.at_bound == "lower" else "upper bound"
+
+
+def _size(weights: Array, covariance: Array) -> float:
+    """Standard deviation of a sum of parameters; those that are not in it may be unknown."""
+    at = np.flatnonzero(weights)
+    own = weights[at]
+    return math.sqrt(float(own @ covariance[np.ix_(at, at)] @ own)) if at.size else 0.0
+
+
+def _spread(gain: Array, covariance: Array) -> Array:
+    return np.asarray(np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", gain, covariance, gain), 0.0)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Entering:
+    """Offsets that serve a controller best which knows of nothing else."""
+
+    offsets: Array
+    """Shape (n_drives,), [m, rad]."""
+    gain: Array
+    """How they follow from the parameters, to first order, shape (n_drives, n_parameters), [SI]."""
+
+
+def choose_offsets(tool: CalibratedTool, start: Array, *, drives: Sequence[int]) -> Entering:
+    """Offsets that leave the least error at the tool, shift and rotation taken out.
+
+    Where that leaves them open, since they do little but shift and turn the whole region, the
+    absolute error decides. Of a machine whose only errors are offsets these are they.
+
+    Args:
+        tool: The calibrated machine's tool; its parameters hold an offset for each of the drives.
+        start: Offsets to begin with, shape (n_drives,), [m, rad].
+        drives: Indices of the drives whose offsets are chosen; the others stay.
+
+    Raises:
+        ClosureError: If the machine cannot reach a point with such offsets.
+    """
+    space, names = tool.workspace, list(tool.sensitivity.free)
+    chosen = list(drives)
+    index = [names.index(f"{tool.sensitivity.robot.drives[i].name}.offset") for i in chosen]
+    root = np.sqrt(space.weights)[:, None]
+
+    def weighted(field: Array) -> tuple[Array, Array]:
+        parts = (space.remove_motion(field, tool.targets), field)
+        flat = [root * part.reshape(len(root), -1) for part in parts]
+        return (flat[0].reshape(-1, *field.shape[2:]), flat[1].reshape(-1, *field.shape[2:]))
+
+    aligned, absolute = weighted(tool.jacobian)
+    gain = np.zeros((len(start), len(names)))
+    gain[chosen] = _solve_in_order(aligned[:, index], absolute[:, index], aligned, absolute)
+    offsets = np.array(start, dtype=np.float64)
+    for _ in range(MOST_STEPS):
+        error = weighted(tool.deviation(offsets))
+        step = _solve_in_order(aligned[:, index], absolute[:, index], *error)
+        offsets[chosen] += step
+        if np.abs(step).max() < SETTLED:
+            break
+    return Entering(read_only(offsets), read_only(gain))
+
+
+def _solve_in_order(first: Array, second: Array, first_rows: Array, second_rows: Array) -> Array:
+    """X with first X = first_rows by least squares, and where that hardly tells, by the second.
+
+    Directions of X are told apart by how much of what they do by `second` they do by `first`.
+    """
+    square = second.T @ second
+    factor = np.linalg.cholesky(square)
+    half = np.linalg.solve(factor, first.T)
+    ratios, turned = np.linalg.eigh(half @ half.T)
+    directions = np.linalg.solve(factor.T, turned)
+    told = ratios > DECIDED**2
+    kept = directions[:, told]
+    result = kept @ np.linalg.lstsq(first @ kept, first_rows, rcond=None)[0]
+    if not told.all():
+        rest = directions[:, ~told]
+        result = (
+            result
+            + rest @ np.linalg.lstsq(second @ rest, second_rows - second @ result, rcond=None)[0]
+        )
+    return np.asarray(result)

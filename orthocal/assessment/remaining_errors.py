@@ -1,0 +1,95 @@
+"""Which errors of a machine, together, matter most of those that are not known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.assessment.calibrated_tool import error_covariance
+from orthocal.assessment.tool_error import ToolAccuracy
+from orthocal.calibration.calibration import Calibration
+
+Array = NDArray[np.float64]
+
+NOTABLE = 0.1
+"""Tolerances by which a parameter must be off to be named in a combination."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RemainingError:
+    """A combination of parameters that is not well known, and what it does at the tool."""
+
+    rms: float
+    """Over the workspace, shift and rotation taken out, [m]."""
+    parts: tuple[tuple[str, float], ...]
+    """Parameters and by how many tolerances each is off, the largest first."""
+
+
+def find_remaining_errors(
+    calibration: Calibration, accuracy: ToolAccuracy, *, count: int = 3
+) -> tuple[RemainingError, ...]:
+    """The combinations of errors that matter most at the tool after a calibration.
+
+    Principal directions of what is not known of the parameters, weighed by the mean square that it
+    makes at the tool with shift and rotation taken out; the largest first.
+    """
+    tolerances = np.r_[[p.tolerance for p in calibration.free], calibration.unmodelled.tolerances]
+    return rank_errors(
+        accuracy.align(accuracy.jacobian),
+        error_covariance(calibration),
+        weights=accuracy.workspace.weights,
+        tolerances=tolerances,
+        names=accuracy.names,
+        count=count,
+    )
+
+
+def rank_errors(
+    field: Array,
+    covariance: Array,
+    *,
+    weights: Array,
+    tolerances: Array,
+    names: Sequence[str],
+    count: int,
+) -> tuple[RemainingError, ...]:
+    """The combinations of parameters that matter most at the tool, the largest first.
+
+    Args:
+        field: What the parameters do at the tool, shape (K, 3, n), [m per parameter unit].
+        covariance: Of them, shape (n, n), [SI].
+        weights: Of the points, shape (K,).
+        tolerances: Shape (n,), [SI].
+        names: Of the parameters.
+        count: Of combinations.
+    """
+    root = _square_root(covariance)
+    effect = field @ root
+    _, directions = np.linalg.eigh(np.einsum("k,kin,kim->nm", weights, effect, effect))
+    found = []
+    for direction in directions.T[::-1][:count]:
+        change = root @ direction
+        moved = field @ change
+        in_tolerances = change / tolerances
+        order = np.argsort(-np.abs(in_tolerances))
+        lead = np.sign(in_tolerances[order[0]]) or 1.0
+        found.append(
+            RemainingError(
+                rms=float(np.sqrt(weights @ (moved**2).sum(axis=1))),
+                parts=tuple(
+                    (names[i], float(lead * in_tolerances[i]))
+                    for i in order
+                    if abs(in_tolerances[i]) > NOTABLE
+                ),
+            )
+        )
+    return tuple(found)
+
+
+def _square_root(covariance: Array) -> Array:
+    """A matrix whose product with its transpose is the covariance, which may be singular."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

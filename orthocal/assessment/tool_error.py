@@ -1,0 +1,352 @@
+"""How well the tool's position is known: the number that users decide by.
+
+A machine with errors θ, commanded to a posture, has its tool at p(θ). What is not known of θ
+becomes a position error J dθ with J = ∂p/∂θ (`kinematics.sensitivity`).
+
+Every figure is given three times: with shift and rotation taken out, which is what a workpiece sees
+that is aligned on the machine; with the common shift taken out; and absolute
+(`kinematics.workspace`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.arguments import require_kind
+from orthocal.assessment.calibrated_tool import (
+    CalibratedTool,
+    error_covariance,
+    find_tool,
+    place_tool,
+)
+from orthocal.assessment.controller_entries import entered_offsets
+from orthocal.calibration.calibration import Calibration
+from orthocal.errors import ClosureError, RobotError
+from orthocal.io.fields import read_only
+from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
+from orthocal.statistics.distributions import chi_square_tail
+
+Array = NDArray[np.float64]
+
+ROUNDING = 1e-9
+"""Residuals below which there are none: as many parameters as readings leave that, [m]."""
+
+EXCESS = 1.5
+"""Residuals by which errors must exceed their tolerances for the machine to be called worse."""
+
+RARE = 0.01
+"""Share of the machines within their tolerances that are called worse."""
+
+MOST_POINTS = 5_000
+"""Points that are assessed together; each takes 40 kB. `rows.accuracy_rows` takes any number."""
+
+DRAWS = 500
+"""Errors drawn to find how large 95 % of the position errors are at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSize:
+    """Size of position errors over a workspace, [m]."""
+
+    rms: float
+    """Root mean square over the points, and over what is not known."""
+    largest: float
+    """At the worst point; of what is not known, root mean square there."""
+    find_percentile: Callable[[], float] = field(repr=False)
+    """How the next is found, which takes time."""
+
+    @cached_property
+    def percentile_95(self) -> float:
+        """What 95 % of the errors, at any point, stay below."""
+        return self.find_percentile()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ErrorSizes:
+    """Size of a field of position errors, told three ways."""
+
+    aligned: ErrorSize | None
+    """With shift and rotation taken out; None for points too few to have a size then."""
+    relative: ErrorSize
+    """With the common shift taken out."""
+    absolute: ErrorSize
+
+    @property
+    def headline(self) -> ErrorSize:
+        """The one that decides: aligned, where there are points enough."""
+        return self.relative if self.aligned is None else self.aligned
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToolUncertainty:
+    """Uncertainty of the tool's position over a set of points."""
+
+    covariance: Array
+    """Of the position at each point, shape (K, 3, 3), [m²]."""
+    aligned_covariance: Array
+    """The same with shift and rotation taken out."""
+    sizes: ErrorSizes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToolAccuracy:
+    """Where the tool is and how well that is known, before and after a calibration."""
+
+    workspace: Workspace
+    targets: Array
+    """Commanded tool positions, shape (K, 3), [m]."""
+    names: tuple[str, ...]
+    """Free, then unmodelled parameters."""
+    jacobian: Array
+    """∂p/∂θ at every point, shape (K, 3, n), [m per parameter unit]."""
+    deviation: Array
+    """Where the calibrated machine's tool is now, less where it is commanded, (K, 3), [m]."""
+    error_after_offsets: Array
+    """The same with what is to be entered in a controller that is nominal otherwise."""
+    before: ToolUncertainty
+    """With all errors within their tolerances and nothing known."""
+    after: ToolUncertainty | None
+    """With the machine as calibrated; None where nothing tells the noise."""
+
+    def align(self, field: Array) -> Array:
+        """A field of position errors with shift and rotation taken out, shape (K, 3, ...)."""
+        if len(self.targets) < FEWEST_ALIGNED:
+            return self.workspace.remove_shift(field)
+        return self.workspace.remove_motion(field, self.targets)
+
+    def measure(self, deviations: Array) -> ErrorSizes:
+        """Size of known position errors, shape (K, 3), [m]."""
+        return measure_deviations(deviations, self.workspace, self.targets)
+
+
+def measure_uncertainty(
+    jacobian: Array, covariance: Array, workspace: Workspace, positions: Array
+) -> ToolUncertainty:
+    """Position uncertainty from sensitivities and the covariance of the parameters.
+
+    Args:
+        jacobian: ∂p/∂θ at every point, shape (K, 3, n), [m per parameter unit].
+        covariance: Of θ, shape (n, n), [SI].
+        workspace: The points, and the weights of their mean.
+        positions: Of the points in space, shape (K, 3), [m].
+    """
+    fields = {
+        "absolute": jacobian,
+        "relative": workspace.remove_shift(jacobian),
+        "aligned": workspace.remove_motion(jacobian, positions),
+    }
+    n = len(covariance)
+    spread = {
+        name: (j.reshape(-1, n) @ covariance).reshape(j.shape) @ j.transpose(0, 2, 1)
+        for name, j in fields.items()
+    }
+    sizes = {name: _spread_size(c, workspace) for name, c in spread.items()}
+    few = len(positions) < FEWEST_ALIGNED
+    return ToolUncertainty(
+        covariance=spread["absolute"],
+        aligned_covariance=spread["relative" if few else "aligned"],
+        sizes=ErrorSizes(None if few else sizes["aligned"], sizes["relative"], sizes["absolute"]),
+    )
+
+
+def measure_deviations(deviations: Array, workspace: Workspace, positions: Array) -> ErrorSizes:
+    """Size of known position errors.
+
+    Args:
+        deviations: Shape (K, 3), [m].
+        workspace: The points, and the weights of their mean.
+        positions: Of the points in space, shape (K, 3), [m].
+    """
+
+    def size(field: Array) -> ErrorSize:
+        lengths = np.linalg.norm(field, axis=1)
+        return ErrorSize(
+            rms=float(np.sqrt(workspace.weights @ lengths**2)),
+            largest=float(lengths.max()),
+            find_percentile=partial(_length_percentile, field, workspace),
+        )
+
+    few = len(positions) < FEWEST_ALIGNED
+    return ErrorSizes(
+        aligned=None if few else size(workspace.remove_motion(deviations, positions)),
+        relative=size(workspace.remove_shift(deviations)),
+        absolute=size(deviations),
+    )
+
+
+def assess_tool(
+    calibration: Calibration,
+    workspace: Workspace | None = None,
+    *,
+    names: Sequence[str] | None = None,
+) -> ToolAccuracy:
+    """Where the tool is and how well that is known, before and after a calibration.
+
+    Errors that were not free are taken at their tolerances, together with what the estimate has
+    taken on of them: a calibration of offsets alone is only as good as legs and axes are.
+
+    Args:
+        calibration: The calibration.
+        workspace: Tool positions that are commanded; by default the largest cube around the zero
+            that the machine reaches, of ±60 mm at most.
+        names: What to call the points in messages.
+
+    Raises:
+        RobotError: If the robot has no tool centre point, or its drives do not command it.
+        ClosureError: If the machine cannot reach a point, or its tool hardly moves at all.
+    """
+    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    if workspace is None:
+        return calibration.remember("accuracy", lambda: _assess_largest_cube(calibration))
+    return _assess(calibration, place_tool(calibration, workspace, names=names), names)
+
+
+def _assess_largest_cube(calibration: Calibration) -> ToolAccuracy:
+    tool = find_tool(calibration)
+    robot = calibration.robot
+    if robot.tcp is None:
+        raise RobotError("has no tool centre point; add orthocal.tcp", where=str(robot.yaml))
+    if len(robot.tcp.coordinates) != len(robot.drives):
+        raise RobotError(
+            f"orthocal.tcp.coordinates names {len(robot.tcp.coordinates)} coordinates for "
+            f"{len(robot.drives)} drives: they do not command it",
+            where=str(robot.yaml),
+        )
+    if tool is None:
+        raise ClosureError(
+            "cannot be reached: there is no cube around it, not even of a millimetre, that the "
+            "machine reaches within its limits",
+            posture="mechanical zero",
+        )
+    return _assess(calibration, tool, None)
+
+
+def _assess(
+    calibration: Calibration, tool: CalibratedTool, names: Sequence[str] | None
+) -> ToolAccuracy:
+    unmodelled = calibration.unmodelled
+    tolerances = np.r_[[p.tolerance for p in calibration.free], unmodelled.tolerances]
+    jacobian = tool.jacobian[:, :, : len(tolerances)]
+    space, where = tool.workspace, tool.targets
+    after = None
+    if np.isfinite(calibration.covariance).all():
+        after = measure_uncertainty(jacobian, error_covariance(calibration), space, where)
+    left = tool.deviation(entered_offsets(calibration), names=names)
+    return ToolAccuracy(
+        workspace=space,
+        targets=where,
+        names=tool.sensitivity.free[: len(tolerances)],
+        jacobian=jacobian,
+        deviation=read_only(tool.deviation(calibration.active_offsets, names=names)),
+        error_after_offsets=read_only(left),
+        before=measure_uncertainty(jacobian, np.diag(tolerances**2), space, where),
+        after=after,
+    )
+
+
+def find_excess(calibration: Calibration) -> float:
+    """How many times their tolerances unmodelled errors must be for what remains of the readings.
+
+    Of the residuals only what the noise does not explain counts, r² = n² + e² u², with n from
+    repeated cycles or the gauge's own σ and u what errors at their tolerances would leave.
+
+    Returns:
+        e; 1 where that is no more than EXCESS, where one in a hundred machines within tolerances
+        leaves as much, where noise explains what remains (99 %), where nothing tells the noise but
+        the residuals themselves, or where no errors were left out: the machine may be as good as
+        its tolerances.
+    """
+    noise, gauge = calibration.noise, calibration.session.gauge_sigma
+    known = noise.cycles_sigma if noise.cycles_dof > 0 else gauge
+    foretold, parts = calibration.unmodelled.residual_rms, calibration.unmodelled.residual_dof
+    if known is None or foretold < ROUNDING or not noise.leaves_more(gauge):
+        return 1.0
+    # residuals keep the noise that parameters and gauge zeros have not taken up
+    kept = noise.residual_dof / len(calibration.residuals)
+    variance = (known * calibration.row_factor) ** 2 * kept
+    ratio = math.sqrt(max(calibration.rms_after**2 - variance, 0.0)) / foretold
+    if ratio <= EXCESS or chi_square_tail(parts, parts * ratio**2) > RARE:
+        return 1.0
+    return ratio
+
+
+def assess_excess(
+    calibration: Calibration, accuracy: ToolAccuracy, excess: float
+) -> ToolUncertainty:
+    """Uncertainty after a calibration with unmodelled errors beyond their tolerances."""
+    covariance = error_covariance(calibration, excess=excess)
+    return measure_uncertainty(accuracy.jacobian, covariance, accuracy.workspace, accuracy.targets)
+
+
+def assess_remaining(
+    calibration: Calibration, accuracy: ToolAccuracy
+) -> tuple[ToolUncertainty | None, float]:
+    """What is not known after a calibration, as far as the readings tell of the machine.
+
+    Returns:
+        Uncertainty, None where nothing tells the noise, and how many times their tolerances
+        unmodelled errors are taken to be: `find_excess`.
+    """
+    if accuracy.after is None:
+        return None, 1.0
+    excess = find_excess(calibration)
+    if excess == 1.0:
+        return accuracy.after, excess
+    return assess_excess(calibration, accuracy, excess), excess
+
+
+def expect_after_offsets(calibration: Calibration, accuracy: ToolAccuracy) -> float | None:
+    """Error of the tool to be expected with what is to be entered, r.m.s. and headline form, [m].
+
+    What the offsets cannot make up for of the identified errors, and what is not known of them.
+
+    Returns:
+        None where nothing tells the noise.
+    """
+    remaining, _ = assess_remaining(calibration, accuracy)
+    if remaining is None:
+        return None
+    left = accuracy.measure(accuracy.error_after_offsets)
+    return math.hypot(left.headline.rms, remaining.sizes.headline.rms)
+
+
+def _spread_size(covariances: Array, workspace: Workspace) -> ErrorSize:
+    """Sizes of normal errors with given covariances, shape (K, 3, 3), at the points."""
+    mean_square = np.trace(covariances, axis1=1, axis2=2)
+    return ErrorSize(
+        rms=float(np.sqrt(workspace.weights @ mean_square)),
+        largest=float(np.sqrt(mean_square.max())),
+        find_percentile=partial(_drawn_percentile, covariances, workspace),
+    )
+
+
+def _length_percentile(field: Array, workspace: Workspace) -> float:
+    """What 95 % of the lengths of a field, shape (K, 3), stay below."""
+    parts, weights = workspace.spread(field)
+    return _weighted_percentile(np.linalg.norm(parts, axis=1), weights)
+
+
+def _drawn_percentile(covariances: Array, workspace: Workspace) -> float:
+    """What 95 % of normal errors stay below, by draws; covariances have the shape (K, 3, 3)."""
+    parts, weights = workspace.spread(covariances)
+    values, vectors = np.linalg.eigh(parts)
+    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    draws = np.random.default_rng(0).normal(size=(3, DRAWS))
+    lengths = np.linalg.norm(roots @ draws, axis=1)
+    shares = np.broadcast_to(weights[:, None] / DRAWS, lengths.shape)
+    return _weighted_percentile(lengths.reshape(-1), shares.reshape(-1))
+
+
+def _weighted_percentile(lengths: Array, weights: Array) -> float:
+    """What 95 % of the weight stays below."""
+    if weights.min() == weights.max():  # without sorting all
+        return float(np.quantile(lengths, 0.95, method="inverted_cdf"))
+    order = np.argsort(lengths)
+    share = np.cumsum(weights[order])
+    return float(lengths[order][min(int(np.searchsorted(share, 0.95)), lengths.size - 1)])

@@ -1,0 +1,175 @@
+"""Tables of many rows on the calibrated machine: a chunk at a time, each row for itself.
+
+Memory does not grow with the table, and a row that cannot be reached stops no other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.assessment.calibrated_tool import error_covariance
+from orthocal.calibration.calibration import Calibration
+from orthocal.errors import ClosureError
+from orthocal.io.fields import read_only
+from orthocal.kinematics.continuation import Failures, as_rows
+from orthocal.kinematics.loop_closure import Assembly, find_beyond_travel, nominal_assembly
+from orthocal.kinematics.sensitivity import ToolSensitivity
+
+Array = NDArray[np.float64]
+
+ROWS_AT_ONCE = 512
+"""Rows of a chunk: a full model takes 20 kB a row while it is evaluated."""
+
+Block = tuple[Sequence[str], Array]
+"""Names of some rows, and their values."""
+
+_Evaluate = Callable[[Array, Sequence[str], Failures], Array]
+"""Values of some rows, by name; fills in which fail, whose values are of no account."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chunk:
+    """Some rows of a table, evaluated."""
+
+    first: int
+    """Index of the first of them in the table."""
+    values: Array
+    """Shape (n_rows, n_columns), [SI]; NaN in rows that are refused."""
+    refused: Mapping[int, ClosureError]
+    """Index in the table to why the machine cannot be there."""
+
+
+def forward_rows(
+    calibration: Calibration, joints: ArrayLike, *, names: Sequence[str] | None = None
+) -> Iterator[Chunk]:
+    """Tool centre points of the calibrated machine.
+
+    Args:
+        calibration: The calibration.
+        joints: Drive coordinates as the encoders give them, without any offset of the controller,
+            shape (K, n_drives), [m, rad].
+        names: What to call the rows in messages.
+
+    Yields:
+        Chunks of shape (n, 3), [m].
+    """
+    rows, _ = as_rows(joints, len(calibration.robot.drives), "drive coordinates")
+    yield from forward_blocks(calibration, _blocks(rows, names))
+
+
+def forward_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterator[Chunk]:
+    """Tool centre points of the calibrated machine, as `forward_rows`, of rows as they come.
+
+    Args:
+        calibration: The calibration.
+        blocks: Names and drive coordinates of some rows, shape (n, n_drives), [m, rad].
+    """
+    robot = calibration.robot
+    assembly = Assembly(robot, fixed=calibration.errors)
+
+    def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
+        failures.update(find_beyond_travel(robot, rows, names))
+        return assembly.forward(rows, names=names, failures=failures)
+
+    yield from _by_chunks(evaluate, blocks)
+
+
+def inverse_rows(
+    calibration: Calibration, points: ArrayLike, *, names: Sequence[str] | None = None
+) -> Iterator[Chunk]:
+    """Drive coordinates that bring the calibrated machine's tool to given points.
+
+    Args:
+        calibration: The calibration.
+        points: Shape (K, n_drives), [m].
+        names: What to call the rows in messages.
+
+    Yields:
+        Chunks of shape (n, n_drives), as the encoders give them, [m, rad].
+    """
+    rows, _ = as_rows(points, len(calibration.robot.drives), "coordinates")
+    yield from inverse_blocks(calibration, _blocks(rows, names))
+
+
+def inverse_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterator[Chunk]:
+    """Drive coordinates of the calibrated machine, as `inverse_rows`, of rows as they come.
+
+    Args:
+        calibration: The calibration.
+        blocks: Names and coordinates of some points, shape (n, n_drives), [m].
+    """
+    assembly = Assembly(calibration.robot, fixed=calibration.errors)
+
+    def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
+        return assembly.inverse(rows, names=names, failures=failures)
+
+    yield from _by_chunks(evaluate, blocks)
+
+
+def accuracy_rows(
+    calibration: Calibration, points: ArrayLike, *, names: Sequence[str] | None = None
+) -> Iterator[Chunk]:
+    """Where the tool is when it is commanded to points, and how well that is known, absolutely.
+
+    As `assess_tool` has it, point by point.
+
+    Args:
+        calibration: The calibration.
+        points: In the coordinates that the drives control, shape (K, n_coordinates), [m].
+        names: What to call the rows in messages.
+
+    Yields:
+        Chunks of shape (n, 9): the commanded position, by how much the tool is off it, and one
+        standard deviation of that, NaN where nothing tells the noise, [m].
+    """
+    robot, values = calibration.robot, calibration.errors
+    free = [p.name for p in calibration.free]
+    tool = ToolSensitivity(robot, free=[*free, *calibration.unmodelled.names], values=values)
+    nominal = nominal_assembly(robot)
+    rows, _ = as_rows(points, len(robot.drives), "coordinates")
+    active = calibration.session.controller_offsets
+    offsets = np.zeros(len(robot.drives)) if active is None else np.array(active)
+    known = bool(np.isfinite(calibration.covariance).all())
+    covariance = error_covariance(calibration) if known else None
+
+    def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
+        drives = nominal.inverse(rows, names=names, failures=failures)
+        target = nominal.forward(drives, names=names, failures=failures)
+        commanded = drives - offsets
+        passive = tool.assembly.close(commanded, names=names, failures=failures)
+        result = np.full((len(rows), 9), np.nan)
+        at = np.array([i for i in range(len(rows)) if i not in failures], dtype=np.int64)
+        if not at.size:
+            return result
+        result[at, :3] = target[at]
+        result[at, 3:6] = tool.assembly.tcp(commanded[at], passive[at]) - target[at]
+        if covariance is not None:
+            jacobian = tool(commanded[at], passive=passive[at])
+            variance = np.einsum("kin,nm,kim->ki", jacobian, covariance, jacobian, optimize=True)
+            result[at, 6:] = np.sqrt(variance)
+        return result
+
+    yield from _by_chunks(evaluate, _blocks(rows, names))
+
+
+def _blocks(rows: Array, names: Sequence[str] | None) -> Iterator[Block]:
+    """Rows some at a time."""
+    names = names or [f"row {i + 1}" for i in range(len(rows))]
+    for first in range(0, len(rows), ROWS_AT_ONCE):
+        part = slice(first, first + ROWS_AT_ONCE)
+        yield names[part], rows[part]
+
+
+def _by_chunks(evaluate: _Evaluate, blocks: Iterable[Block]) -> Iterator[Chunk]:
+    first = 0
+    for names, rows in blocks:
+        failures: Failures = {}
+        values = evaluate(rows, names, failures)
+        values[list(failures)] = np.nan
+        refused = {first + i: e for i, e in sorted(failures.items())}
+        yield Chunk(first, read_only(values), refused)
+        first += len(rows)

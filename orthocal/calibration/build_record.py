@@ -1,0 +1,340 @@
+"""The record of a solved problem: what a calibration is, from its fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal import __version__
+from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.file import require_loadable
+from orthocal.calibration.records import (
+    GaugeRecord,
+    ParameterEstimate,
+    PostureRecord,
+    RobotRecord,
+    SessionRecord,
+    SetupRecord,
+    SolverRecord,
+)
+from orthocal.errors import ClosureError
+from orthocal.estimation.diagnostics.cross_validation import predict_unseen
+from orthocal.estimation.diagnostics.residual_rows import ResidualRow
+from orthocal.estimation.diagnostics.studentised import Diagnostics, diagnose_readings
+from orthocal.estimation.diagnostics.unmodelled import (
+    Unmodelled,
+    find_other_errors,
+    measure_unmodelled,
+)
+from orthocal.estimation.fit import Fit
+from orthocal.estimation.linear import Linearisation, linearise_at_reference
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.weighting import split_by_gauge
+from orthocal.hypotheses.reversed_setup import find_turned_setup
+from orthocal.hypotheses.sessions.changes import find_session_changes
+from orthocal.io.fields import read_only
+from orthocal.robot.loading import packaged_robots
+from orthocal.robot.parameters import Parameter
+from orthocal.session.session import Session
+from orthocal.statistics.chance import confidence_factor
+from orthocal.statistics.identifiability import (
+    Identifiability,
+    analyse_identifiability,
+)
+from orthocal.statistics.information import Information, marginalise
+from orthocal.statistics.zeros import project_out_zeros
+
+Array = NDArray[np.float64]
+
+
+def assemble_calibration(
+    fit: Fit,
+    *,
+    whole: CalibrationProblem | None = None,
+    intervals: Mapping[str, tuple[float, float]] | None = None,
+    nominal: Array | None = None,
+) -> Calibration:
+    """The record of a solved problem.
+
+    Args:
+        fit: The solved problem.
+        whole: The problem with all parameters, where those that were solved for are its base
+            parameters.
+        intervals: Profile-likelihood intervals by name, [SI].
+        nominal: Free parameters of the machine that readings are held against, shape (n_free,),
+            [SI]; what the controller already corrects by default.
+
+    Raises:
+        SolverError: If the result makes no sense.
+    """
+    problem, noise, loss = fit.problem, fit.noise, fit.loss
+    session = problem.session
+    n = problem.n_machine
+    covariance = fit.covariance()
+    # a base parameter is the whole combination: nothing of it is left out
+    others = find_other_errors(
+        fit, spoken_for=() if whole is None else whole.machine_selection.names
+    )
+    unmodelled, taken_on = measure_unmodelled(fit, others)
+    estimates = _estimates(fit, covariance, _widen(fit, unmodelled, intervals or {}))
+    diagnostics = diagnose_readings(fit)
+    residuals = _residual_rows(fit, diagnostics, nominal)
+    calibration = Calibration(
+        robot_record=_robot_record(session),
+        session=_session_record(session),
+        model=problem.selection.label,
+        prior=bool(problem.machine_selection.prior.any()),
+        solver=SolverRecord(
+            name=fit.program.options.solver,
+            status=fit.solution.status,
+            iterations=fit.iterations,
+            seconds_build=fit.seconds_build,
+            seconds_solve=fit.seconds_solve,
+            hessian=fit.solution.hessian,
+            loss=loss.kind,
+            loss_width=loss.width,
+        ),
+        parameters=(*estimates[:n], *_held_estimates(problem)),
+        sensors=estimates[n:],
+        sensor_bias=read_only(taken_on),
+        covariance=read_only(covariance[:n, :n]),
+        unmodelled=unmodelled,
+        identifiability=_identifiability(fit, whole),
+        base=whole is not None,
+        noise=noise,
+        rows_are_differences=session.only_differences,
+        residuals=residuals,
+        turned=find_turned_setup(fit, others, residuals),
+        critical=diagnostics.critical,
+        postures=tuple(
+            PostureRecord(name, tuple(p.drives.tolist()), tuple(fit.solution.passive[i].tolist()))
+            for i, (name, p) in enumerate(session.postures.items())
+        ),
+        setups=_setup_records(fit),
+        gauges=_gauge_records(fit),
+        changes=find_session_changes(fit, others),
+        version=__version__,
+    )
+    require_loadable(calibration)
+    calibration.remember("robot", lambda: session.robot)  # no need to load it again
+    return calibration
+
+
+def _identifiability(fit: Fit, whole: CalibrationProblem | None) -> Identifiability:
+    """Of the free parameters; of base parameters, together with what they stand for."""
+
+    def analyse(information: Information, parameters: Sequence[Parameter]) -> Identifiability:
+        return analyse_identifiability(
+            information,
+            parameters,
+            sigma=fit.noise.sigma,
+            n_postures=fit.problem.n_postures,
+            n_readings=fit.independent_readings,
+        )
+
+    def of_machine(linearisation: Linearisation) -> Identifiability:
+        machine = linearisation.problem.machine_selection.parameters
+        information = marginalise(linearisation.information, len(machine), sigma=fit.sigma)
+        return analyse(information, machine)
+
+    own = of_machine(fit.linearisation)
+    if whole is None:
+        return own
+    # how well the base parameters are told; which they are follows from the whole
+    found = of_machine(linearise_at_reference(whole.with_noise(fit.problem.noise)))
+    return replace(found, singular_values=own.singular_values, rank=own.structural_rank)
+
+
+def _widen(
+    fit: Fit, unmodelled: Unmodelled, intervals: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float]]:
+    """Intervals of what the noise explains, with the errors of the machine that were left out."""
+    spread = confidence_factor(np.inf) * np.sqrt(np.diag(unmodelled.bias_covariance))
+    result = {}
+    for name, ends in intervals.items():
+        i = fit.problem.free.index(name)
+        value, more = float(fit.solution.theta[i]), float(spread[i])
+        low, high = (math.hypot(value - end, more) for end in ends)
+        selection = fit.problem.selection
+        result[name] = (
+            max(value - low, float(selection.lower[i])),
+            min(value + high, float(selection.upper[i])),
+        )
+    return result
+
+
+def _estimates(
+    fit: Fit, covariance: Array, intervals: Mapping[str, tuple[float, float]]
+) -> tuple[ParameterEstimate, ...]:
+    problem, solution = fit.problem, fit.solution
+    selection = problem.selection
+    std = np.sqrt(np.diag(covariance))
+    told = fit.machine_information.determined(sigma=fit.noise.sigma)
+    determined = np.append(told, np.zeros(problem.n_free - told.size, dtype=bool))
+    words: dict[int, Literal["lower", "upper"] | None] = {-1: "lower", 0: None, 1: "upper"}
+    return tuple(
+        ParameterEstimate(
+            name=p.name,
+            unit=p.unit,
+            value=float(solution.theta[i]),
+            linear=float(fit.linear[i]),
+            std=float(std[i]),
+            tolerance=p.tolerance,
+            free=True,
+            identifiable=bool(determined[i]),
+            start=float(problem.reference[i]),
+            prior=bool(selection.prior[i]),
+            mean=float(problem.prior_mean[i]),
+            lower=_bound(selection.lower[i]),
+            upper=_bound(selection.upper[i]),
+            at_bound=words[int(solution.at_bound[i])],
+            interval=intervals.get(p.name),
+        )
+        for i, p in enumerate(problem.parameters)
+    )
+
+
+def _held_estimates(problem: CalibrationProblem) -> tuple[ParameterEstimate, ...]:
+    estimates = []
+    for name, value in problem.fixed.items():
+        p = problem.robot.parameters[name]
+        estimates.append(
+            ParameterEstimate(
+                name=name,
+                unit=p.unit,
+                value=value,
+                linear=value,
+                std=0.0,
+                tolerance=p.tolerance,
+                free=False,
+                identifiable=False,
+                start=value,
+                prior=False,
+                mean=0.0,
+                lower=None,
+                upper=None,
+                at_bound=None,
+                interval=None,
+            )
+        )
+    return tuple(estimates)
+
+
+def _bound(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _robot_record(session: Session) -> RobotRecord:
+    robot = session.robot
+    packaged = packaged_robots().get(session.robot_reference)
+    folder = None if packaged is not None else str(robot.folder.resolve())
+    return RobotRecord(
+        name=robot.name,
+        reference=session.robot_reference,
+        folder=folder,
+        sha256=robot.sha256,
+        legs=tuple((name, leg.length) for name, leg in robot.legs.items()),
+        travel=tuple((d.name, d.unit, _bound(d.lower), _bound(d.upper)) for d in robot.drives),
+        tolerances=tuple(robot.parameters.stated.items()),
+    )
+
+
+def _session_record(session: Session) -> SessionRecord:
+    offsets = session.controller_offsets
+    return SessionRecord(
+        path=None if session.path is None else str(session.path),
+        readings_path=None if session.readings_path is None else str(session.readings_path),
+        title=session.title,
+        source=session.source,
+        sha256=session.sha256,
+        gauge_sigma=session.gauge.sigma,
+        gauge_resolution=session.gauge.resolution,
+        controller_offsets=None if offsets is None else tuple(offsets.tolist()),
+        parts=tuple(_session_record(part) for part in session.parts),
+    )
+
+
+def _residual_rows(
+    fit: Fit, diagnostics: Diagnostics, nominal_theta: Array | None
+) -> tuple[ResidualRow, ...]:
+    """Readings beside what three machines would show, each with its best gauge zeros."""
+    problem, o = fit.problem, fit.problem.observations
+    measured, session, noise = problem.values, problem.session, problem.noise[o.plus]
+
+    def fitted(prediction: Array) -> Array:
+        residual = project_out_zeros(measured - prediction, o, weights=fit.weights)
+        return session.values - noise * o.rows(residual)
+
+    n = problem.n_machine
+    own = nominal_theta is None
+    reference = problem.reference[:n] if nominal_theta is None else nominal_theta
+    # gauges stood as they did, whatever the machine is held to be
+    held = np.append(reference, fit.solution.theta[n:])
+    nominal = fitted(problem.predict(held, problem.reference_passive if own else None))
+    try:
+        closed = problem.close(fit.linear, start=fit.solution.passive)
+        by_linear = fitted(problem.predict(fit.linear, closed))
+    except ClosureError:  # the linearised machine cannot be assembled
+        by_linear = np.full(len(session.readings), np.nan)
+    predicted = session.values - noise * o.rows(fit.residual)
+    unseen = noise * predict_unseen(fit)
+    return tuple(
+        ResidualRow(
+            setup=r.setup,
+            posture=r.posture,
+            minus=r.minus,
+            cycle=r.cycle,
+            measured=r.value,
+            nominal=float(nominal[i]),
+            linear=float(by_linear[i]),
+            predicted=float(predicted[i]),
+            line=r.line,
+            file=None if r.file is None else str(r.file),
+            studentised=float(diagnostics.studentised[i]),
+            influence=float(diagnostics.influence[i]),
+            influenced=problem.free[diagnostics.influenced[i]],
+            unseen=float(unseen[i]),
+        )
+        for i, r in enumerate(session.readings)
+    )
+
+
+def _gauge_records(fit: Fit) -> tuple[GaugeRecord, ...]:
+    problem = fit.problem
+    return tuple(
+        GaugeRecord(
+            name=g.name,
+            sigma=g.gauge.sigma,
+            resolution=g.gauge.resolution,
+            range=g.gauge.range,
+            noise=fit.noise.sigma * float(problem.noise[g.entries][0]),
+            readings=int(g.entries.sum()),
+        )
+        for g in split_by_gauge(problem.session, problem.observations)
+    )
+
+
+def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
+    o = fit.problem.observations
+    noise = np.ones(o.n_zeros)
+    noise[o.zero] = fit.problem.noise
+    zeros = {
+        name: float(fit.solution.zeros[i] * noise[i])
+        for i, (name, real) in enumerate(zip(o.zero_setup, o.zero_real, strict=True))
+        if real
+    }
+    return tuple(
+        SetupRecord(
+            s.name,
+            s.sensor,
+            gauge=s.gauge,
+            active=None if s.active is None else tuple(s.active.tolist()),
+            zero=zeros.get(s.name),
+        )
+        for s in fit.problem.session.setups.values()
+    )

@@ -1,0 +1,162 @@
+"""The same calibration made again: from another session, or from what its file keeps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.arguments import require_kind
+from orthocal.calibration.build_record import assemble_calibration
+from orthocal.calibration.calibration import Calibration
+from orthocal.estimation.fit import Fit, fit_problem
+from orthocal.estimation.gauges import find_gauge_covariance
+from orthocal.estimation.loss import Loss
+from orthocal.estimation.options import SolverOptions
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.selection import Selection
+from orthocal.estimation.weighting import SMALLEST_SIGMA
+from orthocal.hypotheses.sessions.change_records import Changes
+from orthocal.io.fields import read_only
+from orthocal.measurement.joining import Given, gather_sessions, join_sessions
+from orthocal.robot.model import Robot
+from orthocal.session.session import Gauge, Posture, Reading, Session, Setup
+from orthocal.statistics.information import decompose
+
+Array = NDArray[np.float64]
+
+
+def repeat_calibration(calibration: Calibration, sessions: Given | Sequence[Given]) -> Calibration:
+    """The same parameters, with the same priors and bounds, identified from another session.
+
+    Its rows' nominal values are those of the machine as it was calibrated before.
+
+    Args:
+        calibration: Whose parameters they are.
+        sessions: The other session, or several, or paths to them.
+
+    Raises:
+        NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
+    """
+    session = join_sessions(gather_sessions(sessions))
+    nominal = np.array([p.value for p in calibration.free])
+    return assemble_calibration(repeat_fit(calibration, session), nominal=nominal)
+
+
+def find_changes(calibration: Calibration) -> Changes | None:
+    """Whether the machine has changed between the sessions of a calibration, and what of it.
+
+    Args:
+        calibration: Of several sessions, in the order in which they were given.
+
+    Returns:
+        What was tested, from which size on it would have been seen, and what was found; None for
+        a calibration of a single session.
+
+    Raises:
+        RobotError, CalibrationFileError: If its file does not say and the robot cannot be loaded.
+        NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
+    """
+    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    if calibration.changes is not None or not calibration.session.parts:
+        return calibration.changes
+    again = repeat_calibration(calibration, restore_session(calibration))
+    return calibration.remember("changes", lambda: again.changes)
+
+
+def repeat_fit(calibration: Calibration, session: Session) -> Fit:
+    """The fit of `repeat_calibration`."""
+    solver = calibration.solver
+    options = SolverOptions(solver=solver.name, loss=Loss(solver.loss, solver.loss_width))
+    return fit_problem(_repeat_problem(calibration, session), options=options)
+
+
+def restore_gauge_covariance(calibration: Calibration) -> Array:
+    """`find_gauge_covariance` of a calibration, from what its file keeps.
+
+    Shape (n_free, n_free), [SI]; zeros where the noise is not known.
+    """
+    problem = _repeat_problem(calibration, restore_session(calibration))
+    if not math.isfinite(calibration.noise.sigma):
+        return np.zeros((problem.n_machine, problem.n_machine))
+    noise = {g.name: g.noise / calibration.noise.sigma for g in calibration.gauges}
+    of_setup = np.array([noise[s.gauge] for s in problem.session.setups.values()])
+    problem = problem.with_noise(of_setup[problem.observations.setup])
+    theta = np.array([p.value for p in (*calibration.free, *calibration.sensors)])
+    _, jacobian = problem.linearise(theta)
+    return find_gauge_covariance(
+        problem,
+        decompose(jacobian, problem.observations),
+        sigma=max(calibration.noise.sigma, SMALLEST_SIGMA),
+        held=np.array([p.at_bound for p in (*calibration.free, *calibration.sensors)], dtype=bool),
+    )
+
+
+def _repeat_problem(calibration: Calibration, session: Session) -> CalibrationProblem:
+    free = calibration.free
+    parameters = session.robot.parameters
+    selection = Selection(
+        label=calibration.model,
+        parameters=tuple(replace(parameters[p.name], tolerance=p.tolerance) for p in free),
+        prior=np.array([p.prior for p in free]),
+        mean=read_only([p.mean for p in free]),
+        lower=read_only([-np.inf if p.lower is None else p.lower for p in free]),
+        upper=read_only([np.inf if p.upper is None else p.upper for p in free]),
+        fixed={p.name: p.value for p in calibration.parameters if not p.free},
+    )
+    return CalibrationProblem(session, selection)
+
+
+def restore_session(calibration: Calibration) -> Session:
+    """The session that a calibration was made from, as its file keeps it.
+
+    `repeat_calibration(calibration, restore_session(calibration))` identifies the same again.
+
+    Raises:
+        RobotError, CalibrationFileError: If the robot cannot be loaded, or has changed.
+    """
+    record, robot = calibration.session, calibration.robot
+    offsets = record.controller_offsets
+    return Session(
+        robot=robot,
+        robot_reference=calibration.robot_record.reference,
+        title=record.title,
+        source=record.source,
+        gauges={g.name: Gauge(g.sigma, g.resolution, g.range) for g in calibration.gauges},
+        postures={
+            p.name: Posture(p.name, _form(robot), np.array(p.drives), np.array(p.drives))
+            for p in calibration.postures
+        },
+        setups={
+            s.name: Setup(
+                s.name, s.sensor, s.gauge, None if s.active is None else np.array(s.active)
+            )
+            for s in calibration.setups
+        },
+        readings=tuple(
+            Reading(
+                r.setup,
+                r.posture,
+                r.minus,
+                r.cycle,
+                r.measured,
+                r.line,
+                None if r.file is None else Path(r.file),
+            )
+            for r in calibration.residuals
+        ),
+        controller_offsets=None if offsets is None else read_only(offsets),
+        path=None if record.path is None else Path(record.path),
+        readings_path=None if record.readings_path is None else Path(record.readings_path),
+        sha256=record.sha256,
+        joined=bool(record.parts),
+    )
+
+
+def _form(robot: Robot) -> Literal["joints_mm", "joints_deg"]:
+    return "joints_mm" if all(d.unit == "m" for d in robot.drives) else "joints_deg"

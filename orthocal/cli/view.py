@@ -1,0 +1,117 @@
+"""What can be looked at: report, view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from orthocal.cli.options import (
+    CalibrationPath,
+    app,
+)
+from orthocal.cli.printing import put_note, put_out
+
+if TYPE_CHECKING:
+    from orthocal.viewer.scene import Scene
+
+
+@app.command()
+def report(
+    calibration: CalibrationPath,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="A page, or a folder that is there; else report.html beside the calibration."
+        ),
+    ] = None,
+) -> None:
+    """Write a calibration as one page: what to enter, how far to believe it, and why."""
+    from orthocal.calibration.file import load_calibration
+    from orthocal.io.files import is_folder, require_writable_file
+    from orthocal.output.report.page import write_report
+
+    result = load_calibration(calibration)
+    folder = Path() if result.path is None else result.path.parent
+    target = folder if out is None else out
+    if is_folder(target):
+        target = target / "report.html"
+    require_writable_file(target, kinds=(".html", ".htm"))
+    put_note(f"Wrote {write_report(result, target)}")
+
+
+@app.command()
+def view(
+    subject: Annotated[
+        str,
+        typer.Argument(
+            metavar="SESSION|CALIBRATION|ROBOT",
+            help="session.yaml, calibration.json, a folder that holds one, or a robot.",
+        ),
+    ],
+    html: Annotated[
+        Path | None, typer.Option(help="Write one page that opens without network and server.")
+    ] = None,
+    png: Annotated[
+        Path | None, typer.Option(help="Write a picture, by a Chromium that is installed.")
+    ] = None,
+    size: Annotated[
+        str, typer.Option(metavar="WIDTHxHEIGHT", help="Of the picture, in pixels.")
+    ] = "1400x900",
+    posture: Annotated[
+        str | None,
+        typer.Option(help="Stand there, with what was read there; else the whole measurement."),
+    ] = None,
+    exaggerate: Annotated[
+        float | None,
+        typer.Option(
+            metavar="FACTOR",
+            help="How many times its size the machine's deviation is drawn; 1 for true scale.",
+        ),
+    ] = None,
+    show: Annotated[
+        str | None,
+        typer.Option(metavar="readings|tool|all", help="What of a calibration is shown at first."),
+    ] = None,
+    port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Where to listen; else one that is free.")
+    ] = None,
+    browse: Annotated[bool, typer.Option("--open", help="Open the browser, too.")] = False,
+) -> None:
+    """Look at a machine, its measurement and its calibration in 3-D.
+
+    Without --html and --png on a server that only this machine reaches, until Ctrl-C.
+    """
+    from orthocal.io.files import require_writable_file
+    from orthocal.output.scene.drawing import draw_scene
+    from orthocal.output.text.subject import load_subject
+    from orthocal.viewer.browser import find_chromium, parse_size, take_picture
+
+    width, height = parse_size(size)
+    for path, kinds in ((html, (".html", ".htm")), (png, (".png",))):
+        if path is not None:
+            require_writable_file(path, kinds=kinds)
+    if png is not None:
+        find_chromium()
+    scene = draw_scene(load_subject(subject), posture=posture, exaggeration=exaggerate, show=show)
+    if html is not None:
+        put_note(f"Wrote {scene.save(html)}")
+    if png is not None:
+        put_note(f"Wrote {take_picture(scene.to_html(), png, width=width, height=height)}")
+    if html is None and png is None:
+        _serve(scene, port, browse)
+
+
+def _serve(scene: Scene, port: int | None, browse: bool) -> None:
+    """Show a scene until Ctrl-C."""
+    from orthocal.viewer.live import LiveScene
+
+    with LiveScene(scene, port=port) as live:
+        put_out(live.url)
+        put_note("Open this in a browser on this machine; Ctrl-C ends.")
+        if browse:
+            import webbrowser
+
+            webbrowser.open(live.url)
+        live.wait()

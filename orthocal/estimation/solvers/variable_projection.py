@@ -1,0 +1,198 @@
+"""The exact identification with passive joints and gauge zeros eliminated: Gauss-Newton on θ alone.
+
+About the present θ the problem is linear but for a robust loss: that subproblem is solved to its
+end, within the bounds. The passive joints follow the step to first order, and where that leaves the
+loops nearly closed and the whole better, what is left open is a correction to the next step.
+Elsewhere the loops are closed, and the step is taken as far as it makes the whole better. The
+optimum is that of the whole program which Ipopt solves.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.errors import ClosureError, SolverError
+from orthocal.estimation.options import SolverOptions
+from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
+from orthocal.estimation.solvers.program import Solution, no_convergence
+from orthocal.estimation.solvers.subproblem import State, Task
+from orthocal.observation.expansion import Expansion
+
+Array = NDArray[np.float64]
+
+SETTLED = 1e-8
+"""Largest change of θ̂ that the next step would make, in tolerances, by how the last ones shrank:
+each is smaller than the one before by what errors change of the derivatives."""
+
+NEARLY_CLOSED = 1e-3
+"""Largest correction of a passive coordinate that readings are taken to follow to first order,
+[rad] or characteristic lengths: its square moves a reading by less than a micrometre."""
+
+MOST_HALVINGS = 12
+
+ROUNDING = 1e-12
+"""Relative growth of the objective that is none."""
+
+
+class EliminatedProgram:
+    """A calibration problem with nothing left but its free parameters.
+
+    Args:
+        problem: The problem.
+        options: Iterations and loss; the rest is Ipopt's.
+    """
+
+    def __init__(
+        self, problem: CalibrationProblem, *, options: SolverOptions | None = None
+    ) -> None:
+        self.problem = problem
+        self.options = options or SolverOptions(solver="eliminated")
+
+    def with_problem(self, problem: CalibrationProblem) -> EliminatedProgram:
+        """The same for another problem: nothing is built."""
+        return EliminatedProgram(problem, options=self.options)
+
+    def solve(
+        self,
+        *,
+        sigma: float,
+        values: ArrayLike | None = None,
+        start: ArrayLike | None = None,
+        start_passive: Array | None = None,
+        left_out: ArrayLike | None = None,
+        held: Mapping[int, float] | None = None,
+    ) -> Solution:
+        """Solve for given readings; arguments as for `Program.solve`.
+
+        Raises:
+            SolverError: If it does not converge.
+            ClosureError: If the machine cannot reach a posture with the start values.
+        """
+        began = time.perf_counter()
+        task = Task.of(
+            self.problem,
+            self.options.loss,
+            sigma=sigma,
+            values=values,
+            left_out=left_out,
+            held=held,
+        )
+        begin = task.begin(start, start_passive)
+        try:
+            found = self._descend(task, begin, follow=True)
+        except (ClosureError, SolverError):  # on the way the loops were not looked at
+            found = self._descend(task, task.begin(start, start_passive), follow=False)
+        state, jacobian, iterations = found
+        return Solution(
+            theta=state.theta * self.problem.theta_scale,
+            zeros=state.zeros * sigma,
+            passive=state.passive,
+            objective=state.objective,
+            status="Solve_Succeeded",
+            iterations=iterations,
+            hessian="gauss-newton",
+            seconds_build=0.0,
+            seconds_solve=time.perf_counter() - began,
+            closure=0.0,
+            at_bound=task.held_by_bounds(state, jacobian, held),
+        )
+
+    def _descend(
+        self, task: Task, begin: tuple[State, Expansion], *, follow: bool
+    ) -> tuple[State, Array, int]:
+        """The optimum, the Jacobian by which it was found, and iterations.
+
+        Args:
+            task: What is asked for.
+            begin: Where to begin, loops closed.
+            follow: Whether passive joints may follow a step to first order.
+
+        Raises:
+            SolverError: If it does not converge.
+            ClosureError: If the machine found cannot reach a posture.
+        """
+        most = self.options.max_iterations
+        sizes: list[float] = []
+        state, expansion = begin
+        for iterations in range(1, most + 1):
+            jacobian = expansion.jacobian
+            jacobian /= task.sigma  # in its place: it may be large, and is of no more use as it was
+            step = task.step(state, jacobian)
+            sizes.append(float(np.abs(step).max(initial=0.0)))
+            if follow and _settled(sizes):
+                theta = np.clip(state.theta + step, task.low, task.high)
+                passive = state.passive + expansion.follow(theta - state.theta)
+                return task.at(theta, passive), jacobian, iterations
+            followed = self._follow(task, state, expansion, step) if follow else None
+            if followed is not None:
+                state, expansion = followed
+                continue
+            state, taken = self._move(task, state, step)
+            sizes[-1] = float(np.abs(taken).max(initial=0.0))
+            if _settled(sizes):
+                return state, jacobian, iterations
+            expansion = task.expand(state.theta, state.passive)
+        raise SolverError(
+            f"did not converge: the step is still {sizes[-1]:.2g} tolerances after {most} "
+            f"iterations; {no_convergence(self.options)}",
+            status="Maximum_Iterations_Exceeded",
+            iterations=most,
+        )
+
+    def _follow(
+        self, task: Task, state: State, expansion: Expansion, step: Array
+    ) -> tuple[State, Expansion] | None:
+        """A whole step with passive joints that follow it; None where that is not good enough."""
+        theta = np.clip(state.theta + step, task.low, task.high)
+        passive = state.passive + expansion.follow(theta - state.theta)
+        try:
+            found = task.expand(theta, passive)
+        except np.linalg.LinAlgError:
+            return None
+        turned = np.abs(found.correction / task.problem.passive_scale).max(initial=0.0)
+        if not turned * LENGTH_SCALE < NEARLY_CLOSED * task.problem.robot.characteristic_length:
+            return None
+        after = task.near(theta, passive, found)
+        return (after, found) if after.objective <= _no_more_than(state) else None
+
+    def _move(self, task: Task, state: State, step: Array) -> tuple[State, Array]:
+        """Take a step as far as it makes the objective smaller, loops closed.
+
+        Raises:
+            SolverError: If no part of it does.
+        """
+        for halving in range(MOST_HALVINGS):
+            part = step * 0.5**halving
+            try:
+                found = task.at(np.clip(state.theta + part, task.low, task.high), state.passive)
+            except ClosureError:  # there the machine cannot be assembled
+                continue
+            if found.objective <= _no_more_than(state):
+                return found, part
+            if np.abs(part).max(initial=0.0) < SETTLED:
+                return state, np.zeros_like(step)
+        raise SolverError(
+            f"did not converge: no step makes it better; {no_convergence(self.options)}",
+            status="Restoration_Failed",
+            iterations=MOST_HALVINGS,
+        )
+
+
+def _settled(sizes: list[float]) -> bool:
+    """Whether the next step would change nothing, shrinking as the last two did, or slower."""
+    last = sizes[-3:]
+    if last[-1] <= SETTLED:
+        return True
+    if len(last) < 2:
+        return False
+    shrinking = max(b / a for a, b in itertools.pairwise(last))
+    return last[-1] * shrinking <= SETTLED
+
+
+def _no_more_than(state: State) -> float:
+    return state.objective + ROUNDING * max(abs(state.objective), 1.0)

@@ -1,0 +1,1 @@
+"""Files and documents: bounded reading, atomic writing, YAML, JSON, CSV, tables."""

@@ -1,0 +1,492 @@
+"""Documents at the door: YAML, JSON and CSV that come from strangers.
+
+Nothing here knows what a robot or a session is. A reader gets the kind of error to raise, so that
+every message names the file and what was found in it.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import chain
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+
+import yaml
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, TypeAdapter, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticCustomError
+
+from orthocal.errors import OrthocalError
+from orthocal.io.files import read_file
+from orthocal.io.strict_yaml import DEEPEST, LARGEST_YAML, LONGEST_NUMBER, load_yaml
+from orthocal.text import composed, shorten, text_problem
+
+Record = TypeVar("Record")
+
+
+def _refuse_truth_values(value: object) -> object:
+    if isinstance(value, bool):
+        raise PydanticCustomError("float_type", "Input should be a valid number")
+    return value
+
+
+LARGEST_NUMBER = 1e9
+"""No length, angle or coordinate in a file is larger, whatever its unit."""
+
+SMALLEST_POSITIVE = 1e-9
+"""No standard deviation, tolerance or resolution in a file is smaller, whatever its unit."""
+
+
+def _refuse_huge(value: float) -> float:
+    if abs(value) > LARGEST_NUMBER:
+        raise PydanticCustomError("huge", f"Input should be within ±{LARGEST_NUMBER:g}")
+    return value
+
+
+SMALLEST_IN_SI = 1e-16
+"""The same in SI units, below the smallest part per million; squares of quotients by it are still
+numbers."""
+
+
+def _at_least(smallest: float) -> AfterValidator:
+    def refuse_smaller(value: float) -> float:
+        if value < smallest:
+            raise PydanticCustomError("tiny", f"Input should be at least {smallest:g}")
+        return value
+
+    return AfterValidator(refuse_smaller)
+
+
+Number = Annotated[
+    float,
+    BeforeValidator(_refuse_truth_values),
+    Field(allow_inf_nan=False),
+    AfterValidator(_refuse_huge),
+]
+"""A number of sane size; YAML's yes and no are not numbers."""
+
+Count = Annotated[int, Field(ge=0, le=10**9)]
+"""A whole number of sane size."""
+
+Finite = Annotated[float, BeforeValidator(_refuse_truth_values), Field(allow_inf_nan=False)]
+"""A number of any size: one that follows from others and is not computed with."""
+
+PositiveNumber = Annotated[Number, Field(gt=0.0), _at_least(SMALLEST_POSITIVE)]
+"""A number of sane size above 0."""
+
+Name = Annotated[
+    str,
+    Field(min_length=1, max_length=200, pattern=r"^[^,;\s\"]+$"),
+    AfterValidator(composed),
+]
+"""A name that can stand in a CSV."""
+
+PositiveInSI = Annotated[Number, Field(gt=0.0), _at_least(SMALLEST_IN_SI)]
+"""The same in SI units, where it was one in mm, mrad or ppm."""
+
+MOST_JSON_VALUES = 2_000_000
+"""Keys and values of a JSON file, for its memory; a calibration has forty a reading."""
+
+MOST_CSV_ROWS = 1_000_000
+"""Rows of a CSV file, for its memory."""
+
+_LONG_NUMBER = re.compile(rf"[-+.eE0-9]{{{LONGEST_NUMBER + 1}}}")
+
+MOST_SHOWN = 20
+"""Items of a list or mapping up to which it is written out in a message."""
+
+
+def read_text(
+    path: Path,
+    *,
+    error: type[OrthocalError],
+    content: bytes | None = None,
+    largest: int | None = None,
+) -> str:
+    """Text of a UTF-8 file, with a byte order mark taken off.
+
+    Args:
+        path: The file.
+        error: Kind of error to raise.
+        content: What it holds, where it was read already.
+        largest: Size above which it is refused, [bytes]; that of any file by default.
+
+    Raises:
+        OrthocalError: Of the kind given, if the file is missing, too large or not text.
+    """
+    if content is None:
+        content = read_file(path, error=error)
+    if largest is not None and len(content) > largest:
+        raise error(
+            f"has {len(content) / 2**20:.1f} MiB; expected at most {largest / 2**20:g} MiB",
+            where=str(path),
+        )
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as e:
+        raise error(f"is not UTF-8 text (byte {e.start})", where=str(path)) from None
+
+
+def read_yaml(path: Path, *, error: type[OrthocalError], content: bytes | None = None) -> Any:  # noqa: ANN401 - any document
+    """Content of a YAML file; duplicate keys, aliases and tags of other kinds are errors.
+
+    Args:
+        path: The file.
+        error: Kind of error to raise.
+        content: What it holds, where it was read already.
+
+    Raises:
+        OrthocalError: Of the kind given, naming file and line.
+    """
+    text = read_text(path, error=error, content=content, largest=LARGEST_YAML)
+    try:
+        return load_yaml(text)
+    except yaml.MarkedYAMLError as e:
+        mark = e.problem_mark or e.context_mark
+        line = "" if mark is None else f":{mark.line + 1}"
+        problem = str(e.problem)
+        if problem.startswith("but "):  # the sentence begins in the context
+            problem = f"{e.context}, {problem}"
+        raise error(f"is not valid YAML: {problem}", where=f"{path}{line}") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as e:
+        text = " ".join(str(e).split())
+        raise error(f"is not valid YAML: {text or type(e).__name__}", where=str(path)) from None
+
+
+def read_json(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401 - any document
+    """Content of a JSON file.
+
+    Raises:
+        OrthocalError: Of the kind given, naming file and line.
+    """
+    text = read_text(path, error=error)
+
+    commas_and_brackets = sum(text.count(c) for c in ",[{")
+    if commas_and_brackets > MOST_JSON_VALUES:
+        raise error(
+            f"holds about {commas_and_brackets} values; expected at most {MOST_JSON_VALUES}",
+            where=str(path),
+        )
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in found:
+                raise ValueError(f"the key '{shorten(key)}' stands twice")
+            found[key] = value
+        return found
+
+    def short(digits: str) -> str:
+        if len(digits) > LONGEST_NUMBER:
+            raise ValueError(f"the number {shorten(digits)} has {len(digits)} characters")
+        return digits
+
+    readers: dict[str, Any] = {}
+    if _LONG_NUMBER.search(text):  # only then: they take their time
+        readers = {"parse_int": lambda d: int(short(d)), "parse_float": lambda d: float(short(d))}
+    try:
+        document = json.loads(text, object_pairs_hook=unique, **readers)
+        _check_texts(document)
+        return document
+    except json.JSONDecodeError as e:
+        raise error(f"is not valid JSON: {e.msg}", where=f"{path}:{e.lineno}") from None
+    except (ValueError, RecursionError) as e:
+        raise error(f"is not valid JSON: {e or type(e).__name__}", where=str(path)) from None
+
+
+def _check_texts(document: object) -> None:
+    """Refuse a document with characters that are none, wherever in it.
+
+    Raises:
+        ValueError: In words.
+    """
+    pending: list[tuple[Any, int]] = [([document], 0)]
+    while pending:
+        value, depth = pending.pop()
+        if depth > DEEPEST:
+            raise ValueError(f"lists and objects stand more than {DEEPEST} deep in each other")
+        for inner in value if isinstance(value, list) else (*value, *value.values()):
+            if isinstance(inner, list | dict):
+                pending.append((inner, depth + 1))
+            elif isinstance(inner, str):
+                problem = text_problem(inner)
+                if problem:
+                    raise ValueError(problem)
+
+
+def read_csv_rows(
+    path: Path,
+    *,
+    required: tuple[str, ...],
+    optional: tuple[str, ...] = (),
+    error: type[OrthocalError],
+    content: bytes | None = None,
+) -> Iterator[tuple[int, dict[str, str]]]:
+    """Rows of a CSV file with a header, as (line number, column to text); blank lines skipped.
+
+    Semicolons are taken as separators where the header has no comma.
+
+    Args:
+        path: The file.
+        required: Columns that it must have.
+        optional: Columns that it may have.
+        error: Kind of error to raise.
+        content: What it holds, where it was read already.
+
+    Raises:
+        OrthocalError: Of the kind given, naming file and line.
+    """
+    text = read_text(path, error=error, content=content)
+    lines = io.StringIO(text, newline=None)
+    yield from csv_rows(
+        lines,
+        name=str(path),
+        required=required,
+        optional=optional,
+        error=error,
+        most=MOST_CSV_ROWS,
+    )
+
+
+def csv_rows(
+    lines: Iterable[str],
+    *,
+    name: str,
+    required: tuple[str, ...],
+    optional: tuple[str, ...] = (),
+    error: type[OrthocalError],
+    most: int | None = None,
+) -> Iterator[tuple[int, dict[str, str]]]:
+    """Rows of a CSV file as its lines come, as `read_csv_rows` has them.
+
+    Args:
+        lines: Its lines, each with what ends it.
+        name: Of the file, for messages.
+        required: Columns that it must have.
+        optional: Columns that it may have.
+        error: Kind of error to raise.
+        most: Rows above which it is refused.
+
+    Raises:
+        OrthocalError: Of the kind given, naming file and line.
+    """
+    path, lines = name, iter(lines)
+    first = next(lines, "")
+    if not first.strip():
+        found = "is blank" if any(line.strip() for line in lines) else "is empty"
+        raise error(f"{found}; expected a header: {','.join(required)}", where=f"{path}:1")
+    delimiter = ";" if "," not in first and ";" in first else ","
+    reader = csv.reader(
+        chain([first], lines), delimiter=delimiter, skipinitialspace=True, strict=True
+    )
+    try:
+        header = [composed(name.strip()) for name in next(reader)]
+        for name in header:
+            if name not in required and name not in optional:
+                raise error(
+                    f"unknown column '{shorten(name)}'; expected {', '.join(required)}"
+                    + (f" and optionally {', '.join(optional)}" if optional else ""),
+                    where=f"{path}:1",
+                )
+            if header.count(name) > 1:
+                raise error(f"the column '{name}' stands twice", where=f"{path}:1")
+        for name in required:
+            if name not in header:
+                raise error(
+                    f"the column '{name}' is missing; found {shorten(', '.join(header))}",
+                    where=f"{path}:1",
+                )
+        for row in reader:
+            line = reader.line_num
+            if most is not None and line > most:
+                raise error(f"has more than {most} rows", where=path)
+            if not any(cell.strip() for cell in row):
+                continue
+            if len(row) != len(header):
+                comma = delimiter == "," and len(row) > len(header)
+                hint = "; a decimal comma? write a point" if comma else ""
+                raise error(
+                    f"has {len(row)} fields; expected {len(header)} "
+                    f"({delimiter.join(header)}){hint}",
+                    where=f"{path}:{line}",
+                )
+            yield (
+                line,
+                {name: composed(cell.strip()) for name, cell in zip(header, row, strict=True)},
+            )
+    except csv.Error as e:
+        raise error(f"is not valid CSV: {e}", where=f"{path}:{reader.line_num}") from None
+
+
+_DECIMAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?(nan|inf\w*)", re.I)
+
+
+def parse_number(text: str, *, where: str, name: str, error: type[OrthocalError]) -> float:
+    """A finite number from a CSV field.
+
+    Raises:
+        OrthocalError: Of the kind given, for text, NaN, infinity or a decimal comma.
+    """
+    try:
+        if len(text) > LONGEST_NUMBER or not _DECIMAL.fullmatch(text):
+            raise ValueError
+        value = float(text)
+    except ValueError:
+        hint = " (a decimal comma? write a point)" if "," in text else ""
+        raise error(f"{name} is '{shorten(text)}'; expected a number{hint}", where=where) from None
+    if value - value != 0.0:
+        raise error(f"{name} is '{text}'; expected a finite number", where=where)
+    if abs(value) > LARGEST_NUMBER:
+        raise error(
+            f"{name} is '{text}'; expected a number within ±{LARGEST_NUMBER:g}", where=where
+        )
+    return value
+
+
+def validate(
+    schema: type[Record],
+    data: Any,  # noqa: ANN401 - any document
+    *,
+    where: str,
+    error: type[OrthocalError],
+    under: str = "",
+) -> Record:
+    """Data as an instance of a pydantic model, or of a dataclass.
+
+    Args:
+        schema: What is expected.
+        data: The data.
+        where: File, for messages.
+        error: Kind of error.
+        under: Key of the file under which the data stand.
+
+    Raises:
+        OrthocalError: Of the kind given, with the first key that does not fit.
+    """
+    if not isinstance(data, Mapping):
+        kinds = {str: "text", int: "a number", float: "a number", list: "a list", bool: "a word"}
+        found = "nothing" if data is None else kinds.get(type(data), f"a {type(data).__name__}")
+        at = f"{where}: {under}" if under else where
+        raise error(f"holds {found}; expected keys and values", where=at)
+    try:
+        record: Record = _adapter(schema).validate_python(data)
+        return record
+    except ValidationError as e:
+        key, problem = explain_validation_error(e, schema)
+        key = ".".join(part for part in (under, key) if part)
+        raise error(problem, where=f"{where}: {key}" if key else where) from None
+
+
+def write_plain(record: object, schema: type[Any]) -> dict[str, Any]:
+    """A dataclass as plain data, as `validate` reads it."""
+    plain: dict[str, Any] = _adapter(schema).dump_python(record, mode="json", by_alias=True)
+    return plain
+
+
+_ADAPTERS: dict[type[Any], TypeAdapter[Any]] = {}
+
+
+def _adapter(schema: type[Any]) -> TypeAdapter[Any]:
+    """Built once a schema: that takes time."""
+    if schema not in _ADAPTERS:
+        _ADAPTERS[schema] = TypeAdapter(schema)
+    return _ADAPTERS[schema]
+
+
+UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
+"""What pydantic calls a key that is not known, of a model and of a dataclass."""
+
+
+def explain_validation_error(exception: ValidationError, schema: type[Any]) -> tuple[str, str]:
+    """Key and plain words for the first finding of a pydantic ValidationError."""
+    # an unknown key explains a missing one: name it first
+    findings = sorted(
+        exception.errors(include_url=False), key=lambda f: f["type"] not in UNKNOWN_KEY
+    )
+    first = findings[0]
+    path = [part for part in first["loc"] if not _is_pydantic_tag(part)]
+    found, kind = first.get("input"), first["type"]
+    if "[key]" in first["loc"] and not isinstance(found, str):
+        return _join(path[:-1]), f"found the key {_show(found)}; expected text: put it in quotes"
+    key = _join(path)
+    if kind in UNKNOWN_KEY:
+        known = _keys_at(schema, path[:-1])
+        hint = f"; known keys: {', '.join(known)}" if known else ""
+        return key, f"unknown key{hint}"
+    if kind == "missing":
+        return key, "is missing"
+    words = str(first["msg"]).removeprefix("Value error, ")
+    if kind in ("value_error", "assertion_error"):
+        # a validator over several keys begins its message with the one that it is about
+        inner, separator, rest = words.partition("|")
+        return (_join([*path, inner] if inner else path), rest) if separator else (key, words)
+    shown = "nothing" if found is None else f"'{_show(found)}'"
+    return key, f"found {shown}; expected {_expectation(kind, words, first.get('ctx') or {})}"
+
+
+def _show(value: object) -> str:
+    """A value from a document, as it can stand in a message."""
+    if isinstance(value, list | dict) and len(value) > MOST_SHOWN:
+        return f"{'a list' if isinstance(value, list) else 'a mapping'} of {len(value)} items"
+    return shorten(str(value))
+
+
+def _expectation(kind: str, words: str, context: Mapping[str, Any]) -> str:
+    """What pydantic expected, in words of this program."""
+    if kind in ("dict_type", "model_type", "dataclass_type", "mapping_type"):
+        return "keys and values"
+    if kind == "string_pattern_mismatch":
+        return "a name without blanks, commas, semicolons or quotes"
+    if kind in ("too_short", "too_long"):
+        count = context["min_length" if kind == "too_short" else "max_length"]
+        bound = "least" if kind == "too_short" else "most"
+        return f"at {bound} {count} item{'' if count == 1 else 's'}"
+    words = words[0].lower() + words[1:]
+    return words.removeprefix("input should be ").removeprefix("a valid ")
+
+
+def _join(path: list[Any]) -> str:
+    """A location as text: setups.yx.section or closed_loop[2]."""
+    parts = (f"[{p}]" if isinstance(p, int) else f".{shorten(str(p))}" for p in path)
+    return "".join(parts).lstrip(".")
+
+
+def _is_pydantic_tag(part: object) -> bool:
+    """Whether a part of a location is pydantic's name for a branch of a union, not a key."""
+    return isinstance(part, str) and ("[" in part or part in {"float", "int", "str", "bool"})
+
+
+def _keys_at(annotation: Any, path: list[Any]) -> list[str]:  # noqa: ANN401 - typing objects
+    """Names of the fields that a schema has at a location."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        fields = {f.alias or n: f.annotation for n, f in annotation.model_fields.items()}
+        if not path:
+            return list(fields)
+        return _keys_at(fields[path[0]], path[1:]) if path[0] in fields else []
+    if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
+        hints = get_type_hints(annotation, include_extras=True)
+        named = {
+            _alias(hints[f.name]) or f.name: hints[f.name] for f in dataclasses.fields(annotation)
+        }
+        if not path:
+            return list(named)
+        return _keys_at(named[path[0]], path[1:]) if path[0] in named else []
+    if get_origin(annotation) is Annotated:
+        return _keys_at(get_args(annotation)[0], path)
+    arguments = get_args(annotation)
+    if get_origin(annotation) is tuple:
+        return _keys_at(arguments[0], path[1:])
+    if get_origin(annotation) in (dict, list):
+        return _keys_at(arguments[-1], path[1:])
+    return next((found for a in arguments if (found := _keys_at(a, path))), [])
+
+
+def _alias(hint: Any) -> str | None:  # noqa: ANN401 - typing objects
+    """The key of a dataclass's field, where it is not its name."""
+    found = [m.alias for m in get_args(hint)[1:] if isinstance(m, FieldInfo) and m.alias]
+    return found[0] if found else None

@@ -1,0 +1,120 @@
+"""Fields of records that are kept as JSON: closed records, numbers that may be unknown, arrays.
+
+A record is a dataclass; pydantic reads and writes it by these annotations. What is not a number in
+memory (NaN, infinity) is null in a file, and nothing else is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import (
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    PlainSerializer,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
+from pydantic_core import CoreSchema, core_schema
+
+from orthocal.io.documents import Number
+
+Array = NDArray[np.float64]
+Item = TypeVar("Item")
+
+CLOSED = ConfigDict(extra="forbid")
+"""Of a record that has no other keys than its own."""
+
+Many = Annotated[tuple[Item, ...], Field(fail_fast=True)]
+"""Any number of items, of which one that is wrong is told, however many there are."""
+
+Size = Annotated[Number, Field(ge=0.0)]
+"""A number that is not negative."""
+
+
+def _null_for(unknown: float) -> WrapValidator:
+    def read(value: object, handler: ValidatorFunctionWrapHandler) -> object:
+        return unknown if value is None else handler(value)
+
+    return WrapValidator(read)
+
+
+def _finite_or_null(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+NumberOrNaN = Annotated[Number, _null_for(math.nan), PlainSerializer(_finite_or_null)]
+SizeOrNaN = Annotated[Size, _null_for(math.nan), PlainSerializer(_finite_or_null)]
+SizeOrInf = Annotated[Size, _null_for(math.inf), PlainSerializer(_finite_or_null)]
+"""Numbers that may be unknown, or infinite."""
+
+
+class _AsLists:
+    """An array in memory, lists of numbers in a file; null where they are not finite."""
+
+    def __init__(self, lists: Any) -> None:  # noqa: ANN401 - a type
+        self.lists = lists
+
+    def __get_pydantic_core_schema__(
+        self,
+        source: Any,  # noqa: ANN401 - a type
+        handler: GetCoreSchemaHandler,
+    ) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(
+            _to_array,
+            handler.generate_schema(self.lists),
+            serialization=core_schema.plain_serializer_function_ser_schema(_to_lists),
+        )
+
+
+Vector = Annotated[Array, _AsLists(Many[Number])]
+Sizes = Annotated[Array, _AsLists(Many[Size])]
+Matrix = Annotated[Array, _AsLists(Many[Many[NumberOrNaN]])]
+
+
+class As:
+    """A field that a function makes of what stands in a file, and another writes.
+
+    Args:
+        read: From plain data; raises ValueError, with the key within and "|" before its words.
+        write: To plain data.
+    """
+
+    def __init__(self, read: Callable[[Any], object], write: Callable[[Any], object]) -> None:
+        self.read, self.write = read, write
+
+    def __get_pydantic_core_schema__(
+        self,
+        source: Any,  # noqa: ANN401 - a type
+        handler: GetCoreSchemaHandler,
+    ) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            self.read,
+            serialization=core_schema.plain_serializer_function_ser_schema(self.write),
+        )
+
+
+def _to_array(lists: Any) -> Array:  # noqa: ANN401 - tuples of tuples
+    if len({len(row) for row in lists if isinstance(row, tuple)}) > 1:
+        raise ValueError("expected rows of the same length")
+    return read_only(lists)
+
+
+def _to_lists(values: Array) -> object:
+    if np.isfinite(values).all():
+        return values.tolist()
+    plain = values.astype(object)
+    plain[~np.isfinite(values)] = None
+    return plain.tolist()
+
+
+def read_only(values: ArrayLike) -> Array:
+    """A copy of an array that cannot be written to."""
+    result = np.array(values, dtype=np.float64)
+    result.setflags(write=False)
+    return result

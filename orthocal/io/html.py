@@ -1,0 +1,61 @@
+"""Small pieces of HTML; every text in them is escaped."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Iterable, Sequence
+
+from orthocal.text import printable
+
+TYPED = re.compile("`([^`\n]+)`")
+
+
+def escape(text: str) -> str:
+    """A text as HTML that shows it: no markup, and no character that turns others about."""
+    return html.escape(printable(text, keep="\n"))
+
+
+def prose(text: str) -> str:
+    """A text as HTML; what is between `s is what one types."""
+    return TYPED.sub(r"<code>\1</code>", escape(text))
+
+
+def paragraph(text: str, *, kind: str = "") -> str:
+    """A paragraph of prose; `kind` is a class."""
+    return f"<p{_class(kind)}>{prose(text)}</p>"
+
+
+def heading(text: str, *, level: int = 2) -> str:
+    """A heading of a level from 1 to 6."""
+    return f"<h{level}>{escape(text)}</h{level}>"
+
+
+def items(texts: Iterable[str]) -> str:
+    """A list of prose, with bullets."""
+    return "<ul>" + "".join(f"<li>{prose(t)}</li>" for t in texts) + "</ul>"
+
+
+def table(headers: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 1) -> str:
+    """A table.
+
+    Args:
+        headers: Of its columns; all empty for none.
+        rows: Cells.
+        left: Columns of words, at the left; those after are numbers.
+    """
+    words = [i < left or h == "unit" for i, h in enumerate(headers)]
+
+    def cells(tag: str, texts: Sequence[str]) -> str:
+        return "".join(
+            f"<{tag}{_class('' if word else 'number')}>{escape(text)}</{tag}>"
+            for text, word in zip(texts, words, strict=True)
+        )
+
+    head = f"<thead><tr>{cells('th', headers)}</tr></thead>" if any(headers) else ""
+    body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
+    return f"<table>{head}<tbody>{body}</tbody></table>"
+
+
+def _class(name: str) -> str:
+    return f' class="{escape(name)}"' if name else ""

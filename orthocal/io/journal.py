@@ -1,0 +1,125 @@
+"""Files that grow by lines, each on disk before it counts; one process at a time has one.
+
+A process that is killed leaves at most a line without an end, which the next one takes away; what
+was written before stays.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from orthocal.errors import OrthocalError, OutputError
+from orthocal.io.files import require_writable_file, sync_folder
+
+LONGEST_LINE = 2**26
+"""[bytes]"""
+
+
+class Journal:
+    """Lines of JSON in a file that is open and locked.
+
+    Args:
+        path: The file.
+        descriptor: Of it, open for reading and appending.
+        longest: Bytes of its longest line.
+    """
+
+    def __init__(self, path: Path, descriptor: int, *, longest: int = LONGEST_LINE) -> None:
+        self.path = path
+        self._descriptor = descriptor
+        self._longest = longest
+
+    def entries(self) -> Iterator[tuple[str, dict[str, Any] | None]]:
+        """What is there: where each line stands, and its object; None for a line that holds none.
+
+        Whoever has seen all of them without finding fault may write on: then the end of a line
+        that was never finished has been taken away.
+
+        Raises:
+            OutputError: If that cannot be taken away.
+        """
+        end, number = 0, 0
+        with os.fdopen(os.dup(self._descriptor), "rb") as stream:
+            stream.seek(0)
+            while line := stream.readline(self._longest):
+                number += 1
+                if not line.endswith(b"\n"):
+                    if len(line) >= self._longest:
+                        yield f"{self.path}:{number}", None
+                    break
+                yield f"{self.path}:{number}", _parse(line)
+                end = stream.tell()
+        try:
+            os.ftruncate(self._descriptor, end)
+        except OSError as e:
+            raise OutputError(f"cannot be written: {e.strerror}", where=str(self.path)) from None
+
+    def append(self, entry: Mapping[str, Any]) -> None:
+        """Write a line; on disk when this returns.
+
+        Raises:
+            OutputError: If it cannot be written.
+        """
+        data = (json.dumps(entry, allow_nan=False) + "\n").encode()
+        try:
+            while data:
+                data = data[os.write(self._descriptor, data) :]
+            os.fsync(self._descriptor)
+        except OSError as e:
+            raise OutputError(f"cannot be written: {e.strerror}", where=str(self.path)) from None
+
+
+@contextmanager
+def open_journal_file(
+    path: Path, *, busy: str, anew: bool = False, longest: int = LONGEST_LINE
+) -> Iterator[Journal]:
+    """A journal that nobody else has; made if need be.
+
+    Args:
+        path: The file.
+        busy: What is said where another process has it.
+        anew: Whether to throw away what is there.
+        longest: Bytes of its longest line.
+
+    Raises:
+        OrthocalError: If another process has it, or it cannot be a file.
+        OutputError: If it cannot be written.
+    """
+    require_writable_file(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_CLOEXEC", 0)
+        made = not path.exists()
+        descriptor = os.open(path, flags, 0o666)
+    except OSError as e:
+        raise OutputError(f"cannot be written: {e.strerror}", where=str(path)) from None
+    try:
+        _lock(descriptor, path, busy)
+        if anew:
+            os.ftruncate(descriptor, 0)
+        if made:
+            sync_folder(path.parent)
+        yield Journal(path, descriptor, longest=longest)
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, path: Path, busy: str) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        raise OrthocalError(busy, where=str(path)) from None
+
+
+def _parse(line: bytes) -> dict[str, Any] | None:
+    try:
+        data = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return data if isinstance(data, dict) else None

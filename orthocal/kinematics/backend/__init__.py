@@ -1,0 +1,1 @@
+"""Evaluation of CasADi functions at many points."""

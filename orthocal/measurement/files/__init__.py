@@ -1,0 +1,1 @@
+"""Session files: session.yaml, readings.csv, plans; read, checked and written."""

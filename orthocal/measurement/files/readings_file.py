@@ -1,0 +1,269 @@
+"""Rows of a readings.csv, as orthocal writes it or as a spreadsheet saved it.
+
+The house form is UTF-8 with commas, decimal points and mm. What a spreadsheet makes of it, with
+semicolons or tabs, decimal commas, another encoding, German headings or a typographic minus, is
+taken where it can mean one thing only; whatever is less clear is for `orthocal import`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from decimal import Decimal
+from itertools import islice
+from pathlib import Path
+
+from orthocal.errors import SessionError
+from orthocal.io.documents import read_csv_rows
+from orthocal.io.tables.decoding import decode
+from orthocal.io.tables.numerals import (
+    DecimalSign,
+    Seen,
+    Sign,
+    parse_numeral,
+    plain_minus,
+    shown,
+    tell_decimal,
+)
+from orthocal.io.tables.separated import SEPARATORS, said_separator
+from orthocal.io.tables.table import Table, read_table
+from orthocal.io.tables.workbook import BEGINNING
+from orthocal.measurement.files.readings_checks import RawReading
+from orthocal.measurement.files.schema import MOST_READINGS
+from orthocal.measurement.importing.headings import EXPECTED, Columns, choose_columns, find_header
+from orthocal.text import composed, shorten
+
+REQUIRED = ("setup", "posture", "reading_mm")
+OPTIONAL = ("minus", "cycle")
+
+
+def mm_text(value: Decimal) -> str:
+    """A reading in mm as a readings.csv has it: exactly, with two decimals at least."""
+    if not -30 < value.adjusted() < 30:
+        return f"{value:e}"
+    whole, _, decimals = f"{value:f}".partition(".")
+    return f"{whole}.{decimals.rstrip('0').ljust(2, '0')}"
+
+
+def is_house(header: Iterable[str]) -> bool:
+    """Whether headings are those of a readings.csv, letter by letter."""
+    names = [composed(name.strip()) for name in header]
+    return set(REQUIRED) <= set(names) <= {*REQUIRED, *OPTIONAL} and len(set(names)) == len(names)
+
+
+def decide_sign(
+    cells: Sequence[Seen], *, house: bool, ask: str, place: Callable[[int], str]
+) -> DecimalSign:
+    """The decimal sign of readings, which have one only.
+
+    Args:
+        cells: The readings.
+        house: Whether headings are those of a readings.csv: then a point is a decimal point.
+        ask: What to do where it is not certain.
+        place: Line to file and line, for messages.
+
+    Raises:
+        SessionError: Where two signs are possible.
+    """
+    found = tell_decimal(cells)
+    if found.sign is not None:
+        return found
+    if found.rival is not None and found.evidence is not None:
+        raise SessionError(
+            f"the reading '{shorten(found.rival.text)}' has a decimal point, and "
+            f"'{shorten(found.evidence.text)}' in line {found.evidence.line} a decimal comma; "
+            "write all alike",
+            where=place(found.rival.line),
+        )
+    open_cells = (c for c in cells if _is_open(c.text) and not (house and "," not in c.text))
+    rival = next(open_cells, None)
+    if rival is None:
+        return DecimalSign("point", None)
+    comma, point = parse_numeral(rival.text, "comma"), parse_numeral(rival.text, "point")
+    raise SessionError(
+        f"the reading '{rival.text}' is {shown(comma)} with a decimal comma and "
+        f"{shown(point)} with a decimal point, and no other reading tells which; {ask}",
+        where=place(rival.line),
+    )
+
+
+def _is_open(text: str) -> bool:
+    """Whether a numeral is two numbers."""
+    both = parse_numeral(text, "comma"), parse_numeral(text, "point")
+    return None not in both and both[0] != both[1]
+
+
+def read_rows(path: Path, content: bytes) -> Iterator[RawReading]:
+    """Rows of a session's own table of readings, with numbers in the house form.
+
+    Args:
+        path: The file, for messages.
+        content: What it holds.
+
+    Raises:
+        SessionError: Naming file and line.
+    """
+    if content.startswith(BEGINNING):
+        raise SessionError(
+            "is a workbook; expected a CSV file: `orthocal import` makes one of it",
+            where=str(path),
+        )
+    try:
+        decoded = decode(content, where=str(path))
+    except SessionError:
+        return _plain_rows(path, content)
+    first = decoded.text.partition("\n")[0]
+    if any(is_house(first.split(separator)) for separator in ",;"):
+        if decoded.encoding != "utf-8":
+            content = decoded.text.encode()
+        return _plain_rows(path, content)
+    table = _clean_table(path, content)
+    return _plain_rows(path, content) if table is None else _table_rows(*table)
+
+
+def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
+    """Rows below the house's own headings."""
+
+    def rows() -> Iterator[tuple[int, dict[str, str]]]:
+        return read_csv_rows(
+            path, required=REQUIRED, optional=OPTIONAL, error=SessionError, content=content
+        )
+
+    sign: Sign | None = None
+    if not content.isascii() or b'"' in content or b";" in content:
+        cells = []
+        # what is wrong with a row is told when it is read
+        with suppress(SessionError):
+            for line, row in islice(rows(), MOST_READINGS + 1):
+                cells.append(Seen(row["reading_mm"], line))
+        sign = _plain_sign(cells, path)
+    for line, row in rows():
+        yield RawReading(
+            where=f"{path}:{line}",
+            line=line,
+            setup=row["setup"],
+            posture=row["posture"],
+            minus=row.get("minus", ""),
+            cycle=row.get("cycle", ""),
+            reading=_house_number(row["reading_mm"], sign),
+        )
+
+
+ASK = "write it with a decimal point, or say it to `orthocal import --decimal comma|point`"
+
+
+def _plain_sign(cells: Sequence[Seen], path: Path) -> Sign | None:
+    """The decimal sign below the house's own headings, where a point is a decimal point."""
+    if not any("," in cell.text for cell in cells) or tell_decimal(cells).torn:
+        return "point"
+    return decide_sign(cells, house=True, ask=ASK, place=lambda line: f"{path}:{line}").sign
+
+
+def _house_number(text: str, sign: Sign | None) -> str:
+    """A number in the house form; what is none stays as it is, to be refused."""
+    if sign == "comma":
+        value = parse_numeral(text, sign)
+        return text if value is None else mm_text(value)
+    return text if sign is None else plain_minus(text)
+
+
+def _clean_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
+    """A table that a spreadsheet saved, with nothing beside the readings; None if it is none.
+
+    Raises:
+        SessionError: For a column that is nothing of a session's.
+    """
+    try:
+        table = read_table(path, content, find_header, expected=EXPECTED)
+        columns = choose_columns(table.header, {}, where=f"{path}:{table.header_line}")
+    except SessionError:
+        return None
+    first = table.header_line == 1 or said_separator(decode(content, where="").text) is not None
+    if table.above or not first:
+        return None
+    strange = [i for i in columns.extra]
+    strange += [r.index for r in columns.readings if r.unit != "mm" or r.cycle is not None]
+    if strange:
+        name = " ".join(table.header[min(strange)].split())
+        raise SessionError(
+            f"unknown column '{shorten(name)}'; expected {', '.join(REQUIRED)} and optionally "
+            f"{', '.join(OPTIONAL)}",
+            where=f"{path}:{table.header_line}",
+        )
+    return table, columns
+
+
+def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
+    require_whole_cells(table, columns)
+    (reading,) = columns.readings
+    cells = [Seen(row.cell(reading.index).text, row.line) for row in table.rows]
+    sign = decide_sign(cells, house=is_house(table.header), ask=ASK, place=table.place).sign
+    width = len(table.header)
+    for row in table.rows:
+        where = table.place(row.line)
+        if len(row.cells) > width or row.written < width:
+            names = SEPARATORS[table.separator or "comma"].join(table.header)
+            found = max(len(row.cells), row.written if row.written < width else 0)
+            raise SessionError(
+                f"has {found} fields; expected {width} ({shorten(names)})", where=where
+            )
+        text = {
+            name: "" if index is None else composed(row.cell(index).text.strip())
+            for name, index in (
+                ("setup", columns.setup),
+                ("posture", columns.posture),
+                ("minus", columns.minus),
+                ("cycle", columns.cycle),
+                ("reading", reading.index),
+            )
+        }
+        value = None if sign is None else parse_numeral(text["reading"], sign)
+        if value is not None:
+            text["reading"] = mm_text(value)
+        yield RawReading(where, row.line, **text)
+
+
+_WHOLE = re.compile(r"[-+\u2212\u2013]?[0-9]+")
+_DIGITS = re.compile(r"[0-9]+")
+
+
+def require_whole_cells(table: Table, columns: Columns, *, sure: bool = False) -> None:
+    """Refuse a table with commas as separators in which a comma may be a decimal sign as well.
+
+    Who writes 3,5 without quotes between commas makes two cells of a number: the row has a cell
+    more than the headings, or, where nothing followed, looks like two whole numbers.
+
+    Args:
+        table: The table.
+        columns: Which column is what.
+        sure: Whether it was said that commas separate.
+
+    Raises:
+        SessionError: Naming the row.
+    """
+    if table.separator != "comma":
+        return
+    readings = [r.index for r in columns.readings]
+    texts = [row.cell(i).text for row in table.rows for i in readings]
+    certain = sure or is_house(table.header) or any("." in t or "," in t for t in texts)
+    pairs = {(i, i + 1) for i in readings} | {(i - 1, i) for i in readings if i}
+    pairs -= {(i - 1, i) for i in readings if i - 1 in columns.keys}
+    for row in table.rows:
+        if row.written > table.header_written:
+            raise SessionError(
+                f"has {row.written} fields; expected {table.header_written}; a decimal comma "
+                "between commas? Save the table with semicolons, or its numbers in quotes",
+                where=table.place(row.line),
+            )
+        if certain:
+            continue
+        for left, right in sorted(pairs):
+            a, b = row.cell(left).text.strip(), row.cell(right).text.strip()
+            if _WHOLE.fullmatch(a) and _DIGITS.fullmatch(b):
+                raise SessionError(
+                    f"'{shorten(a)},{shorten(b)}' may be two cells or one number with a decimal "
+                    "comma; if they are two, say --separator comma to `orthocal import`, if one, "
+                    "save the table with semicolons",
+                    where=table.place(row.line),
+                )

@@ -1,0 +1,146 @@
+"""What a session.yaml may hold: keys and units as in the file."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from orthocal.io.documents import Name, Number, PositiveNumber
+from orthocal.sensors.mounting import LARGEST_SCALE
+from orthocal.sensors.tips import TipKeys
+from orthocal.units import DEG, MM, MRAD, Unit
+
+Vector = Annotated[list[Number], Field(min_length=1, max_length=12)]
+
+LARGEST_READING_MM = 300.0
+"""No indicator reaches further, and no leg is as far from parallel: it is a wrong unit."""
+
+COARSEST_MM = 10.0
+"""No resolution and no standard deviation of an indicator is larger; a ruler's is 1 mm."""
+
+MOST_POSTURES = 5_000
+"""Postures of a session; each takes a closing of the loops and its variables in the program."""
+
+MOST_SETUPS = 1_000
+"""Setups of a session; each has an unknown zero of its own."""
+
+MOST_READINGS = 50_000
+"""Readings of a session or a plan: four times the largest that was tried, by hand a month's work.
+A calibration takes 10 kB for each."""
+
+MOST_GAUGES = 100
+"""Gauges of a session."""
+
+MOST_NAMES = 1_000
+"""Names or globs of errors; the largest robots have some hundred errors."""
+
+GaugeLength = Annotated[PositiveNumber, Field(le=COARSEST_MM)]
+GaugeEnd = Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)]
+
+
+OFFSET_KEYS: dict[str, tuple[Unit, float]] = {
+    "offsets_mm": ("m", MM),
+    "offsets_deg": ("rad", DEG),
+    "offsets_mrad": ("rad", MRAD),
+}
+"""Keys of `controller` to the unit of the drives they are of, and the factor to it."""
+
+
+class _Keys(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class GaugeKeys(_Keys):
+    """The indicator."""
+
+    sigma_mm: GaugeLength | None = None
+    resolution_mm: GaugeLength | None = None
+    range_mm: Annotated[list[GaugeEnd], Field(min_length=2, max_length=2)] | None = None
+    tip: TipKeys | None = None
+    """What it touches with, in setups that do not say so themselves."""
+    scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] | None = None
+    """How well it shows a millimetre, likewise."""
+
+    @model_validator(mode="after")
+    def _range_rises(self) -> GaugeKeys:
+        if self.range_mm is not None and not self.range_mm[0] < self.range_mm[1]:
+            raise ValueError(f"range_mm|found {self.range_mm}; expected [lowest, highest]")
+        return self
+
+
+class PostureKeys(_Keys):
+    """A commanded machine position."""
+
+    tcp_mm: Vector | None = None
+    joints_mm: Vector | None = None
+    joints_deg: Vector | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> PostureKeys:
+        given = [k for k in ("tcp_mm", "joints_mm", "joints_deg") if getattr(self, k) is not None]
+        if len(given) != 1:
+            found = " and ".join(given) if given else "none"
+            raise ValueError(f"found {found}; expected one of tcp_mm, joints_mm, joints_deg")
+        return self
+
+
+class ControllerKeys(_Keys):
+    """What the controller already corrects: one number a drive of the kind, in their order."""
+
+    offsets_mm: Vector | None = None
+    """Of prismatic drives."""
+    offsets_deg: Vector | None = None
+    """Of revolute drives."""
+    offsets_mrad: Vector | None = None
+    """The same."""
+
+    @property
+    def stated(self) -> list[str]:
+        """The keys that are given."""
+        return [key for key in OFFSET_KEYS if getattr(self, key) is not None]
+
+    @model_validator(mode="after")
+    def _one_form_a_kind(self) -> ControllerKeys:
+        if not self.stated:
+            raise ValueError(f"found none; expected {', '.join(OFFSET_KEYS)}")
+        if {"offsets_deg", "offsets_mrad"} <= set(self.stated):
+            raise ValueError("found offsets_deg and offsets_mrad; expected one of them")
+        return self
+
+
+class CalibrationKeys(_Keys):
+    """What will be identified, and what is known of the machine's errors beforehand."""
+
+    model: str | None = None
+    """A model of the robot's YAML."""
+    free: Annotated[list[str], Field(max_length=MOST_NAMES)] = []
+    """Names or globs that are free too, or instead of a model."""
+    tolerances: Annotated[dict[str, PositiveNumber], Field(max_length=MOST_NAMES)] = {}
+    """Name or glob with its unit to another standard deviation than the robot's."""
+
+
+class SessionKeys(_Keys):
+    """A session.yaml, or a plan: the same without `readings`."""
+
+    robot: str
+    title: str = ""
+    source: str = ""
+    gauge: GaugeKeys = None  # type: ignore[assignment] # absent; what is given has keys
+    """Of a session with one gauge."""
+    gauges: Annotated[dict[Name, GaugeKeys], Field(min_length=1, max_length=MOST_GAUGES)] = None  # type: ignore[assignment] # likewise
+    """Of a session with several; its setups name theirs."""
+    postures: Annotated[dict[Name, PostureKeys], Field(min_length=1, max_length=MOST_POSTURES)]
+    controller: ControllerKeys | None = None
+    calibration: CalibrationKeys | None = None
+    setups: Annotated[dict[Name, dict[str, Any]], Field(min_length=1, max_length=MOST_SETUPS)]
+    """What each may say is the sensor's own affair; see `orthocal.sensors.registry`."""
+    cycles: Annotated[int, Field(ge=1, le=1000)] = 1
+    """In a plan: how often the postures are gone through."""
+    readings: str | None = None
+
+    @model_validator(mode="after")
+    def _one_form_of_gauges(self) -> SessionKeys:
+        if self.gauge is not None and self.gauges is not None:
+            raise ValueError("found gauge and gauges; expected one of them")
+        return self

@@ -1,0 +1,431 @@
+"""Sessions from files: session.yaml with its readings in a CSV beside it, in mm.
+
+They are checked against the robot and the nominal machine.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.errors import ClosureError, ParameterError, RobotError, SessionError
+from orthocal.io.documents import read_yaml, validate
+from orthocal.io.fields import read_only
+from orthocal.io.files import exists, is_folder, read_file, require_plain_name
+from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.measurement.files.readings_checks import check_readings
+from orthocal.measurement.files.readings_file import read_rows
+from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
+from orthocal.measurement.files.session_robot import build_offsets, require_given_zero
+from orthocal.observation.sensor_frames import locate_contacts
+from orthocal.robot.loading import load_robot
+from orthocal.robot.model import Robot
+from orthocal.sensors.protocol import Sensor, SetupKeys, Unknown
+from orthocal.sensors.registry import read_setup
+from orthocal.session.session import Gauge, Posture, Purpose, Reading, Session, Setup
+from orthocal.units import DRIVE_UNITS, MM
+
+Array = NDArray[np.float64]
+
+
+SESSION = "session.yaml"
+
+MOST_LOOKED_AT = 200
+"""Folders in which a session is looked for, where one was not found."""
+
+MOST_NAMED = 5
+"""Sessions of a folder that are named where it is none itself."""
+
+OTHER_KINDS = (".csv", ".json", ".urdf")
+"""What the names of files of other kinds end with."""
+
+
+def load_session(path: str | Path) -> Session:
+    """Read a session: its YAML, its CSV and its robot, checked against each other.
+
+    Args:
+        path: The session.yaml, or the folder that holds it.
+
+    Raises:
+        SessionError: Naming file and line or key, what was found and what was expected.
+        RobotError: If the robot does not load.
+    """
+    file, content, keys = _read_keys(Path(path))
+    return _load_session(file, content, keys)
+
+
+def _load_session(
+    file: Path, content: bytes, keys: SessionKeys, *, unread: set[int] | None = None
+) -> Session:
+    """A session with readings; where `unread` is given cells may be empty, and it tells which."""
+    plan, readings_path = _build_unread(file, keys)
+    table = read_file(readings_path, error=SessionError)
+    rows = read_rows(readings_path, table)
+    readings = check_readings(rows, plan, file=readings_path, unread=unread)
+    digest = hashlib.sha256(content + b"\0" + table).hexdigest()
+    session = replace(plan, readings=readings, readings_path=readings_path, sha256=digest)
+    check_contacts(session)
+    return session
+
+
+def load_unread(path: str | Path) -> tuple[Session, Path]:
+    """Read a session without its readings, and where they are or shall be.
+
+    Args:
+        path: The session.yaml, or the folder that holds it.
+
+    Raises:
+        SessionError: Naming file and key.
+        RobotError: If the robot does not load.
+    """
+    file, _, keys = _read_keys(Path(path))
+    return _build_unread(file, keys)
+
+
+def _build_unread(file: Path, keys: SessionKeys) -> tuple[Session, Path]:
+    if keys.readings is None:
+        raise SessionError("is missing; expected the name of a CSV file", where=f"{file}: readings")
+    require_plain_name(file, error=SessionError)
+    plan = _build_plan(file, keys, _read_setups(file, keys))
+    if not keys.readings.strip() or "\0" in keys.readings:
+        raise SessionError(
+            f"found {keys.readings!r}; expected the name of a CSV file", where=f"{file}: readings"
+        )
+    return plan, file.parent / keys.readings
+
+
+def load_plan(path: str | Path) -> Session:
+    """Read a plan: a session.yaml without `readings`; each planned reading is 0.
+
+    A setup is read in all postures, or in those its `postures` names; `cycles` times. A session
+    that has readings is a plan too: that of its rows, filled in or not.
+
+    Raises:
+        SessionError: Naming file and key.
+        RobotError: If the robot does not load.
+    """
+    session, _ = load_rows(path)
+    return session
+
+
+def load_rows(path: str | Path) -> tuple[Session, frozenset[int]]:
+    """Read a plan, as `load_plan` does, and which of its readings are not there yet.
+
+    Returns:
+        The plan, and indices of its readings that are 0 because nothing was read: of a session with
+        readings its empty cells; else all of them, and it has no `readings_path`.
+
+    Raises:
+        SessionError: Naming file and key.
+        RobotError: If the robot does not load.
+    """
+    file, content, keys = _read_keys(Path(path))
+    if keys.readings is not None:
+        unread: set[int] = set()
+        session = _load_session(file, content, keys, unread=unread)
+        return session, frozenset(unread)
+    read = _read_setups(file, keys)
+    count = keys.cycles * sum(len(s.postures or keys.postures) for s, _ in read.values())
+    if count > MOST_READINGS:
+        raise SessionError(
+            f"plans {count} readings, {keys.cycles} times those of all setups; expected at most "
+            f"{MOST_READINGS}",
+            where=f"{file}: cycles",
+        )
+    plan = _build_plan(file, keys, read)
+    readings = []
+    for name, (setup, _) in read.items():
+        readings += [
+            Reading(name, posture, None, cycle, 0.0, None)
+            for cycle in range(1, keys.cycles + 1)
+            for posture in setup.postures or plan.postures
+        ]
+    session = replace(plan, readings=tuple(readings))
+    check_contacts(session)
+    return session, frozenset(range(len(readings)))
+
+
+def read_purpose(
+    keys: CalibrationKeys | None, robot: Robot, *, where: str
+) -> tuple[Purpose | None, Robot]:
+    """What a session.yaml says under `calibration`.
+
+    Args:
+        keys: That.
+        robot: The robot of the session.
+        where: File and key, for messages.
+
+    Returns:
+        What is to be identified, None where that is not said; and the robot with the tolerances
+        that are stated.
+
+    Raises:
+        SessionError: If a model, name, unit or number is none of the robot's.
+    """
+    if keys is None:
+        return None, robot
+    parameters = robot.parameters
+    at = "model"
+    try:
+        patterns = [] if keys.model is None else parameters.patterns(keys.model)
+        at = "free"
+        free = parameters.select([*patterns, *keys.free])
+        at = "tolerances"
+        robot = robot.with_tolerances(keys.tolerances)
+    except ParameterError as e:
+        raise SessionError(e.problem, where=f"{where}.{at}") from None
+    if keys.model is None and not keys.free:
+        return None, robot
+    if not free:
+        raise SessionError("leaves no error free", where=f"{where}.free")
+    return Purpose(keys.model, tuple(keys.free)), robot
+
+
+def check_contacts(session: Session) -> None:
+    """Check, on the nominal machine, that a sensor touches in every posture it is read in.
+
+    Raises:
+        SessionError: Naming the setup and the posture.
+    """
+    for setup, (postures, contact) in locate_contacts(session).items():
+        for posture, problem in zip(postures, contact.problems, strict=True):
+            if problem:
+                raise SessionError(
+                    f"in posture '{posture}' {problem}",
+                    where=_where(session.path, f"setups.{setup}.{contact.key}"),
+                )
+
+
+def _where(path: Path | None, key: str) -> str:
+    return key if path is None else f"{path}: {key}"
+
+
+def _read_keys(path: Path) -> tuple[Path, bytes, SessionKeys]:
+    file = path / SESSION if is_folder(path) else path
+    if file.suffix.lower() in OTHER_KINDS:
+        raise SessionError("is no session.yaml", where=str(file))
+    if file is not path and not exists(file):
+        raise SessionError(f"there is no such file{_what_is_there(path)}", where=str(file))
+    content = read_file(file, error=SessionError)
+    data = read_yaml(file, error=SessionError, content=content)
+    return file, content, validate(SessionKeys, data, where=str(file), error=SessionError)
+
+
+def _what_is_there(folder: Path) -> str:
+    """What a folder without a session holds instead, as the end of a message."""
+    if exists(folder / "calibration.json"):
+        return "; the folder holds a calibration: name the session that it was made from"
+    own = sorted(f.parent for f in islice(folder.glob(f"*/{SESSION}"), MOST_LOOKED_AT))
+    if not own:
+        return ""
+    more = ", ..." if len(own) > MOST_NAMED else ""
+    return f"; sessions in it: {', '.join(map(str, own[:MOST_NAMED]))}{more}"
+
+
+_Setups = Mapping[str, tuple[SetupKeys, Sensor]]
+
+
+def _read_setups(file: Path, keys: SessionKeys) -> _Setups:
+    """What the file says of each setup, and the sensor that stands there."""
+    gauges = keys.gauges or {"": keys.gauge or GaugeKeys()}
+    only = next(iter(gauges.values())) if len(gauges) == 1 else GaugeKeys()
+    found = {}
+    for name, data in keys.setups.items():
+        named = data.get("gauge")
+        gauge = gauges.get(named, only) if isinstance(named, str) else only
+        given = gauge.model_dump(include={"tip", "scale_tolerance"}, exclude_none=True)
+        found[name] = read_setup(
+            data, where=str(file), under=f"setups.{name}", error=SessionError, gauge=given
+        )
+    return found
+
+
+def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
+    """Everything of a session but its readings."""
+    try:
+        robot = load_robot(keys.robot, beside=file.parent)
+    except RobotError as e:
+        if e.where is None:
+            raise SessionError(e.problem, where=f"{file}: robot") from None
+        raise
+    require_given_zero(robot, f"{file}: robot")
+    purpose, robot = read_purpose(keys.calibration, robot, where=f"{file}: calibration")
+    offsets = build_offsets(keys.controller, robot, f"{file}: controller")
+    gauges = _build_gauges(keys)
+    setups = {}
+    for name, (setup, sensor) in read.items():
+        where = f"{file}: setups.{name}"
+        sensor.require_fit(robot, where=where)
+        setups[name] = Setup(name, sensor, _gauge_of(setup, gauges, where))
+    _check_shared(setups, str(file))
+    _check_planned_postures(file, keys, read)
+    return Session(
+        robot=robot,
+        robot_reference=keys.robot,
+        title=keys.title,
+        source=keys.source,
+        gauges=gauges,
+        postures=_build_postures(keys, robot, offsets, file),
+        setups=setups,
+        readings=(),
+        controller_offsets=offsets,
+        path=file,
+        readings_path=None,
+        sha256="",
+        purpose=purpose,
+    )
+
+
+def _check_shared(setups: Mapping[str, Setup], file: str) -> None:
+    """Refuse setups that share what they cannot: at another place, or known otherwise."""
+    first: dict[tuple[str, str], tuple[Setup, Unknown]] = {}
+    for setup in setups.values():
+        for unknown in setup.sensor.unknowns:
+            owner = f"gauge {setup.gauge}" if unknown.of_gauge else unknown.shared_by
+            if owner is None:
+                continue
+            before, known = first.setdefault((owner, unknown.name), (setup, unknown))
+            if not unknown.of_gauge and before.sensor.place != setup.sensor.place:
+                problem = f"stands at {' '.join(before.sensor.place)}"
+            elif known.tolerance != unknown.tolerance:
+                problem = f"has it known to {known.tolerance:g} {known.unit}"
+            else:
+                continue
+            raise SessionError(
+                f"shares the {unknown.name} of '{owner}' with '{before.name}', which {problem}",
+                where=f"{file}: setups.{setup.name}",
+            )
+
+
+def _build_gauges(keys: SessionKeys) -> dict[str, Gauge]:
+    given = keys.gauges or {"": keys.gauge or GaugeKeys()}
+    return {
+        name: Gauge(
+            None if g.sigma_mm is None else g.sigma_mm * MM,
+            None if g.resolution_mm is None else g.resolution_mm * MM,
+            None if g.range_mm is None else (g.range_mm[0] * MM, g.range_mm[1] * MM),
+        )
+        for name, g in given.items()
+    }
+
+
+def _gauge_of(setup: SetupKeys, gauges: Mapping[str, Gauge], where: str) -> str:
+    """Name of a setup's gauge."""
+    if setup.gauge is None:
+        if len(gauges) > 1:
+            raise SessionError(
+                f"is missing; expected one of {', '.join(gauges)}", where=f"{where}.gauge"
+            )
+        return next(iter(gauges))
+    if setup.gauge not in gauges or not setup.gauge:
+        named = ", ".join(name for name in gauges if name)
+        raise SessionError(
+            f"'{setup.gauge}' is not a gauge; "
+            + (f"gauges: {named}" if named else "the session names none under `gauges`"),
+            where=f"{where}.gauge",
+        )
+    return setup.gauge
+
+
+def _check_planned_postures(file: Path, keys: SessionKeys, read: _Setups) -> None:
+    for name, (setup, _) in read.items():
+        where = f"{file}: setups.{name}.postures"
+        seen: set[str] = set()
+        for posture in setup.postures or ():
+            if posture not in keys.postures:
+                raise SessionError(
+                    f"'{posture}' is not a posture; postures: {', '.join(keys.postures)}",
+                    where=where,
+                )
+            if posture in seen:
+                raise SessionError(f"'{posture}' stands twice", where=where)
+            seen.add(posture)
+
+
+def _check_count(values: Sequence[float], robot: Robot, where: str) -> None:
+    if len(values) != len(robot.drives):
+        names = ", ".join(d.name for d in robot.drives)
+        raise SessionError(
+            f"has {len(values)} numbers; expected {len(robot.drives)}, one a drive: {names}",
+            where=where,
+        )
+
+
+def _build_postures(
+    keys: SessionKeys, robot: Robot, offsets: Array | None, file: Path
+) -> dict[str, Posture]:
+    """Commanded drive coordinates of all postures, through the nominal inverse kinematics."""
+    assembly = nominal_assembly(robot)
+    active = np.zeros(len(robot.drives)) if offsets is None else offsets
+    stated = [] if keys.controller is None else keys.controller.stated
+    nominal: dict[str, Array] = {}
+    given: dict[str, tuple[Any, Array]] = {}
+    targets: dict[str, Array] = {}
+    for name, posture in keys.postures.items():
+        where = f"{file}: postures.{name}"
+        if posture.tcp_mm is not None:
+            if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
+                raise SessionError(
+                    f"{robot.name} cannot be commanded by its tool; give joints", where=where
+                )
+            if len(posture.tcp_mm) != len(robot.drives):
+                raise SessionError(
+                    f"has {len(posture.tcp_mm)} coordinates; expected {len(robot.drives)}",
+                    where=f"{where}.tcp_mm",
+                )
+            given[name] = ("tcp_mm", np.array(posture.tcp_mm) * MM)
+            targets[name] = given[name][1]
+            continue
+        form = "joints_mm" if posture.joints_mm is not None else "joints_deg"
+        values = posture.joints_mm or posture.joints_deg or []
+        _check_count(values, robot, f"{where}.{form}")
+        unit = "m" if form == "joints_mm" else "rad"
+        for drive in robot.drives:
+            if drive.unit != unit:
+                raise SessionError(
+                    f"drive {drive.name} is in {'mm' if drive.unit == 'm' else 'deg'}",
+                    where=f"{where}.{form}",
+                )
+        si = np.array(values) * MM if unit == "m" else np.deg2rad(values)
+        given[name] = (form, si)
+        nominal[name] = si
+    if targets:
+        try:
+            joints = assembly.inverse(np.array(list(targets.values())), names=list(targets))
+        except ClosureError as e:
+            raise SessionError(e.reason, where=f"{file}: postures.{e.posture}") from None
+        nominal.update(zip(targets, joints, strict=True))
+    for name in keys.postures:
+        _check_travel(robot, nominal[name], where=f"{file}: postures.{name}")
+        where = f"{file}: controller.{' and '.join(stated)}: in posture '{name}'"
+        _check_travel(robot, nominal[name] - active, where=where, joiner=" ")
+    try:
+        assembly.close(np.array([nominal[n] for n in keys.postures]), names=list(keys.postures))
+    except ClosureError as e:
+        raise SessionError(e.reason, where=f"{file}: postures.{e.posture}") from None
+    return {
+        name: Posture(
+            name, given[name][0], read_only(given[name][1]), read_only(nominal[name] - active)
+        )
+        for name in keys.postures
+    }
+
+
+def _check_travel(robot: Robot, drives: Array, *, where: str, joiner: str = ": ") -> None:
+    """Refuse drive coordinates beyond a drive's travel."""
+    for drive, value in zip(robot.drives, drives, strict=True):
+        if not drive.lower - 1e-9 <= value <= drive.upper + 1e-9:
+            unit, size = DRIVE_UNITS[drive.unit]
+            file, _, key = where.partition(": ")
+            problem = (
+                f"{key}{joiner}{drive.name} would be at {value / size:.2f} {unit}; it reaches "
+                f"from {drive.lower / size:g} to {drive.upper / size:g} {unit}"
+            )
+            raise SessionError(problem, where=file)

@@ -1,0 +1,154 @@
+"""Sessions to files: session.yaml with its readings in a CSV beside it, in mm."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from orthocal.io.files import write_files
+from orthocal.robot.loading import packaged_robots
+from orthocal.sensors.registry import write_sensor
+from orthocal.session.session import Gauge, Purpose, Reading, Session
+from orthocal.units import MM, tidy, to_mm
+
+COLUMNS = ("setup", "posture", "minus", "cycle", "reading_mm")
+"""Columns of a readings.csv; `minus` and `cycle` may be absent."""
+
+
+def session_document(session: Session, *, readings: str = "readings.csv") -> dict[str, Any]:
+    """The session.yaml of a session, as plain data."""
+    document: dict[str, Any] = {"robot": session.robot_reference}
+    if session.title:
+        document["title"] = session.title
+    if session.source:
+        document["source"] = session.source
+    gauges = {name: _gauge_document(g) for name, g in session.gauges.items()}
+    if "" not in gauges:
+        document["gauges"] = gauges
+    elif gauges[""]:
+        document["gauge"] = gauges[""]
+    document["postures"] = {
+        p.name: {
+            p.form: [tidy(np.rad2deg(v)) if p.form == "joints_deg" else to_mm(v) for v in p.values]
+        }
+        for p in session.postures.values()
+    }
+    if session.controller_offsets is not None:
+        document["controller"] = _offsets_document(session)
+    if calibration := _calibration_document(session):
+        document["calibration"] = calibration
+    document["setups"] = {
+        s.name: {**write_sensor(s.sensor), **({"gauge": s.gauge} if s.gauge else {})}
+        for s in session.setups.values()
+    }
+    document["readings"] = readings
+    return document
+
+
+def _gauge_document(gauge: Gauge) -> dict[str, Any]:
+    entries = {
+        "sigma_mm": None if gauge.sigma is None else to_mm(gauge.sigma),
+        "resolution_mm": None if gauge.resolution is None else to_mm(gauge.resolution),
+        "range_mm": None if gauge.range is None else [to_mm(v) for v in gauge.range],
+    }
+    return {k: v for k, v in entries.items() if v is not None}
+
+
+def _calibration_document(session: Session) -> dict[str, Any]:
+    """What it is measured for, and with which tolerances."""
+    purpose = session.purpose or Purpose()
+    entries = {
+        "model": purpose.model,
+        "free": list(purpose.free),
+        "tolerances": dict(session.robot.parameters.stated),
+    }
+    return {key: value for key, value in entries.items() if value}
+
+
+def _offsets_document(session: Session) -> dict[str, list[float]]:
+    """Offsets of prismatic drives in mm, of revolute ones in mrad."""
+    document: dict[str, list[float]] = {}
+    for drive, offset in zip(session.robot.drives, session.active_offsets, strict=True):
+        key = "offsets_mm" if drive.unit == "m" else "offsets_mrad"
+        document.setdefault(key, []).append(tidy(float(offset) / MM))
+    return document
+
+
+def write_session(
+    session: Session,
+    folder: str | Path,
+    *,
+    decimals: int = 6,
+    comment: str = "",
+    extra: Mapping[str, str] | None = None,
+    blank: bool = False,
+) -> Path:
+    """Write session.yaml and readings.csv into a folder, both or neither.
+
+    Args:
+        session: The session.
+        folder: Made if need be.
+        decimals: Decimals of a reading in mm.
+        comment: Lines put first into the YAML.
+        extra: Other files of the folder, name to text, written with them.
+        blank: Whether readings are left empty, to be filled in.
+
+    Returns:
+        Path of the session.yaml.
+
+    Raises:
+        OrthocalError: If the folder cannot be written to.
+    """
+    folder = Path(folder)
+    document = session_document(session)
+    if session.robot_reference not in packaged_robots():
+        document["robot"] = os.path.relpath(session.robot.folder.resolve(), folder.resolve())
+    head = "".join(f"# {line}\n" for line in comment.splitlines())
+    text = head + yaml.safe_dump(
+        document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
+    )
+    table = readings_table(
+        session.readings, [None if blank else r.value for r in session.readings], decimals=decimals
+    )
+    files = {"session.yaml": text, "readings.csv": table, **(extra or {})}
+    write_files(folder, files)
+    return folder / "session.yaml"
+
+
+def readings_table(
+    rows: Sequence[Reading], values: Sequence[float | None], *, decimals: int = 6
+) -> str:
+    """Text of a readings.csv.
+
+    Args:
+        rows: What is read where.
+        values: Their readings, [m]; None for a cell that stays empty.
+        decimals: Decimals of a reading in mm.
+    """
+    table = io.StringIO()
+    with_minus = any(r.minus for r in rows)
+    with_cycle = any(r.cycle != 1 for r in rows)
+    columns = [c for c in COLUMNS if (c != "minus" or with_minus) and (c != "cycle" or with_cycle)]
+    table.write(",".join(columns) + "\n")
+    for r, value in zip(rows, values, strict=True):
+        fields = {
+            "setup": r.setup,
+            "posture": r.posture,
+            "minus": r.minus or "",
+            "cycle": str(r.cycle),
+            "reading_mm": "" if value is None else _trim(f"{value / MM:.{decimals}f}"),
+        }
+        table.write(",".join(fields[c] for c in columns) + "\n")
+    return table.getvalue()
+
+
+def _trim(number: str) -> str:
+    """A decimal number without trailing zeros beyond the second decimal."""
+    whole, _, decimals = number.partition(".")
+    return f"{whole}.{decimals.rstrip('0').ljust(2, '0')}"

@@ -1,0 +1,1 @@
+"""Import of readings from spreadsheets and tables."""

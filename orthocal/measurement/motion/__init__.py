@@ -1,0 +1,1 @@
+"""Motion from posture to posture while measuring, and programs for it."""

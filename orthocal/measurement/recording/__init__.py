@@ -1,0 +1,1 @@
+"""Recording of readings at the machine, one at a time."""

@@ -1,0 +1,1 @@
+"""Predicted readings: linearisation, batches, simulation."""

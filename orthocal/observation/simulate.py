@@ -1,0 +1,326 @@
+"""Readings of a machine whose errors are known. Simulated data always says that it is simulated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from orthocal.arguments import require_kind, require_names, require_numbers, require_seed
+from orthocal.errors import ParameterError, SessionError
+from orthocal.io.documents import Number, parse_number, read_yaml, validate
+from orthocal.observation.observations import Observations, build_observations
+from orthocal.observation.sensor_frames import predict_entries
+from orthocal.observation.sensor_groups import sensor_unknowns
+from orthocal.robot.model import Robot
+from orthocal.session.session import Reading, Session
+from orthocal.units import MM, to_mm
+
+Array = NDArray[np.float64]
+
+LARGEST_ZERO = 0.2e-3
+"""What a dial shows in the first posture of its setup is drawn from ± this, [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedSession:
+    """A session of simulated readings and what it was simulated from."""
+
+    session: Session
+    errors: Mapping[str, float]
+    """Parameter name to true value, [SI]."""
+    zeros: Mapping[str, float]
+    """Setup to the true zero of its gauge, [m]."""
+    unknowns: Mapping[str, float] = field(default_factory=dict)
+    """What of the sensors is not known exactly: name to true value, [SI]."""
+
+
+def draw_errors(
+    robot: Robot,
+    patterns: Sequence[str],
+    *,
+    seed: int,
+    tolerances: Mapping[str, float] | None = None,
+) -> dict[str, float]:
+    """Errors drawn from the tolerances: independent, normal, with mean 0.
+
+    Args:
+        robot: The robot.
+        patterns: Names or globs of the parameters to draw; '!' takes out. Of a sum and the errors
+            that it is made of only these are drawn.
+        seed: Of the random numbers.
+        tolerances: Name or glob with its unit, such as `*.offset_mm`, to another standard deviation
+            than the robot's.
+
+    Raises:
+        ParameterError: If a pattern matches nothing.
+    """
+    require_kind(robot, Robot, expected="a Robot, such as load_robot(...)")
+    require_names(patterns, argument="patterns")
+    require_seed(seed)
+    rng = np.random.default_rng(seed)
+    parameters = robot.parameters
+    chosen = parameters.select(patterns)
+    # a sum beside the errors that it is made of would be drawn twice
+    chosen = tuple(
+        n
+        for n in chosen
+        if len(parameters[n].terms) == 1 or not {t for t, _ in parameters[n].terms} & set(chosen)
+    )
+    given = parameters.read_tolerances(tolerances or {})
+    own = {n: value for g, value in given.items() for n in parameters.select([g])}
+    return {
+        name: float(rng.normal() * own.get(name, parameters[name].tolerance)) for name in chosen
+    }
+
+
+def simulate_session(
+    plan: Session,
+    errors: Mapping[str, float],
+    *,
+    seed: int = 0,
+    sigma: float | None = None,
+    exact: bool = False,
+) -> SimulatedSession:
+    """Readings of a plan (or of another session's rows) on a machine with given errors.
+
+    Args:
+        plan: What is read where.
+        errors: Parameter name to value, [SI]; absent ones are 0.
+        seed: Of noise and gauge zeros.
+        sigma: Standard deviation of a reading, [m]; the plan's gauge by default.
+        exact: No noise, no rounding to the gauge's resolution; dials show 0 where they begin.
+
+    Raises:
+        SessionError: If the noise is not known, or a reading does not exist or leaves the gauge's
+            range.
+        ClosureError: If the machine cannot reach a posture.
+    """
+    require_kind(plan, Session, expected="a Session, such as load_plan(...)")
+    require_numbers(errors, argument="errors")
+    require_seed(seed)
+    if sigma is not None and not 0.0 <= sigma < math.inf:
+        raise ValueError(f"sigma: found {sigma!r}; expected a number of at least 0")
+    rng = np.random.default_rng(seed)
+    observations = build_observations(plan)
+    unknown = sensor_unknowns(plan).parameters
+    drawn = np.zeros(len(unknown))
+    if unknown and not exact:
+        # their own, so that noise is the same whatever is not known of the gauges
+        own = np.random.default_rng((seed, 1)).normal(size=len(unknown))
+        drawn = own * [p.tolerance for p in unknown]
+    entries = predict_entries(plan, observations, errors, unknowns=drawn)
+    entries, zeros = show_readings(plan, observations, entries, rng=rng, sigma=sigma, exact=exact)
+    rows = observations.rows(entries)
+    for reading, value in zip(plan.readings, rows, strict=True):
+        if not math.isfinite(value):
+            raise SessionError(
+                f"the simulated reading {reading.label} does not exist: on this machine the tip "
+                "passes what it should touch; take smaller errors, or another seed"
+            )
+        gauge_name, limits = plan.setups[reading.setup].gauge, limits_of(plan, reading)
+        if limits is not None and not limits[0] <= value <= limits[1]:
+            beyond = limits[0] if value < limits[0] else limits[1]
+            raise SessionError(
+                f"the simulated reading {reading.label} is {value / MM:.3f} mm; the gauge's "
+                f"range ends at {beyond / MM:g} mm",
+                where=_where(plan, gauge_name, "range_mm") if plan.path is not None else None,
+            )
+    session = replace(
+        plan.with_values(rows),
+        gauges={
+            name: replace(g, resolution=None) if exact else g for name, g in plan.gauges.items()
+        },
+        title=plan.title if plan.title.startswith("Simulated") else f"Simulated: {plan.title}",
+        source=f"Simulated by orthocal, not measured (seed {seed})",
+        path=None,
+        readings_path=None,
+    )
+    found = {p.name: float(v) for p, v in zip(unknown, drawn, strict=True)}
+    return SimulatedSession(session, dict(errors), zeros, found)
+
+
+def show_readings(
+    plan: Session,
+    observations: Observations,
+    entries: Array,
+    *,
+    rng: np.random.Generator,
+    sigma: float | None = None,
+    exact: bool = False,
+) -> tuple[Array, dict[str, float]]:
+    """What dials show of what there is to read: with their zeros, noise and rounding.
+
+    Args:
+        plan: What is read where.
+        observations: Its readings as single ones.
+        entries: What there is to read, gauge zeros at 0, shape (n_entries,), [m].
+        rng: Draws zeros and noise.
+        sigma: Standard deviation of a reading, [m]; the plan's gauge by default.
+        exact: No noise, no rounding to the gauge's resolution; dials show 0 where they begin.
+
+    Returns:
+        Shape (n_entries,), [m], and setup to the zero of its gauge, [m].
+
+    Raises:
+        SessionError: If the noise is not known.
+    """
+    gauges = [plan.gauges[s.gauge] for s in plan.setups.values()]
+    deviation = np.array([_noise_of(plan, s.gauge, sigma, exact) for s in plan.setups.values()])
+    # the dial is set where its setup begins
+    zeros = dict.fromkeys(plan.setups, 0.0)
+    for i, name in enumerate(zeros):
+        zeros[name] = -float(entries[observations.setup == i][:1].sum())
+        if not exact:
+            zeros[name] += round(float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO)), 6)
+    entries = entries + np.array(list(zeros.values()))[observations.setup]
+    if not exact:
+        entries = entries + deviation[observations.setup] * rng.normal(size=observations.size)
+        for i, gauge in enumerate(gauges):
+            if gauge.resolution is not None:
+                own = observations.setup == i
+                entries[own] = np.round(entries[own] / gauge.resolution) * gauge.resolution
+    return entries, zeros
+
+
+def limits_of(plan: Session, reading: Reading) -> tuple[float, float] | None:
+    """Lowest and highest value that a reading can have, [m]; None where the gauge says none."""
+    found = plan.gauges[plan.setups[reading.setup].gauge].range
+    if found is None or reading.minus is None:
+        return found
+    return found[0] - found[1], found[1] - found[0]
+
+
+def _noise_of(plan: Session, gauge: str, sigma: float | None, exact: bool) -> float:
+    """Standard deviation that a gauge's readings are simulated with, [m]."""
+    deviation = plan.gauges[gauge].sigma if sigma is None else sigma
+    if deviation is None and not exact:
+        raise SessionError(
+            "is missing: the noise to simulate is not known",
+            where=_where(plan, gauge, "sigma_mm"),
+        )
+    return deviation or 0.0
+
+
+def _where(plan: Session, gauge: str, key: str) -> str:
+    path = f"gauges.{gauge}.{key}" if gauge else f"gauge.{key}"
+    return path if plan.path is None else f"{plan.path}: {path}"
+
+
+class _TruthKeys(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    errors: Annotated[dict[str, Number], Field(min_length=1)]
+    zeros_mm: dict[str, Number] = {}
+    sensors: dict[str, Number] = {}
+
+
+def load_errors(path: str | Path, robot: Robot) -> dict[str, float]:
+    """Errors from a YAML file: `errors:` with keys such as x_slide.offset_mm.
+
+    Returns:
+        Parameter name to value, [SI].
+
+    Raises:
+        ParameterError: Naming file and key.
+    """
+    file = Path(path)
+    data = read_yaml(file, error=ParameterError)
+    keys = validate(_TruthKeys, data, where=str(file), error=ParameterError)
+    return read_errors(keys.errors, robot, where=f"{file}: errors")
+
+
+def collect_errors(
+    robot: Robot,
+    *,
+    file: Path | None = None,
+    single: Sequence[str] = (),
+    draw: str | None = None,
+    tolerances: Mapping[str, float] | None = None,
+    seed: int = 0,
+) -> dict[str, float]:
+    """Errors drawn, then from a file, then given singly; later ones win.
+
+    Args:
+        robot: The robot.
+        file: As for `load_errors`.
+        single: Texts such as x_slide.offset_mm=1.2.
+        draw: Model of the robot, or names and globs with commas between, to draw.
+        tolerances: For drawing, as for `draw_errors`.
+        seed: Of the random numbers.
+
+    Raises:
+        ParameterError: If a name, unit or number does not fit, or nothing is given.
+    """
+    errors: dict[str, float] = {}
+    if draw is not None:
+        models = robot.parameters.models
+        own = draw in models
+        patterns = robot.parameters.patterns(draw) if own else tuple(draw.split(","))
+        try:
+            errors.update(draw_errors(robot, patterns, seed=seed, tolerances=tolerances))
+        except ParameterError:
+            raise ParameterError(
+                f"'{draw}' is neither a model ({', '.join(models)}) nor the name of an error "
+                "parameter",
+                where="--draw",
+            ) from None
+    if file is not None:
+        errors.update(load_errors(file, robot))
+    for text in single:
+        key, equals, number = text.partition("=")
+        if not equals:
+            raise ParameterError(f"found '{text}'; expected NAME=VALUE", where="--error")
+        value = parse_number(number, where="--error", name=key, error=ParameterError)
+        errors.update(read_errors({key: value}, robot, where="--error"))
+    if not errors:
+        raise ParameterError("no errors: give them by --errors, --error or --draw")
+    return errors
+
+
+def read_errors(values: Mapping[str, float], robot: Robot, *, where: str) -> dict[str, float]:
+    """Errors from keys that carry their unit, [SI].
+
+    Raises:
+        ParameterError: Naming the key.
+    """
+    errors: dict[str, float] = {}
+    for key, value in values.items():
+        try:
+            name, si = robot.parameters.read_quantity(key, value)
+        except ParameterError as e:
+            raise ParameterError(e.problem, where=where) from None
+        if name in errors:
+            raise ParameterError(f"'{name}' is given twice", where=where)
+        errors[name] = si
+    return errors
+
+
+def truth_document(simulated: SimulatedSession) -> str:
+    """The text of a truth.yaml: the errors and zeros that a session was simulated from."""
+    parameters = simulated.session.robot.parameters
+    errors = {}
+    for name, value in simulated.errors.items():
+        p = parameters[name]
+        errors[f"{name}_{p.edge_unit}"] = float(f"{value * p.edge_factor:.9g}")
+    document = {
+        "errors": errors,
+        "zeros_mm": {name: to_mm(value) for name, value in simulated.zeros.items()},
+    }
+    if simulated.unknowns:
+        of_sensors = {p.name: p for p in sensor_unknowns(simulated.session).parameters}
+        document["sensors"] = {
+            f"{name}_{of_sensors[name].edge_unit}": float(
+                f"{value * of_sensors[name].edge_factor:.9g}"
+            )
+            for name, value in simulated.unknowns.items()
+        }
+    head = "# The truth behind the simulated readings beside this file. No calibration reads it.\n"
+    return head + str(yaml.safe_dump(document, sort_keys=False, default_flow_style=False))

@@ -1,0 +1,190 @@
+"""Readings before and after, setups predicted from others, and scatter: plots of the readings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from operator import attrgetter
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy import special
+
+from orthocal.calibration.calibration import Calibration
+from orthocal.estimation.diagnostics.residual_rows import (
+    ResidualRow,
+    root_mean_square,
+    rows_by_setup,
+)
+from orthocal.output.report.figure import (
+    AFTER_LOOK,
+    BEFORE_LOOK,
+    ROW_HEIGHT,
+    UNSEEN_LOOK,
+    count_of,
+    draw_legend,
+    open_figure,
+    open_list,
+    render_figure,
+    scale_log,
+    shade,
+)
+from orthocal.output.text.layout import short_name
+from orthocal.units import MM
+
+Array = NDArray[np.float64]
+
+_deviation, _residual, _unseen = map(attrgetter, ("deviation", "residual", "unseen"))
+
+SMALLEST_LENGTH = 1e-9
+"""What a logarithmic axis shows for smaller lengths, [m]."""
+
+MOST_POINTS = 500
+"""Points of a quantile plot: of more, the outermost and a selection of the others are shown."""
+
+
+def plot_residuals(calibration: Calibration, *, most: int = 40) -> str:
+    """Every reading before and after, the worst first: before or after, whichever is larger.
+
+    Args:
+        calibration: The calibration.
+        most: Readings that are shown.
+    """
+    count = len(calibration.residuals)
+    shown = count_of(min(most, count), count)
+    label = f"Residuals of {shown} readings before and after calibration."
+    return render_figure("residuals", label, lambda: _draw_residuals(calibration, most))
+
+
+def plot_setups(calibration: Calibration, *, most: int = 40) -> str:
+    """Root mean square of every setup before, after and as all others predict it.
+
+    Args:
+        calibration: The calibration.
+        most: Setups that are shown, those with the largest remainder first.
+    """
+    label = "Root mean square of the residuals of each setup before and after calibration."
+    return render_figure("setups", label, lambda: _draw_setups(calibration, most))
+
+
+def plot_spread(calibration: Calibration) -> str:
+    """Whether the residuals have the spread that the noise explains: a normal quantile plot."""
+    label = "Residuals after calibration in order, against those that normal noise would leave."
+    return render_figure("spread", label, lambda: _draw_spread(calibration))
+
+
+def _draw_residuals(calibration: Calibration, most: int) -> Figure:
+    found = calibration.residuals
+    rows = sorted(found, key=lambda r: -max(abs(r.deviation), abs(r.residual)))[:most]
+    title = "Readings before and after calibration, the worst first"
+    if len(rows) < len(found):
+        title = f"Readings before and after calibration: the {len(rows)} worst of {len(found)}"
+    figure, axes = open_list(title, _row_names(calibration, rows))
+    y = np.arange(len(rows))
+    before, after = (np.array([f(r) for r in rows]) / MM for f in (_deviation, _residual))
+    sigma = np.array([_row_sigma(calibration, r) for r in rows]) / MM
+    if np.isfinite(sigma).all():
+        kind = "row" if np.ptp(sigma) > 0.0 else _row_word(calibration)
+        shade(axes, y, -2.0 * sigma, 2.0 * sigma, f"±2 σ of a {kind}")
+    axes.hlines(y, before, after, color="#888888", linewidth=0.8)
+    axes.axvline(0.0, color="black", linewidth=0.8)
+    axes.plot(before, y, label="before", **BEFORE_LOOK)
+    axes.plot(after, y, label="after", **AFTER_LOOK)
+    axes.set_xlabel("measured − model [mm]")
+    draw_legend(figure, axes)
+    return figure
+
+
+def _draw_setups(calibration: Calibration, most: int) -> Figure:
+    groups = rows_by_setup(calibration.residuals)
+    names = sorted(groups, key=lambda n: -root_mean_square(map(_residual, groups[n])))[:most]
+    title = "Which setup the model fits, the worst first"
+    if len(names) < len(groups):
+        title = f"Which setup the model fits: the {len(names)} worst of {len(groups)}"
+    figure, axes = open_list(title, [short_name(n) for n in names], height=2.0 * ROW_HEIGHT)
+    y = np.arange(len(names))
+    shown = []
+    for get, shift, label, look in (
+        (_deviation, -0.2, "before", BEFORE_LOOK),
+        (_residual, 0.0, "after", AFTER_LOOK),
+        (_unseen, 0.2, "predicted from all other setups", UNSEEN_LOOK),
+    ):
+        sizes = np.array([root_mean_square(map(get, groups[n])) for n in names])
+        known = np.isfinite(sizes)
+        if known.any():
+            sizes = np.maximum(sizes[known], SMALLEST_LENGTH) / MM
+            axes.plot(sizes, y[known] + shift, label=label, **look)
+            shown.append(sizes)
+    if math.isfinite(calibration.sigma) and calibration.sigma > SMALLEST_LENGTH:
+        sigma = calibration.sigma / MM
+        axes.axvline(sigma, color="black", linestyle=":", label=f"σ of a {_row_word(calibration)}")
+        shown.append(np.array([sigma]))
+    scale_log(axes, "x", np.concatenate(shown))
+    axes.set_xlabel("r.m.s. of measured − model [mm], logarithmic")
+    draw_legend(figure, axes)
+    return figure
+
+
+def _draw_spread(calibration: Calibration) -> Figure:
+    found = calibration.residuals
+    word = _row_word(calibration)
+    single = np.array([_residual(r) / _noise_factor(r) for r in found])
+    values = np.sort(single) * calibration.row_factor / MM
+    quantiles = special.ndtri((np.arange(values.size) + 0.5) / values.size)
+    chosen = _thin(values.size)
+    figure = open_figure(3.8, "Do the residuals scatter as the noise explains?")
+    axes = figure.subplots()
+    label = f"residuals after: {count_of(chosen.size, values.size)}"
+    look = {**AFTER_LOOK, "markersize": 3.5}
+    axes.plot(quantiles[chosen], values[chosen], label=label, **look)
+    # what parameters and gauge zeros have taken up is missing in the residuals
+    part = math.sqrt(min(calibration.noise.residual_dof / values.size, 1.0))
+    gauge = calibration.session.gauge_sigma
+    given = math.nan if gauge is None else gauge * calibration.row_factor
+    reach = np.array([-1.0, 1.0]) * max(abs(float(quantiles[0])), 1.0)
+    for sigma, name, line in (
+        (calibration.sigma, f"σ of a {word}", "-"),
+        (given, "σ given for the gauge", "--"),
+    ):
+        if math.isfinite(sigma):
+            label = f"{name}: {sigma / MM:.2g} mm"
+            axes.plot(reach, reach * part * sigma / MM, color="black", linestyle=line, label=label)
+    axes.grid(True)
+    axes.set_xlabel(
+        "normal quantile: what pure noise would give at the same place in the order [σ]\n"
+        "lines: what is left of σ when parameters and gauge zeros have taken up their part"
+    )
+    axes.set_ylabel("residual after [mm]")
+    draw_legend(figure, axes)
+    return figure
+
+
+def _noise_factor(row: ResidualRow) -> float:
+    """Standard deviation of a row over that of one reading."""
+    return math.sqrt(2.0) if row.minus else 1.0
+
+
+def _row_sigma(calibration: Calibration, row: ResidualRow) -> float:
+    return calibration.sigma * _noise_factor(row) / calibration.row_factor
+
+
+def _row_word(calibration: Calibration) -> str:
+    return "difference" if calibration.rows_are_differences else "reading"
+
+
+def _row_names(calibration: Calibration, rows: Sequence[ResidualRow]) -> list[str]:
+    """Setup and postures of rows, and the cycle where there are several."""
+    repeated = any(r.cycle != 1 for r in calibration.residuals)
+    return [short_name(f"{r.label}, cycle {r.cycle}" if repeated else r.label) for r in rows]
+
+
+def _thin(count: int) -> NDArray[np.int64]:
+    """Positions in an order that are drawn: of many, the outermost and a selection between."""
+    if count <= MOST_POINTS:
+        return np.arange(count)
+    edge = MOST_POINTS // 4
+    between = np.linspace(edge, count - 1 - edge, MOST_POINTS - 2 * edge).round()
+    return np.concatenate([np.arange(edge), between, np.arange(count - edge, count)]).astype(
+        np.int64
+    )

@@ -1,0 +1,1 @@
+"""Terminal output: answers, tables and lists as text and JSON."""

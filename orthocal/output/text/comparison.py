@@ -1,0 +1,147 @@
+"""A comparison of models as tables and sentences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from orthocal.assessment.comparison import Comparison
+from orthocal.assessment.findings.comparison import decide_comparison
+from orthocal.output.text.layout import (
+    MANY_ROWS,
+    WORST_ROWS,
+    add_row,
+    bullets,
+    mm,
+    plain,
+    section,
+    signed,
+    table_of,
+    um,
+)
+from orthocal.units import MM
+
+
+def render_comparison(comparison: Comparison, *, all_rows: bool = False) -> RenderableType:
+    """A comparison as rich renderables."""
+    c = comparison
+    source = {
+        "cycles": "as repeated cycles scatter",
+        "gauge": "as given for the gauge",
+        "unknown": "nothing tells it",
+    }[c.noise.source]
+    parts = [
+        Text("Which model do the readings support?", style="bold"),
+        Text(c.title),
+        Text(
+            f"{c.independent} independent readings; noise of one {mm(c.noise.sigma)} mm, {source}"
+        ),
+        section("Verdict", bullets([f.words for f in decide_comparison(c).findings])),
+        section("Models side by side", _scores(c)),
+        section("Estimates", _estimates(c, all_rows)),
+        section("What each leaves of the readings", _residuals(c, all_rows)),
+    ]
+    return Group(*parts)
+
+
+def _scores(comparison: Comparison) -> RenderableType:
+    sizes = ("free", "told", "r.m.s. [mm]", "χ²", "dof", "AICc", "BIC")
+    table = table_of("model", "", *sizes, "unseen [mm]", "tool [µm]", left=2)
+    for result in comparison.results:
+        after = None if result.tool is None else result.tool.after
+        checked = comparison.verdict.standing(result.model) != "no check"
+        for score in (result.linearised, result.exact):
+            first = score.method == "linearised"
+            # what can take up every reading is not judged by what it leaves of them
+            fits = (
+                plain(score.rms / MM, 4),
+                _short(score.chi_square),
+                f"{score.dof:.1f}",
+                _short(score.aicc if score.dof >= FEWEST_LEFT else math.inf),
+                _short(score.bic),
+                plain(score.unseen_rms / MM, 4),
+            )
+            add_row(
+                table,
+                result.model if first else "",
+                "linear" if first else "exact",
+                str(result.n_free) if first else "",
+                f"{result.effective:.1f}" if first else "",
+                *(fits if checked else ("–",) * len(fits)),
+                "" if after is None or first else um(after.sizes.headline.rms),
+            )
+    for u in comparison.undetermined:
+        add_row(table, u.model, "", str(u.n_free), "", "not determined", *([""] * 6))
+    return Group(
+        table,
+        Text("–: not comparable: no reading is left to check that model, or too few to spare"),
+        Text("told: effective parameters, those that the readings determine beside tolerances"),
+        Text("AICc, BIC: the lower the better"),
+        Text("unseen: error in predicting the readings of each setup from all others, r.m.s."),
+        Text(
+            "tool: what is not known of its position over the workspace, shift and rotation taken "
+            "out, r.m.s."
+        ),
+    )
+
+
+def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
+    results = comparison.results
+    if not results:
+        return Text("None: no model is determined.")
+    names = list(dict.fromkeys(n for r in results for n in r.exact.estimates))
+    small = [r for r in results if r.n_free <= 12]
+    named = {n for r in small for n in r.exact.estimates}
+    shown = [n for n in names if all_rows or n in named or n.endswith(".offset")]
+    table = table_of("parameter", "model", "linear", "exact", "± σ", "unit", left=2)
+    parameters = results[0].calibration.robot.parameters
+    spreads = {
+        r.model: dict(
+            zip([p.name for p in r.calibration.free], r.calibration.total_std, strict=True)
+        )
+        for r in results
+    }
+    for name in shown:
+        p, first = parameters[name], True
+        for r in results:
+            if name not in r.exact.estimates:
+                continue
+            linear, exact = (s.estimates[name] for s in (r.linearised, r.exact))
+            numbers = [signed(v * p.edge_factor) for v in (linear, exact)]
+            std = plain(spreads[r.model][name] * p.edge_factor)
+            add_row(table, name if first else "", r.model, *numbers, std, p.edge_unit)
+            first = False
+    lines: list[RenderableType] = [table]
+    if len(shown) < len(names):
+        lines.append(Text(f"{len(names) - len(shown)} more; --all lists every parameter."))
+    return Group(*lines)
+
+
+def _residuals(comparison: Comparison, all_rows: bool) -> RenderableType:
+    results = comparison.results
+    if not results:
+        return Text("Nothing was fitted.")
+    table = table_of("reading", *(f"{r.model} [mm]" for r in results))
+    order: Sequence[int] = range(len(comparison.labels))
+    note = ""
+    if len(comparison.labels) > MANY_ROWS and not all_rows:
+        largest = [max(abs(r.exact.residuals[i]) for r in results) for i in order]
+        order = sorted(order, key=lambda i: -largest[i])[:WORST_ROWS]
+        note = f"The {WORST_ROWS} largest of {len(comparison.labels)}; --all lists every reading."
+    for i in order:
+        add_row(table, comparison.labels[i], *(signed(r.exact.residuals[i] / MM) for r in results))
+    return Group(table, Text(note)) if note else table
+
+
+FEWEST_LEFT = 3.0
+"""Degrees of freedom below which AICc is decided by its correction, and hundredths of a parameter
+move it by more than the readings do."""
+
+
+def _short(value: float) -> str:
+    if math.isinf(value):
+        return "–"
+    return f"{value:.1f}" if math.isfinite(value) else "unknown"

@@ -1,0 +1,79 @@
+"""What was calibrated, from what and how, in lines."""
+
+from __future__ import annotations
+
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from orthocal.assessment.plausibility import describe_machine
+from orthocal.calibration.calibration import Calibration
+from orthocal.output.text.layout import counted, list_places, short_name
+
+LONGEST_LINE = 150
+"""Characters of a line whose length others decide, where there is little room."""
+
+
+def render_subject(calibration: Calibration) -> RenderableType:
+    """What was measured, and of which machine, in four lines."""
+    title = short_name(calibration.session.title, LONGEST_LINE)
+    return Group(
+        Text(_name(calibration), style="bold"),
+        *([Text(title)] if title else []),
+        Text(short_name(f"Machine: {describe_machine(calibration)}", LONGEST_LINE)),
+        Text(short_name(_measured(calibration), LONGEST_LINE)),
+    )
+
+
+def render_heading(calibration: Calibration, *, effort: bool = True) -> RenderableType:
+    """What was calibrated, from what and how, with what it took."""
+    session = calibration.session
+    return Group(
+        Text(_name(calibration), style="bold"),
+        Text(session.title),
+        *([Text(f"Source: {session.source}")] if session.source else []),
+        Text(f"Machine: {describe_machine(calibration)}"),
+        Text(_measured(calibration)),
+        Text(_solved(calibration, effort)),
+    )
+
+
+def render_origin(calibration: Calibration) -> RenderableType:
+    """Where the session is from, and how it was solved."""
+    source = calibration.session.source
+    return Group(*([Text(f"Source: {source}")] if source else []), Text(_solved(calibration, True)))
+
+
+def _name(calibration: Calibration) -> str:
+    return f"Calibration of {calibration.robot_record.name}, model '{calibration.model}'"
+
+
+def _measured(calibration: Calibration) -> str:
+    kind = "difference" if calibration.rows_are_differences else "reading"
+    read = {r.setup for r in calibration.residuals}
+    setups = [s for s in calibration.setups if s.name in read]
+    idle = [s.name for s in calibration.setups if s.name not in read]
+    places = list_places(s.sensor.place for s in setups)
+    used = {r.posture for r in calibration.residuals} | {
+        r.minus for r in calibration.residuals if r.minus
+    }
+    return (
+        f"Measured: {counted(len(calibration.residuals), kind)} in "
+        f"{counted(len(used), 'posture')}, {counted(len(setups), 'setup')} on {places}"
+        + (f"; no reading of {', '.join(idle)}" if idle else "")
+    )
+
+
+def _solved(calibration: Calibration, effort: bool) -> str:
+    solver = calibration.solver
+    with_prior = sum(p.prior for p in calibration.free)
+    prior = "tolerances as prior" if with_prior else "no prior"
+    if 0 < with_prior < len(calibration.free):
+        prior = f"{with_prior} with a prior"
+    kind = "base parameter" if calibration.base else "parameter"
+    loss = ", Huber's loss" if solver.loss == "huber" else ""
+    took = (
+        f"; {solver.name}: {solver.status}, {counted(solver.iterations, 'iteration')}, "
+        f"{solver.seconds_build:.2f} + {solver.seconds_solve:.2f} s"
+    )
+    solved = f"Solved: {counted(len(calibration.free), kind)}, {prior}{loss}"
+    return f"{solved}{took if effort else ''}"

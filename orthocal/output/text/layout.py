@@ -1,0 +1,188 @@
+"""Tables, sections and numbers as all printed results have them."""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Callable, Iterable
+
+from rich import box
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.measure import Measurement
+from rich.padding import Padding
+from rich.segment import Segment, Segments
+from rich.table import Table
+from rich.text import Text
+
+# numbers stand in tables as they stand in sentences
+from orthocal.assessment.wording import counted as counted
+from orthocal.assessment.wording import mm as mm
+from orthocal.assessment.wording import plain as plain
+from orthocal.assessment.wording import signed as signed
+from orthocal.assessment.wording import um as um
+from orthocal.estimation.diagnostics.residual_rows import ResidualRow
+from orthocal.text import printable
+
+MANY_ROWS = 60
+"""Readings above which only the worst are listed, unless all are asked for."""
+
+WORST_ROWS = 20
+
+LONGEST_NAME = 44
+"""Characters of a name that are shown where there is little room."""
+
+
+WIDTH = 100
+"""Columns of plain text."""
+
+
+SHORTEST_WORD = 12
+"""Columns that a column of words keeps when a table gets narrow; longer words are broken then."""
+
+GAP = 3
+"""Columns between those of a table."""
+
+TIGHT_GAP = 1
+"""The same where there is little room."""
+
+NEW_LINE = Segment("\n")
+
+
+class NumberTable(Table):
+    """A table whose numbers are never cut: where it is too wide each row becomes a paragraph."""
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """As rich asks for it."""
+        for gap, padding in ((GAP, (0, 1)), (TIGHT_GAP, (0, 0))):
+            if self._least_width(gap) <= options.max_width:
+                self.padding = padding
+                yield from super().__rich_console__(console, options)
+                return
+        lead = max(1, next((i for i, c in enumerate(self.columns) if c.no_wrap), 1))
+        cells = [[_plain(cell) for cell in column.cells] for column in self.columns]
+        headers = [_plain(column.header) for column in self.columns]
+        for row in zip(*cells, strict=True):
+            yield Text(" ".join(text.strip() for text in row[:lead] if text), style="bold")
+            for header, text in zip(headers[lead:], row[lead:], strict=True):
+                if text:
+                    words = f"{header}: {text}" if header else text
+                    yield Padding(Text(words), (0, 0, 0, 2))
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        """As rich asks for it; as narrow as its paragraphs are."""
+        return super().__rich_measure__(console, options).with_maximum(options.max_width)
+
+    def _least_width(self, gap: int) -> int:
+        """Columns of the console below which a number would be cut."""
+        least = gap * (len(self.columns) - 1)
+        for column in self.columns:
+            texts = [_plain(column.header), *(_plain(cell) for cell in column.cells)]
+            if column.no_wrap:
+                least += max(cell_len(text) for text in texts)
+            else:
+                words = [cell_len(word) for text in texts for word in text.split()]
+                least += min(max(words, default=0), SHORTEST_WORD)
+        return least
+
+
+def to_text(content: RenderableType, *, width: int = WIDTH) -> str:
+    """Rich renderables as plain text.
+
+    Args:
+        content: What rich can print.
+        width: Columns.
+    """
+    stream = io.StringIO()
+    console = Console(file=stream, width=width, no_color=True, highlight=False)
+    console.print(content)
+    lines = printable(stream.getvalue(), keep="\n").split("\n")
+    return "\n".join(line.rstrip() for line in lines[:-1]) + "\n"
+
+
+def print_rich(content: RenderableType) -> None:
+    """Print rich renderables: in colour on a terminal, else as plain text."""
+    if sys.stdout.isatty():
+        console = Console(highlight=False)
+        segments = [
+            s for line in console.render_lines(content, pad=False) for s in (*line, NEW_LINE)
+        ]
+        shown = (Segment(printable(s.text, keep="\n"), s.style, s.control) for s in segments)
+        console.print(Segments(shown), end="", soft_wrap=True)
+    else:
+        sys.stdout.write(to_text(content))
+    sys.stdout.flush()
+
+
+def section(title: str, body: RenderableType) -> RenderableType:
+    """A titled, indented part."""
+    return Group(Text(), Text(title, style="bold cyan"), Padding(body, (0, 0, 0, 2)))
+
+
+def bullets(sentences: list[str]) -> RenderableType:
+    """Sentences, each with a bullet."""
+    return Group(*(Text(f"• {s}") for s in sentences))
+
+
+def table_of(*columns: str, left: int = 1) -> Table:
+    """A table with a rule under its header; columns after the first are numbers."""
+    table = NumberTable(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for i, column in enumerate(columns):
+        word = i < left or column == "unit"
+        table.add_column(
+            Text(column), justify="left" if word else "right", overflow="fold", no_wrap=i >= left
+        )
+    return table
+
+
+def add_row(table: Table, *cells: str) -> None:
+    """Add a row of plain text: names come from files, and are not markup."""
+    table.add_row(*(Text(printable(cell)) for cell in cells))
+
+
+def _plain(cell: RenderableType) -> str:
+    return cell.plain if isinstance(cell, Text) else str(cell)
+
+
+def typeset(value: float, decimals: int = 3) -> str:
+    """A number with its sign for a page or a picture: with a true minus, and zero without a sign.
+
+    Args:
+        value: The number.
+        decimals: Of them.
+    """
+    rounded = round(value, decimals)
+    text = signed(rounded, decimals) if rounded else plain(0.0, decimals)
+    return text.replace("-", "−")
+
+
+def choose_rows(
+    rows: tuple[ResidualRow, ...],
+    all_rows: bool,
+    *,
+    key: Callable[[ResidualRow], float] = lambda r: abs(r.residual),
+) -> tuple[Iterable[ResidualRow], str]:
+    """All rows, or the worst of many, and a note that says so."""
+    if all_rows or len(rows) <= MANY_ROWS:
+        return rows, ""
+    worst = sorted(rows, key=key, reverse=True)[:WORST_ROWS]
+    return worst, f"The {WORST_ROWS} largest of {len(rows)}; --all lists every reading."
+
+
+def short_name(text: str, longest: int = LONGEST_NAME) -> str:
+    """A name from a file as it can be shown: printable, and not too long."""
+    shown = printable(text)
+    half = longest // 2
+    return shown if len(shown) <= longest else f"{shown[:half]}…{shown[-half + 1 :]}"
+
+
+def list_places(places: Iterable[tuple[str, str]]) -> str:
+    """Where sensors stand, such as "legs x, y, z" or "leg x and tool"."""
+    named: dict[str, list[str]] = {}
+    for kind, name in sorted(set(places)):
+        named.setdefault(kind, []).append(name)
+    words = [
+        f"{kind}{'' if len(names) == 1 else 's'} {', '.join(names)}".strip()
+        for kind, names in named.items()
+    ]
+    return " and ".join(words)

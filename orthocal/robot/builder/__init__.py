@@ -1,0 +1,1 @@
+"""Robot files of an Orthoglide with given dimensions."""

@@ -1,0 +1,1 @@
+"""Worker processes, interrupts, standard streams and the disk cache."""

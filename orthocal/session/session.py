@@ -1,0 +1,220 @@
+"""A measuring session: postures, gauge setups and readings, in SI units.
+
+A reading is what the indicator shows in a posture, or the difference of two postures, in which the
+indicator's unknown zero drops out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.arguments import require_array
+from orthocal.io.fields import read_only
+from orthocal.io.html import paragraph, table
+from orthocal.robot.model import Robot
+from orthocal.sensors.protocol import Sensor
+from orthocal.units import MM
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Purpose:
+    """Which errors are free; `calibrate` takes them where nothing else is said."""
+
+    model: str | None = None
+    """A model of the robot's YAML."""
+    free: tuple[str, ...] = ()
+    """Names or globs that are free too, or instead of a model; '!' takes out."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gauge:
+    """The indicator."""
+
+    sigma: float | None
+    """Standard deviation of one reading, [m]."""
+    resolution: float | None
+    """[m]."""
+    range: tuple[float, float] | None
+    """Lowest and highest reading, [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posture:
+    """A commanded machine position."""
+
+    name: str
+    form: Literal["tcp_mm", "joints_mm", "joints_deg"]
+    """How it was given."""
+    values: Array
+    """As given, in SI: tool coordinates or drive coordinates, [m] or [rad]."""
+    drives: Array
+    """Commanded drive coordinates ρ with the controller's offsets taken off, [m, rad]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setup:
+    """One standing of a sensor, with one unknown zero."""
+
+    name: str
+    sensor: Sensor
+    gauge: str = ""
+    """Name of what shows its readings, among the session's gauges."""
+    active: Array | None = None
+    """Offsets that were active in the controller while it stood, shape (n_drives,), [m, rad]; those
+    of the session where not given."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """What the indicator showed in a posture, or in one less in another."""
+
+    setup: str
+    posture: str
+    minus: str | None
+    """Posture whose reading was taken off; None for a reading as shown."""
+    cycle: int
+    value: float
+    """[m]."""
+    line: int | None
+    """Line in the CSV, for messages."""
+    file: Path | None = None
+    """The CSV; that of the session where not given."""
+
+    @property
+    def label(self) -> str:
+        """Setup and postures in words."""
+        return f"{self.setup} {self.posture}" + (f" − {self.minus}" if self.minus else "")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """A session of gauge readings on a robot."""
+
+    robot: Robot
+    robot_reference: str
+    """As the file names it."""
+    title: str
+    source: str
+    gauges: Mapping[str, Gauge]
+    """Name to gauge; an only one may have the name ""."""
+    postures: Mapping[str, Posture]
+    setups: Mapping[str, Setup]
+    readings: tuple[Reading, ...]
+    controller_offsets: Array | None
+    """Offsets active in the controller, shape (n_drives,), [m, rad]; None where not stated."""
+    path: Path | None
+    """The session.yaml, or None for a session that is not from a file."""
+    readings_path: Path | None
+    sha256: str
+    parts: tuple[Session, ...] = ()
+    """The sessions that were joined into this one, where they are at hand."""
+    joined: bool = False
+    """Whether several were, so that names begin with that of their session and a slash."""
+    purpose: Purpose | None = None
+    """What it is measured for, where it says so."""
+
+    @property
+    def gauge(self) -> Gauge:
+        """The gauge; of several the first, by which the others' noise is measured."""
+        return next(iter(self.gauges.values()))
+
+    def with_gauge(self, gauge: Gauge) -> Session:
+        """The same session with another gauge instead of all of its own."""
+        setups = {name: replace(s, gauge="") for name, s in self.setups.items()}
+        return replace(self, gauges={"": gauge}, setups=setups)
+
+    @property
+    def active_offsets(self) -> Array:
+        """Offsets active in the controller, 0 where not stated, shape (n_drives,), [m, rad]."""
+        if self.controller_offsets is None:
+            return np.zeros(len(self.robot.drives))
+        return self.controller_offsets
+
+    @property
+    def zero_drives(self) -> Array:
+        """Commanded drive coordinates of the mechanical zero while each setup stood.
+
+        Shape (n_setups, n_drives), [m, rad].
+        """
+        own = [s.active for s in self.setups.values()]
+        active = [self.active_offsets if a is None else a for a in own]
+        return np.asarray(self.robot.drive_zero - np.array(active))
+
+    @property
+    def values(self) -> Array:
+        """All readings, shape (n_readings,), [m]."""
+        return np.array([r.value for r in self.readings])
+
+    @property
+    def only_differences(self) -> bool:
+        """Whether every reading is a difference of two postures."""
+        return all(r.minus is not None for r in self.readings)
+
+    def where(self, reading: Reading) -> str:
+        """File and line of a reading, for messages."""
+        file = reading.file or self.readings_path
+        if file is None or reading.line is None:
+            return f"reading {reading.label}"
+        return f"{file}:{reading.line}"
+
+    def _repr_html_(self) -> str:
+        """In a notebook: the setups and what was read in each."""
+        rows = []
+        for setup in self.setups.values():
+            values = [r.value / MM for r in self.readings if r.setup == setup.name]
+            span = (f"{min(values):+.3f}", f"{max(values):+.3f}") if values else ("", "")
+            rows.append((setup.name, setup.sensor.describe(), str(len(values)), *span))
+        kind = "differences" if self.only_differences else "readings"
+        about = f"{len(self.readings)} {kind} in {len(self.postures)} postures"
+        headers = ("setup", "what is read", kind, "least [mm]", "largest [mm]")
+        return (
+            paragraph(f"Session on {self.robot.name}: {self.title}")
+            + (paragraph(f"Source: {self.source}") if self.source else "")
+            + table(headers, rows, left=2)
+            + paragraph(about)
+        )
+
+    def with_controller(self, offsets: ArrayLike) -> Session:
+        """The same session with other offsets active in the controller than it states.
+
+        Args:
+            offsets: Shape (n_drives,), [m, rad].
+        """
+        active = require_array(offsets, shape=(len(self.robot.drives),), argument="offsets")
+        shift = self.active_offsets - active
+        postures = {
+            name: replace(p, drives=read_only(p.drives + shift))
+            for name, p in self.postures.items()
+        }
+        return replace(self, postures=postures, controller_offsets=read_only(active), sha256="")
+
+    def with_tolerances(self, given: Mapping[str, float]) -> Session:
+        """The same session of a robot whose errors have other tolerances.
+
+        Args:
+            given: Name or glob with its unit to one standard deviation.
+
+        Raises:
+            ParameterError: If a name or unit is unknown, or a number makes no sense.
+        """
+        return replace(self, robot=self.robot.with_tolerances(given)) if given else self
+
+    def with_values(self, values: Sequence[float] | Array) -> Session:
+        """The same session with other readings.
+
+        Args:
+            values: Shape (n_readings,), [m].
+        """
+        given = require_array(values, shape=(len(self.readings),), argument="values")
+        changed = tuple(
+            replace(r, value=float(v)) for r, v in zip(self.readings, given, strict=True)
+        )
+        return replace(self, readings=changed, sha256="")

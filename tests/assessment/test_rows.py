@@ -1,0 +1,152 @@
+"""Tables row by row: the same numbers as all at once, and no row stops another."""
+
+from __future__ import annotations
+
+import csv
+import io
+import sys
+
+import numpy as np
+import pytest
+
+from orthocal import assess_tool, calibrate, cli
+from orthocal.assessment import tool_tables as module
+from orthocal.assessment.tool_error import Workspace
+from orthocal.assessment.tool_tables import accuracy_rows, forward_rows, inverse_rows
+from orthocal.calibration.file import write_calibration
+
+OUT_OF_REACH = [0.0, 0.0, 0.9]
+BEYOND_TRAVEL = [0.1, 0.0, 0.0]
+
+
+@pytest.fixture(scope="module")
+def calibration(experiment_2):
+    return calibrate(experiment_2)
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    monkeypatch.setattr(module, "ROWS_AT_ONCE", 7)
+
+
+@pytest.fixture(scope="module")
+def points():
+    return np.random.default_rng(0).uniform(-0.05, 0.05, (20, 3))
+
+
+def joined(chunks):
+    return np.concatenate([c.values for c in chunks])
+
+
+def test_chunks_are_the_whole(calibration, points):
+    chunks = list(inverse_rows(calibration, points))
+    assert [c.first for c in chunks] == [0, 7, 14]
+    drives = joined(chunks)
+    assert drives == pytest.approx(calibration.machine.inverse(points), abs=1e-12)
+    assert joined(forward_rows(calibration, drives)) == pytest.approx(points, abs=1e-12)
+    whole = assess_tool(calibration, Workspace.even(points))
+    found = joined(accuracy_rows(calibration, points))
+    assert whole.after is not None
+    sigma = np.sqrt(np.diagonal(whole.after.covariance, axis1=1, axis2=2))
+    expected = np.hstack([whole.targets, whole.deviation, sigma])
+    assert found == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("table", [inverse_rows, accuracy_rows])
+def test_rows_that_cannot_be_reached_are_named_and_the_others_served(table, calibration, points):
+    odd = np.array(points)
+    odd[3], odd[12], odd[13] = OUT_OF_REACH, BEYOND_TRAVEL, [np.nan, 0.0, 0.0]
+    names = [f"file:{i + 2}" for i in range(len(odd))]
+    chunks = list(table(calibration, odd, names=names))
+    refused = {i: e for c in chunks for i, e in c.refused.items()}
+    assert sorted(refused) == [3, 12, 13]
+    assert "the loops stay open by" in refused[3].reason
+    assert "outside its limits" in refused[12].reason
+    assert "not numbers" in refused[13].reason
+    assert refused[12].posture == "file:14"
+    found, expected = joined(chunks), joined(table(calibration, points))
+    served = np.setdiff1d(np.arange(len(odd)), list(refused))
+    assert found[served] == pytest.approx(expected[served], abs=1e-12)
+    assert np.isnan(found[list(refused)]).all()
+
+
+def test_joints_beyond_the_travel_are_refused_one_by_one(calibration):
+    chunks = list(forward_rows(calibration, [[0.31, 0.31, 0.31], [0.5, 0.31, 0.31]]))
+    assert np.isfinite(chunks[0].values[0]).all()
+    assert chunks[0].refused[1].reason == "x_slide_mm is 500; the drive reaches from 120 to 390"
+
+
+@pytest.fixture
+def orthocal(monkeypatch, capsys, tmp_path, calibration):
+    write_calibration(calibration, tmp_path / "calibration.json")
+
+    def run(command, text):
+        (tmp_path / "table.csv").write_text(text)
+        words = ["orthocal", command, str(tmp_path), str(tmp_path / "table.csv")]
+        monkeypatch.setattr(sys, "argv", words)
+        with pytest.raises(SystemExit) as stopped:
+            cli.main()
+        out, err = capsys.readouterr()
+        return (
+            stopped.value.code,
+            list(csv.reader(io.StringIO(out))),
+            err.replace(str(tmp_path), ""),
+        )
+
+    return run
+
+
+def test_the_command_line_leaves_empty_cells_and_says_where(orthocal):
+    good = "0,0,0\n" * 19
+    text = f"x_mm,y_mm,z_mm\n{good}0,0,900\n{good}100,0,0\n"
+    for command, columns in (("inverse", 3), ("accuracy", 9)):
+        code, table, err = orthocal(command, text)
+        assert code == 3
+        assert len(table) == 1 + 40
+        assert table[20] == table[40] == [""] * columns
+        assert all(cell for i, row in enumerate(table) if i not in (20, 40) for cell in row)
+        lines = err.splitlines()
+        assert lines[0].startswith("orthocal: /table.csv:21: cannot be reached: the loops stay")
+        assert lines[1].startswith("orthocal: /table.csv:41: cannot be reached: joint 'x_slide'")
+        assert lines[2] == "orthocal: 2 of the rows cannot be reached; their cells are empty"
+
+
+def test_a_table_of_which_no_row_can_be_reached_is_bad_input(orthocal):
+    code, table, err = orthocal("inverse", "x_mm,y_mm,z_mm\n" + "0,0,900\n" * 30)
+    assert (code, table) == (2, [])
+    assert err.count("\n") == 1
+    assert err.startswith("orthocal: /table.csv:2: cannot be reached")
+
+
+def test_rows_before_the_first_that_is_served_are_named_too(orthocal):
+    code, table, err = orthocal("inverse", "x_mm,y_mm,z_mm\n" + "0,0,900\n" * 10 + "0,0,0\n")
+    assert (code, len(table)) == (3, 12)
+    assert all(row == ["", "", ""] for row in table[1:11])
+    assert err.count("cannot be reached: the loops") == 10
+
+
+def test_memory_does_not_grow_with_the_table(calibration, monkeypatch):
+    """What is held is a chunk and the rows themselves."""
+    import tracemalloc
+
+    monkeypatch.setattr(module, "ROWS_AT_ONCE", 100)
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (1000, 3))
+    peaks = []
+    for count in (100, 1000):
+        tracemalloc.start()
+        for _ in accuracy_rows(calibration, points[:count]):
+            pass
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.5 * peaks[0]
+
+
+def test_json_of_too_many_points_says_so(monkeypatch, capsys, tmp_path, calibration):
+    write_calibration(calibration, tmp_path / "calibration.json")
+    table = tmp_path / "table.csv"
+    table.write_text("x_mm,y_mm,z_mm\n" + "0,0,0\n" * 5001)
+    monkeypatch.setattr(sys, "argv", ["orthocal", "accuracy", str(tmp_path), str(table), "--json"])
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    assert stopped.value.code == 2
+    assert "holds 5001 points; expected at most 5000 with --json" in capsys.readouterr().err

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gauges import exact
+
+from orthocal import calibrate, compare_models, load_session
+from orthocal.estimation.diagnostics.cross_validation import predict_unseen
+from orthocal.estimation.fit import fit_problem
+from orthocal.estimation.loss import Loss
+from orthocal.estimation.options import SolverOptions
+from orthocal.estimation.problem import build_problem
+
+FIRST_ORDER = 2e-3
+"""[1] Of the largest error: what leaving a setup out to first order leaves of solving again."""
+
+
+@pytest.mark.parametrize(
+    ("session", "model"),
+    [("table1/experiment-2", "offsets"), ("table1/experiment-2", "lengths"), ("sweep", "full")],
+)
+def test_leaving_a_setup_out_is_solving_without_it(root, session, model):
+    """Against Ipopt, which solves again without every setup in turn."""
+    loaded = exact(load_session(root / "examples" / session))
+    unseen = np.array([r.unseen for r in calibrate(loaded, model).residuals])
+    solved = compare_models(loaded, models=[model])[model].exact.unseen
+    assert np.abs(unseen - solved).max() < FIRST_ORDER * np.abs(solved).max()
+    fitted = [r.residual for r in calibrate(loaded, model).residuals]
+    assert np.linalg.norm(unseen) > 1.05 * np.linalg.norm(fitted)
+
+
+def test_a_setup_that_the_others_do_not_determine_has_no_prediction(raw_cycles):
+    """Only yx sees the offset of y; each of the others sees two offsets, in two ways."""
+    rows = tuple(r for r in raw_cycles.readings if r.setup in ("yx", "zx", "xz"))
+    result = calibrate(replace(raw_cycles, readings=rows))
+    assert {r.setup for r in result.residuals if np.isnan(r.unseen)} == {"yx"}
+    assert {r.setup for r in result.residuals if np.isfinite(r.unseen)} == {"zx", "xz"}
+
+
+def test_one_setup_alone_predicts_nothing(raw_cycles):
+    rows = tuple(r for r in raw_cycles.readings if r.setup == "yx")
+    result = calibrate(replace(raw_cycles, readings=rows), "lengths")
+    assert all(np.isnan(r.unseen) for r in result.residuals)
+
+
+def test_with_a_robust_loss_it_is_the_robust_fit_that_predicts(raw_cycles):
+    """Where no residual is large Huber's loss is all but squares, and predicts as they do."""
+    wide = SolverOptions(loss=Loss("huber", width=100.0))
+    problem = build_problem(exact(raw_cycles))
+    robust = predict_unseen(fit_problem(problem, options=wide))
+    squares = predict_unseen(fit_problem(problem))
+    assert np.abs(robust - squares).max() < 1e-3 * np.abs(squares).max()

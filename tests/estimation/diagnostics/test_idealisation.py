@@ -1,0 +1,53 @@
+"""How far a rod is from the line that is read, against Pinocchio's machines one error at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from machines import place, reading_by_pinocchio
+
+from orthocal import calibrate, load_plan, simulate_session
+from orthocal.assessment.findings.calibration import decide
+from orthocal.estimation.diagnostics.idealisation import find_idealised
+from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.units import MM
+
+
+def test_a_rod_differs_from_the_line_as_placements_say(raw_cycles):
+    """Every error at a tenth of its tolerance: central differences of the two readings."""
+    robot, setup = raw_cycles.robot, raw_cycles.setups["yx"]
+    zero, low = (raw_cycles.postures[n] for n in ("zero", "x_min"))
+    rod, axis = robot.legs["x"].rods["a"], robot.legs["x"].axis
+
+    def difference(machine):
+        found = []
+        for posture in (zero, low, raw_cycles.postures["x_max"]):
+            root, tip = (place(machine, posture.drives, f) for f in (rod.root, rod.tip))
+            at_zero = axis @ place(machine, zero.drives, "x_leg_root")
+            plane = setup.sensor.plane(machine)[0] + at_zero
+            on_rod = root + (plane - axis @ root) / (axis @ (tip - root)) * (tip - root)
+            line = reading_by_pinocchio(raw_cycles, machine, setup, posture)
+            found.append(on_rod[1] - line)
+        return found[1] - np.mean(found)
+
+    total = 0.0
+    for name in machine_errors(robot):
+        step = 0.1 * robot.parameters[name].tolerance
+        plus, minus = (difference(robot.with_errors({name: s * step})) for s in (1.0, -1.0))
+        total += ((plus - minus) / 0.2) ** 2
+    found = find_idealised(raw_cycles)
+    assert (found.setup[0], found.touches) in {("y", "a"), ("x", "a")}
+    assert found.size == pytest.approx(np.sqrt(total), rel=1e-4)
+
+
+def test_it_is_told_where_a_line_is_said_to_be_read_and_where_it_matters(root, raw_cycles):
+    (told,) = decide(calibrate(raw_cycles, "full")).of_kind("line in the air")
+    assert told.numbers["off_line_mm"] == pytest.approx(0.032, abs=1e-3)
+    assert "`touches: a`" in told.action
+    coarse = raw_cycles.with_values(raw_cycles.values)
+    coarse = coarse.with_gauge(type(coarse.gauge)(0.1 * MM, 0.01 * MM, None))
+    assert not decide(calibrate(coarse)).of_kind("line in the air")
+    plan = load_plan(root / "examples/workshop/plan.yaml")
+    on_rods = simulate_session(plan, {}, seed=0).session
+    assert find_idealised(on_rods) is None
+    assert not decide(calibrate(on_rods)).of_kind("line in the air")

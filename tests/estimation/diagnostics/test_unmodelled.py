@@ -1,0 +1,148 @@
+"""What unmodelled errors do to an estimate: the formula against machines that have them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fleets import Fleet
+from gauges import exact
+from models import JOINTS
+
+from orthocal import Choice, calibrate, load_plan, simulate_session
+from orthocal.assessment.tool_error import RARE
+from orthocal.calibration import build_record as recording
+from orthocal.estimation.diagnostics.unmodelled import (
+    find_other_errors,
+    machine_errors,
+    measure_unmodelled,
+)
+from orthocal.estimation.fit import fit_problem
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.estimation.solvers.machine_readings import Fleet as Machines
+from orthocal.statistics.distributions import chi_square_tail
+from orthocal.statistics.zeros import project_out_zeros
+
+
+@pytest.fixture(scope="module")
+def plan(root):
+    return exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
+
+
+@pytest.mark.parametrize("name", ["x_slide.rz", "x_swivel.x", "y_coupler.x", "z_bar_b.z"])
+@pytest.mark.parametrize("model", ["offsets", "lengths"])
+def test_an_unmodelled_error_moves_the_estimate_by_its_leakage(plan, name, model):
+    """Perfect readings of a machine with one small error, calibrated without it."""
+    probe = simulate_session(plan, {}, exact=True).session
+    fit = fit_problem(build_problem(probe, model=model))
+    found, _ = measure_unmodelled(fit, find_other_errors(fit))
+    if name not in found.names:
+        assert (model, name) == ("lengths", "y_coupler.x")  # the length of the leg has it
+        return
+    column = found.leakage[:, found.names.index(name)]
+    size = 1e-6
+    problem = build_problem(simulate_session(plan, {name: size}, exact=True).session, model=model)
+    sigma = fit_problem(build_problem(probe, model=model)).sigma
+    moved = NonlinearProgram(problem).solve(sigma=sigma).theta / size
+    assert moved == pytest.approx(column, abs=2e-3 * max(1.0, np.abs(column).max()))
+
+
+@pytest.fixture(scope="module")
+def machines(plan):
+    """Offsets and residuals found on 1,000 machines with all other errors, perfect readings."""
+    offsets = build_problem(plan)
+    errors = [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
+    others = build_problem(plan, free=errors)
+    rng = np.random.default_rng(0)
+    drawn = Machines(others, rng.normal(size=(1000, others.n_free)))
+    assert drawn.close().all()
+    values = drawn.predict()
+    theta = BatchProgram(offsets).solve(values, sigma=1e-5).theta
+    found = Machines(offsets, theta / offsets.theta_scale)
+    assert found.close().all()
+    left = [project_out_zeros(r, offsets.observations) for r in values - found.predict()]
+    return theta, np.array(left)
+
+
+def test_residuals_of_machines_with_all_errors_are_as_large_as_foretold(plan, machines):
+    result = calibrate(simulate_session(plan, {}, exact=True).session)
+    rms = np.sqrt(np.mean(machines[1] ** 2))
+    assert rms == pytest.approx(result.unmodelled.residual_rms, rel=0.06)
+
+
+def test_one_machine_in_a_hundred_leaves_as_much_as_is_called_worse(plan, machines):
+    """Residuals' squares scatter as χ² of so many parts does; few machines are beyond its 99 %."""
+    result = calibrate(simulate_session(plan, {}, exact=True).session)
+    parts = result.unmodelled.residual_dof
+    squares = np.mean(machines[1] ** 2, axis=1) / result.unmodelled.residual_rms**2
+    assert 2.0 / squares.var() == pytest.approx(parts, rel=0.25)
+    beyond = np.mean([chi_square_tail(parts, parts * s) < RARE for s in squares])
+    assert 0.0 < beyond < 0.025  # 10 of 1,000, and three standard deviations
+
+
+def test_the_offsets_of_machines_with_all_errors_scatter_as_foretold(plan, machines):
+    """Whitened by the covariance foretold they are standard normal."""
+    result = calibrate(simulate_session(plan, {}, exact=True).session)
+    root = np.linalg.cholesky(result.unmodelled.bias_covariance)
+    white = np.linalg.solve(root, machines[0].T)
+    spread = np.linalg.eigvalsh(white @ white.T / white.shape[1])
+    edge = np.sqrt(3 / white.shape[1])
+    assert (1 - edge) ** 2 - 0.1 < spread.min()
+    assert spread.max() < (1 + edge) ** 2 + 0.1
+
+
+def test_a_machine_has_all_errors_of_its_parts(orthoglide, biglide):
+    """21 placements and offsets, three scales, both ends of what its loops join, but idle ones."""
+    names = machine_errors(orthoglide)
+    assert names == orthoglide.parameters.select_model("full")
+    assert {n for n in names if n.endswith(".scale")} == {f"{k}_slide.scale" for k in "xyz"}
+    owners = {n.rsplit(".", 1)[0] for n in names if n.startswith("frame.")}
+    rods = {f"frame.{k}_{end}" for k in "xyz" for end in ("crossbar_end", "rod_b_tip")}
+    assert owners == rods | {"frame.y_foot_end", "frame.z_foot_end"}
+    # where the tool hangs on a closure's frame, that frame says where the tool is
+    assert not any(n.startswith("frame.x_tip") for n in machine_errors(biglide))
+
+
+def test_the_full_model_leaves_nothing_out(plan):
+    session = simulate_session(plan, {"x_slide.offset": 1e-3}, seed=1).session
+    assert calibrate(session, "full").unmodelled.names == ()
+    free = plan.robot.parameters.select(JOINTS)
+    found = calibrate(session, Choice(free=JOINTS, prior=True)).unmodelled
+    assert set(found.names) == set(machine_errors(plan.robot)) - set(free)
+    assert found.leakage.shape == (126, len(found.names))
+    assert len(found.names) == 3 * 4 + 12 + 3  # ends of rods, feet, scales
+
+
+def test_with_a_sum_free_its_parts_may_still_differ(plan):
+    """A leg's length is told by its coupler; the second rod may be longer than the first."""
+    session = simulate_session(plan, {"x_slide.offset": 1e-3}, seed=1).session
+    found = calibrate(session, "lengths").unmodelled
+    assert "x_coupler.x" not in found.names
+    assert "frame.x_rod_b_tip.x" in found.names
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "least"), [("offsets", 0.93), ("lengths", 0.93)])
+def test_intervals_hold_what_they_say_with_all_errors_at_their_tolerances(
+    plan, model, least, monkeypatch
+):
+    """200 sessions: what scatter alone would promise is missed by far, all together is not."""
+    fleet = Fleet(plan, model=model)
+    # they hardly change from machine to machine, and take longest to find
+    monkeypatch.setattr(recording, "find_other_errors", lambda *_, **__: fleet.others)
+    known = fleet.machine.free
+    free = [known.index(n) if n in known else -1 for n in fleet.problem.free]
+    hits, scatter_hits, count = 0, 0, 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        errors = fleet.draw(rng)
+        fit = fleet.fit(fleet.read(rng, errors))
+        result = recording.assemble_calibration(fit)
+        for p, (low, high), at in zip(result.free, result.intervals, free, strict=True):
+            if at >= 0:
+                hits += low <= errors[at] <= high
+                scatter_hits += abs(p.value - errors[at]) < result.confidence_factor * p.std
+                count += 1
+    assert least < hits / count < 0.99
+    assert scatter_hits / count < 0.6

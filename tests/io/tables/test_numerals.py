@@ -1,0 +1,94 @@
+"""Numerals: what each is with either decimal sign, and what a table of them tells."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+
+import pytest
+
+from orthocal.io.tables.numerals import Seen, is_unread, parse_numeral, tell_decimal
+
+CASES = {
+    # text: with a decimal point, with a decimal comma
+    "0": ("0", "0"),
+    "007": ("7", "7"),
+    "-12": ("-12", "-12"),
+    "+0.5": ("0.5", None),
+    "0,5": (None, "0.5"),
+    ".5": ("0.5", None),
+    ",5": (None, "0.5"),
+    "5.": ("5", None),
+    "5,": (None, "5"),
+    "1,234": ("1234", "1.234"),
+    "1.234": ("1.234", "1234"),
+    "0.123": ("0.123", None),
+    "0,123": (None, "0.123"),
+    "12,34": (None, "12.34"),
+    "1234,567": (None, "1234.567"),
+    "1,2345": (None, "1.2345"),
+    "1,234,567": ("1234567", None),
+    "1.234.567,8": (None, "1234567.8"),
+    "1,234.5": ("1234.5", None),
+    "1 234,5": (None, "1234.5"),
+    "1\u00a0234.5": ("1234.5", None),
+    "1'234.5": ("1234.5", None),
+    "12 34": (None, None),
+    "1 234'567": (None, None),
+    "−0,43": (None, "-0.43"),
+    "– 0.43": ("-0.43", None),
+    "'0.43": ("0.43", None),
+    "\u200e0.43\u200b": ("0.43", None),
+    "1e-3": ("0.001", "0.001"),
+    "1,5E-03": (None, "0.0015"),
+    "—0.5": (None, None),
+    "--1": (None, None),
+    "(1)": (None, None),
+    "1-": (None, None),
+    "0x10": (None, None),
+    "1_0": (None, None),
+    "٣": (None, None),
+    "²": (None, None),
+    "nan": (None, None),
+    "inf": (None, None),
+    "1e": (None, None),
+    "1e9999": (None, None),
+    ".": (None, None),
+    ",": (None, None),
+    "": (None, None),
+    "9" * 101: (None, None),
+}
+
+
+@pytest.mark.parametrize("text", CASES)
+def test_a_numeral_with_either_sign(text):
+    found = [parse_numeral(text, sign) for sign in ("point", "comma")]
+    assert found == [None if v is None else Decimal(v) for v in CASES[text]]
+
+
+@pytest.mark.parametrize(
+    ("texts", "expected"),
+    [
+        (["1", "0,5", "1,234"], ("comma", "0,5", None, False)),
+        (["1,234", "0.5"], ("point", "0.5", None, False)),
+        (["1", "2"], ("point", None, None, False)),
+        (["1", "1,234"], (None, None, "1,234", False)),
+        (["0,5", "0.5"], (None, "0,5", "0.5", True)),
+        (["gut", "0,5"], ("comma", "0,5", None, False)),
+        ([], ("point", None, None, False)),
+    ],
+)
+def test_what_numerals_tell_of_their_sign(texts, expected):
+    found = tell_decimal([Seen(text, at) for at, text in enumerate(texts)])
+    evidence = found.evidence and found.evidence.text
+    rival = found.rival and found.rival.text
+    assert (found.sign, evidence, rival, found.torn) == expected
+
+
+@pytest.mark.parametrize("text", ["", " ", "-", "–", "---", "n/a", "#N/A", "NaN", "k.A.", "…"])
+def test_cells_that_are_not_yet_read(text):
+    assert is_unread(text)
+
+
+@pytest.mark.parametrize("text", ["0", "-0", "–1", "#DIV/0!", "x", "1-"])
+def test_cells_that_say_something(text):
+    assert not is_unread(text)

@@ -1,0 +1,252 @@
+"""Machines with revolute drives: offsets in the controller, and directions square to a leg."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from linkages import joint, write_robot, write_wide_linkage
+from scipy.stats import binom
+from tolerances import KINEMATICS, TRUTH_BACK
+
+from orthocal import calibrate, load_plan, load_session, write_session
+from orthocal.assessment.controller_entries import find_entries
+from orthocal.assessment.validation import CHANGE_CHANCE, validate_calibration
+from orthocal.errors import SessionError
+from orthocal.measurement.motion.guidance import guide
+from orthocal.measurement.recording.recording import open_recording
+from orthocal.observation.simulate import simulate_session
+from orthocal.output.text.recording import describe_row
+from orthocal.statistics.chance import BY_CHANCE
+
+OFFSETS = {"motor_a.offset": 8e-3, "motor_b.offset": -5e-3}
+"""[rad]"""
+
+ACTIVE = np.array([6e-3, -2e-3])
+"""[rad]"""
+
+YAML = """closed_loop: [[end_a, end_b]]
+type: ['6d']
+name_mot: [motor_a, motor_b]
+orthocal:
+  closures: {apex: {rows: [x, y, rz]}}
+  legs:
+    a: {root: a2, tip: rail_a}
+    b: {root: b2, tip: rail_b}
+"""
+
+
+def write_fivebar(root, folder, *, yaml=YAML, drop=0.0):
+    """The five-bar with a rail along x on each of its rods; that of a ends lower by `drop`."""
+    urdf = (root / "tests/robots/fivebar/fivebar.urdf").read_text()
+    rails = joint("rail_a", "a2", (0.1, -drop, 0), "") + joint("rail_b", "b2", (-0.1, 0, 0), "")
+    folder.mkdir()
+    (folder / "rails.urdf").write_text(urdf.replace("</robot>", f"{rails}</robot>"))
+    (folder / "rails.yaml").write_text(yaml)
+    return folder
+
+
+def write_plan(
+    folder, robot, controller="", setup_a="{leg: a, direction: y, section: {fraction: 0.3}}"
+):
+    folder.mkdir()
+    postures = {f"p{i}{k}": (6.0 * i, 6.0 * k) for i in (-1, 0, 1) for k in (-1, 0, 1)}
+    lines = [f"  {name}: {{joints_deg: [{a}, {b}]}}" for name, (a, b) in postures.items()]
+    text = "\n".join(
+        [
+            f"robot: {robot}",
+            "gauge: {sigma_mm: 0.005}",
+            *([f"controller: {controller}"] if controller else []),
+            "postures:",
+            *lines,
+            "setups:",
+            f"  ya: {setup_a}",
+            "  yb: {leg: b, direction: y, section: {fraction: 0.7}}",
+        ]
+    )
+    (folder / "session.yaml").write_text(text + "\n")
+    return folder
+
+
+@pytest.fixture
+def robot(root, tmp_path):
+    return write_fivebar(root, tmp_path / "rails")
+
+
+def controllers():
+    mrad, deg = (ACTIVE * 1e3).tolist(), np.rad2deg(ACTIVE).tolist()
+    return {"mrad": f"{{offsets_mrad: {mrad}}}", "deg": f"{{offsets_deg: {deg}}}"}
+
+
+@pytest.mark.parametrize("unit", ["mrad", "deg"])
+def test_offsets_in_the_controller_lead_to_the_same_truth(tmp_path, robot, unit):
+    """The drives stand elsewhere, the readings differ, and what is identified does not."""
+    plain = load_plan(write_plan(tmp_path / "plain", robot))
+    active = load_plan(write_plan(tmp_path / "active", robot, controllers()[unit]))
+    assert np.abs(active.active_offsets - ACTIVE).max() < KINEMATICS
+    for name, posture in plain.postures.items():
+        shift = active.postures[name].drives - posture.drives
+        assert np.abs(shift + ACTIVE).max() < KINEMATICS
+    results = []
+    for plan in (plain, active):
+        session = simulate_session(plan, OFFSETS, exact=True).session
+        results.append((session, calibrate(session)))
+    (first, one), (second, other) = results
+    assert np.abs(first.values - second.values).max() > 1e-5
+    for name, value in OFFSETS.items():
+        assert abs(one.errors[name] - value) < TRUTH_BACK
+        assert abs(other.errors[name] - value) < TRUTH_BACK
+    changes = [e.change for e in find_entries(other)]
+    assert np.abs(np.array(changes) - (np.array([*OFFSETS.values()]) - ACTIVE)).max() < TRUTH_BACK
+
+
+def test_offsets_survive_a_round_trip(tmp_path, robot):
+    plan = load_plan(write_plan(tmp_path / "plan", robot, controllers()["deg"]))
+    session = simulate_session(plan, OFFSETS, exact=True).session
+    path = write_session(session, tmp_path / "copy", decimals=12)
+    again = load_session(path)
+    assert "offsets_mrad" in path.read_text()
+    assert np.abs(again.active_offsets - ACTIVE).max() < KINEMATICS
+    drives = [
+        np.abs(again.postures[n].drives - p.drives).max() for n, p in session.postures.items()
+    ]
+    assert max(drives) < KINEMATICS
+
+
+def test_what_was_identified_is_validated(tmp_path, robot):
+    """Entered as found, it is confirmed; entered otherwise, the key that states it is named."""
+    before, confirmed, sizes = load_plan(write_plan(tmp_path / "a", robot)), [], []
+    for seed in range(40):  # legs that turn by 6 degrees: how a gauge stands matters most
+        found = calibrate(simulate_session(before, OFFSETS, seed=seed).session)
+        entered = [round(e.enter * 1e3, 4) for e in find_entries(found)]
+        folder = tmp_path / f"b{seed}"
+        plan = load_plan(write_plan(folder, robot, f"{{offsets_mrad: {entered}}}"))
+        new = simulate_session(plan, OFFSETS, seed=seed + 1000).session
+        result = validate_calibration(found, new)
+        confirmed.append(result.confirmed)
+        sizes.append((result.expected_rms, result.achieved_rms))
+    # one in a hundred is refused for its noise, one in twenty for a change
+    assert binom.cdf(sum(confirmed), 40, (1 - BY_CHANCE) * (1 - CHANGE_CHANCE)) > 0.01
+    # how gauges stood is what is expected to differ most
+    expected, achieved = np.sqrt(np.mean(np.square(sizes), axis=0))
+    assert expected > 2.0 * found.rms_after
+    assert achieved == pytest.approx(expected, rel=0.2)
+    wrong = load_plan(write_plan(tmp_path / "c", robot, "{offsets_deg: [0, 0]}"))
+    with pytest.raises(
+        SessionError, match=r"controller.*: motor_a has 0 mrad where the calibration"
+    ):
+        validate_calibration(found, simulate_session(wrong, OFFSETS, seed=3).session)
+
+
+MIXED = """closed_loop: []
+type: []
+name_mot: [slide, turn, lift]
+orthocal:
+  tcp: {frame: hand, coordinates: [x, y, z]}
+  legs: {a: {root: turn, tip: hand}}
+"""
+
+
+def write_mixed(folder):
+    """A slide along z, a turn about z and a slide along x, so that the tool goes anywhere."""
+    joints = joint("slide", "base", (0, 0, 0), "z", kind="prismatic")
+    joints += joint("turn", "slide", (0, 0, 0), "z")
+    joints += joint("lift", "turn", (0.2, 0, 0), "x", kind="prismatic")
+    return write_robot(folder, joints + joint("hand", "lift", (0.1, 0, 0), ""), MIXED)
+
+
+def load_mixed(tmp_path, controller):
+    robot = write_mixed(tmp_path / "mixed")
+    (tmp_path / "session.yaml").write_text(
+        f"robot: {robot}\n"
+        "postures: {zero: {tcp_mm: [300, 0, 0]}, up: {tcp_mm: [300, 10, 5]}}\n"
+        f"controller: {controller}\n"
+        "setups: {ya: {leg: a, direction: y, section: {fraction: 0.5}}}\n"
+    )
+    return load_plan(tmp_path / "session.yaml")
+
+
+def test_each_key_has_the_drives_of_its_kind(tmp_path):
+    session = load_mixed(tmp_path, "{offsets_mm: [1, 2], offsets_deg: [3]}")
+    assert np.abs(session.active_offsets - [1e-3, np.deg2rad(3), 2e-3]).max() < KINEMATICS
+    text = write_session(session, tmp_path / "copy").read_text()
+    assert "offsets_mm: [1.0, 2.0]" in text
+    assert "offsets_mrad: [52.35" in text
+
+
+@pytest.mark.parametrize(
+    ("controller", "message"),
+    [
+        (
+            "{offsets_mm: [1, 2, 3], offsets_deg: [3]}",
+            "controller.offsets_mm: has 3 numbers; expected 2, one a prismatic drive: slide, lift",
+        ),
+        (
+            "{offsets_mm: [1, 2]}",
+            "controller: states no offset of turn; expected offsets_deg or off",
+        ),
+        ("{offsets_mrad: [1]}", "controller: states no offset of slide; expected offsets_mm, too"),
+    ],
+)
+def test_offsets_that_do_not_fit_the_drives_are_refused(tmp_path, controller, message):
+    with pytest.raises(SessionError, match=message):
+        load_mixed(tmp_path, controller)
+
+
+def test_mm_do_not_fit_revolute_drives(tmp_path, robot):
+    plan = write_plan(tmp_path / "plan", robot, "{offsets_mm: [0, 0]}")
+    message = "offsets_mm: rails has no prismatic drive; expected offsets_deg or offsets_mrad"
+    with pytest.raises(SessionError, match=message):
+        load_plan(plan)
+
+
+def test_a_session_needs_a_zero_that_is_given(tmp_path):
+    """What a view may choose, legs and offsets may not count from: the found one can be adopted."""
+    legs = "  legs: {a: {root: elbow_a, tip: end_a}}\n"
+    folder = write_wide_linkage(tmp_path / "wide", legs)
+    message = (
+        r"robot: 'wide' cannot stand with its drives at 0, and its mechanical zero is not given; "
+        r"add to orthocal.drives in .*wide.yaml: motor_a.zero_deg \(-?\d+\.\d+ was found\), motor_b"
+    )
+    with pytest.raises(SessionError, match=message):
+        load_plan(write_plan(tmp_path / "plan", folder))
+
+
+# ---- gauges are square to the leg
+
+
+@pytest.mark.parametrize(("direction", "angle"), [("y", "65.0"), ("-x", "25.0")])
+def test_an_oblique_direction_is_refused(root, tmp_path, direction, angle):
+    """A five-bar's rod leans by 25 degrees: no gauge along x or y is square to it."""
+    robot = write_fivebar(root, tmp_path / "rails", yaml=YAML.replace("tip: rail_a", "tip: end_a"))
+    setup = f"{{leg: a, direction: {direction}, section: {{fraction: 0.3}}}}"
+    message = (
+        f"setups.ya.direction: '{direction}' is at {angle}° to leg a in the mechanical zero; "
+        "expected a direction square to the leg, to within 1°; square to it: z, -z$"
+    )
+    with pytest.raises(SessionError, match=message):
+        load_plan(write_plan(tmp_path / "plan", robot, setup_a=setup))
+
+
+@pytest.mark.parametrize(("degrees", "good"), [(0.9, True), (1.1, False)])
+def test_square_means_within_a_degree(root, tmp_path, degrees, good):
+    drop = 0.1 * np.tan(np.deg2rad(degrees))
+    robot = write_fivebar(root, tmp_path / "rails", drop=drop)
+    plan = write_plan(tmp_path / "plan", robot)
+    if good:
+        assert load_plan(plan).setups["ya"].sensor.direction == "y"
+    else:
+        with pytest.raises(SessionError, match=r"'y' is at 88\.9° to leg a"):
+            load_plan(plan)
+
+
+def test_somebody_who_records_is_shown_degrees_as_the_controller_has_them(root, tmp_path):
+    robot = write_fivebar(root, tmp_path / "rails")
+    folder = write_plan(tmp_path / "s", robot, "{offsets_mrad: [6, -2]}")
+    with open_recording(folder) as recording:
+        shown = describe_row(
+            recording.session, guide(recording.session), recording.rows, 1, width=100
+        )
+    assert shown.splitlines()[:2] == [
+        "2 of 18 (line 3 of the table): ya p-10",
+        "  joints motor_a -6.000 deg, motor_b 0.000 deg",
+    ]

@@ -1,0 +1,680 @@
+"""What the plots draw is what the calibration says, and each can stand in a page with others."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from xml.etree import ElementTree
+
+import matplotlib
+import numpy as np
+import pytest
+from scipy import stats
+
+from orthocal import Choice, calibrate, load_session
+from orthocal.output.report import figure as style
+from orthocal.output.report import parameter_plots, reading_plots
+from orthocal.output.text import layout
+from orthocal.units import MM
+
+PLOTS = (
+    reading_plots.plot_residuals,
+    reading_plots.plot_setups,
+    reading_plots.plot_spread,
+    parameter_plots.plot_linearised,
+    parameter_plots.plot_parameters,
+    parameter_plots.plot_correlations,
+    parameter_plots.plot_singular_values,
+)
+
+SVG = "{http://www.w3.org/2000/svg}"
+HREF = "{http://www.w3.org/1999/xlink}href"
+
+UNIT = 1e-12
+"""[mm, σ, %] Numbers of which only the unit was changed."""
+
+PLACE = 1e-3
+"""[pt] Positions in a file, which has six decimals of them."""
+
+QUANTILE = 1e-9
+"""[1] Normal quantiles by two routes."""
+
+LARGEST = 250_000
+"""[byte] Of a plot, however many readings there are."""
+
+NAMES = ("$x_{$", "<b>&\"'", "机器", "bell\x07", "n" * 200)
+"""What strangers may call things."""
+
+
+@pytest.fixture(scope="module")
+def table1(experiment_2):
+    return calibrate(experiment_2)
+
+
+@pytest.fixture(scope="module")
+def sweep(root):
+    return calibrate(load_session(root / "examples/sweep"), "full")
+
+
+@pytest.fixture(scope="module")
+def raw(raw_cycles):
+    return calibrate(raw_cycles)
+
+
+@pytest.fixture(scope="module")
+def bound(experiment_2):
+    return calibrate(experiment_2, Choice(bounds={"x_slide.offset_m": (-0.1e-3, 0.1e-3)}))
+
+
+@pytest.fixture(scope="module")
+def unknown(root, tmp_path_factory):
+    """A single reading, and nothing that tells its noise."""
+    folder = tmp_path_factory.mktemp("unknown")
+    source = root / "examples/table1/experiment-2"
+    text = (source / "session.yaml").read_text()
+    (folder / "session.yaml").write_text(text.replace("sigma_mm: 0.02, ", ""))
+    rows = (source / "readings.csv").read_text().splitlines()
+    (folder / "readings.csv").write_text("\n".join(rows[:2]) + "\n")
+    return calibrate(load_session(folder), "full")
+
+
+@pytest.fixture(scope="module")
+def many(sweep):
+    """More than 12,000 readings, each with a spread of its own."""
+    noise = np.random.default_rng(3).normal(0.0, sweep.sigma, (75, len(sweep.residuals)))
+    rows = [
+        replace(r, cycle=k + 1, measured=r.measured + float(noise[k, i]))
+        for k in range(75)
+        for i, r in enumerate(sweep.residuals)
+    ]
+    return replace(sweep, residuals=tuple(rows))
+
+
+@pytest.fixture(scope="module")
+def drawn(table1, sweep, unknown):
+    """Every plot of every calibration that has it."""
+    return [svg for c in (table1, sweep, unknown) for plot in PLOTS if (svg := plot(c))]
+
+
+def worst(row):
+    """Sorts the largest deviation, before or after, to the front."""
+    return -max(abs(row.deviation), abs(row.residual))
+
+
+def draw(function, *args):
+    with style.house_style():
+        return function(*args)
+
+
+def line(axes, label):
+    """x and y of the markers with a label."""
+    found = next(a for a in axes.lines if str(a.get_label()).startswith(label))
+    return np.asarray(found.get_xdata(), float), np.asarray(found.get_ydata(), float)
+
+
+def segments(axes):
+    """Ends of horizontal lines, shape (n, 2), and where they are."""
+    ends = np.array(axes.collections[0].get_segments())
+    return ends[:, :, 0], ends[:, 0, 1]
+
+
+def row_names(axes):
+    return [t.get_text() for t in axes.get_yticklabels()]
+
+
+def title(figure):
+    return figure.texts[0].get_text()
+
+
+def texts(svg):
+    return ["".join(e.itertext()) for e in ElementTree.fromstring(svg).iter(f"{SVG}text")]
+
+
+def test_each_is_one_inline_element_that_scales_and_says_what_it_is(drawn):
+    for svg in drawn:
+        assert svg.startswith("<svg ")
+        assert svg.endswith("</svg>")
+        root = ElementTree.fromstring(svg)
+        assert root.get("role") == "img"
+        assert len(root.get("aria-label")) > 20
+        assert root[0].tag == f"{SVG}title"
+        assert root[0].text == root.get("aria-label")
+        assert root.get("width") is None
+        assert root.get("height") is None
+        assert root.get("viewBox").startswith("0 0 518.4 ")
+        assert root.get("style").startswith("width:720px;max-width:100%;height:auto")
+
+
+def test_none_refers_to_anything_outside_or_styles_the_page(drawn):
+    for svg in drawn:
+        inside = re.sub(r'xmlns(:\w+)?="[^"]*"', "", svg)
+        assert "http" not in inside
+        assert "<!--" not in svg
+        tags = {e.tag.removeprefix(SVG) for e in ElementTree.fromstring(svg).iter()}
+        assert tags.isdisjoint({"style", "metadata", "script", "image", "a"})
+        assert "text" in tags  # not drawn as outlines
+
+
+def test_ids_do_not_collide_on_one_page_and_all_references_are_kept(drawn):
+    seen = set()
+    for svg in drawn:
+        elements = list(ElementTree.fromstring(svg).iter())
+        ids = [e.get("id") for e in elements if e.get("id")]
+        assert len(set(ids)) == len(ids)
+        assert seen.isdisjoint(ids)
+        seen.update(ids)
+        used = [e.get(HREF).removeprefix("#") for e in elements if e.get(HREF)]
+        used += re.findall(r"url\(#([^)]*)\)", svg)
+        assert used
+        assert set(used) <= set(ids)
+
+
+def test_the_same_calibration_makes_the_same_plots(table1, drawn):
+    assert [plot(table1) for plot in PLOTS] == drawn[: len(PLOTS)]
+
+
+def test_what_the_user_set_in_matplotlib_is_neither_used_nor_changed(table1):
+    usual = reading_plots.plot_residuals(table1)
+    with matplotlib.rc_context({"font.size": 20.0, "svg.fonttype": "path", "axes.grid": True}):
+        before = dict(matplotlib.rcParams)
+        assert reading_plots.plot_residuals(table1) == usual
+        assert dict(matplotlib.rcParams) == before
+
+
+def test_pyplot_is_not_needed():
+    code = (
+        "import sys, orthocal.output.report.reading_plots, orthocal.output.report.tool_map\n"
+        "print('matplotlib.pyplot' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_names_of_strangers_come_out_as_they_are(table1):
+    rows = [
+        replace(r, setup=NAMES[i % 5], posture=NAMES[(i + 1) % 5], minus=None)
+        for i, r in enumerate(table1.residuals)
+    ]
+    names = [f"{name}.offset" for name in NAMES[:3]]
+    parameters = [replace(p, name=n) for p, n in zip(table1.parameters, names, strict=True)]
+    strange = replace(table1, residuals=tuple(rows), parameters=tuple(parameters))
+    for plot in PLOTS:
+        svg = plot(strange)
+        assert "<b>" not in svg
+        assert "\x07" not in svg
+    assert {"$x_{$ <b>&\"'", "<b>&\"' 机器", "机器 bell\\x07"} <= set(
+        texts(reading_plots.plot_residuals(strange))
+    )
+    shown = set(texts(reading_plots.plot_setups(strange)))
+    assert {"$x_{$", "<b>&\"'", "机器", "bell\\x07"} <= shown
+    (long,) = (t for t in shown if t.startswith("nnn"))
+    assert long == "n" * 22 + "…" + "n" * 21
+    assert set(names) <= set(texts(parameter_plots.plot_parameters(strange)))
+    assert set(names) <= set(texts(parameter_plots.plot_correlations(strange)))
+
+
+def test_dollars_in_pairs_are_not_mathematics(table1):
+    rows = tuple(replace(r, setup="$\\frac{$") for r in table1.residuals)
+    assert "$\\frac{$" in texts(reading_plots.plot_setups(replace(table1, residuals=rows)))
+
+
+def test_residuals_are_listed_before_and_after_the_worst_first(table1):
+    figure = draw(reading_plots._draw_residuals, table1, 40)
+    axes = figure.axes[0]
+    rows = sorted(table1.residuals, key=lambda r: -abs(r.measured - r.nominal))
+    assert row_names(axes) == [r.label for r in rows]
+    assert row_names(axes)[0] == "zx x_max − x_min"
+    bottom, top = axes.get_ylim()
+    assert bottom > top  # the first row is the highest
+    for label, values in (
+        ("before", [r.measured - r.nominal for r in rows]),
+        ("after", [r.measured - r.predicted for r in rows]),
+    ):
+        x, y = line(axes, label)
+        np.testing.assert_allclose(x, np.array(values) * 1e3, atol=UNIT)
+        np.testing.assert_array_equal(y, np.arange(6))
+    low, high = axes.get_xlim()
+    assert low < -1.14
+    assert high > 2.0 * table1.sigma * 1e3
+    assert axes.get_xlabel() == "measured − model [mm]"
+
+
+def test_markers_in_the_file_are_where_the_deviations_are(table1):
+    root = ElementTree.fromstring(reading_plots.plot_residuals(table1))
+    found = [e for e in root.iter(f"{SVG}use") if "#e69f00" in e.get("style", "")]
+    assert len(found) == 7  # six readings, and one in the legend
+    by_height = sorted(found, key=lambda e: float(e.get("y")))[1:]
+    place = np.array([float(e.get("x")) for e in by_height])
+    values = sorted((r.deviation for r in table1.residuals), key=lambda v: -abs(v))
+    slope, start = np.polyfit(values, place, 1)
+    assert slope > 0.0
+    assert np.abs(start + slope * np.array(values) - place).max() < PLACE
+
+
+def test_the_band_is_two_sigma_of_each_row(table1):
+    mixed = [replace(r, minus=r.minus if i < 3 else None) for i, r in enumerate(table1.residuals)]
+    mixed_up = replace(table1, residuals=tuple(mixed), rows_are_differences=False)
+    for calibration, word in ((table1, "difference"), (mixed_up, "row")):
+        axes = draw(reading_plots._draw_residuals, calibration, 40).axes[0]
+        (band,) = axes.containers
+        assert band.get_label() == f"±2 σ of a {word}"
+        rows = sorted(calibration.residuals, key=worst)
+        sigma = np.array([table1.sigma / (1.0 if r.minus else np.sqrt(2)) for r in rows]) * 1e3
+        left = np.array([bar.get_x() for bar in band])
+        width = np.array([bar.get_width() for bar in band])
+        np.testing.assert_allclose(left, -2.0 * sigma, atol=UNIT)
+        np.testing.assert_allclose(width, 4.0 * sigma, atol=UNIT)
+
+
+def test_of_many_readings_the_largest_are_shown_and_that_is_said(sweep):
+    assert "Readings before and after calibration: the 40 worst of 162" in texts(
+        reading_plots.plot_residuals(sweep)
+    )
+    figure = draw(reading_plots._draw_residuals, sweep, 7)
+    assert title(figure).endswith("the 7 worst of 162")
+    x, _ = line(figure.axes[0], "before")
+    rows = sorted(sweep.residuals, key=worst)[:7]
+    np.testing.assert_allclose(x, [r.deviation * 1e3 for r in rows], atol=UNIT)
+
+
+def test_a_reading_that_the_calibration_spoils_is_among_the_worst(table1):
+    best = min(table1.residuals, key=lambda r: abs(r.deviation))
+    spoilt = replace(best, predicted=best.measured - 3e-3)
+    rows = tuple(spoilt if r is best else r for r in table1.residuals)
+    figure = draw(reading_plots._draw_residuals, replace(table1, residuals=rows), 1)
+    x, _ = line(figure.axes[0], "after")
+    np.testing.assert_allclose(x, [3.0], atol=UNIT)
+
+
+def test_plots_of_many_readings_stay_small(many):
+    for name in ("residuals", "setups", "spread"):
+        plot = getattr(reading_plots, f"plot_{name}")
+        assert len(plot(many)) < LARGEST
+
+
+def test_cycles_are_named_where_there_are_some(raw, table1):
+    names = row_names(draw(reading_plots._draw_residuals, raw, 40).axes[0])
+    assert names[0] == "xz z_min, cycle 2"
+    assert all(", cycle " in n for n in names)
+    assert not any(
+        "cycle" in n for n in row_names(draw(reading_plots._draw_residuals, table1, 9).axes[0])
+    )
+
+
+def test_setups_are_sorted_by_what_the_model_leaves_of_them(raw):
+    figure = draw(reading_plots._draw_setups, raw, 40)
+    axes = figure.axes[0]
+    names = row_names(axes)
+    assert sorted(names) == sorted({r.setup for r in raw.residuals})
+
+    def rms(name, attribute):
+        values = [getattr(r, attribute) * 1e3 for r in raw.residuals if r.setup == name]
+        return np.sqrt(np.mean(np.square(values)))
+
+    for label, attribute, shift in (
+        ("before", "deviation", -0.2),
+        ("after", "residual", 0.0),
+        ("predicted", "unseen", 0.2),
+    ):
+        x, y = line(axes, label)
+        np.testing.assert_allclose(x, [rms(n, attribute) for n in names], rtol=UNIT)
+        np.testing.assert_allclose(y, np.arange(6) + shift, atol=UNIT)
+    after, _ = line(axes, "after")
+    assert (np.diff(after) <= 0.0).all()
+    np.testing.assert_allclose(line(axes, "σ of a reading")[0], raw.sigma * 1e3, atol=UNIT)
+    assert axes.get_xscale() == "log"
+    looks = [(a.get_marker(), a.get_color()) for a in axes.lines[:3]]
+    assert len({marker for marker, _ in looks}) == len({colour for _, colour in looks}) == 3
+
+
+def test_setups_that_no_other_predicts_have_no_such_marker(table1, unknown):
+    def forget(row):
+        return replace(row, unseen=np.nan) if row.setup in ("xy", "zy") else row
+
+    calibration = replace(table1, residuals=tuple(map(forget, table1.residuals)))
+    axes = draw(reading_plots._draw_setups, calibration, 40).axes[0]
+    _, y = line(axes, "predicted")
+    names = row_names(axes)
+    assert {names[round(v - 0.2)] for v in y} == {"yx", "zx", "xz", "yz"}
+    labels = [a.get_label() for a in draw(reading_plots._draw_setups, unknown, 40).axes[0].lines]
+    assert labels == ["before", "after"]
+
+
+def test_the_worst_of_many_setups_are_shown(sweep):
+    figure = draw(reading_plots._draw_setups, sweep, 5)
+    assert title(figure).endswith("the 5 worst of 18")
+    assert len(row_names(figure.axes[0])) == 5
+
+
+def test_setups_without_any_error_stay_on_a_logarithmic_axis(table1):
+    rows = tuple(replace(r, predicted=r.measured, nominal=r.measured) for r in table1.residuals)
+    axes = draw(reading_plots._draw_setups, replace(table1, residuals=rows), 40).axes[0]
+    assert (line(axes, "after")[0] == reading_plots.SMALLEST_LENGTH / MM).all()
+    low, high = axes.get_xlim()
+    assert 0.0 < low < reading_plots.SMALLEST_LENGTH * 1e3 < table1.sigma * 1e3 < high
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([0.3, 0.4], [0.2, 0.5]),
+        ([0.12, 1.14], [0.1, 0.2, 0.5, 1.0, 2.0]),
+        ([2e-3, 0.4], [1e-3, 1e-2, 1e-1, 1.0]),
+        ([1.0, 1.0], [0.5, 1.0, 2.0]),
+    ],
+)
+def test_logarithmic_axes_have_round_ticks_on_both_sides(values, expected):
+    with style.house_style():
+        axes = style.open_figure(3.0, "").subplots()
+        style.scale_log(axes, "x", np.array(values))
+        np.testing.assert_allclose(axes.get_xticks(), expected)
+        np.testing.assert_allclose(axes.get_xlim(), [expected[0], expected[-1]])
+
+
+def test_ticks_of_many_decades_do_not_crowd():
+    with style.house_style():
+        axes = style.open_figure(3.0, "").subplots()
+        style.scale_log(axes, "y", np.array([1e-13, 20.0]))
+        assert 5 <= len(axes.get_yticks()) <= 9
+        assert axes.get_ylim()[0] < 1e-13
+        assert axes.get_ylim()[1] > 20.0
+
+
+def test_residuals_stand_in_order_against_normal_quantiles(raw):
+    axes = draw(reading_plots._draw_spread, raw).axes[0]
+    x, y = line(axes, "residuals after: 54")
+    np.testing.assert_allclose(y, np.sort([r.residual * 1e3 for r in raw.residuals]), atol=UNIT)
+    np.testing.assert_allclose(x, stats.norm.ppf((np.arange(54) + 0.5) / 54), atol=QUANTILE)
+    assert (y[np.abs(x) < 1.0].max()) < 2.0 * raw.sigma * 1e3
+
+
+def test_lines_of_the_spread_are_sigma_less_what_was_fitted(table1, raw):
+    for calibration in (table1, raw):
+        axes = draw(reading_plots._draw_spread, calibration).axes[0]
+        word = "difference" if calibration is table1 else "reading"
+        x, y = line(axes, f"σ of a {word}: {calibration.sigma * 1e3:.2g} mm")
+        slope = y[1] / x[1]
+        part = np.sqrt(calibration.noise.residual_dof / len(calibration.residuals))
+        np.testing.assert_allclose(slope, calibration.sigma * 1e3 * part, rtol=UNIT)
+        given_x, given_y = line(axes, "σ given for the gauge")
+        given = calibration.session.gauge_sigma * calibration.row_factor
+        np.testing.assert_allclose(
+            given_y[1] / given_x[1] / slope, given / calibration.sigma, rtol=UNIT
+        )
+    # where σ is from the residuals, that is their root mean square
+    x, y = line(draw(reading_plots._draw_spread, table1).axes[0], "σ of a difference")
+    np.testing.assert_allclose(y[1] / x[1], table1.rms_after * 1e3, rtol=QUANTILE)
+
+
+def test_differences_count_as_readings_where_both_are(table1):
+    rows = [replace(r, minus=None if i else r.minus) for i, r in enumerate(table1.residuals)]
+    calibration = replace(table1, residuals=tuple(rows), rows_are_differences=False)
+    _, y = line(draw(reading_plots._draw_spread, calibration).axes[0], "residuals")
+    own = [r.residual * 1e3 / (np.sqrt(2) if i == 0 else 1.0) for i, r in enumerate(rows)]
+    np.testing.assert_allclose(y, np.sort(own), atol=UNIT)
+
+
+def test_of_many_residuals_the_outermost_all_stay(many):
+    x, y = line(draw(reading_plots._draw_spread, many).axes[0], "residuals after: 500 of 12150")
+    assert x.size == reading_plots.MOST_POINTS
+    values = np.sort([r.residual * 1e3 for r in many.residuals])
+    np.testing.assert_allclose(y[:100], values[:100], atol=UNIT)
+    np.testing.assert_allclose(y[-100:], values[-100:], atol=UNIT)
+    assert (np.diff(x) > 0.0).all()
+
+
+def test_unknown_noise_has_neither_band_nor_line(unknown):
+    assert not draw(reading_plots._draw_residuals, unknown, 40).axes[0].containers
+    assert len(draw(reading_plots._draw_spread, unknown).axes[0].lines) == 1
+
+
+def test_linearising_is_shown_in_sigma_the_most_first(sweep):
+    shifts = parameter_plots._linearisation_shifts(sweep)
+    figure = draw(parameter_plots._draw_linearised, shifts)
+    axes = figure.axes[0]
+    x, _ = line(axes, "exact − linearised")
+    free = sweep.free
+    every = np.array([(p.value - p.linear) / p.std for p in free])
+    np.testing.assert_allclose(np.abs(x), np.sort(np.abs(every))[::-1][:20], atol=UNIT)
+    worst = free[int(np.abs(every).argmax())]
+    cost = f"{(worst.value - worst.linear) * 1e3:+.4f}".replace("-", "−")
+    assert row_names(axes)[0] == f"{worst.name} ({cost} mm)"
+    limits = [a.get_xdata()[0] for a in axes.lines if a.get_linestyle() == ":"]
+    assert limits == [-0.1, 0.1]
+    assert axes.get_xlim()[0] < -0.1
+    assert axes.get_xlim()[1] > 0.1
+
+
+def test_linearising_is_left_out_where_it_cannot_be_told(table1, bound, unknown):
+    assert parameter_plots.plot_linearised(table1)
+    assert parameter_plots.plot_linearised(unknown) == ""
+    robust = replace(table1, solver=replace(table1.solver, loss="huber"))
+    assert parameter_plots.plot_linearised(robust) == ""
+    assert [p.name for _, p in parameter_plots._linearisation_shifts(bound)] == [
+        *("y_slide.offset", "z_slide.offset")
+    ]
+    first, *rest = table1.parameters
+    open_one = replace(table1, parameters=(replace(first, std=np.inf), *rest))
+    assert [p.name for _, p in parameter_plots._linearisation_shifts(open_one)] == [
+        p.name for p in rest
+    ]
+
+
+def test_few_parameters_of_one_unit_are_in_that(table1):
+    figure = draw(parameter_plots._draw_parameters, table1, 30)
+    (axes,) = figure.axes  # without a prior the readings told all
+    assert axes.get_xlabel() == "estimate [mm]"
+    assert row_names(axes) == ["x_slide.offset", "y_slide.offset", "z_slide.offset"]
+    x, _ = line(axes, "estimate")
+    np.testing.assert_allclose(x, [p.value * 1e3 for p in table1.free], atol=UNIT)
+    ends, y = segments(axes)
+    intervals = np.array(table1.intervals) * 1e3
+    np.testing.assert_allclose(ends, intervals, atol=UNIT)
+    np.testing.assert_array_equal(y, np.arange(3))
+    assert not axes.containers
+
+
+def test_many_parameters_are_in_tolerances_what_is_told_best_first(sweep):
+    figure = draw(parameter_plots._draw_parameters, sweep, 30)
+    axes, beside = figure.axes
+    assert title(figure) == "Estimates with 95 % intervals: 30 of 129, offsets, then the best told"
+    assert axes.get_xlabel() == "estimate [tolerances]"
+    names = row_names(axes)
+    assert len(names) == 30
+    assert all(n.endswith(".offset") for n in names[:3])
+    shares = [sweep[n].data_share for n in names]
+    assert (np.diff(shares[3:]) <= 0.0).all()
+    others = [p.data_share for p in sweep.free if p.name not in names]
+    assert max(others) <= shares[-1]
+    x, _ = line(axes, "estimate")
+    scale = np.array([1.0 / sweep[n].tolerance for n in names])
+    np.testing.assert_allclose(x, [sweep[n].value for n in names] * scale, atol=UNIT)
+    ends, _ = segments(axes)
+    own = dict(zip([p.name for p in sweep.free], sweep.intervals, strict=True))
+    intervals = np.array([own[n] for n in names]) * scale[:, None]
+    np.testing.assert_allclose(ends, intervals, atol=UNIT)
+    (band,) = axes.containers
+    assert [(b.get_x(), b.get_width()) for b in band] == [(-1.0, 2.0)] * 30
+    widths = [b.get_width() for b in beside.containers[0]]
+    np.testing.assert_allclose(widths, np.array(shares) * 100.0, atol=UNIT)
+    assert beside.get_ylim() == axes.get_ylim()
+
+
+def test_the_band_of_a_parameter_is_where_its_prior_was(sweep):
+    known = replace(sweep.parameters[0], mean=0.01, tolerance=0.005, std=0.004)
+    without = replace(sweep.parameters[1], prior=False)
+    parameters = (known, without, *sweep.parameters[2:])
+    axes = draw(parameter_plots._draw_parameters, replace(sweep, parameters=parameters), 30).axes[0]
+    (band,) = axes.containers
+    bars = {round(b.get_y() + 0.5): (b.get_x(), b.get_width()) for b in band}
+    names = row_names(axes)
+    assert len(bars) == 29
+    assert names.index(without.name) not in bars
+    np.testing.assert_allclose(bars[names.index(known.name)], (1.0, 2.0), atol=UNIT)
+
+
+def test_a_parameter_at_its_bound_is_marked_as_such(bound):
+    axes = draw(parameter_plots._draw_parameters, bound, 30).axes[0]
+    x, y = line(axes, "held by its bound")
+    assert row_names(axes)[int(y[0])] == "x_slide.offset at lower bound"
+    np.testing.assert_allclose(x, [bound["x_slide.offset"].value * 1e3], atol=UNIT)
+    assert line(axes, "estimate")[0].size == 2
+    assert len(segments(axes)[0]) == 2
+
+
+def test_without_noise_there_are_estimates_but_no_intervals(unknown):
+    svg = parameter_plots.plot_parameters(unknown)
+    assert "no intervals: nothing tells the noise" in texts(svg)
+    axes = draw(parameter_plots._draw_parameters, unknown, 30).axes[0]
+    assert not axes.collections
+    assert line(axes, "estimate")[0].size == 30
+
+
+def test_few_correlations_are_printed_as_numbers(table1):
+    figure = draw(parameter_plots._draw_correlations, table1, 40)
+    axes = figure.axes[0]
+    r = table1.correlation
+    shown = {
+        (t.get_position()[0], t.get_position()[1]): t.get_text().replace("−", "-")
+        for t in axes.texts
+    }
+    expected = {(j + 0.5, i - 0.5): f"{r[i, j]:+.2f}" for i in (1, 2) for j in range(i)}
+    assert shown == expected
+    assert not any("-" in t.get_text() for t in axes.texts)
+    assert row_names(axes) == ["y_slide.offset", "z_slide.offset"]
+    assert [t.get_text() for t in axes.get_xticklabels()] == ["x_slide.offset", "y_slide.offset"]
+    assert figure.axes == [axes]  # numbers need no bar of colours
+    (cells,) = axes.collections
+    np.testing.assert_allclose(cells.get_array(), [r[1, 0], r[2, 0], r[2, 1]], atol=UNIT)
+    assert (cells.norm.vmin, cells.norm.vmax) == (-1.0, 1.0)
+    weak, strong = cells.cmap(cells.norm([0.0, 0.95]))
+    assert weak[:3].min() > 0.9 > strong[:3].max()
+
+
+def test_numbers_have_the_signs_that_axes_have():
+    assert [layout.typeset(v, 2) for v in (-0.25, 0.25, -0.001, 0.0)] == [
+        *("−0.25", "+0.25", "0.00", "0.00")
+    ]
+
+
+def test_of_many_parameters_those_with_the_strongest_correlations_are_shown(sweep):
+    figure = draw(parameter_plots._draw_correlations, sweep, 10)
+    assert title(figure).endswith("the 10 of 129 parameters with the strongest")
+    axes = figure.axes[0]
+    names = [axes.get_xticklabels()[0].get_text(), *row_names(axes)]
+    order = [p.name for p in sweep.free]
+    index = [order.index(n) for n in names]
+    assert index == sorted(index)
+    size = np.abs(sweep.correlation)
+    np.fill_diagonal(size, 0.0)
+    strongest = size.max(axis=1)
+    assert strongest[index].min() >= np.sort(strongest)[-10]
+    (a, b, _), *_ = sweep.correlated(above=0.0)
+    assert {a, b} <= set(names)
+
+
+def test_negative_correlations_can_be_told_without_colour(sweep):
+    axes = draw(parameter_plots._draw_correlations, sweep, 40).axes[0]
+    (cells,) = axes.collections
+    assert len(cells.get_paths()) == 40 * 39 / 2
+    centres = np.array([p.vertices[:4].mean(axis=0) for p in cells.get_paths()])
+    negative = np.asarray(cells.get_array()) < -parameter_plots.CLEAR
+    marked = np.concatenate([a.get_xydata() for a in axes.lines])
+    assert {tuple(p) for p in marked} == {tuple(p) for p in centres[negative]}
+    assert 0 < len(marked) < 100
+    assert {a.get_marker() for a in axes.lines} == {"_"}
+
+
+def test_correlations_need_two_parameters_that_have_any(table1, bound, unknown):
+    single = replace(table1, parameters=table1.parameters[:1], covariance=table1.covariance[:1, :1])
+    assert parameter_plots.plot_correlations(single) == ""
+    assert parameter_plots.plot_correlations(unknown) == ""
+    shown = texts(parameter_plots.plot_correlations(bound))
+    assert "x_slide.offset" not in shown
+    assert {"y_slide.offset", "z_slide.offset"} <= set(shown)
+
+
+def test_singular_values_above_the_noise_are_filled(sweep):
+    found = sweep.identifiability
+    figure = draw(parameter_plots._draw_singular_values, sweep)
+    assert title(figure).endswith(f"{found.rank} of 129 combinations rise above the noise")
+    axes = figure.axes[0]
+    values = found.singular_values * 1e3
+    x, y = line(axes, "told better")
+    np.testing.assert_array_equal(x, np.arange(1, found.rank + 1))
+    np.testing.assert_allclose(y, values[: found.rank], rtol=UNIT)
+    x, y = line(axes, "lost in the noise")
+    np.testing.assert_array_equal(x, np.arange(found.rank + 1, found.structural_rank + 1))
+    np.testing.assert_allclose(y, values[found.rank : found.structural_rank], rtol=UNIT)
+    faces = [a.get_markerfacecolor() for a in axes.lines[:2]]
+    assert faces == [style.AFTER, "white"]
+    np.testing.assert_allclose(line(axes, "σ of a reading")[1], found.threshold * 1e3)
+    assert axes.get_yscale() == "log"
+    assert axes.get_xlabel().endswith(f"({129 - found.structural_rank} more are zero)")
+
+
+def test_all_singular_values_are_named_where_none_is_zero(table1):
+    axes = draw(parameter_plots._draw_singular_values, table1).axes[0]
+    assert axes.get_xlabel() == "combination of parameters, the best told first"
+    assert len(axes.lines) == 2
+
+
+def test_unknown_noise_is_not_called_noise(unknown):
+    axes = draw(parameter_plots._draw_singular_values, unknown).axes[0]
+    labels = [str(a.get_label()) for a in axes.lines]
+    assert any(text.startswith("rounding: the noise is unknown") for text in labels)
+    assert not any(text.startswith("σ") for text in labels)
+
+
+def test_readings_that_tell_nothing_have_no_singular_values_to_show(table1):
+    nothing = replace(
+        table1.identifiability,
+        singular_values=np.zeros(3),
+        threshold=0.0,
+        rank=0,
+        structural_rank=0,
+    )
+    assert parameter_plots.plot_singular_values(replace(table1, identifiability=nothing)) == ""
+
+
+def test_nothing_is_cut_off_and_no_labels_overlap(sweep, many, table1):
+    figures = [
+        draw(reading_plots._draw_residuals, many, 40),
+        draw(reading_plots._draw_setups, sweep, 40),
+        draw(reading_plots._draw_spread, table1),
+        draw(parameter_plots._draw_linearised, parameter_plots._linearisation_shifts(sweep)),
+        draw(parameter_plots._draw_parameters, sweep, 30),
+        draw(parameter_plots._draw_correlations, sweep, 40),
+        draw(parameter_plots._draw_singular_values, sweep),
+    ]
+    for figure in figures:
+        with style.house_style():
+            figure.draw_without_rendering()
+            inside = figure.bbox.padded(1.0)
+            for box in (b for axes in figure.axes for b in label_boxes(axes)):
+                assert inside.contains(box.x0, box.y0)
+                assert inside.contains(box.x1, box.y1)
+            for axes in figure.axes:
+                for side in (ticks(axes.xaxis), ticks(axes.yaxis)):
+                    boxes = [t.get_window_extent() for t in side if t.get_text()]
+                    for a, b in pairwise(boxes):
+                        assert not a.padded(-0.5).overlaps(b.padded(-0.5))
+            for legend in figure.legends:
+                box = legend.get_window_extent()
+                assert inside.contains(box.x1, box.y1)
+                assert not any(box.overlaps(axes.bbox) for axes in figure.axes)
+
+
+def label_boxes(axes):
+    shown = [*ticks(axes.xaxis), *ticks(axes.yaxis), axes.xaxis.label, axes.yaxis.label]
+    return [t.get_window_extent() for t in shown if t.get_text()]
+
+
+def ticks(axis):
+    """Labels that are seen."""
+    low, high = sorted(axis.get_view_interval())
+    found = [t for t in axis.get_major_ticks() if low <= t.get_loc() <= high]
+    return [label for t in found for label in (t.label1, t.label2) if label.get_visible()]

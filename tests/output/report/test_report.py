@@ -1,0 +1,296 @@
+"""The report's content, without a browser."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from rich.console import Group
+from rich.panel import Panel
+from rich.text import Text
+
+from orthocal import Choice, calibrate, load_calibration, load_session
+from orthocal.assessment.controller_entries import find_entries
+from orthocal.calibration.file import write_calibration
+from orthocal.io.html import items, paragraph, table
+from orthocal.output.report.page import _provenance, build_report
+from orthocal.output.report.rich_markup import to_markup
+from orthocal.output.text.layout import add_row, bullets, section, table_of
+
+EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & $x_{$'
+
+
+class Reader(HTMLParser):
+    """Headings, tables and visible text of a page; raises nothing, so tests must look."""
+
+    VOID = ("meta", "link", "br", "img", "input")
+
+    def __init__(self, page):
+        super().__init__()
+        self.tags, self.ids, self.open, self.text = [], [], [], {}
+        self.rows: list[list[str]] = []
+        self.frames: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        named = dict(attributes)
+        self.tags.append(tag)
+        if "id" in named:
+            self.ids.append(named["id"])
+        if tag == "iframe":
+            self.frames.append(named["srcdoc"])
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.tags.append(tag)
+        if "id" in dict(attributes):
+            self.ids.append(dict(attributes)["id"])
+
+    def handle_endtag(self, tag):
+        assert self.open, f"</{tag}> without its beginning"
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open:
+            self.text.setdefault(self.open[-1], []).append(data)
+        if self.open and self.open[-1] in ("td", "th"):
+            self.rows[-1][-1] += data
+
+
+@pytest.fixture(scope="module")
+def calibration(experiment_2):
+    return calibrate(experiment_2)
+
+
+@pytest.fixture(scope="module")
+def page(calibration):
+    return build_report(calibration)
+
+
+@pytest.fixture(scope="module")
+def read(page):
+    return Reader(page)
+
+
+def test_reading_order_is_verdict_tool_fit_residuals_and_the_rest(page, read):
+    names = re.findall(r'<section id="(\w+)">', page)
+    assert names == [
+        *("verdict", "tool", "fit", "residuals", "parameters", "sensors"),
+        *("correlations", "identifiability", "words", "provenance", "scene"),
+    ]
+    assert not read.open
+    assert all(f'href="#{name}"' in page for name in names)
+
+
+def test_what_to_enter_stands_first_and_is_what_was_identified(calibration, read):
+    first = read.rows[1:4]
+    for row, entry in zip(first, find_entries(calibration), strict=True):
+        assert row[0] == entry.drive
+        assert row[2:] == [
+            f"{entry.enter * 1e3:+.3f}",
+            f"{entry.std * 1e3:.3f}",
+            "mm",
+        ]
+
+
+def test_every_reading_is_listed(calibration, read):
+    for row in calibration.residuals:
+        listed = [r for r in read.rows if r[:1] == [row.setup] and len(r) > 5]
+        assert len(listed) == 1
+        assert f"{row.residual * 1e3:+.3f}" in listed[0]
+        assert f"{row.deviation * 1e3:+.3f}" in listed[0]
+
+
+def test_provenance_names_files_by_their_sums(calibration, page):
+    assert calibration.session.sha256 in page
+    assert calibration.robot_record.sha256 in page
+    assert calibration.version in page
+    assert "Pashkevich, Chablat, Wenger (2006)" in page
+
+
+def test_provenance_says_what_was_given_beside_the_readings(root, read, calibration, page):
+    assert _provenance(calibration) in page
+    assert ["Given beside the readings", "nothing: the robot's own tolerances hold"] in read.rows
+    found = calibrate(
+        root / "examples/raw-cycles",
+        Choice(
+            model="lengths",
+            tolerances={"*.offset_m": 2e-3},
+            known={"x_leg.length_m": 0.12e-3, "y_leg.length_m": (0.05e-3, 0.02e-3)},
+            bounds={"z_slide.offset_m": (-1e-3, 2e-3)},
+        ),
+    )
+    rows = Reader(_provenance(found)).rows
+    offsets = [f"{leg}_slide.offset 2 mm instead of 5" for leg in "xyz"]
+    assert ["Tolerances", "; ".join(offsets)] in rows
+    assert ["Known values", "y_leg.length 0.05 ± 0.02 mm; x_leg.length 0.12 mm"] in rows
+    assert ["Bounds", "z_slide.offset -1 … 2 mm"] in rows
+
+
+def test_plots_are_drawn_into_the_page(page, read):
+    assert read.tags.count("svg") >= 9
+    assert len(read.ids) == len(set(read.ids))
+    own = re.sub(r'srcdoc="[^"]*"', "", page)
+    links = set(re.findall(r'(?:href|src|xlink:href)="([^"]*)"', own))
+    assert all(link.startswith(("#", "data:")) for link in links), links
+    assert not re.findall(r"url\((?!#)", own)
+    assert "://" not in re.sub(r'xmlns(:\w+)?="[^"]*"', "", own)
+
+
+def test_scene_is_embedded_whole(read):
+    (frame,) = read.frames
+    assert frame.startswith("<!DOCTYPE html>")
+    assert "Leg x is furthest from parallel" in frame
+
+
+def test_full_model_says_what_the_offsets_leave(root):
+    found = calibrate(load_session(root / "examples/sweep"), "full")
+    page = build_report(found)
+    assert "once the offsets above are entered" in page
+    read = Reader(page)
+    assert ["drive", "active now", "enter", "± σ", "identified", "unit"] in read.rows
+    assert (
+        len([r for r in read.rows if len(r) > 5 and r[0] in {s.name for s in found.setups}]) == 162
+    )
+    listed = {r[0] for r in read.rows if r}
+    assert {p.name for p in found.free} <= listed
+
+
+def test_same_calibration_makes_the_same_report(calibration, page, tmp_path):
+    assert build_report(calibration) == page
+    path = write_calibration(calibration, tmp_path / "calibration.json")
+    loaded = build_report(load_calibration(path))
+    assert loaded == page
+
+
+def test_texts_of_strangers_are_text(raw_cycles):
+    session = replace(
+        raw_cycles,
+        title=EVIL,
+        source=EVIL,
+        setups={f"{n}{EVIL}": replace(s, name=f"{n}{EVIL}") for n, s in raw_cycles.setups.items()},
+        postures={
+            f"{n}{EVIL}": replace(p, name=f"{n}{EVIL}") for n, p in raw_cycles.postures.items()
+        },
+        readings=tuple(
+            replace(r, setup=f"{r.setup}{EVIL}", posture=f"{r.posture}{EVIL}")
+            for r in raw_cycles.readings
+        ),
+    )
+    found = calibrate(session)
+    read = Reader(build_report(found))
+    assert "script" not in read.tags
+    assert "img" not in read.tags
+    assert not read.open
+    frame = Reader(read.frames[0])
+    assert "img" not in frame.tags
+    assert frame.tags.count("script") == 3
+    for part in (found._repr_html_(), session._repr_html_()):
+        seen = Reader(part)
+        assert set(seen.tags) <= {
+            "p",
+            "table",
+            "thead",
+            "tbody",
+            "tr",
+            "th",
+            "td",
+            "ul",
+            "li",
+            "code",
+        }
+        assert any(EVIL in t for t in seen.text["p"])
+
+
+def test_report_of_what_nothing_tells(raw_cycles):
+    """One setup with a prior: no cross-validation, and no gauge that tells the noise."""
+    rows = tuple(r for r in raw_cycles.readings if r.setup == "yx" and r.cycle == 1)
+    session = replace(raw_cycles, readings=rows).with_gauge(
+        replace(raw_cycles.gauge, sigma=None, resolution=None)
+    )
+    found = calibrate(session, "full")
+    assert not np.isfinite([r.unseen for r in found.residuals]).any()
+    page = build_report(found)
+    assert "No setup can be predicted from the others" in page
+    assert not Reader(page).open
+
+
+def test_robot_without_a_tool_has_a_report(experiment_2):
+    bare = replace(experiment_2.robot, tcp=None)
+    found = calibrate(replace(experiment_2, robot=bare))
+    page = build_report(found)
+    assert "Nothing can be said of the tool" in page
+    assert "no tool centre point" in page
+
+
+# ---- notebooks
+
+
+def test_calibration_in_a_notebook(calibration):
+    read = Reader(calibration._repr_html_())
+    assert read.rows[0] == ["drive", "active now", "enter", "±", "unit"]
+    entry = find_entries(calibration)[0]
+    assert read.rows[1] == [
+        "x_slide",
+        "+0.000",
+        f"{calibration['x_slide.offset'].value * 1e3:+.3f}",
+        f"{entry.std * 1e3:.3f}",
+        "mm",
+    ]
+    words = " ".join(read.text["p"])
+    assert "Enter these, and measure again. What remains, σ = 0.276 mm of a difference" in words
+    assert "it is error of the model" in words
+    assert "At the tool expect 118 µm" in words
+
+
+def test_calibration_with_many_parameters_lists_what_to_enter(root):
+    found = calibrate(load_session(root / "examples/sweep"), "full")
+    read = Reader(found._repr_html_())
+    assert [r[0] for r in read.rows[1:]] == ["x_slide", "y_slide", "z_slide"]
+    assert "In a controller that knows all errors: 12.7 µm" in " ".join(read.text["p"])
+
+
+def test_session_in_a_notebook(raw_cycles):
+    read = Reader(raw_cycles._repr_html_())
+    assert len(read.rows) == 7
+    values = [r.value * 1e3 for r in raw_cycles.readings if r.setup == "yx"]
+    assert read.rows[1] == [
+        *("yx", "leg x, y, fraction 0.5", "9"),
+        *(f"{min(values):+.3f}", f"{max(values):+.3f}"),
+    ]
+
+
+# ---- pieces of HTML
+
+
+def test_pieces_of_html_are_escaped():
+    assert paragraph("a < b & c", kind="x") == '<p class="x">a &lt; b &amp; c</p>'
+    assert items(["<", "b"]) == "<ul><li>&lt;</li><li>b</li></ul>"
+    found = table(("a", "b"), [("<i>", "1")])
+    assert '<td>&lt;i&gt;</td><td class="number">1</td>' in found
+    assert "thead" not in table(("", ""), [("a", "b")])
+    with pytest.raises(ValueError, match="zip"):
+        table(("a",), [("1", "2")])
+
+
+def test_what_is_printed_becomes_html():
+    printed = table_of("name", "value", "unit")
+    add_row(printed, "[b]x[/b]", "1", "mm")
+    content = Group(
+        section("T", Group(Text("before"), printed)), bullets(["one", "two"]), Text("end")
+    )
+    found = to_markup(content)
+    assert "<p>T</p>" in found
+    assert "<td>[b]x[/b]</td>" in found
+    assert "<ul><li>one</li><li>two</li></ul>" in found
+    assert found.endswith("<p>end</p>")
+    with pytest.raises(TypeError, match="no HTML for a Panel"):
+        to_markup(Panel("x"))

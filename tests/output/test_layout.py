@@ -1,0 +1,52 @@
+"""Tables in narrow terminals: words break, numbers never."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from orthocal import calibrate, validate_calibration
+from orthocal.assessment.comparison import compare_models
+from orthocal.output.text.layout import add_row, table_of, to_text
+from orthocal.output.text.summary import _render
+
+NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?")
+
+
+@pytest.fixture(scope="module")
+def results(experiment_2):
+    calibration = calibrate(experiment_2, "full")
+    unstated = replace(experiment_2, controller_offsets=None)
+    return {
+        "offsets": calibrate(experiment_2),
+        "full": calibration,
+        "validation": validate_calibration(calibration, unstated),
+        "comparison": compare_models(experiment_2, models=["offsets", "lengths"]),
+    }
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 100])
+@pytest.mark.parametrize("details", [True, False], ids=["details", "answer"])
+@pytest.mark.parametrize("name", ["offsets", "full", "validation", "comparison"])
+def test_no_number_is_cut_however_narrow_it_gets(name, details, width, results):
+    content = _render(results[name], details, details)
+    wide, narrow = to_text(content, width=400), to_text(content, width=width)
+    assert max(len(line) for line in narrow.splitlines()) <= width
+    assert not re.search(r"\d…|\.…", narrow)
+    numbers = set(NUMBER.findall(wide))
+    assert numbers
+    assert numbers - set(NUMBER.findall(narrow)) == set()
+
+
+def test_a_table_that_does_not_fit_is_told_row_by_row():
+    table = table_of("parameter", "exact", "interval", "unit")
+    add_row(table, "x_slide.offset", "-0.527", "-1.759 … +0.705", "mm")
+    assert to_text(table, width=60).splitlines()[-1].split()[0] == "x_slide.offset"
+    assert to_text(table, width=30).splitlines() == [
+        "x_slide.offset",
+        "  exact: -0.527",
+        "  interval: -1.759 … +0.705",
+        "  unit: mm",
+    ]

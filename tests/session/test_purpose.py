@@ -1,0 +1,132 @@
+"""What a session says of its calibration: a model and tolerances, where nothing else is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from orthocal import Choice, ParameterError, SessionError, calibrate, load_calibration
+from orthocal.calibration.file import write_calibration
+from orthocal.calibration.refit import repeat_calibration, restore_session
+from orthocal.estimation.choice import choose
+from orthocal.measurement.files.session_file import load_session
+from orthocal.measurement.files.write_session import write_session
+from orthocal.measurement.joining import join_sessions
+from orthocal.session.session import Purpose
+from orthocal.study.shipped_functions import ShippedSession
+
+TOLERANCES = {"*_fork.rx_mrad": 3.0, "*_swivel.rx_mrad": 2.0, "*.offset_mm": 0.4}
+FORK = "x_fork.rx"
+
+
+def say(session, folder, **said):
+    """The session from a folder where its file says this of its calibration."""
+    told = replace(session, purpose=Purpose(said.get("model"), tuple(said.get("free", ()))))
+    return load_session(write_session(told.with_tolerances(said.get("tolerances", {})), folder))
+
+
+@pytest.fixture(scope="module")
+def stated(raw_cycles, tmp_path_factory):
+    return say(raw_cycles, tmp_path_factory.mktemp("full"), model="full", tolerances=TOLERANCES)
+
+
+def test_what_a_session_says_is_what_options_would(raw_cycles, stated):
+    assert stated.purpose == Purpose("full")
+    found, expected = (
+        calibrate(stated, solver="eliminated"),
+        calibrate(raw_cycles, Choice("full", tolerances=TOLERANCES), solver="eliminated"),
+    )
+    assert found.model == expected.model == "full"
+    assert [p.tolerance for p in found.free] == [p.tolerance for p in expected.free]
+    assert [(p.value, p.std) for p in found.free] == [(p.value, p.std) for p in expected.free]
+
+
+def test_tolerances_hold_for_what_is_left_out(raw_cycles, stated):
+    own, told = (calibrate(s, "offsets", solver="eliminated") for s in (raw_cycles, stated))
+    np.testing.assert_allclose(*([p.value for p in c.free] for c in (own, told)), atol=1e-12)
+    index = own.unmodelled.names.index(FORK)
+    assert own.unmodelled.tolerances[index] == 1e-3
+    assert told.unmodelled.tolerances[index] == pytest.approx(3e-3)
+    assert told.unmodelled.residual_rms > own.unmodelled.residual_rms
+
+
+def test_a_calibration_keeps_them(stated, tmp_path):
+    first = calibrate(stated, solver="eliminated")
+    again = load_calibration(write_calibration(first, tmp_path / "calibration.json"))
+    assert again.robot.parameters[FORK].tolerance == pytest.approx(3e-3)
+    repeated = repeat_calibration(again, restore_session(again))
+    np.testing.assert_allclose(
+        [p.value for p in repeated.free], [p.value for p in first.free], atol=1e-12
+    )
+
+
+def test_options_come_before_what_a_session_says(stated):
+    parameters = stated.robot.parameters
+    assert choose("offsets", stated).model == "offsets"
+    assert choose(Choice(free=["*.offset"]), stated).model is None
+    only_known = choose(Choice(known={"x_leg.length_mm": 0.1}), stated)
+    assert (only_known.model, dict(only_known.known)) == ("full", {"x_leg.length_mm": 0.1})
+    narrower = choose(Choice(tolerances={"x_fork.rx_mrad": 0.5}), stated).select(parameters)
+    sizes = {p.name: p.tolerance for p in narrower.parameters}
+    assert sizes[FORK] == pytest.approx(0.5e-3)
+    assert sizes["y_fork.rx"] == pytest.approx(3e-3)
+
+
+def test_where_nothing_is_said(raw_cycles, stated):
+    assert choose(None, raw_cycles).model == "offsets"
+    assert choose(None, raw_cycles, usual="full").model == "full"
+    assert choose(None, None, usual="full").model == "full"
+    assert choose(None, stated, usual="lengths").model == "full"
+
+
+def test_globs_instead_of_a_model(raw_cycles, tmp_path):
+    session = say(raw_cycles, tmp_path, free=["*.offset", "!x_slide.offset"])
+    assert [p.name for p in calibrate(session, solver="eliminated").free] == [
+        "y_slide.offset",
+        "z_slide.offset",
+    ]
+
+
+def test_sessions_agree_or_are_asked(raw_cycles, stated, tmp_path):
+    also = say(raw_cycles, tmp_path / "also", model="full", tolerances={"*.scale_ppm": 50.0})
+    joined = join_sessions([stated, also])
+    assert joined.purpose == Purpose("full")
+    assert joined.robot.parameters.stated == {**TOLERANCES, "*.scale_ppm": 50.0}
+    offsets = say(raw_cycles, tmp_path / "offsets", model="offsets")
+    joined = join_sessions([stated, offsets])
+    with pytest.raises(ParameterError) as e:
+        choose(None, joined)
+    assert str(e.value) == (
+        f"model: sessions are for different models: full in {stated.path}; offsets in "
+        f"{offsets.path}; say which"
+    )
+    assert choose("full", joined).model == "full"
+    assert choose(None, join_sessions([stated, raw_cycles])).model == "full"
+
+
+def test_one_machine_has_one_tolerance(raw_cycles, stated, tmp_path):
+    other = say(raw_cycles, tmp_path, model="full", tolerances={"*.offset_mm": 2.0})
+    with pytest.raises(SessionError) as e:
+        join_sessions([stated, other])
+    assert str(e.value) == (
+        f"{other.path}: calibration.tolerances.*.offset_mm: is 2; it is 0.4 in {stated.path}, and "
+        "the machine is the same"
+    )
+
+
+def test_a_worker_gets_them(stated):
+    there = ShippedSession.of(stated).unpack()
+    assert there.purpose == stated.purpose
+    assert there.robot.parameters[FORK].tolerance == pytest.approx(3e-3)
+
+
+def test_later_ones_come_on_top(orthoglide):
+    parameters = orthoglide.parameters.with_tolerances({"*.offset_mm": 2.0})
+    parameters = parameters.with_tolerances({"x_slide.offset_mm": 1.0})
+    assert [parameters[f"{a}_slide.offset"].tolerance for a in "xyz"] == [1e-3, 2e-3, 2e-3]
+    parameters = parameters.with_tolerances({"*.offset_mm": 0.5})
+    assert {parameters[f"{a}_slide.offset"].tolerance for a in "xyz"} == {0.5e-3}
+    assert parameters.own is orthoglide.parameters
+    assert parameters.idle == orthoglide.parameters.idle
