@@ -64,3 +64,8 @@ def to_mm(value: float) -> float:
 def tidy(value: float) -> float:
     """A number without what a factor has left in its last digits."""
     return float(f"{value:.12g}") + 0.0
+
+
+def format_fixed(value: float, decimals: int, *, sign: bool = False) -> str:
+    """Number with fixed decimals, and without a negative zero."""
+    return f"{round(value, decimals) + 0.0:{'+' if sign else ''}.{decimals}f}"

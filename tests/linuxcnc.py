@@ -183,10 +183,10 @@ net switch{i} comp.{i}.out => joint.{i}.home-sw-in
 
 DRIVE = """\
 #!/usr/bin/python3
-import linuxcnc, subprocess, sys, time
+import json, linuxcnc, subprocess, time
 
 command, status, errors = linuxcnc.command(), linuxcnc.stat(), linuxcnc.error_channel()
-lines = open("program.ngc").read().splitlines()
+runs = json.load(open("runs.json"))
 
 
 def wait(done, what, seconds=30.0):
@@ -203,9 +203,37 @@ def wait(done, what, seconds=30.0):
         time.sleep(0.005)
 
 
-def finish():
-    command.wait_complete(30.0)
-    wait(lambda: status.interp_state == linuxcnc.INTERP_IDLE and status.inpos, "the program")
+def idle():
+    return status.interp_state == linuxcnc.INTERP_IDLE and status.inpos
+
+
+def paused():
+    return status.interp_state == linuxcnc.INTERP_PAUSED and status.inpos
+
+
+def mdi(lines):
+    command.mode(linuxcnc.MODE_MDI)
+    command.wait_complete()
+    for line in lines:
+        command.mdi(line)
+        command.wait_complete(30.0)
+        wait(idle, line)
+
+
+def run(name):
+    pauses = []
+    command.mode(linuxcnc.MODE_AUTO)
+    command.wait_complete()
+    command.program_open(name)
+    command.auto(linuxcnc.AUTO_RUN, 1)
+    wait(lambda: status.interp_state != linuxcnc.INTERP_IDLE, "to begin", 5.0)
+    while True:
+        wait(lambda: idle() or paused(), "the program")
+        if idle():
+            return pauses
+        pauses.append(list(status.joint_position[:status.joints]))
+        command.auto(linuxcnc.AUTO_RESUME)
+        wait(lambda: status.interp_state != linuxcnc.INTERP_PAUSED, "to go on", 5.0)
 
 
 def main():
@@ -218,22 +246,18 @@ def main():
     command.wait_complete()
     command.home(-1)
     wait(lambda: all(status.homed[:joints]), "to be homed")
-    command.mode(linuxcnc.MODE_MDI)
-    command.wait_complete()
-    command.mdi(lines[0])
-    finish()
+    mdi(runs[0]["mdi"])
     recording = subprocess.Popen(["halsampler", "recorded.txt"])
     time.sleep(0.2)
     subprocess.run(["halcmd", "setp", "sampler.0.enable", "1"], check=True)
-    command.mode(linuxcnc.MODE_AUTO)
-    command.wait_complete()
-    command.program_open("program.ngc")
-    command.auto(linuxcnc.AUTO_RUN, 1)
-    wait(lambda: status.interp_state != linuxcnc.INTERP_IDLE, "to begin", 5.0)
-    finish()
+    pauses = [run(runs[0]["program"])]
     time.sleep(0.3)
     recording.terminate()
     recording.wait()
+    for following in runs[1:]:
+        mdi(following["mdi"])
+        pauses.append(run(following["program"]))
+    json.dump(pauses, open("pauses.json", "w"))
 
 
 try:
@@ -307,24 +331,36 @@ def installed(folder):
         target.unlink(missing_ok=True)
 
 
-def run_program(program, joints, *, letters="XYZ", lines="", module=None):
-    """Home, go to the program's first line, run the rest; slides in every servo period.
+def run_program(program, joints, **options):
+    """Slides in every servo period while a program runs, shape (K, n_joints), [mm].
 
     Args:
-        program: Lines of G-code; the first brings the tool to where the rest begins.
-        joints: Of the machine.
-        letters: Of the coordinates.
-        lines: Of an INI, typed over those that are there.
-        module: Folder of exported kinematics; each joint is a coordinate of its own by default.
+        program: Lines of G-code; the first brings the tool to the start of the path.
+        joints: Joints of the machine.
+        **options: Options of `run_programs`.
+    """
+    return run_programs([(program[:1], [*program, "M2"])], joints, **options)[0]
+
+
+def run_programs(runs, joints, *, letters="XYZ", lines="", module=None):
+    """Home the machine, then run programs one after the other.
+
+    Args:
+        runs: For each program the lines to run in MDI before it, and its own lines.
+        joints: Joints of the machine.
+        letters: Letters of the coordinates.
+        lines: Lines that replace those of the same name in the INI.
+        module: Folder of an exported kinematics module; without it each joint is a coordinate.
 
     Returns:
-        Shape (K, n_joints), [mm].
+        Slides in every servo period of the first program, shape (K, n_joints), [mm]; and for each
+        program the joints' positions at its pauses (M0), shape (n_pauses, n_joints), [mm].
     """
     require_linuxcnc()
     with only_one(), nullcontext() if module is None else installed(module):
         folder = Path(tempfile.mkdtemp(prefix="orthocal-linuxcnc-"))
         try:
-            _write(folder, program, joints, letters=letters, lines=lines)
+            _write(folder, runs, joints, letters=letters, lines=lines)
             return _run(folder)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
@@ -356,7 +392,7 @@ def filter_program(ini, program, result):
     return found["code"], found["said"], found["progress"]
 
 
-def _write(folder, program, joints, *, letters, lines):
+def _write(folder, runs, joints, *, letters, lines):
     n = len(joints)
     ini = BASE.format(joints=n, letters=letters)
     ini += "".join(AXIS.format(letter=letter) for letter in letters)
@@ -384,8 +420,11 @@ def _write(folder, program, joints, *, letters, lines):
         "simulated.ini": _as_text(sections),
         "simulated.hal": hal,
         "simulated.tbl": "",
-        "program.ngc": "\n".join([*program, "M2", ""]),
         "drive.py": DRIVE,
+        "runs.json": json.dumps(
+            [{"mdi": mdi, "program": f"{i}.ngc"} for i, (mdi, _) in enumerate(runs)]
+        ),
+        **{f"{i}.ngc": "\n".join([*program, ""]) for i, (_, program) in enumerate(runs)},
     }
     for name, text in files.items():
         (folder / name).write_text(text)
@@ -450,4 +489,4 @@ def _run(folder):
         pytest.fail(f"{reason}\n{(folder / 'said.txt').read_text()[-3000:]}")
     rows = np.loadtxt(recorded, ndmin=2, comments="o")  # `overrun` stands where samples are lost
     assert len(rows) > 100
-    return rows
+    return rows, [np.array(places) for places in json.loads((folder / "pauses.json").read_text())]

@@ -20,7 +20,7 @@ from orthocal import load_session
 from orthocal.cli.run import main
 from orthocal.hypotheses import prediction as foresight
 from orthocal.measurement.files.session_file import load_plan
-from orthocal.measurement.motion.guidance import guide
+from orthocal.measurement.motion.motion import guide
 from orthocal.measurement.recording.recording import SUFFIX, open_recording
 from orthocal.robot.loading import packaged_robots
 from orthocal.units import MM

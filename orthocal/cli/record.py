@@ -67,7 +67,7 @@ class _Dialogue:
     """Questions and answers about the rows of a recording."""
 
     def __init__(self, recording: Recording, path: str) -> None:
-        from orthocal.measurement.motion.guidance import guide
+        from orthocal.measurement.motion.motion import guide
 
         self._recording = recording
         self._path = path

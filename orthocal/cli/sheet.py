@@ -35,7 +35,7 @@ def sheet(
         typer.Option(
             "--shift-mm",
             metavar="X,Y,Z",
-            help="What the program's coordinates have more than the world's.",
+            help="Machine coordinates (G53) of the world's origin, mm.",
         ),
     ] = "0,0,0",
     force: Annotated[bool, typer.Option("--force", help="Write over what is there.")] = False,

@@ -1,7 +1,7 @@
-"""The way through a plan and its programs: in order, approached from one side, within reach.
+"""Motion plans and measuring programs: order, approach from one side, reach.
 
-What joints show is held against Pinocchio's loops, programs against a reader of their own and
-LinuxCNC's interpreter.
+Joints are compared with Pinocchio's loop closure, programs with a reader of their own, with
+LinuxCNC's interpreter and with LinuxCNC's joints in simulation.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from linuxcnc import Joint, run_programs
 from machines import place
 
-from orthocal import load_plan
+from orthocal import calibrate, export_calibration, load_plan, simulate_session
 from orthocal.errors import ParameterError, SessionError
+from orthocal.export.options import ExportOptions
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.measurement.motion.motion import APPROACH, plan_motion, shown_joints
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
@@ -26,8 +28,8 @@ from orthocal.robot.builder.dimensions import Counting, Sizes
 from orthocal.units import MM
 
 ROUNDED = 1e-4
-"""Coordinates of a program and joints in its comments have four decimals, [mm]; half of that in
-each of three joints moves the tool by less."""
+"""Rounding of coordinates and joints in a program, [mm]. Half a unit in each of three
+joints moves the tool by less."""
 
 SMALL = Sizes(leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004)
 COUNTING = (Counting(True, 0.0), Counting(False, 0.005), Counting(False, None))
@@ -46,7 +48,7 @@ setups:
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """A plan on a machine of other sizes, whose joints count in three ways."""
+    """A plan on a machine of other dimensions, with three joint conventions."""
     folder = tmp_path_factory.mktemp("motion")
     make_robot(SMALL, folder / "mine", counting=COUNTING)
     (folder / "plan.yaml").write_text(PLAN)
@@ -59,22 +61,23 @@ def motions(small):
 
 
 def read_program(text, robot):
-    """Where the machine pauses in a program: coordinates and joints; and all places it goes to."""
+    """All coordinates of a program's motions; coordinates and commented joints at its pauses."""
     position: dict[str, float] = {}
-    places, pauses, joints = [], [], None
+    points, pauses, joints = [], [], None
     for line in text.splitlines():
         message = re.search(r"joints ([-0-9. ]+);", line)
         joints = [float(v) for v in message[1].split()] if message else joints
         code = re.sub(r"\([^)]*\)", "", line).strip()
-        if code.startswith("G1 "):
-            position.update({w[0]: float(w[1:]) for w in code.split()[1:]})
-            places.append([position[c] for c in "XYZ"])
+        assert code.startswith("G53 G1 ") or not re.search("[XYZ]", code)
+        if code.startswith("G53 G1 "):
+            position.update({w[0]: float(w[1:]) for w in code.split()[2:]})
+            points.append([position[c] for c in "XYZ"])
         elif code == "M0":
-            pauses.append((np.array(places[-1]), np.array(joints)))
-    return np.array(places), pauses
+            pauses.append((np.array(points[-1]), np.array(joints)))
+    return np.array(points), pauses
 
 
-def test_a_program_pauses_in_every_posture_in_order(small, motions):
+def test_program_pauses_in_every_posture_in_order(small, motions):
     for motion in motions:
         text = write_program(small, motion)
         _, pauses = read_program(text, small.robot)
@@ -91,8 +94,7 @@ def test_a_program_pauses_in_every_posture_in_order(small, motions):
         assert text.isascii()
 
 
-def test_joints_are_those_of_the_posture_by_pinocchio(small, motions):
-    """What is shown, turned back into coordinates, brings Pinocchio's tool to where it is sent."""
+def test_commented_joints_reach_the_coordinates_by_pinocchio(small, motions):
     robot = small.robot
     for motion in motions:
         _, pauses = read_program(write_program(small, motion), robot)
@@ -104,20 +106,20 @@ def test_joints_are_those_of_the_posture_by_pinocchio(small, motions):
     assert shown_joints(robot, robot.drive_zero + 0.01) == pytest.approx([0.01, -0.005, 0.24])
 
 
-def test_every_drive_comes_from_the_same_side(small, motions):
-    """On the last move each drive grows all the way; and by what it was to come back."""
+def test_every_drive_approaches_from_the_same_side(small, motions):
+    """Each drive coordinate grows monotonically by the approach length."""
     robot = small.robot
     for motion in motions:
-        places, _ = read_program(write_program(small, motion), robot)
+        points, _ = read_program(write_program(small, motion), robot)
         assert motion.side == -1
-        for before, after in zip(places[0::2], places[1::2], strict=True):
+        for before, after in zip(points[0::2], points[1::2], strict=True):
             shares = np.linspace(0.0, 1.0, 9)[:, None]
             drives = nominal_assembly(robot).inverse((before + shares * (after - before)) * MM)
             assert np.all(np.diff(drives, axis=0) > 0.0)
             assert drives[-1] - drives[0] == pytest.approx([APPROACH] * 3, abs=3e-7)
 
 
-def test_the_other_side_is_taken_at_the_end_of_travel(small):
+def test_approach_from_the_other_side_at_the_end_of_travel(small):
     lower = replace(small.robot.drives[0], lower=0.2)
     robot = replace(small.robot, drives=(lower, *small.robot.drives[1:]))
     motion = plan_motion(replace(small, robot=robot))[0]
@@ -130,7 +132,7 @@ def test_the_other_side_is_taken_at_the_end_of_travel(small):
         plan_motion(replace(small, robot=robot))
 
 
-def test_it_ends_where_it_began(motions, raw_cycles):
+def test_motion_ends_in_the_first_posture(motions, raw_cycles):
     for motion in motions:
         assert motion.stops[-1].posture == motion.stops[0].posture
         assert motion.stops[-1].role == "return"
@@ -140,36 +142,33 @@ def test_it_ends_where_it_began(motions, raw_cycles):
     assert [s.line for s in cycles.stops] == [*range(2, 11), None]
 
 
-def test_differences_stop_in_both_postures(experiment_2):
+def test_a_difference_stops_in_both_postures(experiment_2):
     session = experiment_2
     stops = plan_motion(session)[0].stops
     reading = session.readings[0]
     assert [(s.posture, s.role) for s in stops[:2]] == [
-        (reading.minus, "taken off"),
+        (reading.minus, "subtracted"),
         (reading.posture, "reading"),
     ]
 
 
-def test_active_offsets_change_nothing_that_is_shown(small, motions):
-    """The controller shows the same, and its drives stand elsewhere."""
+def test_active_offsets_do_not_change_the_program(small, motions):
     entered = small.with_controller([1e-3, -2e-3, 0.0])
     for before, after in zip(motions, plan_motion(entered), strict=True):
         assert write_program(entered, after) == write_program(small, before)
 
 
-def test_what_a_perfect_machine_shows_is_told(small, motions):
-    """The rod's own tilt at the section, where the leg moves aside: by Pinocchio's rod."""
+def test_predicted_readings_of_a_machine_without_errors(small, motions):
     for motion in motions:
         first, *rest = motion.stops
         assert first.expected == 0.0
         assert rest[-1].expected == pytest.approx(0.0, abs=1e-12)
     aside = motions[0].stops[1]
-    # y -10 at the tool, less at mid-leg; a ball of a round rod that also goes 5 mm aside less still
+    # y is -10 mm at the tool and less at mid-leg; the rod also moves 5 mm sideways under the ball
     assert -0.01 < aside.expected < -0.004
 
 
-def test_the_plunger_is_lifted_where_it_would_be_lost(small):
-    """A fine dial, or a tip that passes the rod on the way between postures it may stand in."""
+def test_plunger_is_lifted_where_the_dial_would_leave_its_range(small):
     gauge = replace(small.gauge, range=(-2e-3, 2e-3))
     motion = plan_motion(replace(small, gauges={"": gauge}))[0]
     lifts = [s.lift for s in motion.stops]
@@ -179,8 +178,8 @@ def test_the_plunger_is_lifted_where_it_would_be_lost(small):
     assert "hold the plunger up on the way to line 3" in text
 
 
-def test_a_way_that_leaves_the_travel_goes_over_the_zero(small):
-    """From side to side 10 mm above the zero: between, the z-leg is upright and z furthest."""
+def test_path_that_leaves_the_travel_passes_through_the_mechanical_zero(small):
+    """Between the postures, 10 mm above zero, the z leg is upright and its drive farthest."""
     robot = small.robot
     points = np.array([[60.0, 0.0, 10.0], [-60.0, 0.0, 10.0]]) * MM
     drives = nominal_assembly(robot).inverse(points)
@@ -193,18 +192,18 @@ def test_a_way_that_leaves_the_travel_goes_over_the_zero(small):
     }
     readings = tuple(replace(small.readings[0], posture=n, cycle=i) for i, n in enumerate("ab"))
     session = replace(small, postures=postures, readings=readings)
-    assert not any(s.over_zero for s in plan_motion(session)[0].stops)
+    assert not any(s.via_zero for s in plan_motion(session)[0].stops)
     session = replace(session, robot=replace(robot, drives=(*robot.drives[:2], z)))
     motion = plan_motion(session)[0]
-    assert [s.over_zero for s in motion.stops] == [False, True, True]
-    places, _ = read_program(write_program(session, motion), robot)
-    assert np.flatnonzero(np.abs(places).max(axis=1) == 0.0).tolist() == [2, 5]
-    for start, end in pairwise(places * MM):
-        way = start + np.linspace(0.0, 1.0, 50)[:, None] * (end - start)
-        assert nominal_assembly(robot).inverse(way)[:, 2].max() < z.upper
+    assert [s.via_zero for s in motion.stops] == [False, True, True]
+    points, _ = read_program(write_program(session, motion), robot)
+    assert np.flatnonzero(np.abs(points).max(axis=1) == 0.0).tolist() == [2, 5]
+    for start, end in pairwise(points * MM):
+        path = start + np.linspace(0.0, 1.0, 50)[:, None] * (end - start)
+        assert nominal_assembly(robot).inverse(path)[:, 2].max() < z.upper
 
 
-def test_a_work_offset_moves_all_coordinates(small, motions):
+def test_shift_moves_all_coordinates(small, motions):
     motion = motions[0]
     plain, _ = read_program(write_program(small, motion), small.robot)
     options = ProgramOptions(shift_mm=(1.0, -2.0, 300.5), feed=1000.0)
@@ -222,7 +221,7 @@ def test_a_work_offset_moves_all_coordinates(small, motions):
         (ProgramOptions(shift_mm=(0.0, 1e9, 0.0)), "--shift-mm: expected numbers within"),
     ],
 )
-def test_feeds_and_offsets_that_nobody_means_are_refused(small, motions, options, message):
+def test_feeds_and_shifts_out_of_range_are_refused(small, motions, options, message):
     with pytest.raises(ParameterError) as e:
         write_program(small, motions[0], options)
     assert message in str(e.value)
@@ -234,12 +233,12 @@ def test_too_many_readings_are_refused(small):
         plan_motion(replace(small, readings=many))
 
 
-def test_names_of_programs_are_plain(motions):
+def test_program_names_hold_safe_characters(motions):
     assert [program_name(m) for m in motions] == ["01-y_x___.ngc", "02-xy.ngc"]
 
 
 @pytest.mark.skipif(shutil.which("rs274") is None, reason="LinuxCNC's rs274 is not installed")
-def test_linuxcncs_interpreter_goes_the_same_way(small, motions, tmp_path):
+def test_linuxcnc_interpreter_reads_the_same_motions(small, motions, tmp_path):
     for motion in motions:
         text = write_program(small, motion)
         file = tmp_path / program_name(motion)
@@ -248,9 +247,48 @@ def test_linuxcncs_interpreter_goes_the_same_way(small, motions, tmp_path):
             ["rs274", "-g", str(file)], capture_output=True, text=True, timeout=60, check=False
         )
         moves = re.findall(r"STRAIGHT_FEED\(([^)]*)\)", done.stdout)
-        places, pauses = read_program(text, small.robot)
+        points, pauses = read_program(text, small.robot)
         seen = np.array([[float(v) for v in m.split(",")[:3]] for m in moves])
-        assert seen == pytest.approx(places)
+        assert seen == pytest.approx(points)
         assert done.stdout.count("PROGRAM_STOP()") == len(pauses)
         assert "PROGRAM_END()" in done.stdout
         assert done.stdout.count("MESSAGE(") >= len(pauses)
+
+
+RESET = ["G92.1", "G49", *(f"G10 L2 P{k} X0 Y0 Z0 R0" for k in (1, 2)), "G54 G90 G21 G17"]
+
+CONTROLLER_STATES = {
+    "initial": [],
+    "G54 set": ["G10 L2 P1 X11 Y-7 Z5"],
+    "G55 active": ["G10 L2 P2 X-9 Y4 Z8", "G55"],
+    "G92 active": ["G92 X5 Y6 Z7"],
+    "G54 rotated": ["G10 L2 P1 R30"],
+    "tool length active": ["G43.1 X3 Z-5"],
+    "incremental inches": ["G20 G91 G18"],
+    "all": ["G10 L2 P2 X3 Y-2 Z6 R-40", "G55", "G92 X1 Y2 Z3", "G43.1 X3 Z-5", "G20 G91 G18"],
+}
+
+
+def test_linuxcnc_joints_do_not_depend_on_offsets_rotation_or_tool_length(small, motions, tmp_path):
+    """At every pause LinuxCNC's joints equal those in the program's comment, on nominal legs."""
+    robot = small.robot
+    anything = replace(small, gauges={"": replace(small.gauge, range=None)})
+    exact = simulate_session(anything, {}, exact=True).session
+    options = ExportOptions(module=True, half_side=0.055)
+    files = export_calibration(
+        calibrate(exact, "offsets"), "linuxcnc", anyway=True, options=options
+    )
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    fast = ProgramOptions(feed=12_000.0, approach_feed=3_000.0)
+    program = write_program(small, motions[0], fast)
+    switch = [d.zero / MM + 10.0 for d in robot.drives]
+    joints = [
+        Joint(d.direction, s, float(d.to_joint(s * MM)) / MM, float(d.to_joint(d.zero)) / MM)
+        for d, s in zip(robot.drives, switch, strict=True)
+    ]
+    runs = [([*RESET, *mdi], program.splitlines()) for mdi in CONTROLLER_STATES.values()]
+    _, pauses = run_programs(runs, joints, lines=files["kinematics.ini"], module=tmp_path)
+    expected = np.array([shown for _, shown in read_program(program, robot)[1]])
+    for state, shown in zip(CONTROLLER_STATES, pauses, strict=True):
+        assert shown == pytest.approx(expected, abs=2 * ROUNDED), state

@@ -12,7 +12,7 @@ from orthocal import calibrate, load_plan, load_session, write_session
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.validation import CHANGE_CHANCE, validate_calibration
 from orthocal.errors import SessionError
-from orthocal.measurement.motion.guidance import guide
+from orthocal.measurement.motion.motion import guide
 from orthocal.measurement.recording.recording import open_recording
 from orthocal.observation.simulate import simulate_session
 from orthocal.output.text.recording import describe_row

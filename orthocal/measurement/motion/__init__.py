@@ -1,1 +1,1 @@
-"""Motion from posture to posture while measuring, and programs for it."""
+"""Motion of the machine while a session is measured, and G-code programs for it."""

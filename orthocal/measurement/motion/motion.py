@@ -1,8 +1,8 @@
-"""The way of the machine through a plan: where it stops to be read, and how it gets there.
+"""Path of the machine through the postures of a session.
 
-Every posture is approached from one side: the last move of each drive goes the same way, so that
-play in it is always taken up alike. Ways are looked at in steps: whether the drives reach, and
-whether the tip stays on what it touches and the dial within its range.
+Every posture is approached from one side: on its last motion each drive moves in the same
+direction, so that backlash acts alike in all readings. Each segment of the path is sampled to
+check that the drives reach it, that the tip stays on the rod and that the dial stays in its range.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,138 +18,160 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.errors import ClosureError, SessionError
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_assembly
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.observation.observations import build_observations
+from orthocal.observation.observations import build_observations, drive_table
 from orthocal.observation.sensor_frames import locate_contacts, predict_entries
 from orthocal.robot.model import Robot
+from orthocal.sensors.protocol import Contact
 from orthocal.session.session import Posture, Reading, Session
 from orthocal.units import DEG, MM
 
 Array = NDArray[np.float64]
-Role = Literal["reading", "taken off", "return"]
+Role = Literal["reading", "subtracted", "return"]
 
 APPROACH = 2e-3
-"""What a sliding drive comes back by to a posture, [m]."""
+"""Length of the approach of a sliding drive, [m]."""
 
 APPROACH_TURN = 0.5 * DEG
-"""The same of a turning drive, [rad]."""
+"""Angle of the approach of a turning drive, [rad]."""
 
 STEP = 5e-3
-"""From one place that is looked at to the next on a way, at most, [m]."""
+"""Largest distance between samples of a segment, [m]."""
 
 MOST_STOPS = 2000
-"""Of a session that one machine goes through by a sheet: two weeks of reading."""
+"""Largest number of readings in one plan: two weeks of work."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Guidance:
+    """Joints, tool and contacts of the nominal machine in the postures of a session."""
+
+    joints: dict[str, Array]
+    """Posture to the joint coordinates that the controller displays, [m, rad]."""
+    tool: dict[str, Array]
+    """Posture to the tool centre point, shape (3,), [m]; empty for a robot without a tool."""
+    contacts: dict[str, tuple[list[str], Contact]]
+    """Setup to the postures in which it is read, and its contact there."""
+
+    def touched(self, setup: str, posture: str) -> Array:
+        """Contact point of a setup's gauge in a posture, shape (3,), [m]."""
+        postures, contact = self.contacts[setup]
+        return np.asarray(contact.points[postures.index(posture)])
+
+
+def guide(session: Session) -> Guidance:
+    """Guidance for the operator who measures a session.
+
+    A controller displays the coordinates that it commands. It adds its active offsets to them
+    without displaying them.
+    """
+    robot = session.robot
+    commanded = drive_table(session) + session.active_offsets
+    tool: dict[str, Array] = {}
+    if robot.tcp is not None:
+        assembly = nominal_assembly(robot)
+        passive = assembly.close(commanded, names=list(session.postures))
+        tool = dict(zip(session.postures, assembly.tcp(commanded, passive), strict=True))
+    return Guidance(
+        joints=dict(zip(session.postures, shown_joints(robot, commanded), strict=True)),
+        tool=tool,
+        contacts=locate_contacts(session),
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stop:
-    """A posture in which the machine stands still, and the way to it."""
+    """A posture in which the machine stops, and the path that leads to it."""
 
     posture: str
     role: Role
-    """Whether it is read, read and taken off the next reading, or only gone back to."""
+    """Posture to read, posture whose reading is subtracted from the next one, or return to the
+    first posture."""
     line: int | None
-    """Of the readings.csv; None for none."""
+    """Line of readings.csv; None for the return."""
     cycle: int
     drives: Array
     """Nominal drive coordinates, shape (n_drives,), [m, rad]."""
     approach_drives: Array
-    """The same a little before it, on the side from which it is approached."""
+    """Drive coordinates at the start of the approach, shape (n_drives,), [m, rad]."""
     point: Array | None
-    """Tool coordinates that the drives control, shape (n_coordinates,), [m]; None where they
-    command no tool."""
+    """Tool coordinates that the drives control, shape (n_coordinates,), [m]; None where the
+    drives do not command the tool."""
     approach_point: Array | None
-    """The same a little before it."""
-    over_zero: bool = False
-    """Whether the way here goes over the mechanical zero, for the straight one cannot be gone."""
+    """Tool coordinates at the start of the approach, [m]."""
+    via_zero: bool = False
+    """Whether the path passes through the mechanical zero, the direct one being out of reach."""
     lift: str = ""
-    """Why the plunger is to be held up on the way here; empty where it may stay on."""
+    """Reason to hold the plunger up on this path; empty where it may stay on the rod."""
     expected: float = 0.0
-    """What a perfect machine shows here, less in the first posture, [m]."""
+    """Reading of a machine without errors, relative to the first posture, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetupMotion:
-    """The way through all postures of a setup, and back to the first."""
+    """Path through all postures of a setup, and back to the first."""
 
     setup: str
     number: int
-    """Of the setup in the order of measuring, from 1."""
+    """Position in the order of measurement, from 1."""
     count: int
-    """Setups in all."""
+    """Number of setups."""
     side: int
-    """From which side every drive comes: -1 from lesser coordinates, 1 from larger ones."""
+    """Side of the approach: -1 from smaller drive coordinates, 1 from larger ones."""
     stops: tuple[Stop, ...]
 
 
+class _Approach(NamedTuple):
+    drives: Array
+    start: Array | None
+    end: Array | None
+
+
+class _Path(NamedTuple):
+    """Sampled tool coordinates, (n, n_coordinates), with their drive and passive coordinates."""
+
+    points: Array
+    drives: Array
+    passive: Array
+
+
 def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
-    """The way through a plan, a setup after the other in the order of its rows.
+    """Plan the path through every setup, in the order of the rows.
 
     Raises:
-        SessionError: If there are too many stops, or a posture cannot be approached or gone to.
+        SessionError: If there are too many readings, or a posture cannot be reached or approached.
     """
-    rows: dict[str, list[tuple[int, Reading]]] = {}
-    for i, reading in enumerate(session.readings):
-        line = i + 2 if reading.line is None else reading.line
-        rows.setdefault(reading.setup, []).append((line, reading))
     if len(session.readings) > MOST_STOPS:
         raise SessionError(
             f"plans {len(session.readings)} readings; a sheet holds at most {MOST_STOPS}",
             where=str(session.path or "session"),
         )
+    rows: dict[str, list[tuple[int, Reading]]] = {}
+    for i, reading in enumerate(session.readings):
+        line = i + 2 if reading.line is None else reading.line
+        rows.setdefault(reading.setup, []).append((line, reading))
     side, approaches = _find_approaches(session)
-    found = []
-    for number, (setup, own) in enumerate(rows.items(), 1):
-        stops = _go(session, setup, [_stop(session, visit, approaches) for visit in _visits(own)])
-        found.append(SetupMotion(setup, number, len(rows), side, tuple(stops)))
-    return tuple(found)
+    return tuple(
+        SetupMotion(setup, number, len(rows), side, _plan_setup(session, setup, of, approaches))
+        for number, (setup, of) in enumerate(rows.items(), 1)
+    )
 
 
 def shown_joints(robot: Robot, drives: ArrayLike) -> Array:
-    """What the controller's joints show at nominal drive coordinates, shape (..., n_drives)."""
+    """Joint coordinates that the controller displays at drive coordinates, (..., n_drives)."""
     values = np.asarray(drives, dtype=np.float64)
     columns = [d.to_joint(values[..., i]) for i, d in enumerate(robot.drives)]
     return np.stack(columns, axis=-1)
-
-
-_Visit = tuple[str, Role, int | None, int]
-"""A posture with its role, line and cycle."""
-
-
-def _visits(rows: Sequence[tuple[int, Reading]]) -> Iterator[_Visit]:
-    """Postures in order; the first one again at the end."""
-    first = rows[0][1].minus or rows[0][1].posture
-    last = first
-    for line, reading in rows:
-        if reading.minus is not None:
-            yield reading.minus, "taken off", line, reading.cycle
-        yield reading.posture, "reading", line, reading.cycle
-        last = reading.posture
-    if last != first:
-        yield first, "return", None, 1
-
-
-def _stop(
-    session: Session,
-    visit: _Visit,
-    approaches: Mapping[str, tuple[Array, Array | None, Array | None]],
-) -> Stop:
-    posture, role, line, cycle = visit
-    before, before_point, point = approaches[posture]
-    drives = session.postures[posture].drives + session.active_offsets
-    return Stop(posture, role, line, cycle, drives, before, point, before_point)
 
 
 def _commands_tool(robot: Robot) -> bool:
     return robot.tcp is not None and len(robot.tcp.coordinates) == len(robot.drives)
 
 
-def _find_approaches(
-    session: Session,
-) -> tuple[int, dict[str, tuple[Array, Array | None, Array | None]]]:
-    """From which side postures are approached, and of each where from and where to.
+def _find_approaches(session: Session) -> tuple[int, dict[str, _Approach]]:
+    """Side from which all postures can be approached, and the approach of each.
 
     Raises:
-        SessionError: If some can be approached from neither side.
+        SessionError: If no side serves all postures.
     """
     robot = session.robot
     used = {p for r in session.readings for p in (r.posture, r.minus) if p is not None}
@@ -159,111 +181,128 @@ def _find_approaches(
     assembly = nominal_assembly(robot)
     refused: ClosureError | None = None
     for side in (-1, 1):
-        before = nominal + side * step
-        failures = find_beyond_travel(robot, before, names)
+        drives = nominal + side * step
+        failures = find_beyond_travel(robot, drives, names)
         if not failures:
-            passive = assembly.close(before, names=names, failures=failures)
+            passive = assembly.close(drives, names=names, failures=failures)
         if failures:
             refused = refused or next(iter(failures.values()))
             continue
-        points: Sequence[Array | None] = [None] * len(names)
-        places: Sequence[Array | None] = points
+        starts: Sequence[Array | None] = [None] * len(names)
+        ends: Sequence[Array | None] = starts
         if _commands_tool(robot) and robot.tcp is not None:
-            chosen = list(robot.tcp.coordinates)
-            points = list(assembly.tcp(before, passive)[:, chosen])
-            places = list(assembly.forward(nominal, names=names)[:, chosen])
-        return side, dict(zip(names, zip(before, points, places, strict=True), strict=True))
-    given = "" if refused is None else f": {refused.reason}"
+            coordinates = list(robot.tcp.coordinates)
+            starts = list(assembly.tcp(drives, passive)[:, coordinates])
+            ends = list(assembly.forward(nominal, names=names)[:, coordinates])
+        approaches = map(_Approach, drives, starts, ends)
+        return side, dict(zip(names, approaches, strict=True))
+    reason = "" if refused is None else f": {refused.reason}"
     posture = "" if refused is None else refused.posture
     raise SessionError(
-        f"can be approached neither from below nor from above by {APPROACH / MM:g} mm{given}",
+        f"can be approached neither from below nor from above by {APPROACH / MM:g} mm{reason}",
         where=f"{session.path or 'session'}: postures.{posture}",
     )
 
 
-def _go(session: Session, setup: str, stops: list[Stop]) -> list[Stop]:
-    """The same stops with their ways: over the zero where need be, and where the tip is lost."""
+def _plan_setup(
+    session: Session,
+    setup: str,
+    rows: Sequence[tuple[int, Reading]],
+    approaches: Mapping[str, _Approach],
+) -> tuple[Stop, ...]:
+    """Stops of a setup with the paths between them."""
     robot = session.robot
+    stops = list(_stops(session, rows, approaches))
     if not _commands_tool(robot):
-        return stops
+        return tuple(stops)
     zero = tool_at_zero(robot)
-    gone: list[Stop] = []
-    ways: list[_Gone] = []
-    for stop in stops:
-        start = gone[-1].point if gone else zero
-        way = _follow(robot, _way(start, stop))
-        over_zero = way is None
-        if way is None:
-            way = _follow(robot, _way(start, stop, zero))
-        if way is None:
+    paths: list[_Path] = []
+    position = zero
+    for i, stop in enumerate(stops):
+        corners = [np.asarray(stop.approach_point), np.asarray(stop.point)]
+        path = _follow(robot, [position, *corners])
+        if path is None:
+            path = _follow(robot, [position, zero, *corners])
+            stops[i] = replace(stop, via_zero=True)
+        if path is None:
             raise SessionError(
-                f"the way to posture '{stop.posture}' of setup '{setup}' leaves what the machine "
-                "reaches, straight and over the mechanical zero; put a posture between",
+                f"the path to posture '{stop.posture}' of setup '{setup}' leaves the workspace, "
+                "both directly and through the mechanical zero; insert a posture between them",
                 where=str(session.path or "session"),
             )
-        gone.append(replace(stop, over_zero=over_zero))
-        ways.append(way)
-    return _touch(session, setup, gone, ways)
+        paths.append(path)
+        position = corners[-1]
+    return tuple(_predict(session, setup, stops, paths))
 
 
-def _way(start: Array | None, stop: Stop, over: Array | None = None) -> Array:
-    """Places on a way to a stop, before which it is approached, shape (n, n_coordinates), [m]."""
-    corners = [start, *([] if over is None else [over]), stop.approach_point, stop.point]
-    places = [np.asarray(start)[None]]
-    for a, b in pairwise(corners):
-        first, last = np.asarray(a), np.asarray(b)
-        count = max(2, int(np.ceil(np.linalg.norm(last - first) / STEP)))
-        shares = np.arange(1, count + 1)[:, None] / count
-        places.append(first + shares * (last - first))
-    return np.concatenate(places)
+def _stops(
+    session: Session, rows: Sequence[tuple[int, Reading]], approaches: Mapping[str, _Approach]
+) -> Iterator[Stop]:
+    """Stops in the order of the rows; the first posture again at the end."""
+
+    def stop(posture: str, role: Role, line: int | None, cycle: int) -> Stop:
+        approach = approaches[posture]
+        drives = session.postures[posture].drives + session.active_offsets
+        return Stop(
+            posture, role, line, cycle, drives, approach.drives, approach.end, approach.start
+        )
+
+    for line, reading in rows:
+        if reading.minus is not None:
+            yield stop(reading.minus, "subtracted", line, reading.cycle)
+        yield stop(reading.posture, "reading", line, reading.cycle)
+    first = rows[0][1].minus or rows[0][1].posture
+    if rows[-1][1].posture != first:
+        yield stop(first, "return", None, 1)
 
 
-_Gone = tuple[Array, Array, Array]
-"""Places on a way with the drives and passive coordinates there."""
-
-
-def _follow(robot: Robot, way: Array) -> _Gone | None:
-    """A way as the machine goes it; None where it does not reach."""
+def _follow(robot: Robot, corners: Sequence[Array]) -> _Path | None:
+    """Samples of a polyline of tool coordinates; None if the machine does not reach all of it."""
+    points = [corners[0][None]]
+    for start, end in pairwise(corners):
+        count = max(2, int(np.ceil(np.linalg.norm(end - start) / STEP)))
+        points.append(start + np.arange(1, count + 1)[:, None] / count * (end - start))
+    sampled = np.concatenate(points)
     try:
-        drives, passive = nominal_assembly(robot).reach(way)
+        drives, passive = nominal_assembly(robot).reach(sampled)
     except ClosureError:
         return None
-    if find_beyond_travel(robot, drives, [""] * len(way)):
+    if find_beyond_travel(robot, drives, [""] * len(sampled)):
         return None
-    return way, drives, passive
+    return _Path(sampled, drives, passive)
 
 
-def _touch(session: Session, setup: str, stops: list[Stop], ways: Sequence[_Gone]) -> list[Stop]:
-    """The same stops, with what a perfect machine shows, and where the plunger is to be lifted."""
-    places, drives, passive = (np.concatenate(part) for part in zip(*ways, strict=True))
-    names = [str(i) for i in range(len(places))]
-    along = replace(
+def _predict(
+    session: Session, setup: str, stops: Sequence[Stop], paths: Sequence[_Path]
+) -> Iterator[Stop]:
+    """Stops with predicted readings, and with the reason to lift the plunger where there is one."""
+    points, drives, passive = (np.concatenate(part) for part in zip(*paths, strict=True))
+    names = [str(i) for i in range(len(points))]
+    sampled = replace(
         session,
         postures={
             n: Posture(n, "tcp_mm", p, d - session.active_offsets)
-            for n, p, d in zip(names, places, drives, strict=True)
+            for n, p, d in zip(names, points, drives, strict=True)
         },
         setups={setup: session.setups[setup]},
         readings=tuple(Reading(setup, n, None, 1, 0.0, None) for n in names),
     )
-    observations = build_observations(along)
-    shown = observations.rows(predict_entries(along, observations, passive=passive))
-    _, contact = locate_contacts(along)[setup]
-    ends = np.cumsum([len(way) for way, _, _ in ways])
-    zero = shown[ends[0] - 1]
-    gauge = session.gauges[session.setups[setup].gauge]
-    room = np.inf if gauge.range is None else 0.5 * (gauge.range[1] - gauge.range[0])
-    found = []
-    for i, (stop, end) in enumerate(zip(stops, ends.tolist(), strict=True)):
-        own = range(end - len(ways[i][0]), end)
+    observations = build_observations(sampled)
+    predicted = observations.rows(predict_entries(sampled, observations, passive=passive))
+    _, contact = locate_contacts(sampled)[setup]
+    ends = np.cumsum([len(path.points) for path in paths]).tolist()
+    relative = predicted - predicted[ends[0] - 1]
+    limits = session.gauges[session.setups[setup].gauge].range
+    room = np.inf if limits is None else 0.5 * (limits[1] - limits[0])
+    for i, (stop, end) in enumerate(zip(stops, ends, strict=True)):
         lift = ""
-        if i > 0:  # before the first stop no gauge stands there
-            off = shown[own.start : own.stop] - zero
-            problems = [contact.problems[k] for k in own if contact.problems[k]]
-            if problems or not np.isfinite(off).all():
+        if i > 0:  # the gauge is mounted at the first stop
+            start = end - len(paths[i].points)
+            on_path = relative[start:end]
+            problems = [p for p in contact.problems[start:end] if p]
+            if problems or not np.isfinite(on_path).all():
                 lift = "the tip would leave the rod" if not problems else problems[0]
-            elif np.abs(off).max() > room:
-                far = f"{off[np.abs(off).argmax()] / MM:+.1f}".replace("-", "−")
-                lift = f"the dial would go {far} mm"
-        found.append(replace(stop, lift=lift, expected=float(shown[end - 1] - zero)))
-    return found
+            elif np.abs(on_path).max() > room:
+                largest = f"{on_path[np.abs(on_path).argmax()] / MM:+.1f}".replace("-", "−")
+                lift = f"the dial would go {largest} mm"
+        yield replace(stop, lift=lift, expected=float(relative[end - 1]))

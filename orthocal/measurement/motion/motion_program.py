@@ -1,6 +1,8 @@
-"""G-code of the way through a setup: a pause (M0) at each reading.
+"""G-code programs that move the machine through a setup and pause (M0) at each reading.
 
-Tool coordinates in mm, as nominal kinematics command them; what the joints show stands in comments.
+Every motion is in machine coordinates (G53), so that work offsets (G54 to G59.3), G92 and a
+coordinate rotation have no effect. Coordinates are those of nominal kinematics; comments list the
+joints.
 """
 
 from __future__ import annotations
@@ -16,38 +18,50 @@ from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.motion import SetupMotion, Stop, shown_joints
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session
-from orthocal.units import DRIVE_UNITS, MM
+from orthocal.units import DRIVE_UNITS, MM, format_fixed
 
 Array = NDArray[np.float64]
 
 LETTERS = "XYZ"
 
+DECIMALS = 4
+"""Decimals of coordinates in mm and of joints in mm or degrees."""
+
 LONGEST_NAME = 40
-"""Characters of a name in a comment: controllers read lines of 80 to 256."""
+"""Largest length of a name in a comment: controllers read lines of 80 to 256 characters."""
 
 FASTEST = 20_000.0
-"""[mm/min]"""
+"""Largest feed, [mm/min]."""
 
-FURTHEST = 1e5
-"""No work offset is larger, [mm]."""
+LARGEST_SHIFT = 1e5
+"""Largest coordinate of the machine's origin, [mm]."""
 
-_STRANGE = re.compile(r"[^A-Za-z0-9 _.,:;=+\-/*]")
-"""What controllers take for something else in a comment, or cannot show."""
+_UNSAFE = re.compile(r"[^A-Za-z0-9 _.,:;=+\-/*]")
+"""Characters that a controller may misread in a comment or cannot display."""
+
+_PREAMBLE = (
+    "(Start at the mechanical zero, with no gauge mounted)",
+    "(Every motion is in machine coordinates: G53 G1 in G90)",
+    "(Work offsets G54 to G59.3, G92 and rotation have no effect; G49 cancels the tool length)",
+    "(Requires a controller that runs G53 with G1 at the programmed feed)",
+    "(Cancel scaling and mirroring before. First run: no gauge, slow override)",
+    "G21 G90 G94 G40 G49",
+)
 
 
 @dataclass(frozen=True, slots=True)
 class ProgramOptions:
-    """How programs are written."""
+    """Options of measuring programs."""
 
     feed: float = 600.0
-    """From posture to posture, [mm/min]."""
+    """Feed between postures, [mm/min]."""
     approach_feed: float = 120.0
-    """On the last millimetres, [mm/min]."""
+    """Feed of the approach, [mm/min]."""
     shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """What the program's coordinates have more than the world's, [mm]."""
+    """Machine coordinates (G53) of the world's origin, [mm]."""
 
     def require_sane(self) -> None:
-        """Refuse feeds and shifts that nobody means.
+        """Refuse feeds and shifts out of range.
 
         Raises:
             ParameterError: Naming the option.
@@ -57,24 +71,25 @@ class ProgramOptions:
                 raise ParameterError(
                     f"found {feed:g}; expected 1 to {FASTEST:g} mm/min", where=name
                 )
-        if not all(abs(v) <= FURTHEST for v in self.shift_mm):
-            raise ParameterError(f"expected numbers within ±{FURTHEST:g} mm", where="--shift-mm")
+        if not all(abs(v) <= LARGEST_SHIFT for v in self.shift_mm):
+            raise ParameterError(
+                f"expected numbers within ±{LARGEST_SHIFT:g} mm", where="--shift-mm"
+            )
 
 
 def program_name(motion: SetupMotion) -> str:
-    """Name of a setup's program: its number, for the order, and what its name has of plain text."""
-    plain = re.sub(r"[^A-Za-z0-9_-]", "_", motion.setup)[:LONGEST_NAME]
-    return f"{motion.number:02d}-{plain}.ngc"
+    """File name of a setup's program: its number, then its name in safe characters."""
+    safe = re.sub(r"[^A-Za-z0-9_-]", "_", motion.setup)[:LONGEST_NAME]
+    return f"{motion.number:02d}-{safe}.ngc"
 
 
 def write_program(
     session: Session, motion: SetupMotion, options: ProgramOptions | None = None
 ) -> str:
-    """The program of a setup.
+    """Program of a setup.
 
     Raises:
-        ParameterError: If a feed or a shift is nothing that can be meant, or the drives command no
-            tool.
+        ParameterError: If a feed or a shift is out of range, or the drives command no tool.
     """
     options = options or ProgramOptions()
     options.require_sane()
@@ -84,79 +99,66 @@ def write_program(
             "the drives do not command the tool: there are no coordinates for a program",
             where=str(robot.yaml),
         )
-    first = motion.stops[0]
     shift = ", ".join(f"{v:g}" for v in options.shift_mm)
     lines = [
-        f"(orthocal: {robot_name(robot)}, setup {plain(motion.setup)}, {motion.number} of "
+        f"(orthocal: {_safe(robot.name)}, setup {_safe(motion.setup)}, {motion.number} of "
         f"{motion.count})",
-        f"({plain(session.setups[motion.setup].sensor.describe(), 120)})",
-        f"(Coordinates: nominal kinematics, world + {shift} mm; no tool length)",
-        "(Start in the mechanical zero, with nothing at the rods)",
-        "G21 G90 G94 G40 G49",
+        f"({_safe(session.setups[motion.setup].sensor.describe(), 120)})",
+        f"(Coordinates: nominal kinematics, machine = world + {shift} mm)",
+        *_PREAMBLE,
         f"F{options.feed:g}",
     ]
     for i, stop in enumerate(motion.stops):
-        after = motion.stops[i + 1] if i + 1 < len(motion.stops) else None
+        following = motion.stops[i + 1] if i + 1 < len(motion.stops) else None
         lines += [f"(to {_label(stop)})", *_moves(robot, stop, options)]
-        lines += [f"(MSG, {text})" for text in _messages(robot, stop, after, first is stop)]
+        lines += [f"(MSG, {text})" for text in _messages(robot, stop, following, first=i == 0)]
         if stop.role != "return":
             lines.append("M0")
     return "\n".join([*lines, "M2", ""])
 
 
 def _moves(robot: Robot, stop: Stop, options: ProgramOptions) -> list[str]:
-    """To a little before a posture, and into it."""
-    places: list[tuple[Array | None, float]] = []
-    if stop.over_zero:
-        places.append((tool_at_zero(robot), options.feed))
-    places += [(stop.approach_point, options.feed), (stop.point, options.approach_feed)]
-    return [f"G1 {_words(robot, point, options)} F{feed:g}" for point, feed in places]
-
-
-def _words(robot: Robot, point: Array | None, options: ProgramOptions) -> str:
+    """Motion to the start of the approach, and the approach."""
     coordinates = () if robot.tcp is None else robot.tcp.coordinates
-    values = np.asarray(point) / MM
-    return " ".join(
-        f"{LETTERS[c]}{round(v + options.shift_mm[c], 4) + 0.0:.4f}"
-        for c, v in zip(coordinates, values, strict=True)
-    )
+    targets: list[tuple[Array | None, float]] = []
+    if stop.via_zero:
+        targets.append((tool_at_zero(robot), options.feed))
+    targets += [(stop.approach_point, options.feed), (stop.point, options.approach_feed)]
+    lines = []
+    for point, feed in targets:
+        words = " ".join(
+            f"{LETTERS[c]}{format_fixed(v + options.shift_mm[c], DECIMALS)}"
+            for c, v in zip(coordinates, np.asarray(point) / MM, strict=True)
+        )
+        lines.append(f"G53 G1 {words} F{feed:g}")
+    return lines
 
 
-def _messages(robot: Robot, stop: Stop, after: Stop | None, first: bool) -> list[str]:
-    """What is to be done at a stop, and on the way to the next."""
-    what = {
+def _messages(robot: Robot, stop: Stop, following: Stop | None, *, first: bool) -> list[str]:
+    """Instructions to the operator at a stop, and for the path to the next one."""
+    action = {
         "reading": "read",
-        "taken off": "set the dial to 0",
-        "return": "back at the first: does the dial show what it did",
+        "subtracted": "set the dial to 0",
+        "return": "first posture again: the dial must show its first reading",
     }[stop.role]
     if first:
-        what = f"stand the gauge, set its zero, then {what}"
-    texts = [f"{_label(stop)}; joints {joint_words(robot, stop.drives)}; {what}"]
-    if after is not None and after.lift:
-        texts.append(f"hold the plunger up on the way to {_label(after)}")
+        action = f"mount the gauge, set its zero, then {action}"
+    joints = " ".join(
+        format_fixed(float(v) / DRIVE_UNITS[d.unit][1], DECIMALS)
+        for d, v in zip(robot.drives, shown_joints(robot, stop.drives), strict=True)
+    )
+    texts = [f"{_label(stop)}; joints {joints}; {action}"]
+    if following is not None and following.lift:
+        texts.append(f"hold the plunger up on the way to {_label(following)}")
     return texts
 
 
 def _label(stop: Stop) -> str:
     if stop.line is None:
-        return f"posture {plain(stop.posture)}"
-    return f"line {stop.line}: {plain(stop.posture)}"
+        return f"posture {_safe(stop.posture)}"
+    return f"line {stop.line}: {_safe(stop.posture)}"
 
 
-def joint_words(robot: Robot, drives: Array) -> str:
-    """What the controller's joints show, in mm or degrees with four decimals."""
-    shown = shown_joints(robot, drives)
-    return " ".join(
-        f"{round(float(v) / DRIVE_UNITS[d.unit][1], 4) + 0.0:.4f}"
-        for d, v in zip(robot.drives, shown, strict=True)
-    )
-
-
-def robot_name(robot: Robot) -> str:
-    """A robot's name, as it can stand in a comment."""
-    return plain(robot.name)
-
-
-def plain(text: str, longest: int = LONGEST_NAME) -> str:
-    """A text as it can stand in a comment of any controller."""
-    return _STRANGE.sub("_", text)[:longest]
+def _safe(text: str, longest: int = LONGEST_NAME) -> str:
+    """Text in characters that a comment of any controller accepts."""
+    return _UNSAFE.sub("_", text)[:longest]

@@ -134,15 +134,14 @@ def _front(
     how = ""
     if with_programs:
         shift = (options or ProgramOptions()).shift_mm
-        added = (
-            "no work offset"
-            if not any(shift)
-            else f"the world moved by {', '.join(f'{v:g}' for v in shift)} mm"
+        origin = (
+            f", world origin at ({', '.join(f'{v:g}' for v in shift)}) mm" if any(shift) else ""
         )
         how = paragraph(
-            f"Programs: G-code in mm, {added}, no tool length; they pause (M0) at each reading and "
-            "go on by cycle start. Run the first one without a gauge, at a slow override. Keep "
-            "the machine clear: they start from the mechanical zero."
+            f"Programs: G-code in mm in machine coordinates (G53){origin}: work offsets, G92 and "
+            "rotation have no effect. They cancel the tool length (G49), pause (M0) at each "
+            "reading and continue by cycle start. Run the first one without a gauge, at a slow "
+            "override. Keep the machine clear: they start from the mechanical zero."
         )
     blanks = "".join(
         f"<p>{escape(words)}: <span class='fill'>&nbsp;</span></p>"
@@ -234,7 +233,7 @@ def _set_zero(gauge: Gauge, first: Stop) -> str:
             f"Move the gauge in until half of its travel ({0.5 * (high - low):g} mm) is taken, "
             f"and turn the bezel until it shows {middle:g}"
         )
-    again = " Set it to the same again where the table says so." * (first.role == "taken off")
+    again = " Set it to the same again where the table says so." * (first.role == "subtracted")
     return f"{how}, here only. Tap the stand: the hand must come back.{again}"
 
 
@@ -290,7 +289,7 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
         if told:
             cells.append((number(stop.expected / MM, 2, sign=True), "number"))
         body = "".join(f'<td class="{kind}">{escape(text)}</td>' for text, kind in cells)
-        read = stop.role != "taken off"
+        read = stop.role != "subtracted"
         box = '<td class="box"></td>' if read else "<td>set to 0</td>"
         asked = "as at first?" if stop.role == "return" else ""
         rows.append(f'<tr>{body}{box}<td class="note">{asked}</td></tr>')
@@ -302,7 +301,7 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
 def _posture(stop: Stop) -> str:
     if stop.role == "return":
         return f"{stop.posture}, again"
-    if stop.cycle == 1 or stop.role == "taken off":
+    if stop.cycle == 1 or stop.role == "subtracted":
         return stop.posture
     return f"{stop.posture}, cycle {stop.cycle}"
 

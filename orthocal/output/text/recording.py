@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.assessment.wording import counted, joined
-from orthocal.measurement.motion.guidance import Guidance
+from orthocal.measurement.motion.motion import Guidance
 from orthocal.measurement.recording.anomalies import Oddity, Slip
 from orthocal.measurement.recording.recording import Recording, Row
 from orthocal.session.session import Session, Setup

@@ -267,7 +267,7 @@ def test_the_command_writes_beside_the_session_or_elsewhere(monkeypatch, capsys,
     assert code == 0
     assert f"Wrote {out}/sheet.html to print and 4 programs" in err
     assert "Z50.0000" in (out / "03-zx.ngc").read_text()
-    assert "the world moved by 0, 0, 50 mm" in (out / "sheet.html").read_text()
+    assert "world origin at (0, 0, 50) mm" in (out / "sheet.html").read_text()
     code, _, err = run(monkeypatch, capsys, "sheet", session, "--out", out)
     assert code == 2
     assert err == f"orthocal: {out}/sheet.html: is there already; --force writes over it\n"
