@@ -16,6 +16,8 @@ _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 _NO_TEXT = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """Control characters but newline and tabulator, and halves of surrogate pairs."""
 
+_UNSAFE = re.compile(r"[^A-Za-z0-9 _.,:;=+-]")
+
 LONGEST_SHOWN = 58
 """Characters of a value in a message."""
 
@@ -61,6 +63,11 @@ def composed(text: str) -> str:
 def shorten(text: str) -> str:
     """A value as it can stand in a message."""
     return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 3]}..."
+
+
+def comment_safe(text: str, longest: int = 60) -> str:
+    """Text in characters that comments of G-code, C and INI files and Markdown tables accept."""
+    return _UNSAFE.sub("_", text)[:longest]
 
 
 def _is_escaped(character: str) -> bool:

@@ -673,14 +673,12 @@ def correction_of(file: Path) -> Any:
 def use_program(folder: Path, *, deep: bool) -> None:
     """Correct a program; what comes out has lines that are read, and is a program of G0 and G1."""
     from orthocal.cli.correct import _lines
+    from orthocal.gcode.interpreter import Interpreter
     from orthocal.gcode.program import ProgramCorrector
-    from orthocal.gcode.state import Interpreter
 
     def correct(lines: Any, by: Any) -> str:
         interpreter = Interpreter("p", axes=(0, 1), offsets={"G54": (0.0, 0.0, 0.0)})
-        corrector = ProgramCorrector(
-            "p", axes=(0, 1), interpreter=interpreter, correct=by, within=1e-4
-        )
+        corrector = ProgramCorrector(interpreter, by, within=1e-4)
         return "".join(corrector.run(lines))
 
     by = correction_of(folder / "calibration.json") if deep else Shifted()

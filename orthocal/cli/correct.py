@@ -1,4 +1,4 @@
-"""Programs for controllers with nominal kinematics: correct."""
+"""The command correct: G-code programs for a controller with nominal kinematics."""
 
 from __future__ import annotations
 
@@ -18,25 +18,23 @@ import typer
 from orthocal.cli.options import CalibrationPath, app
 from orthocal.cli.printing import put_note, put_part
 from orthocal.errors import GcodeError, OutputError, ParameterError
-from orthocal.units import MM, UM
+from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
 
 if TYPE_CHECKING:
     from orthocal.calibration.calibration import Calibration
     from orthocal.export.correction_field import CorrectionField
     from orthocal.gcode.path import Vector
     from orthocal.gcode.program import Summary
-    from orthocal.robot.model import Drive
 
-PART = 2**16
+BLOCK = 2**16
 """Characters or bytes that are read or written together."""
 
-
-PROGRESS_ASKED = "AXIS_PROGRESS_BAR"
-"""Variable of the environment in which LinuxCNC's window says that it shows how far a filter is."""
+PROGRESS_VARIABLE = "AXIS_PROGRESS_BAR"
+"""Environment variable with which LinuxCNC's window requests progress from a filter."""
 
 
 class Offsets(StrEnum):
-    """What is in the controller when the program runs."""
+    """Offsets in the controller when the program runs."""
 
     ENTERED = "entered"
     ACTIVE = "active"
@@ -46,7 +44,7 @@ class Offsets(StrEnum):
 def correct(
     calibration: CalibrationPath,
     program: Annotated[
-        Path, typer.Argument(metavar="PROGRAM", help="G-code; - for standard input.")
+        Path, typer.Argument(metavar="PROGRAM", help="G-code file; - for standard input.")
     ],
     within_um: Annotated[
         float,
@@ -54,14 +52,14 @@ def correct(
             "--within",
             min=0.01,
             max=1000.0,
-            help="By how much what is written may be off the corrected path, µm.",
+            help="Largest distance of the written path from the corrected one, µm.",
         ),
     ] = 1.0,
     offsets: Annotated[
         Offsets,
         typer.Option(
-            help="In the controller when the program runs: those that `calibrate` says to enter, "
-            "or those that were active while measuring."
+            help="Offsets in the controller when the program runs: those that `calibrate` says to "
+            "enter, or those that were active during the measurement."
         ),
     ] = Offsets.ENTERED,
     work_offset: Annotated[
@@ -69,7 +67,7 @@ def correct(
         typer.Option(
             "--work-offset-mm",
             metavar="[G54=]X,Y,Z",
-            help="Where the program's zero is in the machine's coordinates; repeat for G55 ...",
+            help="Zero of the program in machine coordinates; repeat for G55 ...",
         ),
     ] = None,
     start: Annotated[
@@ -77,28 +75,30 @@ def correct(
         typer.Option(
             "--start-mm",
             metavar="X,Y,Z",
-            help="Where the controller shows the tool before the program, if the first motion does "
-            "not say X, Y and Z.",
+            help="Position that the controller displays before the program; needed if the first "
+            "motion does not have X, Y and Z.",
         ),
     ] = None,
     tool: Annotated[
         str | None,
         typer.Option(
             metavar="X,Y,Z",
-            help="The tip of the tool in the frame of the tool centre point, mm; 0,0,0 by default.",
+            help="Tip of the tool in the frame of the tool centre point, mm; 0,0,0 by default. "
+            "With it the program may use one tool only.",
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="File for the result, instead of standard output.")
+        Path | None, typer.Option(help="File for the corrected program; default: standard output.")
     ] = None,
     anyway: Annotated[
-        bool, typer.Option("--anyway", help="Also where the decision is not to enter it.")
+        bool, typer.Option("--anyway", help="Correct even if the decision is not to enter.")
     ] = False,
 ) -> None:
     """Correct a G-code program for a controller with nominal kinematics.
 
-    Lines and arcs are cut so that chords stay near the corrected path; feed along it and all other
-    words are kept. What cannot be corrected is named by its line, and nothing is written.
+    Lines and arcs are divided into chords that stay near the corrected path. The feed along the
+    path and all other words are preserved. If a line cannot be corrected, its number and the
+    reason are reported, and nothing is written.
 
     Exit code 3: the decision is not to enter the calibration.
     """
@@ -107,12 +107,12 @@ def correct(
     from orthocal.export.correction_field import CorrectionField
     from orthocal.export.formats import require_entering
     from orthocal.export.options import ExportOptions
+    from orthocal.gcode.interpreter import Interpreter
     from orthocal.gcode.program import ProgramCorrector
-    from orthocal.gcode.state import Interpreter
     from orthocal.io.files import require_writable_file, write_file
 
     zeros = _read_offsets(work_offset or [])
-    begin = None if start is None else _read_vector(start, "--start-mm")
+    position = None if start is None else _read_vector(start, "--start-mm")
     tip = ExportOptions(tool=None if tool is None else _read_vector(tool, "--tool")).tool
     if out is not None:
         require_writable_file(out)
@@ -124,37 +124,48 @@ def correct(
     within = within_um * UM
     field = CorrectionField(result, values, within=within, tool=tip or (0.0, 0.0, 0.0))
     file = "standard input" if str(program) == "-" else str(program)
-    interpreter = Interpreter(file, axes=field.axes, offsets=zeros, start=begin)
-    corrector = ProgramCorrector(
-        file, axes=field.axes, interpreter=interpreter, correct=field, within=within
+    interpreter = Interpreter(
+        file, axes=field.axes, offsets=zeros, start=position, one_tool=tip is not None
     )
-    with tempfile.TemporaryFile() as spool:  # nothing is written before all of it is good
+    corrector = ProgramCorrector(interpreter, field, within=within)
+    with tempfile.TemporaryFile() as spool:  # nothing is written before all lines are corrected
         with _frozen():
             _spool(corrector.run(_lines(program, file)), spool)
         if not corrector.summary.lines:
             raise GcodeError("is empty; expected a program", where=file)
         if out is not None:
-            write_file(out, iter(lambda: spool.read(PART), b""))
+            write_file(out, iter(lambda: spool.read(BLOCK), b""))
         else:
             text = io.TextIOWrapper(spool, encoding="utf-8", errors="replace", newline="")
-            while part := text.read(PART):
+            while part := text.read(BLOCK):
                 put_part(part)
             sys.stdout.flush()
-    put_note(
-        _describe(corrector.summary, field, within)
-        + "\n"
-        + _describe_controller(result, values, active=active)
-        + _describe_tool(tip)
-        + ("" if zeros else "\nThe program's coordinates are taken for the machine's own.")
-        + ("\nNo G20 or G21 before its coordinates: mm." if corrector.summary.unit_assumed else "")
-    )
+    notes = [
+        _describe(corrector.summary, field, within),
+        _describe_controller(result, values, active=active),
+    ]
+    tools = interpreter.tools.used
+    if tip is not None:
+        notes.append(
+            f"For a tip at {', '.join(f'{v / MM:g}' for v in tip)} mm from the tool centre point."
+        )
+    elif len(tools) > 1:
+        notes.append(
+            f"Several tools ({', '.join(tools)}) and no --tool: corrected at the tool centre "
+            "point. The tilt of the platform moves their tips."
+        )
+    if not zeros:
+        notes.append("The program's coordinates are taken as machine coordinates.")
+    if corrector.summary.unit_assumed:
+        notes.append("No G20 or G21 before the first coordinates: taken as mm.")
+    put_note("\n".join(notes))
 
 
 @contextmanager
 def _frozen() -> Iterator[None]:
-    """Keep the collector of garbage from looking at all that is loaded, again and again.
+    """Exclude all loaded objects from garbage collection.
 
-    Lines come and go by the thousand, in no circles.
+    A program creates and drops thousands of lines, without cycles.
     """
     gc.freeze()
     try:
@@ -164,7 +175,7 @@ def _frozen() -> Iterator[None]:
 
 
 def _lines(program: Path, file: str) -> Iterator[str]:
-    from orthocal.gcode.words import LONGEST_LINE
+    from orthocal.gcode.lines import LONGEST_LINE
     from orthocal.io.files import read_parts
 
     if str(program) != "-":
@@ -174,23 +185,23 @@ def _lines(program: Path, file: str) -> Iterator[str]:
     else:
         source = sys.stdin.buffer
     parts = read_parts(source, longest=LONGEST_LINE + 2, name=file, error=GcodeError)
-    if isinstance(source, Path) and PROGRESS_ASKED in os.environ:
-        parts = _tell_progress(parts, source)
+    if isinstance(source, Path) and PROGRESS_VARIABLE in os.environ:
+        parts = _report_progress(parts, source)
     for part in parts:
         text = part.decode("utf-8", "surrogateescape")
-        # what is too long in bytes is so in characters: a part of a line is none
+        # padded, a part of a line that is too long in bytes is also too long in characters
         yield text.ljust(len(part)) if len(part) > LONGEST_LINE else text
 
 
-def _tell_progress(parts: Iterable[bytes], source: Path) -> Iterator[bytes]:
-    """The parts of a file, and on stderr how far one is, as LinuxCNC's windows understand it."""
-    done = told = size = 0
+def _report_progress(parts: Iterable[bytes], source: Path) -> Iterator[bytes]:
+    """Parts of a file; reports progress on stderr in the form of LinuxCNC's filters."""
+    done = percent = size = 0
     for part in parts:
         size = size or source.stat().st_size
         done += len(part)
-        if 100 * done // size > told:
-            told = 100 * done // size
-            put_note(f"FILTER_PROGRESS={min(told, 100)}")
+        if 100 * done // size > percent:
+            percent = 100 * done // size
+            put_note(f"FILTER_PROGRESS={min(percent, 100)}")
         yield part
 
 
@@ -204,21 +215,22 @@ def _spool(texts: Iterable[str], spool: IO[bytes]) -> None:
 
 
 def _read_offsets(texts: list[str]) -> dict[str, Vector]:
-    from orthocal.gcode.state import SYSTEMS
+    from orthocal.gcode.interpreter import SYSTEMS
 
-    known, found = list(SYSTEMS.values()), {}
+    option, systems = "--work-offset-mm", list(SYSTEMS.values())
+    offsets: dict[str, Vector] = {}
     for text in texts:
         name, has_name, values = text.rpartition("=")
-        name = name.strip().upper() if has_name else known[0]
-        if name not in known:
+        name = name.strip().upper() if has_name else systems[0]
+        if name not in systems:
             raise ParameterError(
-                f"found '{text}'; expected X,Y,Z or one of {', '.join(known)} = X,Y,Z",
-                where="--work-offset-mm",
+                f"found '{text}'; expected X,Y,Z or one of {', '.join(systems)} = X,Y,Z",
+                where=option,
             )
-        if name in found:
-            raise ParameterError(f"{name} stands twice", where="--work-offset-mm")
-        found[name] = _read_vector(values, "--work-offset-mm")
-    return found
+        if name in offsets:
+            raise ParameterError(f"found {name} twice", where=option)
+        offsets[name] = _read_vector(values, option)
+    return offsets
 
 
 def _read_vector(text: str, option: str) -> Vector:
@@ -238,31 +250,22 @@ def _describe(summary: Summary, field: CorrectionField, within: float) -> str:
     from orthocal.gcode.program import ROUNDING
 
     low, high = ((v - 1.0) * 100.0 for v in summary.stretch)
-    off = summary.chord + field.error + ROUNDING * within
+    bound = summary.deviation + field.error + ROUNDING * within
     return (
-        f"Corrected {summary.lines} lines: {summary.points} points, by up to "
-        f"{summary.correction / UM:.3g} µm. What is written is within {off / UM:.3g} µm of the "
-        f"corrected path (asked for: {within / UM:g}): chords {summary.chord / UM:.3g}, correction "
-        f"{field.error / UM:.2g}, decimals {ROUNDING * within / UM:.2g}. Feeds were changed by "
-        f"{low:+.2f} … {high:+.2f} %, so that the tool keeps them."
+        f"Corrected {summary.lines} lines: {summary.points} points, largest correction "
+        f"{summary.correction / UM:.3g} µm. The written path is within {bound / UM:.3g} µm of the "
+        f"corrected path (requested: {within / UM:g} µm): chords {summary.deviation / UM:.3g} µm, "
+        f"correction {field.error / UM:.2g} µm, rounding {ROUNDING * within / UM:.2g} µm. Feeds "
+        f"changed by {low:+.2f} to {high:+.2f} % to preserve the speed of the tool."
     )
 
 
-def _describe_tool(tip: Vector | None) -> str:
-    shown = ", ".join(f"{v / MM:g}" for v in tip or ())
-    return f"\nIt is for a tip at {shown} mm from the tool centre point." if tip else ""
-
-
 def _describe_controller(result: Calibration, values: Iterable[float], *, active: bool) -> str:
-    from orthocal.units import DRIVE_UNITS
-
-    def show(drive: Drive, value: float) -> str:
+    listed = []
+    for drive, value in zip(result.robot.drives, values, strict=True):
         unit, size = DRIVE_UNITS[drive.unit]
-        return f"{drive.name} {value / size:+.4f} {unit}"
-
-    pairs = zip(result.robot.drives, values, strict=True)
-    listed = ", ".join(show(d, float(v)) for d, v in pairs)
-    state = "active while measuring" if active else "to enter"
-    known = result.session.controller_offsets is not None
-    more = "" if known else " (on top of those that were active while measuring)"
-    return f"It is for a controller with the offsets {state}{more}: {listed}."
+        listed.append(f"{drive.name} {format_fixed(float(value) / size, 4, sign=True)} {unit}")
+    state = "active during the measurement" if active else "to enter"
+    if result.session.controller_offsets is None:
+        state += " (in addition to those that were active during the measurement)"
+    return f"For a controller with the offsets {state}: {', '.join(listed)}."

@@ -1,1 +1,1 @@
-"""G-code as text that is rewritten: knows no machine but a function of points."""
+"""Reading, interpreting and correcting G-code programs, for any machine."""

@@ -1,11 +1,12 @@
-"""Motions as curves: lines, arcs and helices, many at once.
+"""Lines, arcs and helices as curves, many at once, and arcs from a centre or a radius.
 
 Every motion is p(t) = base + slope t + r(t) (cos φ(t) e₁ + sin φ(t) e₂), with r and φ linear in t
-from 0 to 1; a line has no radius.
+from 0 to 1. A line has r = 0.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,28 +14,49 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.errors import GcodeError
+
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Vector = tuple[float, float, float]
 
 PLANES: dict[int, tuple[int, int, int]] = {17: (0, 1, 2), 18: (2, 0, 1), 19: (1, 2, 0)}
-"""G17, G18, G19: indices of the plane's axes, from the first to the second of which a turn is
-counterclockwise, and of the one square to them."""
+"""G17, G18, G19: indices of the first and second axis of the plane, counterclockwise in this order,
+and of the normal axis."""
+
+AXES = "XYZ"
+CENTERS = "IJK"
+"""Letters of an arc's centre, in the order of the axes."""
+
+RADIUS_TOLERANCE = 5e-6
+"""Largest difference of an arc's radii at its ends, [m]: centres have three or four decimals."""
+
+RELATIVE_RADIUS_TOLERANCE = 1e-3
+"""Largest difference of an arc's radii, relative to the radius."""
+
+LARGEST_RADIUS_TOLERANCE = 127e-6
+"""Upper limit of the relative tolerance, as in controllers, [m]."""
+
+SMALLEST_RADIUS = 1e-7
+"""Smallest radius of an arc, [m]."""
+
+SHORT_RADIUS = 5e-6
+"""Largest shortfall of R against half the distance of the ends, for a half circle, [m]."""
 
 
 class Arc(NamedTuple):
-    """What makes an arc or a helix of a motion."""
+    """Geometry of an arc or a helix."""
 
     plane: int
     """17, 18 or 19."""
     center: tuple[float, float]
-    """In the axes of the plane, [m]."""
+    """Coordinates in the plane, [m]."""
     radii: tuple[float, float]
-    """At its start and at its end, [m]."""
+    """Radius at the start and at the end, [m]."""
     angle: float
-    """Where it starts, [rad]."""
+    """Angle of the start, [rad]."""
     sweep: float
-    """By how much it turns, counterclockwise above 0, [rad]."""
+    """Angle of rotation, positive counterclockwise, [rad]."""
 
 
 class Motion(NamedTuple):
@@ -47,22 +69,22 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Paths:
-    """Many motions."""
+    """Curves of n motions."""
 
     base: Array
     """Shape (n, 3), [m]."""
     slope: Array
     """Shape (n, 3), [m]."""
     radius: Array
-    """r at 0 and its change, shape (n, 2), [m]."""
+    """Radius at the start and its change, shape (n, 2), [m]."""
     angle: Array
-    """φ at 0 and its change, shape (n, 2), [rad]."""
+    """Angle at the start and its change, shape (n, 2), [rad]."""
     axes: Indices
-    """e₁ and e₂, shape (n, 2)."""
+    """Indices of e₁ and e₂, shape (n, 2)."""
 
     @classmethod
     def of(cls, motions: Sequence[Motion]) -> Paths:
-        """Those of a list."""
+        """Curves of a list of motions."""
         base = np.array([m.start for m in motions], dtype=np.float64).reshape(-1, 3)
         slope = np.array([m.end for m in motions], dtype=np.float64).reshape(-1, 3) - base
         radius, angle = np.zeros((len(base), 2)), np.zeros((len(base), 2))
@@ -79,29 +101,113 @@ class Paths:
 
     @property
     def lengths(self) -> Array:
-        """Shape (n,), [m]."""
+        """Lengths of the curves, shape (n,), [m]."""
         middle = self.radius[:, 0] + 0.5 * self.radius[:, 1]
         turned = np.hypot(middle * self.angle[:, 1], self.radius[:, 1])
         return np.asarray(np.hypot(np.linalg.norm(self.slope, axis=1), turned))
 
     @property
     def largest_radii(self) -> Array:
-        """Shape (n,), 0 for lines, [m]."""
+        """Largest radius of each curve, 0 for lines, shape (n,), [m]."""
         return np.asarray(np.maximum(self.radius[:, 0], self.radius.sum(axis=1)))
 
     def points(self, of: Indices, t: Array) -> Array:
-        """Points of motions, shape (k, 3), [m].
+        """Points on the curves, shape (k, 3), [m].
 
         Args:
-            of: Which motion, shape (k,).
-            t: Where on it, 0 to 1, shape (k,).
+            of: Index of the motion of each point, shape (k,).
+            t: Parameter of each point, 0 to 1, shape (k,).
         """
-        found = self.base[of] + t[:, None] * self.slope[of]
+        points = self.base[of] + t[:, None] * self.slope[of]
         radius = self.radius[of, 0] + t * self.radius[of, 1]
         at = np.flatnonzero(radius)
         if at.size:
-            own, r = of[at], radius[at]
-            angle = self.angle[own, 0] + t[at] * self.angle[own, 1]
-            found[at, self.axes[own, 0]] += r * np.cos(angle)
-            found[at, self.axes[own, 1]] += r * np.sin(angle)
-        return np.asarray(found)
+            arcs, r = of[at], radius[at]
+            angle = self.angle[arcs, 0] + t[at] * self.angle[arcs, 1]
+            points[at, self.axes[arcs, 0]] += r * np.cos(angle)
+            points[at, self.axes[arcs, 1]] += r * np.sin(angle)
+        return np.asarray(points)
+
+
+def arc_about(
+    start: Vector,
+    end: Vector,
+    center: tuple[float, float],
+    *,
+    plane: int,
+    clockwise: bool,
+    turns: int,
+    where: str,
+) -> Arc:
+    """Arc around a centre.
+
+    Args:
+        start: First point, [m].
+        end: Last point, [m].
+        center: Coordinates of the centre in the plane, [m].
+        plane: 17, 18 or 19.
+        clockwise: Whether it is G2, seen from the positive end of the normal axis.
+        turns: Number of times that the arc reaches its end.
+        where: File and line for messages.
+
+    Raises:
+        GcodeError: If the radii at its ends differ.
+    """
+    i, j, _ = PLANES[plane]
+    first = (start[i] - center[0], start[j] - center[1])
+    last = (end[i] - center[0], end[j] - center[1])
+    r0, r1 = math.hypot(*first), math.hypot(*last)
+    if min(r0, r1) < SMALLEST_RADIUS:
+        raise GcodeError("the centre of an arc is at one of its ends", where=where)
+    tolerance = max(RADIUS_TOLERANCE, min(RELATIVE_RADIUS_TOLERANCE * r0, LARGEST_RADIUS_TOLERANCE))
+    if abs(r0 - r1) > tolerance:
+        raise GcodeError(
+            f"an arc has a radius of {r0 * 1e3:.6g} mm at its start and {r1 * 1e3:.6g} mm at its "
+            "end; expected equal radii",
+            where=where,
+        )
+    angle = math.atan2(first[1], first[0])
+    sweep = math.atan2(last[1], last[0]) - angle
+    if start[i] == end[i] and start[j] == end[j]:
+        sweep = 0.0
+    sweep %= 2.0 * math.pi
+    if clockwise:
+        sweep -= 2.0 * math.pi
+    elif sweep == 0.0:
+        sweep = 2.0 * math.pi
+    sweep += math.copysign(2.0 * math.pi * (turns - 1), sweep)
+    return Arc(plane, center, (r0, r1), angle, sweep)
+
+
+def center_of_radius(
+    start: Vector, end: Vector, radius: float, *, plane: int, clockwise: bool, where: str
+) -> tuple[float, float]:
+    """Centre of an arc with a radius R; a negative R selects the arc of more than 180°.
+
+    Raises:
+        GcodeError: If there is no such arc, or more than one.
+    """
+    i, j, _ = PLANES[plane]
+    across = (end[i] - start[i], end[j] - start[j])
+    distance = math.hypot(*across)
+    if distance < SMALLEST_RADIUS:
+        raise GcodeError(
+            f"found R with both ends at the same {AXES[i]} and {AXES[j]}, which determines no "
+            f"centre; expected {CENTERS[i]} and {CENTERS[j]}",
+            where=where,
+        )
+    half = 0.5 * distance
+    if abs(radius) < half - SHORT_RADIUS:
+        raise GcodeError(
+            f"R is {abs(radius) * 1e3:.6g} mm, less than half the distance of the arc's ends, "
+            f"{half * 1e3:.6g} mm",
+            where=where,
+        )
+    height = math.sqrt(max(radius * radius - half * half, 0.0))
+    if clockwise != (radius < 0.0):
+        height = -height
+    middle = (0.5 * (start[i] + end[i]), 0.5 * (start[j] + end[j]))
+    return (
+        middle[0] - height * across[1] / distance,
+        middle[1] + height * across[0] / distance,
+    )

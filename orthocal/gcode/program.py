@@ -1,82 +1,75 @@
-"""A program corrected as it is read: lines in, lines out, and little in between."""
+"""Correction of a program in one pass, with little of it in memory."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from orthocal.errors import GcodeError
-from orthocal.gcode.cutting import LONGEST_PIECE, Correct, Refused, cut
+from orthocal.gcode.interpreter import Interpreter, Step
+from orthocal.gcode.lines import CONTROL, Line, split_line, split_point_line
 from orthocal.gcode.path import Motion, Paths
-from orthocal.gcode.state import Interpreter, Step
-from orthocal.gcode.words import Line, split_line, split_plain
-from orthocal.gcode.writing import Writer
+from orthocal.gcode.segmentation import LONGEST_SEGMENT, Correction, Refused, segment_motions
+from orthocal.gcode.writer import Writer
+from orthocal.units import UM
 
 LINES_AT_ONCE = 2000
+"""Largest number of lines in memory."""
 
-PIECES_AT_ONCE = 20_000
-"""Of motions as they are first cut."""
+SEGMENTS_AT_ONCE = 20_000
+"""Estimated number of segments from which the lines in memory are written."""
 
 ROUNDING = 0.1
-"""Part of what is asked for that the decimals of coordinates may take."""
+"""Part of the tolerance for the rounding of coordinates."""
 
 LONGEST_READ = 252
 """Bytes of a line that LinuxCNC reads, without the newline."""
 
 SHORT = LONGEST_READ // 4
-"""Characters of which there are not more bytes than that."""
-
-_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+"""Characters that have at most LONGEST_READ bytes in UTF-8."""
 
 
 @dataclass(slots=True)
 class Summary:
-    """What was done to a program."""
+    """Statistics of a corrected program."""
 
     lines: int = 0
     points: int = 0
-    chord: float = 0.0
+    deviation: float = 0.0
     """Largest distance of the corrected path from a chord, [m]."""
     correction: float = 0.0
     """Largest correction, [m]."""
     stretch: list[float] = field(default_factory=lambda: [1.0, 1.0])
-    """Least and largest share by which a feed was changed."""
+    """Smallest and largest factor of a feed."""
     unit_assumed: bool = False
-    """Whether coordinates stood before any G20 or G21."""
+    """Whether coordinates precede any G20 or G21."""
     ended: bool = False
-    """Whether it says that it ends."""
+    """Whether the program has an end (M2, M30 or a second %)."""
 
 
 class ProgramCorrector:
-    """Corrects programs.
+    """Corrector of one program.
 
     Args:
-        file: Name of the program, for messages.
-        axes: Indices of the axes that the drives command.
-        interpreter: What the program's lines mean; new.
-        correct: The correction.
-        within: Largest distance of what is written from the corrected path, [m].
+        interpreter: New interpreter of the program.
+        correct: Correction of points.
+        within: Largest distance of the written path from the corrected one, [m].
 
     Raises:
-        GcodeError: If the correction itself is not known that well.
+        GcodeError: If the error bound of the correction exceeds the tolerance.
     """
 
-    def __init__(
-        self,
-        file: str,
-        *,
-        axes: Sequence[int],
-        interpreter: Interpreter,
-        correct: Correct,
-        within: float,
-    ) -> None:
-        self._file, self._correct, self._interpreter = file, correct, interpreter
-        self._writer = Writer(axes, rounding=ROUNDING * within, start=interpreter.position)
+    def __init__(self, interpreter: Interpreter, correct: Correction, *, within: float) -> None:
+        self._interpreter, self._correct = interpreter, correct
+        self._file = interpreter.file
+        self._writer = Writer(
+            interpreter.axes, rounding=ROUNDING * within, start=interpreter.position
+        )
         self._tolerance = (1.0 - ROUNDING) * within - correct.bound
         if self._tolerance < ROUNDING * within:
             raise GcodeError(
-                f"the correction is known to {correct.bound * 1e6:.3g} µm; expected more",
+                f"found {within / UM:.3g} µm; the correction has an error of up to "
+                f"{correct.bound / UM:.3g} µm: expected more",
                 where="--within",
             )
         self.summary = Summary()
@@ -85,50 +78,54 @@ class ProgramCorrector:
         """Lines of the corrected program, a block at a time.
 
         Args:
-            lines: Of the program, each with what ends it.
+            lines: Lines of the program, each with its line end.
 
         Raises:
             GcodeError: Naming the first line that cannot be corrected.
         """
         steps: list[Step | str] = []
-        pieces, marks = 0.0, 0
+        segments, marks = 0.0, 0
         summary, interpreter = self.summary, self._interpreter
         for text in lines:
             summary.lines += 1
-            if text.strip() == "%":
-                marks += 1
-                self._require_readable([text], summary.lines)
-                steps.append(text)
-            elif interpreter.modes.ended or marks > 1:
-                if _CONTROL.search(text.rstrip("\r\n")):
-                    raise GcodeError("is no text", where=f"{self._file}:{summary.lines}")
+            if text.strip() == "%" or interpreter.modes.ended or marks > 1:
+                marks += text.strip() == "%"
+                if CONTROL.search(text.rstrip("\r\n")):
+                    where = f"{self._file}:{summary.lines}"
+                    raise GcodeError("holds a control character", where=where)
                 self._require_readable([text], summary.lines)
                 steps.append(text)
             else:
-                plain = split_plain(text, summary.lines)
-                step = None if plain is None else interpreter.read_plain(plain)
-                try:
-                    if step is None:
-                        line = split_line(text, summary.lines, file=self._file)
-                        step = interpreter.read(line)
-                except GcodeError:
-                    self._flush(steps)  # what cannot be reached stands before it
-                    raise
+                step = self._read(text, steps)
                 steps.append(step)
                 if step.motion is not None:
-                    summary.unit_assumed |= not step.modes.unit_told
-                    pieces += _estimate(step.motion)
-            if len(steps) >= LINES_AT_ONCE or pieces > PIECES_AT_ONCE:
-                yield self._flush(steps)
-                steps, pieces = [], 0.0
-        yield self._flush(steps)
+                    summary.unit_assumed |= not step.modes.has_unit
+                    segments += _estimate(step.motion)
+            if len(steps) >= LINES_AT_ONCE or segments > SEGMENTS_AT_ONCE:
+                yield self._write(steps)
+                steps, segments = [], 0.0
+        yield self._write(steps)
         summary.ended = interpreter.modes.ended or marks > 1
 
-    def _flush(self, steps: Sequence[Step | str]) -> str:
-        """What is written for some steps."""
+    def _read(self, text: str, pending: Sequence[Step | str]) -> Step:
+        """Effect of a line."""
+        number, interpreter = self.summary.lines, self._interpreter
+        point = split_point_line(text, number)
+        step = None if point is None else interpreter.read_point(point)
+        if step is not None:
+            return step
+        try:
+            return interpreter.read(split_line(text, number, file=self._file))
+        except GcodeError:
+            self._write(pending)  # raises if an earlier line is out of reach
+            raise
+
+    def _write(self, steps: Sequence[Step | str]) -> str:
+        """Corrected text of some lines."""
         moving = [s for s in steps if isinstance(s, Step) and s.motion is not None]
         motions = [s.motion for s in moving if s.motion is not None]
-        cuts = iter(cut(Paths.of(motions), self._correct, tolerance=self._tolerance))
+        paths = Paths.of(motions)
+        results = iter(segment_motions(paths, self._correct, tolerance=self._tolerance))
         summary, low, high = self.summary, *self.summary.stretch
         texts: list[str] = []
         for step in steps:
@@ -136,43 +133,43 @@ class ProgramCorrector:
                 texts.append(step)
                 continue
             if isinstance(step.line, Line) and step.motion is None:
-                own = [self._writer.keep(step.line)]
+                written = [self._writer.copy(step.line)]
             else:
-                found = next(cuts)
-                if isinstance(found, Refused):
-                    where = f"{self._file}:{step.line.number}"
+                segments = next(results)
+                if isinstance(segments, Refused):
                     raise GcodeError(
-                        f"the machine cannot make this motion: it {found.reason}", where=where
+                        f"the machine cannot make this motion: it {segments.reason}",
+                        where=f"{self._file}:{step.line.number}",
                     )
-                summary.points += len(found.points)
-                summary.chord = max(summary.chord, found.chord)
-                summary.correction = max(summary.correction, found.correction)
-                if not step.straight and step.modes.motion:
-                    low = min(low, *found.stretch)
-                    high = max(high, *found.stretch)
-                own = self._writer.write(step, found)
-            if len(own[0]) > SHORT or len(own[-1]) > SHORT:  # those between are places and feeds
-                self._require_readable(own, step.line.number)
-            texts += own
+                summary.points += len(segments.points)
+                summary.deviation = max(summary.deviation, segments.deviation)
+                summary.correction = max(summary.correction, segments.correction)
+                if not step.end_only and step.modes.motion:
+                    low = min(low, *segments.stretch)
+                    high = max(high, *segments.stretch)
+                written = self._writer.write(step, segments)
+            if len(written[0]) > SHORT or len(written[-1]) > SHORT:  # others: coordinates alone
+                self._require_readable(written, step.line.number)
+            texts += written
         summary.stretch = [low, high]
         return "".join(texts)
 
     def _require_readable(self, texts: Sequence[str], number: int) -> None:
-        """Refuse lines that a controller would cut off or stop at."""
+        """Refuse lines that a controller would truncate."""
         for text in texts:
             size = len(text.removesuffix("\n").encode("utf-8", "surrogateescape"))
             if size > LONGEST_READ:
                 raise GcodeError(
-                    f"has {size} bytes once it is corrected; expected at most {LONGEST_READ}, "
-                    "as LinuxCNC reads: shorten what stands beside its words",
+                    f"has {size} bytes after correction; expected at most {LONGEST_READ}, "
+                    "as LinuxCNC reads: shorten its comments",
                     where=f"{self._file}:{number}",
                 )
 
 
 def _estimate(motion: Motion) -> float:
-    """Pieces of a motion, about."""
+    """Estimated number of segments of a motion."""
     a, b = motion.start, motion.end
     length = abs(b[0] - a[0]) + abs(b[1] - a[1]) + abs(b[2] - a[2])
     if motion.arc is None:
-        return 1.0 + length / LONGEST_PIECE
-    return 1.0 + (length + 10.0 * abs(motion.arc.sweep) * motion.arc.radii[0]) / LONGEST_PIECE
+        return 1.0 + length / LONGEST_SEGMENT
+    return 1.0 + (length + 10.0 * abs(motion.arc.sweep) * motion.arc.radii[0]) / LONGEST_SEGMENT

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from orthocal.export.correction_field import CorrectionField
+from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.program import ProgramCorrector
-from orthocal.gcode.state import Interpreter
 from orthocal.kinematics.backend.lanes import Way, running
 
 CORRECTED = 9.0
@@ -31,9 +31,7 @@ def test_programs_are_corrected_faster_than_the_machine_is_asked(orthoglide, rec
 
     def correct():
         interpreter = Interpreter("p", axes=field.axes, offsets={})
-        corrector = ProgramCorrector(
-            "p", axes=field.axes, interpreter=interpreter, correct=field, within=1e-6
-        )
+        corrector = ProgramCorrector(interpreter, field, within=1e-6)
         return sum(1 for _ in corrector.run(text))
 
     def ask():

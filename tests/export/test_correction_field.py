@@ -16,8 +16,8 @@ from orthocal import ExportError, calibrate, draw_errors, write_calibration
 from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.cli import main
 from orthocal.export.correction_field import CorrectionField, Unknown
+from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.program import ProgramCorrector
-from orthocal.gcode.state import Interpreter
 from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
 
 WITHIN = 1e-6
@@ -104,13 +104,8 @@ def tips(robot, errors, drives, tool):
 
 def correct(field, *text):
     """Lines of a program as they are written."""
-    corrector = ProgramCorrector(
-        "p",
-        axes=field.axes,
-        interpreter=Interpreter("p", axes=field.axes, offsets={}),
-        correct=field,
-        within=WITHIN,
-    )
+    interpreter = Interpreter("p", axes=field.axes, offsets={})
+    corrector = ProgramCorrector(interpreter, field, within=WITHIN)
     return "".join(corrector.run(f"{line}\n" for line in text)).splitlines()
 
 
@@ -226,11 +221,11 @@ def test_the_command_line(command, tmp_path, monkeypatch):
     code, out, err = command(PROGRAM)
     assert code == 0
     assert out.splitlines()[0] == "G21 G0 X1.0000 Y2.0000 Z3.0000"
-    assert "It is for a controller with the offsets to enter: x_slide -0.5" in err
-    assert "The program's coordinates are taken for the machine's own." in err
+    assert "For a controller with the offsets to enter: x_slide -0.5" in err
+    assert "The program's coordinates are taken as machine coordinates." in err
     code, out, err = command(PROGRAM, "--offsets", "active", "--work-offset-mm", "10,0,-5")
     assert code == 0
-    assert "active while measuring: x_slide +0.0000 mm" in err
+    assert "active during the measurement: x_slide +0.0000 mm" in err
     wanted = np.array([11.0, 2.0, -2.0]) * 1e-3
     machine = command.calibration
     expected = nominal_assembly(machine.robot).forward(machine.machine.inverse(wanted))
@@ -238,7 +233,7 @@ def test_the_command_line(command, tmp_path, monkeypatch):
     assert np.abs(got - expected * 1e3).max() < 1e-4
     assert np.abs(entered_offsets(machine)).max() > 1e-4
     code, _, err = command(PROGRAM, "--out", str(tmp_path / "o.ngc"), "--tool=-3,0,-50.5")
-    assert "It is for a tip at -3, 0, -50.5 mm from the tool centre point." in err
+    assert "For a tip at -3, 0, -50.5 mm from the tool centre point." in err
     assert (tmp_path / "o.ngc").read_bytes().endswith(b"F100 (\xe9)\r\n")
     stream = io.TextIOWrapper(io.BytesIO(PROGRAM.encode("latin-1")))
     monkeypatch.setattr(sys, "stdin", stream)
@@ -261,7 +256,7 @@ def test_a_line_that_is_too_long_in_bytes_is_not_read_as_two(command, monkeypatc
     [
         ("", (), "/p.ngc: is empty; expected a program"),
         (PROGRAM + "G1 X300", (), "/p.ngc:3: the machine cannot make this motion: it cannot be"),
-        (PROGRAM + "G54", (), "/p.ngc:3: found G54, and nothing says where its zero is"),
+        (PROGRAM + "G54", (), "/p.ngc:3: found G54, whose zero in machine coordinates is not"),
         (PROGRAM, ("--work-offset-mm", "1,2"), "--work-offset-mm: found '1,2'; expected X,Y,Z"),
         (PROGRAM, ("--work-offset-mm", "G53=1,2,3"), "--work-offset-mm: found 'G53=1,2,3'"),
         (PROGRAM, ("--tool", "1,2"), "--tool: found '1,2'; expected X,Y,Z"),

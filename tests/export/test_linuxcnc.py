@@ -564,7 +564,7 @@ def test_linuxcnc_runs_what_its_window_has_had_filtered(root, mixed, full, filte
     ]
     code, said, progress, text = filtered(program)
     assert code == 0, said
-    assert "It is for a tip at 5, 0, -50 mm" in said
+    assert "For a tip at 5, 0, -50 mm" in said
     assert progress[-1] == 100
     assert progress == sorted(progress)
     nominal = calibrated(root, mixed, "raw-cycles", {}, "offsets", active=np.zeros(3))

@@ -1,4 +1,4 @@
-"""Corrected programs against dense samples of what they mean, and another interpreter."""
+"""Corrected programs against dense samples of their motions and LinuxCNC's interpreter."""
 
 from __future__ import annotations
 
@@ -12,22 +12,21 @@ import pytest
 from programs import Move, distances, own_distances, random_program, read_polyline
 
 from orthocal import GcodeError
-from orthocal.gcode import words as program_words
+from orthocal.gcode.interpreter import Interpreter
+from orthocal.gcode.lines import split_point_line
 from orthocal.gcode.program import ProgramCorrector
-from orthocal.gcode.state import Interpreter
 
 WITHIN = 1e-6
 
 EACH = 8
-"""Samples of a piece."""
+"""Samples of each segment."""
 
 READ_BACK = 0.02
-"""[µm] By how much what a random program says with six decimals may differ from what was meant:
-arcs end 1e-6 inch off their circle."""
+"""Rounding of a random program with six decimals, [µm]: arcs end 1e-6 inch off their circle."""
 
 
 def bend(mm):
-    """A smooth correction of a millimetre, bent as those of machines are, mm to mm."""
+    """Smooth correction of about a millimetre with the curvature of a machine's, mm to mm."""
     x, y, z = np.asarray(mm).T
     change = [
         0.8 * np.sin(x / 50.0 + y / 70.0) + 0.003 * z,
@@ -45,17 +44,17 @@ class Bent:
         return bend(points * 1e3) * 1e-3, refused
 
 
-def corrected(text, *, within=WITHIN, offsets=None, start=None, correct=None, file="p.ngc"):
-    interpreter = Interpreter(file, axes=(0, 1, 2), offsets=offsets or {}, start=start)
-    corrector = ProgramCorrector(
-        file, axes=(0, 1, 2), interpreter=interpreter, correct=correct or Bent(), within=within
+def corrected(text, *, within=WITHIN, offsets=None, start=None, correct=None, one_tool=False):
+    interpreter = Interpreter(
+        "p.ngc", axes=(0, 1, 2), offsets=offsets or {}, start=start, one_tool=one_tool
     )
+    corrector = ProgramCorrector(interpreter, correct or Bent(), within=within)
     lines = "".join(corrector.run(f"{line}\n" for line in text)).splitlines()
     return lines, corrector.summary
 
 
 def check_program(program, lines, *, within, offset=(0.0, 0.0, 0.0)):
-    """Every motion's samples near its pieces, every piece near its motion, its time as it was."""
+    """Check that each motion stays near its segments and keeps its duration."""
     found = read_polyline(lines, offset)
     last = None
     for move in program.moves:
@@ -77,14 +76,14 @@ def check_program(program, lines, *, within, offset=(0.0, 0.0, 0.0)):
 
 
 @pytest.mark.parametrize("seed", range(100))
-def test_what_is_written_is_near_the_corrected_path(seed):
+def test_written_program_is_near_the_corrected_path(seed):
     offset = (0.0, 0.0, 0.0) if seed % 3 else (12.5, -7.25, 3.0)
     within = [0.3e-6, 1e-6, 20e-6][seed % 3]
     program = random_program(seed, moves=6, offset=offset)
     offsets = {"G54": tuple(v * 1e-3 for v in offset)}
     lines, summary = corrected(program.text, within=within, offsets=offsets)
     check_program(program, lines, within=within, offset=offset)
-    assert summary.chord < within
+    assert summary.deviation < within
     assert [line for line in lines if "(move" in line] == [
         line for line in lines if re.match(r"N\d+ .*\(move \d+\)$", line) and "N1 " not in line
     ]
@@ -99,36 +98,35 @@ PLAIN = [
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_lines_that_are_nothing_but_a_place_are_read_the_short_way_alike(seed, monkeypatch):
-    """Most lines are; what they mean is told once more, and must be what the long way says."""
+def test_shortcut_for_point_lines_equals_the_interpreter(seed, monkeypatch):
     from orthocal.gcode import program
 
     text = [re.sub(r" \(.*\)$", "", line) for line in random_program(seed, moves=20).text[:-1]]
     text += ["G21 G90 G91.1 G17 G0 X0 Y0 Z0", "F100", *PLAIN]
     offsets = {"G54": (0.0125, -0.001, 0.003)}
-    read, split = [], program.split_plain
+    read, split = [], program.split_point_line
 
     def seen(text, number):
         read.append(split(text, number))
         return read[-1]
 
-    monkeypatch.setattr(program, "split_plain", seen)
+    monkeypatch.setattr(program, "split_point_line", seen)
     short, summary = corrected(text, offsets=offsets)
     assert sum(line is not None for line in read) > 20
-    monkeypatch.setattr(program, "split_plain", lambda text, number: None)
+    monkeypatch.setattr(program, "split_point_line", lambda text, number: None)
     long, expected = corrected(text, offsets=offsets)
     assert short == long
     assert summary == expected
 
 
-BY_THE_LONG_WAY = [
+WITHOUT_SHORTCUT = [
     "X600", "X1 Z1e1", "X", "X1..2", "X1.2.3", "X--1", "X" + "9" * 999, "G2 X2 I1\nX3", "G20\nX1",
     "G80\nX1", "G1", "G2 X2",
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("lines", BY_THE_LONG_WAY, ids=lambda lines: lines[:10])
-def test_the_short_way_refuses_nothing_by_itself(lines, monkeypatch):
+@pytest.mark.parametrize("lines", WITHOUT_SHORTCUT, ids=lambda lines: lines[:10])
+def test_shortcut_refuses_nothing_itself(lines, monkeypatch):
     from orthocal.gcode import program
 
     said = []
@@ -136,7 +134,7 @@ def test_the_short_way_refuses_nothing_by_itself(lines, monkeypatch):
         with pytest.raises(GcodeError) as refused:
             corrected([*HEAD, "G1", *lines.splitlines(), "G81"])
         said.append(str(refused.value))
-        monkeypatch.setattr(program, "split_plain", lambda text, number: None)
+        monkeypatch.setattr(program, "split_point_line", lambda text, number: None)
     assert said[0] == said[1]
 
 
@@ -149,32 +147,32 @@ def test_the_short_way_refuses_nothing_by_itself(lines, monkeypatch):
     ],
     ids=["blanks", "blanks-behind", "digits"],
 )
-def test_a_line_is_read_once_however_long_its_blanks_and_digits_are(line):
-    """In steps in proportion to its length: with as many ways to read it this would take hours."""
-    assert program_words.split_plain(f"{line}\n", 1) is None
+def test_lines_are_matched_in_linear_time(line):
+    """With several ways to match blanks or digits these lines would take hours."""
+    assert split_point_line(f"{line}\n", 1) is None
 
 
-def test_a_spindle_that_turns_left_is_no_dwell():
-    lines, _ = corrected(["G21 G0 X0 Y0 Z0", "M4 S100 G0 X1"], correct=lambda_of(lambda p: p))
+def test_m4_is_not_a_dwell():
+    lines, _ = corrected(["G21 G0 X0 Y0 Z0", "M4 S100 G0 X1"], correct=as_correction(lambda p: p))
     assert lines[1] == "M4 S100 G0 X1.0000 Y0.0000 Z0.0000"
 
 
-def test_no_zero_is_below_nought():
-    lines, _ = corrected(["G21 G0 X-0.00004 Y-0.0 Z-10.00001"], correct=lambda_of(lambda p: p))
+def test_zero_has_no_sign():
+    lines, _ = corrected(["G21 G0 X-0.00004 Y-0.0 Z-10.00001"], correct=as_correction(lambda p: p))
     assert lines == ["G21 G0 X0.0000 Y0.0000 Z-10.0000"]
 
 
-def test_as_few_pieces_as_that_takes():
-    """The chord of an arc of 20 mm within 1 µm: s² = 8 r h."""
+def test_number_of_segments_follows_the_sagitta():
+    """Chords of an arc of 20 mm within 1 µm: s² = 8 r h."""
     text = ["G21 G0 X20 Y0 Z0", "G3 X-20 I-20 F100"]
-    lines, _ = corrected(text, correct=lambda_of(lambda p: p))
+    lines, _ = corrected(text, correct=as_correction(lambda p: p))
     at_most = np.pi * 20.0 / np.sqrt(8 * 20.0 * 1e-3)
     assert at_most < len(lines) - 1 < 1.1 * at_most
-    lines, _ = corrected(["G21 G0 X0 Y0 Z0", "G1 X100 F100"], correct=lambda_of(lambda p: p))
-    assert len(lines) == 11  # none is longer than 10 mm
+    lines, _ = corrected(["G21 G0 X0 Y0 Z0", "G1 X100 F100"], correct=as_correction(lambda p: p))
+    assert len(lines) == 11  # no segment is longer than 10 mm
 
 
-def lambda_of(function):
+def as_correction(function):
     class Simple:
         bound = 0.0
 
@@ -184,12 +182,12 @@ def lambda_of(function):
     return Simple()
 
 
-def test_all_else_stays_where_it_is():
+def test_other_words_and_comments_are_preserved():
     text = [
         "%", "(a comment)", "", "N10 g21 G90 G17 G64 P0.01 T1 M6", "S1000 M3 ;spindle",
         "G0 X0 Y0 Z5", "  n20 G1 Z4 F100 M8 (down) ; and on", "X0.5 M30", "anything # at all", "%",
     ]  # fmt: skip
-    lines, summary = corrected(text, correct=lambda_of(lambda p: p + 1e-3))
+    lines, summary = corrected(text, correct=as_correction(lambda p: p + 1e-3))
     assert lines == [
         *text[:5],
         "G0 X1.0000 Y1.0000 Z6.0000",
@@ -200,9 +198,9 @@ def test_all_else_stays_where_it_is():
     assert summary.ended
 
 
-def test_what_stops_the_program_comes_after_the_last_piece():
+def test_stops_follow_the_last_segment():
     lines, _ = corrected(
-        ["G21 G0 X0 Y0 Z0", "N5 M1 G1 X25 F100 M8"], correct=lambda_of(lambda p: p)
+        ["G21 G0 X0 Y0 Z0", "N5 M1 G1 X25 F100 M8"], correct=as_correction(lambda p: p)
     )
     assert lines[1:] == [
         "N5 G1 X8.3333 Y0.0000 Z0.0000 F100 M8",
@@ -211,14 +209,14 @@ def test_what_stops_the_program_comes_after_the_last_piece():
     ]
 
 
-def test_decimals_do_not_add_up_in_steps():
+def test_rounding_does_not_accumulate_in_incremental_mode():
     text = ["G21 G0 X0 Y0 Z0", "G91 F100", *["G1 X0.3333"] * 300]
     lines, _ = corrected(text)
     end = read_polyline(lines)[0][-1][0]
     assert np.linalg.norm(end - bend(np.array([[99.99, 0.0, 0.0]]))[0]) < 1e-4
 
 
-def test_a_rapid_from_an_unknown_place_goes_straight_to_its_end():
+def test_first_rapid_motion_has_one_segment():
     lines, _ = corrected(["G21 G0 X100 Y0 Z0"])
     assert len(lines) == 1
     lines, _ = corrected(["G21 G0 Z10"], start=(0.001, 0.002, 0.003))
@@ -231,50 +229,51 @@ HEAD = ["G21 G90 G17", "G0 X0 Y0 Z0", "F100"]
 REFUSED = {
     "G81 X1 Z-1 R1": "found G81, which is a canned cycle, whose motions the controller makes",
     "G41 D1": "found G41, which is cutter compensation",
-    "G43 H1": "found G43, which is a tool length",
-    "G92 X0": "found G92, which moves the program's zero; leave it out, and say where",
+    "G43 H1": "found G43, which is a tool length offset",
+    "H1": "found H1, a tool length offset; remove it, and give the tip with --tool",
+    "G92 X0": "found G92, which moves the zero of the program; set it before",
     "G93": "found G93, which is inverse time feed; expected G94",
-    "G95 F0.1": "found G95, which is feed a revolution",
-    "G53 G0 X0": "found G53, which is a motion in other coordinates",
-    "G28": "found G28, which goes by way of a place that the controller has stored",
+    "G95 F0.1": "found G95, which is feed per revolution",
+    "G53 G0 X0": "found G53, which is a motion in machine coordinates",
+    "G28": "found G28, which is a motion to a position that the controller has stored",
     "G5 X1 I1 J1 P0 Q0": "found G5, which is a spline",
-    "G33 Z1 K1": "found G33, which is a motion that the spindle leads",
-    "G38.2 Z-1": "found G38.2, which is a probing move",
-    "G123": "found G123, which is not known here; expected G0 to G3",
-    "G55": "found G55, and nothing says where its zero is in the machine's coordinates; expected "
+    "G33 Z1 K1": "found G33, which is a motion synchronised with the spindle",
+    "G38.2 Z-1": "found G38.2, which is a probing motion",
+    "G123": "found G123, which is unknown; expected G0 to G3",
+    "G55": "found G55, whose zero in machine coordinates is not given; expected "
     "--work-offset-mm G55=X,Y,Z",
     "M98 P1": "found M98, which calls a subroutine",
-    "M100": "found M100, which is not known here",
+    "M100": "found M100, which is unknown",
     "G1 A10": "found A10, a rotary axis; expected X, Y, Z",
-    "G1 U10": "found U10, a further axis; expected X, Y, Z",
+    "G1 U10": "found U10, a secondary axis; expected X, Y, Z",
     "#1=5": "found '#1=5' (parameters); expected words such as X1.5 and comments",
     "G1 X[1+2]": "found 'X[1+2]' (expressions)",
     "G1 X#1": "found 'X#1' (parameters)",
     "o100 sub": "found 'o100 sub' (subroutines and loops)",
     "O100": "found O100, subroutines and loops; write their lines out",
-    "/G1 X1": "found '/G1 X1' (lines that the controller may leave out)",
+    "/G1 X1": "found '/G1 X1' (optional lines)",
     "G1 @1 ^2": "found '@1 ^2' (polar coordinates)",
-    "G1 X1 (no end": "found '(no end' (a comment that does not end)",
+    "G1 X1 (no end": "found '(no end' (a comment without an end)",
     "G1 X1 2": "found '2'; expected words",
-    "G1 X1 X2": "the word X stands twice",
-    "G1 G2 X1": "found G2 beside another word of its kind; expected one",
-    "G1 X1 I1": "found I, a word of arcs, where the motion is G1; expected G2 or G3",
-    "G1 X1 P2": "found P or Q, which nothing on the line takes",
+    "G1 X1 X2": "found the word X twice",
+    "G1 G2 X1": "found G2 and another word of its group; expected one",
+    "G1 X1 I1": "found I, a word of arcs, and the motion is G1; expected G2 or G3",
+    "G1 X1 P2": "found P or Q without a word that takes it",
     "G2 X1 Y1": "found an arc without a centre; expected I and J, or R",
     "G2 X1 Y1 K1 I0": "found K with G17; expected I and J",
     "G2 X1 Y1 I1 R1": "found R and I; expected one of them",
     "G2 X10 Y0 R2": "R is 2 mm, less than half the distance of the arc's ends, 5 mm",
-    "G2 R2 Z1": "R with both ends at the same X and Y tells no centre; expected I and J",
-    "G2 X10 Y0 I3": "an arc begins 3 mm from its centre and ends 7 mm from it; expected the same",
+    "G2 R2 Z1": "found R with both ends at the same X and Y, which determines no centre",
+    "G2 X10 Y0 I3": "an arc has a radius of 3 mm at its start and 7 mm at its end; expected",
     "G2 X0 Y0 I3 P1.5": "P is 1.5; expected a whole number of turns",
-    "G2 X0 Y0 I400 P9999": "the machine cannot make this motion: it needs more than 50000 pieces",
+    "G2 X0 Y0 I400 P9999": "the machine cannot make this motion: it needs more than 50000 segments",
     "G90.1 G2 X2 I1": "found only I; expected I and J, or R",
     "G80 X1": "found coordinates without a motion; expected G0 to G3",
-    "G20 G1 X1": "found G1, and no feed is known; expected F before it, and again after another",
+    "G20 G1 X1": "found G1 without a feed; expected F before it, and again after a change",
     "G4 P1 X1": "found a dwell and coordinates; expected one of them",
     "G1 X1e3": "found e3, a word of splines",
     "G1 X600": "the machine cannot make this motion: it is too far",
-    "G1 X99999999": "X is beyond any machine",
+    "G1 X99999999": "found X at 1e+08 mm; expected at most 1e+06 mm",
     "F-1": "found a feed of -1",
     "(\x1b[31m)": "a comment holds the control character '\\x1b'",
     "X" + "1" * 2000: "has 2002 characters; expected at most 1000",
@@ -282,24 +281,62 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("line", REFUSED, ids=lambda line: line[:20].replace("\x1b", "ESC"))
-def test_what_is_not_known_is_refused_by_its_line(line):
+def test_refused_words_are_named_with_their_line(line):
     with pytest.raises(GcodeError) as refused:
         corrected([*HEAD, line, "G1 X1"])
     assert str(refused.value).startswith(f"p.ngc:4: {REFUSED[line]}")
 
 
-def test_what_must_be_known_before():
+CUT = ["G0 X0 Y0 Z0", "G1 X1 F100"]
+
+ONE_TOOL = {
+    "loaded once": ["T1 M6", *CUT, "M6", "T1 M6", "X2"],
+    "preselected": ["T1 M6", *CUT, "T2", "X2", "T1", "M6", "X3"],
+    "selected before M6": ["T1", *CUT, "T1 M6", "X2"],
+    "changed before it moves": ["T2", "T3 M6", "T1 M6", *CUT],
+    "retracted before": ["G0 X0 Y0 Z9", "T1 M6", *CUT],
+    "unloaded at the end": ["T1 M6", *CUT, "T0 M6", "G0 Z9", "T1 M6", "G1 X2"],
+    "without a number": ["M6", *CUT],
+}
+
+SECOND_TOOL = {
+    "loaded": (["T1 M6", *CUT, "T2 M6"], 4, "found T2 after motions of T1"),
+    "loaded for a rapid motion": (["T1 M6", "G0 X0 Y0 Z0", "T2", "M6"], 4, "found T2 after"),
+    "preselected, then loaded": (["T1 M6", "T2", *CUT, "X2", "M6"], 6, "found T2 after motions"),
+    "selected without M6": (["T1", *CUT, "N9 T2"], 4, "found T2 after motions of T1"),
+    "after a tool without T": ([*CUT, "T2 M6"], 3, "found T2 after motions of the tool that"),
+    "both without T": (["M6", *CUT, "M6"], 4, "found M6 without T after motions of the tool"),
+    "after an unloaded one": (["T1 M6", *CUT, "T0 M6", "T2 M6"], 5, "found T2 after motions of T1"),
+    "after point lines": (["G0 X0 Y0 Z0", "F100", "G1", "X1", "T2 M6"], 5, "found T2 after"),
+}
+
+
+@pytest.mark.parametrize("text", ONE_TOOL.values(), ids=ONE_TOOL)
+def test_one_tool_is_accepted_with_a_tip(text):
+    assert corrected(["G21", *text], one_tool=True)[1].lines == len(text) + 1
+
+
+@pytest.mark.parametrize(("text", "number", "message"), SECOND_TOOL.values(), ids=SECOND_TOOL)
+def test_second_tool_is_refused_with_a_tip(text, number, message):
+    with pytest.raises(GcodeError) as refused:
+        corrected(["G21", *text, "G1 X9", "M2"], one_tool=True)
+    assert str(refused.value).startswith(f"p.ngc:{number + 1}: {message}")
+    assert "expected one tool: split the program by tools" in str(refused.value)
+    corrected(["G21", *text, "G1 X9 F100", "M2"])  # without a tip
+
+
+def test_position_and_first_motion_must_be_known():
     for text, message in (
-        (["G21 F1 G1 X1"], "where the tool is along Y is not known before this motion; expected a"),
-        (["G91 G0 X1 Y1 Z1"], "where the tool is along X is not known"),
-        (["F1 G1 X1 Y1 Z1"], "found G1 as the first motion: where the machine stands is not on"),
+        (["G21 F1 G1 X1"], "the position along Y is not known before this motion; expected a"),
+        (["G91 G0 X1 Y1 Z1"], "the position along X is not known"),
+        (["F1 G1 X1 Y1 Z1"], "found G1 as the first motion, from a position that is not on"),
     ):
         with pytest.raises(GcodeError, match=message):
             corrected(text)
 
 
-def test_the_first_line_that_is_wrong_is_named():
-    """What cannot be reached is found later than words that are not known."""
+def test_first_bad_line_is_named():
+    """Unreachable points are found later than refused words."""
     with pytest.raises(GcodeError, match=r"^p\.ngc:4: the machine cannot"):
         corrected([*HEAD, "G1 X600", "G81"])
 
@@ -317,9 +354,7 @@ def test_memory_does_not_grow_with_the_program(monkeypatch):
     peaks = []
     for count in (300, 3000):
         interpreter = Interpreter("p", axes=(0, 1, 2), offsets={})
-        corrector = ProgramCorrector(
-            "p", axes=(0, 1, 2), interpreter=interpreter, correct=Bent(), within=WITHIN
-        )
+        corrector = ProgramCorrector(interpreter, Bent(), within=WITHIN)
         tracemalloc.start()
         for _ in corrector.run(lines(count)):
             pass
@@ -329,8 +364,8 @@ def test_memory_does_not_grow_with_the_program(monkeypatch):
 
 
 @pytest.mark.parametrize("line", ["%" + " " * 260, "(" + "a" * 300 + ")", "x" * 253])
-def test_no_line_behind_the_end_is_longer_than_linuxcnc_reads(line):
-    with pytest.raises(GcodeError, match=r"^p\.ngc:5: has \d+ bytes once it is corrected"):
+def test_long_lines_after_the_end_are_refused(line):
+    with pytest.raises(GcodeError, match=r"^p\.ngc:5: has \d+ bytes after correction"):
         corrected([*HEAD, "M2", line])
 
 
@@ -338,7 +373,7 @@ RS274 = shutil.which("rs274")
 
 
 def interpret(text, folder):
-    """Motions of a program as LinuxCNC's interpreter makes them."""
+    """Motions of a program by LinuxCNC's interpreter."""
     path = folder / "program.ngc"
     path.write_text("\n".join(text) + "\n", newline="")
     done = subprocess.run(
@@ -346,19 +381,19 @@ def interpret(text, folder):
         capture_output=True, text=True, check=True, cwd=folder,
     )  # fmt: skip
     unit, plane, feed, at, moves = 1.0, 17, None, np.zeros(3), []
-    for name, told in re.findall(r"N\S+ +(\w+)\((.*)\)", done.stdout):
+    for name, arguments in re.findall(r"N\S+ +(\w+)\((.*)\)", done.stdout):
         if name == "USE_LENGTH_UNITS":
-            unit = 25.4 if "INCHES" in told else 1.0
+            unit = 25.4 if "INCHES" in arguments else 1.0
         elif name == "SELECT_PLANE":
-            plane = {"XY": 17, "XZ": 18, "YZ": 19}[told[-2:]]
+            plane = {"XY": 17, "XZ": 18, "YZ": 19}[arguments[-2:]]
         elif name == "SET_FEED_RATE":
-            feed = float(told) * unit
+            feed = float(arguments) * unit
         elif name in ("STRAIGHT_FEED", "STRAIGHT_TRAVERSE"):
-            end = np.array([float(v) for v in told.split(",")[:3]]) * unit
+            end = np.array([float(v) for v in arguments.split(",")[:3]]) * unit
             moves.append(Move(0, at, end, feed if name == "STRAIGHT_FEED" else None))
             at = end
         elif name == "ARC_FEED":
-            a, b, ca, cb, turns, height = (float(v) for v in told.split(",")[:6])
+            a, b, ca, cb, turns, height = (float(v) for v in arguments.split(",")[:6])
             order = {17: (0, 1, 2), 18: (2, 0, 1), 19: (1, 2, 0)}[plane]
             end, center, normal = np.zeros(3), np.array(at), np.zeros(3)
             end[list(order)] = np.array([a, b, height]) * unit
@@ -377,13 +412,13 @@ def interpret(text, folder):
 
 
 PRINTED_MM = 0.0002
-"""rs274 prints ends and centres with four decimals."""
+"""Rounding of ends and centres by rs274, four decimals, [mm]."""
 
 
 @pytest.mark.skipif(RS274 is None, reason="LinuxCNC's rs274 is not installed (linuxcnc-uspace)")
 @pytest.mark.parametrize("seed", range(12))
-def test_another_interpreter_before_and_after(seed, tmp_path):
-    """Its samples of the program, corrected, against its polyline of what was written."""
+def test_linuxcnc_interpreter_before_and_after_correction(seed, tmp_path):
+    """Samples of the program, corrected, against the polyline of the written program."""
     text = random_program(1000 + seed, moves=10, inches=False).text
     lines, _ = corrected(text)
     before, after = interpret(text, tmp_path), interpret(lines, tmp_path)
@@ -399,15 +434,13 @@ def test_another_interpreter_before_and_after(seed, tmp_path):
 
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 @pytest.mark.parametrize("line", ["G1 X1 (%s)", "(%s)", "G1 X25 (%s)", "G1 X1 M8 ;%s", "M7%s"])
-def test_no_line_is_written_that_is_longer_than_linuxcnc_reads(line, end, tmp_path, monkeypatch):
-    """One of 252 bytes, which it reads; one of 253, which is refused here, and there."""
+def test_longest_written_line_is_what_linuxcnc_reads(line, end, tmp_path, monkeypatch):
+    """A line of 252 bytes is read; one of 253 bytes is refused here and by LinuxCNC."""
     from orthocal.gcode import program
 
     def written(fill):
         interpreter = Interpreter("p.ngc", axes=(0, 1, 2), offsets={})
-        corrector = ProgramCorrector(
-            "p.ngc", axes=(0, 1, 2), interpreter=interpreter, correct=Bent(), within=WITHIN
-        )
+        corrector = ProgramCorrector(interpreter, Bent(), within=WITHIN)
         text = "".join(corrector.run(f"{t}{end}" for t in [*HEAD, line % fill, "M2"]))
         return text, max(len(part.encode()) for part in text.split("\n"))
 
@@ -417,7 +450,7 @@ def test_no_line_is_written_that_is_longer_than_linuxcnc_reads(line, end, tmp_pa
     longest = " " * (missing % n) + fill * (missing // n)
     text, size = written(longest)
     assert size == 252
-    with pytest.raises(GcodeError, match=r"^p\.ngc:4: has 253 bytes once it is corrected"):
+    with pytest.raises(GcodeError, match=r"^p\.ngc:4: has 253 bytes after correction"):
         written(" " + longest)
     if RS274:
         interpret(text.split("\n"), tmp_path)

@@ -18,6 +18,7 @@ from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.motion import SetupMotion, Stop, shown_joints
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session
+from orthocal.text import comment_safe
 from orthocal.units import DRIVE_UNITS, MM, format_fixed
 
 Array = NDArray[np.float64]
@@ -35,9 +36,6 @@ FASTEST = 20_000.0
 
 LARGEST_SHIFT = 1e5
 """Largest coordinate of the machine's origin, [mm]."""
-
-_UNSAFE = re.compile(r"[^A-Za-z0-9 _.,:;=+\-/*]")
-"""Characters that a controller may misread in a comment or cannot display."""
 
 _PREAMBLE = (
     "(Start at the mechanical zero, with no gauge mounted)",
@@ -100,10 +98,10 @@ def write_program(
             where=str(robot.yaml),
         )
     shift = ", ".join(f"{v:g}" for v in options.shift_mm)
+    name, setup = (comment_safe(text, LONGEST_NAME) for text in (robot.name, motion.setup))
     lines = [
-        f"(orthocal: {_safe(robot.name)}, setup {_safe(motion.setup)}, {motion.number} of "
-        f"{motion.count})",
-        f"({_safe(session.setups[motion.setup].sensor.describe(), 120)})",
+        f"(orthocal: {name}, setup {setup}, {motion.number} of {motion.count})",
+        f"({comment_safe(session.setups[motion.setup].sensor.describe(), 120)})",
         f"(Coordinates: nominal kinematics, machine = world + {shift} mm)",
         *_PREAMBLE,
         f"F{options.feed:g}",
@@ -155,10 +153,5 @@ def _messages(robot: Robot, stop: Stop, following: Stop | None, *, first: bool) 
 
 def _label(stop: Stop) -> str:
     if stop.line is None:
-        return f"posture {_safe(stop.posture)}"
-    return f"line {stop.line}: {_safe(stop.posture)}"
-
-
-def _safe(text: str, longest: int = LONGEST_NAME) -> str:
-    """Text in characters that a comment of any controller accepts."""
-    return _UNSAFE.sub("_", text)[:longest]
+        return f"posture {comment_safe(stop.posture, LONGEST_NAME)}"
+    return f"line {stop.line}: {comment_safe(stop.posture, LONGEST_NAME)}"

@@ -1,0 +1,543 @@
+"""Interpreter of a program: modes, tools, positions and motions in machine coordinates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple, NoReturn
+
+from orthocal.errors import GcodeError
+from orthocal.gcode.lines import Line, PointLine, Word
+from orthocal.gcode.path import (
+    AXES,
+    CENTERS,
+    PLANES,
+    Arc,
+    Motion,
+    Vector,
+    arc_about,
+    center_of_radius,
+)
+from orthocal.units import MM
+
+INCH = 25.4 * MM
+
+LARGEST_COORDINATE = 1e3
+"""Largest coordinate of a point, [m]."""
+
+MOST_TURNS = 10_000
+"""Largest number of turns of an arc."""
+
+SYSTEMS = {
+    **{540.0 + 10 * k: f"G{54 + k}" for k in range(6)},
+    **{591.0 + k: f"G59.{1 + k}" for k in range(3)},
+}
+"""Ten times the number of a G-word to the name of its work coordinate system."""
+
+GROUPS: dict[float, str] = {
+    **dict.fromkeys((0.0, 10.0, 20.0, 30.0, 800.0), "motion"),
+    **dict.fromkeys((170.0, 180.0, 190.0), "plane"),
+    **dict.fromkeys((200.0, 210.0), "unit"),
+    **dict.fromkeys((900.0, 910.0), "distance"),
+    **dict.fromkeys((901.0, 911.0), "arc distance"),
+    **dict.fromkeys((940.0, 950.0), "feed"),
+    **dict.fromkeys((610.0, 611.0, 640.0), "path"),
+    **dict.fromkeys((980.0, 990.0), "return"),
+    **dict.fromkeys(SYSTEMS, "system"),
+    40.0: "dwell",
+    80.0: "diameter",
+    400.0: "compensation",
+    490.0: "tool length",
+    921.0: "shift",
+    970.0: "spindle",
+}
+"""Ten times the number of each accepted G-word to its modal group; a line has one of a group."""
+
+STOPS = frozenset({0.0, 1.0, 2.0, 30.0, 60.0})
+"""M-words that take effect after the motion of their line."""
+
+ENDS = frozenset({2.0, 30.0})
+"""M-words that end the program."""
+
+P_WORDS = frozenset({50.0, 51.0, 52.0, 53.0, 62.0, 63.0, 64.0, 65.0})
+"""M-words with an argument P."""
+
+M_WORDS = STOPS | P_WORDS | frozenset(float(m) for m in (3, 4, 5, 6, 7, 8, 9, 48, 49))
+"""Accepted M-words."""
+
+TOOL_CHANGE = 6.0
+
+_LINES_AND_ARCS = "write the motion as lines and arcs (G0 to G3)"
+_ADD = "set it before the program, and give the zero with --work-offset-mm"
+_CENTER_PATH = "export the path of the tool centre point from the CAM"
+
+REFUSED_CODES: dict[str, tuple[str, str]] = {
+    **dict.fromkeys(("G5", "G5.1", "G5.2", "G5.3"), ("is a spline", _LINES_AND_ARCS)),
+    "G7": ("is diameter mode", "expected G8"),
+    "G10": ("sets values of the controller", "set them before the program"),
+    **dict.fromkeys(("G15", "G16"), ("is for polar coordinates", "write X, Y and Z")),
+    **dict.fromkeys(
+        ("G28", "G28.1", "G30", "G30.1"),
+        ("is a motion to a position that the controller has stored", "write its coordinates"),
+    ),
+    **dict.fromkeys(
+        ("G33", "G33.1"), ("is a motion synchronised with the spindle", _LINES_AND_ARCS)
+    ),
+    **dict.fromkeys(
+        ("G38.2", "G38.3", "G38.4", "G38.5"),
+        ("is a probing motion, whose end is not known in advance", "remove it"),
+    ),
+    **dict.fromkeys(
+        ("G41", "G41.1", "G42", "G42.1"),
+        ("is cutter compensation, which the controller applies to uncorrected paths", _CENTER_PATH),
+    ),
+    **dict.fromkeys(
+        ("G43", "G43.1", "G43.2"),
+        (
+            "is a tool length offset, and the length is in the controller",
+            f"{_CENTER_PATH}, and give the tip with --tool",
+        ),
+    ),
+    "G53": ("is a motion in machine coordinates", "write it in those of the program"),
+    **dict.fromkeys(
+        ("G73", "G76", *(f"G{k}" for k in range(81, 90))),
+        ("is a canned cycle, whose motions the controller makes", _LINES_AND_ARCS),
+    ),
+    **dict.fromkeys(("G92", "G92.2", "G92.3"), ("moves the zero of the program", _ADD)),
+    "G93": ("is inverse time feed", "expected G94"),
+    "G95": ("is feed per revolution", "expected G94"),
+    "G96": ("is constant surface speed", "expected G97"),
+    "M61": ("sets the number of the current tool", "remove it"),
+    "M66": ("waits for an input", "remove it"),
+    "M98": ("calls a subroutine", "write its lines out"),
+    "M99": ("ends a subroutine", "write its lines out"),
+}
+"""G and M words that cannot be corrected: the reason, and what is expected instead."""
+
+REFUSED_LETTERS: dict[str, tuple[str, str]] = {
+    **dict.fromkeys("ABC", ("a rotary axis", "expected {axes}")),
+    **dict.fromkeys("UVW", ("a secondary axis", "expected {axes}")),
+    **dict.fromkeys("XYZ", ("an axis that the drives do not command", "expected {axes}")),
+    "D": ("a tool radius", "remove it"),
+    "H": ("a tool length offset", "remove it, and give the tip with --tool"),
+    "O": ("subroutines and loops", "write their lines out"),
+    "L": ("repetitions", "write them out"),
+    "E": ("a word of splines", _LINES_AND_ARCS),
+}
+"""Letters that cannot be corrected: what they are, and what is expected instead."""
+
+
+@dataclass(frozen=True, slots=True)
+class Modes:
+    """Modal state of the controller."""
+
+    motion: int | None = None
+    """0 to 3."""
+    plane: int = 17
+    unit: float = MM
+    """Length unit, [m]."""
+    has_unit: bool = False
+    """Whether the program has set the unit."""
+    absolute: bool = True
+    centers_absolute: bool = False
+    feed: float | None = None
+    """Feed in units of the program per minute; None if unknown."""
+    system: str | None = None
+    """Work coordinate system that the program has selected."""
+    ended: bool = False
+
+
+class Step(NamedTuple):
+    """Effect of a line."""
+
+    line: Line | PointLine
+    modes: Modes
+    """Modes during the line."""
+    offset: Vector
+    """Zero of the work coordinates, [m]."""
+    motion: Motion | None = None
+    has_feed: bool = False
+    """Whether the line sets the feed."""
+    end_only: bool = False
+    """Whether only the end is known: the first motion, from an unknown position."""
+
+
+class Tools:
+    """Tools that a program moves, by its T and M6 words.
+
+    T selects a tool and M6 loads it. Before the first M6 the selected tool counts as loaded, as on
+    controllers that change tools by T alone. A tool without a number is the one that is loaded
+    when the program starts. T0 unloads the tool.
+
+    Args:
+        one: Whether a second tool is refused.
+    """
+
+    def __init__(self, *, one: bool) -> None:
+        self.used: list[str] = []
+        """Tools that have moved, in order."""
+        self._one = one
+        self._selected: float | None = None
+        self._loaded: float | None = None
+        self._changed = False
+
+    def read(self, number: float | None, *, load: bool, where: str) -> None:
+        """Apply the T and M6 words of a line.
+
+        Args:
+            number: Number of the T word, if there is one.
+            load: Whether the line holds M6.
+            where: File and line for messages.
+
+        Raises:
+            GcodeError: If another tool than the one that has moved is loaded.
+        """
+        if number is not None:
+            self._selected = number
+        if load or not self._changed:
+            self._changed |= load
+            self._loaded = self._selected
+            again = self._loaded is not None and _tool_name(self._loaded) in self.used[-1:]
+            if self._one and self.used and not again and self._loaded != 0.0:
+                second = "M6 without T" if self._loaded is None else _tool_name(self._loaded)
+                raise GcodeError(
+                    f"found {second} after motions of {self.used[-1]}, and --tool gives one tip; "
+                    "expected one tool: split the program by tools, and correct each part with "
+                    "its own --tool",
+                    where=where,
+                )
+
+    def move(self, *, feed: bool) -> None:
+        """Record a motion; rapid motions of a tool without a number do not count.
+
+        Args:
+            feed: Whether it is not a rapid motion.
+        """
+        if self._loaded != 0.0 and (feed or self._loaded is not None):
+            name = _tool_name(self._loaded)
+            if name not in self.used:
+                self.used.append(name)
+
+
+def _tool_name(number: float | None) -> str:
+    return "the tool that was loaded before" if number is None else f"T{number:g}"
+
+
+class Interpreter:
+    """Reads a program line by line.
+
+    Args:
+        file: Name of the program, for messages.
+        axes: Indices of the axes that the drives command.
+        offsets: Work coordinate systems to their zero in machine coordinates, [m]. Without G54
+            the program starts in machine coordinates.
+        start: Position before the program, in its coordinates, [m]; None if unknown.
+        one_tool: Whether a second tool is refused.
+    """
+
+    def __init__(
+        self,
+        file: str,
+        *,
+        axes: Sequence[int],
+        offsets: Mapping[str, Vector],
+        start: Vector | None = None,
+        one_tool: bool = False,
+    ) -> None:
+        self.file, self.axes = file, tuple(axes)
+        self.modes = Modes()
+        self.tools = Tools(one=one_tool)
+        self.offset = zero = offsets.get("G54", (0.0, 0.0, 0.0))
+        """Zero of the work coordinates, [m]."""
+        self.position: list[float | None] = [
+            (None if start is None else start[k] + zero[k]) if k in self.axes else 0.0
+            for k in range(3)
+        ]
+        """Programmed position of the tool, [m]; None if unknown."""
+        self._offsets = offsets
+        self._letters = {k: AXES[k] for k in self.axes}
+        self._accepted = _ACCEPTED.union(self._letters.values())
+        self._moved = False
+
+    def read(self, line: Line) -> Step:
+        """Apply a line to modes, tools and position.
+
+        Raises:
+            GcodeError: If it holds a word that cannot be corrected.
+        """
+        where = f"{self.file}:{line.number}"
+        words, codes = self._sort(line, where)
+        dwell = ends = change = False
+        for word in codes:
+            if word.letter == "M":
+                ends |= word.value in ENDS
+                change |= word.value == TOOL_CHANGE
+            elif word.value != self.modes.motion:
+                dwell |= word.value == 4.0
+                self._set_mode(word, where)
+        if change or "T" in words:
+            self.tools.read(words.get("T"), load=change, where=where)
+        if "F" in words:
+            if words["F"] < 0.0:
+                raise GcodeError(f"found a feed of {words['F']:g}", where=where)
+            if words["F"] != self.modes.feed:
+                self.modes = replace(self.modes, feed=words["F"])
+        if not _ARGUMENTS.isdisjoint(words):
+            self._check_arguments(words, codes, where)
+        moves = not _COORDINATES.isdisjoint(words)
+        if moves and dwell:
+            raise GcodeError("found a dwell and coordinates; expected one of them", where=where)
+        step = self._move(line, words, where) if moves else Step(line, self.modes, self.offset)
+        if ends:
+            self.modes = replace(self.modes, ended=True)
+        return step
+
+    def read_point(self, line: PointLine) -> Step | None:
+        """Apply a line of coordinates alone; None where `read` is needed.
+
+        A shortcut of `read` that halves the time of a program of short lines.
+        """
+        modes, offset, position = self.modes, self.offset, self.position
+        code, unit = line.motion, modes.unit
+        if (
+            not self._moved
+            or (modes.motion != 0 and (modes.motion != 1 or not modes.feed or not self.tools.used))
+            or (code is not None and int(code) != modes.motion)
+        ):
+            return None
+        start: Vector = (position[0] or 0.0, position[1] or 0.0, position[2] or 0.0)
+        end = list(start)
+        for k, digits in enumerate(line[3:6]):
+            if digits is not None:
+                base = offset[k] if modes.absolute else start[k]
+                end[k] = coordinate = float(digits) * unit + base
+                if k not in self._letters or abs(coordinate) > LARGEST_COORDINATE:
+                    return None
+        if line[3:6] == _NO_COORDINATES:
+            return None
+        self.position[:] = end
+        return Step(line, modes, offset, Motion(start, (end[0], end[1], end[2])))
+
+    def _sort(self, line: Line, where: str) -> tuple[dict[str, float], list[Word]]:
+        """Values by letter, and the G and M words.
+
+        Raises:
+            GcodeError: If a word is repeated or not accepted.
+        """
+        words: dict[str, float] = {}
+        codes: list[Word] = []
+        groups: set[str] = set()
+        for item in line.items:
+            if isinstance(item, str):
+                continue
+            letter = item.letter
+            if letter in self._accepted:
+                if letter in words:
+                    raise GcodeError(f"found the word {letter} twice", where=where)
+                words[letter] = item.value
+            elif letter == "G":
+                group = GROUPS.get(_tenfold(item.value))
+                if group is None:
+                    _refuse_code(item, where)
+                if group in groups:
+                    raise GcodeError(
+                        f"found {item.code} and another word of its group; expected one",
+                        where=where,
+                    )
+                groups.add(group)
+                codes.append(item)
+            elif letter == "M":
+                if item.value not in M_WORDS:
+                    _refuse_code(item, where)
+                codes.append(item)
+            else:
+                self._refuse_letter(item, where)
+        return words, codes
+
+    def _refuse_letter(self, word: Word, where: str) -> NoReturn:
+        reason, remedy = REFUSED_LETTERS.get(word.letter, ("an unknown word", "remove it"))
+        remedy = remedy.format(axes=", ".join(self._letters.values()))
+        raise GcodeError(f"found {word.text.strip()}, {reason}; {remedy}", where=where)
+
+    def _set_mode(self, word: Word, where: str) -> None:
+        code, modes = _tenfold(word.value), self.modes
+        match GROUPS[code]:
+            case "motion":
+                motion = None if code == 800.0 else int(word.value)
+                if motion != modes.motion:
+                    self.modes = replace(modes, motion=motion)
+            case "plane":
+                self.modes = replace(modes, plane=int(word.value))
+            case "unit":
+                unit = INCH if code == 200.0 else MM
+                feed = modes.feed if unit == modes.unit else None
+                self.modes = replace(modes, unit=unit, has_unit=True, feed=feed)
+            case "distance":
+                self.modes = replace(modes, absolute=code == 900.0)
+            case "arc distance":
+                self.modes = replace(modes, centers_absolute=code == 901.0)
+            case "feed":
+                if code == 950.0:
+                    _refuse_code(word, where)
+            case "system":
+                name = SYSTEMS[code]
+                if name not in self._offsets:
+                    raise GcodeError(
+                        f"found {name}, whose zero in machine coordinates is not given; expected "
+                        f"--work-offset-mm {name}=X,Y,Z (0,0,0 for machine coordinates)",
+                        where=where,
+                    )
+                self.modes, self.offset = replace(modes, system=name), self._offsets[name]
+
+    def _check_arguments(
+        self, words: Mapping[str, float], codes: Sequence[Word], where: str
+    ) -> None:
+        """Refuse P, Q and the words of arcs on lines without a word that takes them."""
+        arc = self.modes.motion in (2, 3)
+        if "P" in words or "Q" in words:
+            with_p = {("G", 4.0), ("G", 64.0), *(("M", m) for m in P_WORDS)}
+            of_code = any((w.letter, w.value) in with_p for w in codes)
+            of_arc = arc and not _COORDINATES.isdisjoint(words)
+            if not (of_code or (of_arc and "Q" not in words)):
+                raise GcodeError("found P or Q without a word that takes it", where=where)
+            if of_code and of_arc:
+                raise GcodeError(
+                    "found an arc and P for another word; write two lines", where=where
+                )
+        for letter in ("I", "J", "K", "R"):
+            if letter in words and not arc:
+                raise GcodeError(
+                    f"found {letter}, a word of arcs, and the motion is {self._motion}; expected "
+                    "G2 or G3",
+                    where=where,
+                )
+
+    @property
+    def _motion(self) -> str:
+        return "none" if self.modes.motion is None else f"G{self.modes.motion}"
+
+    def _move(self, line: Line, words: Mapping[str, float], where: str) -> Step:
+        modes = self.modes
+        if modes.motion is None:
+            raise GcodeError("found coordinates without a motion; expected G0 to G3", where=where)
+        if modes.motion != 0 and not modes.feed:
+            raise GcodeError(
+                f"found {self._motion} without a feed; expected F before it, and again after a "
+                "change of unit",
+                where=where,
+            )
+        end = self._end(words, where)
+        start = self.position
+        first, self._moved = not self._moved, True
+        if first and modes.motion != 0:
+            raise GcodeError(
+                f"found {self._motion} as the first motion, from a position that is not on the "
+                "corrected path; expected G0 to its start",
+                where=where,
+            )
+        self.position = list(end)
+        self.tools.move(feed=modes.motion != 0)
+        has_feed = "F" in words
+        if first:
+            return Step(line, modes, self.offset, Motion(end, end), has_feed, end_only=True)
+        begin: Vector = (start[0] or 0.0, start[1] or 0.0, start[2] or 0.0)
+        arc = None if modes.motion < 2 else self._arc(begin, end, words, where)
+        return Step(line, modes, self.offset, Motion(begin, end, arc), has_feed)
+
+    def _end(self, words: Mapping[str, float], where: str) -> Vector:
+        absolute, unit, offset = self.modes.absolute, self.modes.unit, self.offset
+        end: list[float] = [0.0, 0.0, 0.0]
+        for k, letter in self._letters.items():
+            value, position = words.get(letter), self.position[k]
+            if value is not None and absolute:
+                end[k] = coordinate = value * unit + offset[k]
+            elif position is None:
+                names = ", ".join(self._letters.values())
+                raise GcodeError(
+                    f"the position along {letter} is not known before this motion; expected "
+                    f"a first G0 to {names} in G90, or --start-mm",
+                    where=where,
+                )
+            else:
+                end[k] = coordinate = position + (value or 0.0) * unit
+            if not -LARGEST_COORDINATE <= coordinate <= LARGEST_COORDINATE:
+                raise GcodeError(
+                    f"found {letter} at {coordinate / MM:.6g} mm; expected at most "
+                    f"{LARGEST_COORDINATE / MM:g} mm",
+                    where=where,
+                )
+        return (end[0], end[1], end[2])
+
+    def _arc(self, start: Vector, end: Vector, words: Mapping[str, float], where: str) -> Arc:
+        modes = self.modes
+        i, j, _ = PLANES[modes.plane]
+        if i not in self.axes or j not in self.axes:
+            raise GcodeError(
+                f"found an arc in the plane of {AXES[i]} and {AXES[j]}; the drives command "
+                f"{', '.join(self._letters.values())}",
+                where=where,
+            )
+        clockwise = modes.motion == 2
+        wrong = [c for k, c in enumerate(CENTERS) if k not in (i, j) and c in words]
+        if wrong:
+            raise GcodeError(
+                f"found {wrong[0]} with G{modes.plane}; expected {CENTERS[i]} and {CENTERS[j]}",
+                where=where,
+            )
+        turns = words.get("P", 1.0)
+        if turns != math.floor(turns) or not 1.0 <= turns <= MOST_TURNS:
+            raise GcodeError(
+                f"P is {turns:g}; expected a whole number of turns, 1 to {MOST_TURNS}", where=where
+            )
+        centers = [c for c in (CENTERS[i], CENTERS[j]) if c in words]
+        if centers and "R" in words:
+            raise GcodeError(f"found R and {centers[0]}; expected one of them", where=where)
+        if "R" in words:
+            radius = words["R"] * modes.unit
+            center = center_of_radius(
+                start, end, radius, plane=modes.plane, clockwise=clockwise, where=where
+            )
+        else:
+            if not centers or (modes.centers_absolute and len(centers) < 2):
+                found = f"only {centers[0]}" if centers else "an arc without a centre"
+                raise GcodeError(
+                    f"found {found}; expected {CENTERS[i]} and {CENTERS[j]}, or R", where=where
+                )
+            base = self.offset if modes.centers_absolute else start
+            first, second = (base[k] + words.get(CENTERS[k], 0.0) * modes.unit for k in (i, j))
+            center = (first, second)
+        return arc_about(
+            start,
+            end,
+            center,
+            plane=modes.plane,
+            clockwise=clockwise,
+            turns=int(turns),
+            where=where,
+        )
+
+
+def _refuse_code(word: Word, where: str) -> NoReturn:
+    """Refuse a G or M word.
+
+    Raises:
+        GcodeError: Always.
+    """
+    reason, remedy = REFUSED_CODES.get(
+        word.code, ("is unknown", "expected G0 to G3 and words that do not change coordinates")
+    )
+    raise GcodeError(f"found {word.code}, which {reason}; {remedy}", where=where)
+
+
+@lru_cache(maxsize=256)
+def _tenfold(value: float) -> float:
+    """Ten times the number of a G-word, without binary rounding."""
+    return round(10.0 * value, 6)
+
+
+_NO_COORDINATES = (None, None, None)
+_COORDINATES = frozenset("XYZIJKR")
+_ARGUMENTS = frozenset("PQIJKR")
+_ACCEPTED = frozenset("NFSTPQIJKR")

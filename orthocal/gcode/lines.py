@@ -1,0 +1,149 @@
+"""Lines of a program (RS274/NGC) as words and comments, with their text."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+from orthocal.errors import GcodeError
+from orthocal.text import shorten
+
+LONGEST_LINE = 1000
+"""Largest number of characters in a line; controllers read 255."""
+
+_NUMBER = r"[-+]?(?:[0-9]++\.?+[0-9]*+|\.[0-9]++)"  # possessive: linear time for any length
+
+_ITEM = re.compile(rf"[ \t]*(?:([A-Za-z])[ \t]*({_NUMBER})(?![0-9.])|(\([^()]*\)|;.*))")
+
+_WORD = re.compile(rf"([ \t]*([A-Za-z])[ \t]*({_NUMBER})(?![0-9.]))")
+
+_POINT = re.compile(
+    r"(N[0-9]++)?+(?:[ \t]*+G0?([01]))?+"
+    rf"(?:[ \t]*+X({_NUMBER}))?+(?:[ \t]*+Y({_NUMBER}))?+(?:[ \t]*+Z({_NUMBER}))?+[ \t]*+(\r?\n)"
+)
+
+CONTROL = re.compile("[\x00-\x08\x0a-\x1f\x7f-\x9f]")
+"""Control characters but the tabulator."""
+
+_SUBROUTINE = re.compile(r"[ \t]*(?:[Nn][0-9. \t]*)?[Oo]")
+
+_HINTS = {
+    "#": "parameters",
+    "[": "expressions",
+    "]": "expressions",
+    "/": "optional lines",
+    "@": "polar coordinates",
+    "^": "polar coordinates",
+    "=": "assignments",
+}
+"""Characters that begin no word, and the syntax that they belong to."""
+
+
+class Word(NamedTuple):
+    """A letter and its number."""
+
+    letter: str
+    value: float
+    text: str
+    """Text in the program, with preceding blanks."""
+
+    @property
+    def code(self) -> str:
+        """Normal form: G1 for g01."""
+        return f"{self.letter}{self.value:g}"
+
+
+Item = Word | str
+"""A word or a comment; each with preceding blanks."""
+
+
+class Line(NamedTuple):
+    """A line of a program."""
+
+    number: int
+    """Number of the line, from 1."""
+    items: tuple[Item, ...]
+    """Words and comments in order."""
+    ending: str
+    """Trailing blanks and line end."""
+    text: str
+    """Text of the line."""
+
+
+class PointLine(NamedTuple):
+    """A line of coordinates alone, as most lines are."""
+
+    number: int
+    """Number of the line, from 1."""
+    label: str | None
+    """N and its digits."""
+    motion: str | None
+    """0 or 1."""
+    x: str | None
+    y: str | None
+    z: str | None
+    ending: str
+
+
+def split_point_line(text: str, number: int) -> PointLine | None:
+    """Split a line of coordinates alone; None for other lines, and for some of these.
+
+    Args:
+        text: Line with its line end.
+        number: Number of the line.
+    """
+    match = _POINT.fullmatch(text)
+    return None if match is None or len(text) > LONGEST_LINE else PointLine(number, *match.groups())
+
+
+def split_line(text: str, number: int, *, file: str) -> Line:
+    """Split a line into words and comments.
+
+    Args:
+        text: Line with its line end.
+        number: Number of the line.
+        file: Name of the program, for messages.
+
+    Raises:
+        GcodeError: If a part of it is neither a word nor a comment.
+    """
+    body = text.rstrip(" \t\r\n")
+    ending, where = text[len(body) :], f"{file}:{number}"
+    if len(text) > LONGEST_LINE:
+        raise GcodeError(
+            f"has {len(text)} characters; expected at most {LONGEST_LINE}", where=where
+        )
+    words = _WORD.findall(body)
+    if sum([len(word[0]) for word in words]) == len(body):  # words alone: the fast case
+        items = [Word(letter.upper(), float(digits), word) for word, letter, digits in words]
+        return Line(number, tuple(items), ending, text)
+    mixed: list[Item] = []
+    position = 0
+    while position < len(body):
+        match = _ITEM.match(body, position)
+        if match is None:
+            raise _refuse(body, position, where=where)
+        letter, digits, comment = match.groups()
+        if letter is not None:
+            mixed.append(Word(letter.upper(), float(digits), match[0]))
+        else:
+            control = CONTROL.search(comment)
+            if control:
+                raise GcodeError(
+                    f"a comment holds the control character '{control[0]}'", where=where
+                )
+            mixed.append(match[0])
+        position = match.end()
+    return Line(number, tuple(mixed), ending, text)
+
+
+def _refuse(body: str, position: int, *, where: str) -> GcodeError:
+    text = body[position:].lstrip()
+    hint = next((f" ({syntax})" for c, syntax in _HINTS.items() if c in text[:2]), "")
+    if _SUBROUTINE.match(body):
+        text, hint = body.strip(), " (subroutines and loops)"
+    if text[:1] == "(":
+        hint = " (a comment without an end)"
+    return GcodeError(
+        f"found '{shorten(text)}'{hint}; expected words such as X1.5 and comments", where=where
+    )

@@ -1,0 +1,171 @@
+"""Segmentation of motions into chords that stay near the corrected path.
+
+The deviation of a chord is evaluated at a quarter, a half and three quarters of it. Segments are
+short compared with the curvature of any correction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.gcode.path import Paths
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+LONGEST_SEGMENT = 10e-3
+"""Largest length of a segment, [m]."""
+
+LARGEST_ANGLE = math.pi / 4.0
+"""Largest angle of a segment of an arc, [rad]."""
+
+MOST_SEGMENTS = 50_000
+"""Largest number of segments of one motion."""
+
+POINTS_AT_ONCE = 40_000
+"""Number of points that are corrected together."""
+
+EVALUATED = 0.97
+"""Limit of the evaluated deviations, relative to the tolerance: others may be slightly larger."""
+
+FRACTIONS = np.array([0.25, 0.5, 0.75])
+"""Positions on a chord at which its deviation is evaluated."""
+
+
+class Correction(Protocol):
+    """Correction of points for a controller."""
+
+    @property
+    def bound(self) -> float:
+        """Largest error of a corrected point, [m]."""
+
+    def __call__(self, points: Array) -> tuple[Array, Mapping[int, str]]:
+        """Corrected points.
+
+        Args:
+            points: Desired points of the tool, shape (k, 3), [m].
+
+        Returns:
+            Points to command, shape (k, 3), [m]; and the index of the first point out of reach with
+            the reason. Later points may be refused without a check.
+        """
+
+
+class Segments(NamedTuple):
+    """Polyline of a motion."""
+
+    points: list[list[float]]
+    """Corrected x, y, z of the segments' ends, without the start of the motion, [m]."""
+    stretch: list[float]
+    """Length of each segment relative to that of its part of the motion."""
+    deviation: float
+    """Largest evaluated distance of the corrected motion from its chords, [m]."""
+    correction: float
+    """Largest correction, [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """A motion without segments."""
+
+    reason: str
+
+
+def segment_motions(
+    paths: Paths, correct: Correction, *, tolerance: float
+) -> list[Segments | Refused]:
+    """Divide motions into as few segments as the tolerance allows.
+
+    Args:
+        paths: Curves of the motions.
+        correct: Correction of points.
+        tolerance: Largest distance of the corrected motion from its chords, [m].
+    """
+    lengths, radii = paths.lengths, paths.largest_radii
+    # sagitta of an arc: s²/8r
+    longest = np.where(radii > 0.0, np.sqrt(8.0 * radii * EVALUATED * tolerance), np.inf)
+    counts = lengths / np.minimum(longest, LONGEST_SEGMENT)
+    counts = np.maximum(counts, np.abs(paths.angle[:, 1]) / LARGEST_ANGLE)
+    counts = np.maximum(np.ceil(counts), 1.0)
+    results: list[Segments | Refused | None] = [None] * len(lengths)
+    pending = np.arange(len(lengths))
+    while pending.size:
+        for i in pending[counts[pending] > MOST_SEGMENTS]:
+            results[i] = Refused(
+                f"needs more than {MOST_SEGMENTS} segments; expected a shorter motion or a larger "
+                "tolerance"
+            )
+        refined: list[int] = []
+        for group in _groups(pending[counts[pending] <= MOST_SEGMENTS], counts):
+            for i, count in _segment_group(paths, group, counts, correct, tolerance, results):
+                counts[i] = count
+                refined.append(i)
+        pending = np.array(refined, dtype=np.int64)
+    return [r for r in results if r is not None]
+
+
+def _groups(pending: Indices, counts: Array) -> Iterator[Indices]:
+    """Groups of motions whose points are corrected together, at least one motion each."""
+    load = np.cumsum(4.0 * counts[pending] + 1.0)
+    first = 0
+    while first < pending.size:
+        before = load[first - 1] if first else 0.0
+        last = max(int(np.searchsorted(load, before + POINTS_AT_ONCE, side="right")), first + 1)
+        yield pending[first:last]
+        first = last
+
+
+def _segment_group(
+    paths: Paths,
+    group: Indices,
+    counts: Array,
+    correct: Correction,
+    tolerance: float,
+    results: list[Segments | Refused | None],
+) -> Iterator[tuple[int, float]]:
+    """Divide motions into given numbers of segments.
+
+    Yields:
+        Motions that need more segments, and the next number to try.
+    """
+    n = counts[group].astype(np.int64)
+    size = 4 * n + 1
+    first = np.cumsum(size) - size
+    member = np.repeat(np.arange(group.size), size)
+    step = np.arange(member.size) - first[member]
+    points = paths.points(group[member], step / (4.0 * n[member]))
+    corrected, refused = correct(points)
+    corrections = np.maximum.reduceat(np.linalg.norm(corrected - points, axis=1), first)
+    reasons: dict[int, str] = {}
+    for k, reason in refused.items():
+        reasons.setdefault(int(member[k]), reason)
+    starts = np.flatnonzero((step % 4 == 0) & (step < 4 * n[member]))
+    a, b = corrected[starts], corrected[starts + 4]
+    deviation = np.zeros(starts.size)
+    for k, fraction in enumerate(FRACTIONS):
+        chord = (1.0 - fraction) * a + fraction * b
+        distance = np.linalg.norm(corrected[starts + 1 + k] - chord, axis=1)
+        np.maximum(deviation, distance, out=deviation)
+    deviations = np.maximum.reduceat(deviation, np.cumsum(n) - n)
+    part = paths.lengths[group[member[starts]]] / n[member[starts]]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        stretch = np.where(part > 0.0, np.linalg.norm(b - a, axis=1) / part, 1.0)
+    ends, stretches = b.tolist(), stretch.tolist()
+    last = 0
+    columns = (group.tolist(), n.tolist(), deviations.tolist(), corrections.tolist())
+    for k, (i, count, largest, correction) in enumerate(zip(*columns, strict=True)):
+        part_of = slice(last, last + count)
+        last += count
+        if k in reasons:
+            results[i] = Refused(reasons[k])
+        elif largest > EVALUATED * tolerance:
+            # the deviation of a chord grows with the square of its length
+            yield i, max(count + 1.0, math.ceil(count * math.sqrt(largest / tolerance) * 1.05))
+        else:
+            results[i] = Segments(ends[part_of], stretches[part_of], largest, correction)

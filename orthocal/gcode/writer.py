@@ -1,0 +1,180 @@
+"""Writer of corrected lines: new coordinates and feeds, all other words unchanged."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from orthocal.gcode.interpreter import INCH, STOPS, Modes, Step
+from orthocal.gcode.lines import Line, PointLine, Word
+from orthocal.gcode.segmentation import Segments
+from orthocal.units import MM
+
+FEWEST_DECIMALS = {MM: 4, INCH: 5}
+MOST_DECIMALS = 9
+
+FEED_STEP = 1e-4
+"""Relative change of the feed from which a new F is written."""
+
+FEED_DIGITS = 6
+
+_REPLACED = frozenset("XYZIJKR")
+_MOTIONS = frozenset({0.0, 1.0, 2.0, 3.0})
+_ARCS = frozenset({2, 3})
+_CANCEL = 80.0
+_RESETS = frozenset({_CANCEL, 20.0, 21.0})
+"""G-words after which the motion or the feed has to be written again."""
+
+
+def find_decimals(unit: float, rounding: float) -> int:
+    """Decimals that round points in space by less than a distance.
+
+    Args:
+        unit: Unit of the coordinates, [m].
+        rounding: Largest distance, [m].
+    """
+    needed = math.ceil(math.log10(0.5 * math.sqrt(3.0) * unit / rounding))
+    return min(max(FEWEST_DECIMALS[unit], needed), MOST_DECIMALS)
+
+
+class Writer:
+    """Writer of lines that tracks the modes and the position of the controller.
+
+    Args:
+        axes: Indices of the axes that the drives command.
+        rounding: Largest rounding of a point, [m].
+        start: Position of the controller before the program, [m]; None if unknown.
+    """
+
+    def __init__(
+        self, axes: Sequence[int], *, rounding: float, start: Sequence[float | None]
+    ) -> None:
+        self._axes = tuple(axes)
+        self._formats: dict[float, tuple[int, str, str]] = {}
+        """Unit to decimals, format of a point, and a negative zero."""
+        for unit in (MM, INCH):
+            n = find_decimals(unit, rounding)
+            words = " ".join(f"{'XYZ'[k]}%.{n}f" for k in axes)
+            self._formats[unit] = (n, words, f"-{0.0:.{n}f}")
+        self._position: list[float] = [0.0 if v is None else v for v in start]
+        """Position that was written last, with its rounding, [m]."""
+        self._motion: int | None = None
+        self._feed: float | None = None
+
+    def copy(self, line: Line) -> str:
+        """Text of a line without a motion."""
+        for item in line.items:
+            if isinstance(item, Word):
+                if item.letter == "F":
+                    self._feed = item.value
+                elif item.letter == "G" and item.value in _MOTIONS:
+                    self._motion = int(item.value)
+                elif item.letter == "G" and item.value in _RESETS:
+                    self._motion = None if item.value == _CANCEL else self._motion
+                    self._feed = self._feed if item.value == _CANCEL else None
+        return line.text
+
+    def write(self, step: Step, segments: Segments) -> list[str]:
+        """Lines of the segments of a motion."""
+        feeds = self._feeds(step, segments)
+        points = self._points(step, segments)
+        motion = 0 if step.modes.motion == 0 else 1
+        if isinstance(step.line, PointLine):
+            code = None if step.line.motion is None else f"G{step.line.motion}"
+            first = " ".join(w for w in (step.line.label, code, points[0], feeds[0]) if w)
+            stops = ""
+        else:
+            defer = len(points) > 1
+            first, stops = self._begin(step.line, step.modes, points[0], feeds[0], defer=defer)
+        self._motion = motion
+        if step.has_feed and not motion:
+            self._feed = step.modes.feed
+        end = step.line.ending.lstrip(" \t") or "\n"
+        if len(points) == 1:
+            return [first + end]
+        following = zip(points[1:], feeds[1:], strict=True)
+        texts = [first, *(f"{words} {feed}" if feed else words for words, feed in following)]
+        texts[-1] += stops
+        return [text + end for text in texts]
+
+    def _begin(
+        self, line: Line, modes: Modes, point: str, feed: str, *, defer: bool
+    ) -> tuple[str, str]:
+        """Line up to its first point and feed, and the stops to append to the last one."""
+        motion = 0 if modes.motion == 0 else 1
+        parts: list[str] = []
+        stops = ""
+        has_motion = has_point = False
+        feed_at = 0
+        for item in line.items:
+            if isinstance(item, str):
+                parts.append(item)
+                continue
+            letter, value = item.letter, item.value
+            if letter in _REPLACED or (letter == "P" and modes.motion in _ARCS):
+                if not has_point:
+                    parts.append(f" {point}" if parts else point)
+                    has_point, feed_at = True, len(parts)
+            elif letter == "G" and value in _MOTIONS:
+                parts.append(f" G{motion}" if parts else f"G{motion}")
+                has_motion = True
+            elif letter == "F" and motion:
+                continue
+            elif letter == "M" and defer and value in STOPS:
+                stops += f" {item.text.strip()}"
+            else:
+                parts.append(item.text)
+        if feed:
+            parts.insert(feed_at, f" {feed}")
+        if self._motion != motion and not has_motion:
+            parts.insert(_after_number(line), f" G{motion}" if line.items else f"G{motion}")
+        return "".join(parts).lstrip(), stops
+
+    def _points(self, step: Step, segments: Segments) -> list[str]:
+        """Coordinate words of each segment's end."""
+        unit, axes = step.modes.unit, self._axes
+        decimals, form, negative_zero = self._formats[unit]
+        base: Sequence[float] = step.offset
+        texts = []
+        for point in segments.points:
+            if not step.modes.absolute:
+                base = tuple(self._position)
+            values = tuple([(point[k] - base[k]) / unit for k in axes])
+            text = form % values
+            if negative_zero in text:
+                text = text.replace(negative_zero, negative_zero[1:])
+            texts.append(text)
+            for k, value in zip(axes, values, strict=True):
+                self._position[k] = round(value, decimals) * unit + base[k]
+        return texts
+
+    def _feeds(self, step: Step, segments: Segments) -> list[str]:
+        """Feed word of each segment; empty where the feed does not change."""
+        programmed, changed = step.modes.feed, step.has_feed
+        if step.modes.motion == 0 or programmed is None:
+            return [""] * len(segments.points)
+        texts = []
+        for stretch in segments.stretch:
+            feed, current = programmed * stretch, self._feed
+            if changed or current is None or abs(feed - current) > FEED_STEP * current:
+                text = _significant(feed)
+                self._feed, changed = float(text), False
+                texts.append(f"F{text}")
+            else:
+                texts.append("")
+        return texts
+
+
+def _after_number(line: Line) -> int:
+    """Index of the first item after the line's number."""
+    first = line.items[0] if line.items else ""
+    return 1 if isinstance(first, Word) and first.letter == "N" else 0
+
+
+def _significant(value: float) -> str:
+    """Positive number with six digits, without an exponent."""
+    if value <= 0.0:
+        return "0"
+    decimals = max(FEED_DIGITS - 1 - math.floor(math.log10(value)), 0)
+    text = f"{value:.{decimals}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
