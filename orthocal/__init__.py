@@ -25,7 +25,7 @@ _HOMES = {
     "Comparison": "orthocal.assessment.comparison",
     "Decision": "orthocal.assessment.findings.decision",
     "ExportError": "orthocal.errors",
-    "ExportOptions": "orthocal.export.options",
+    "ExportOptions": "orthocal.export.linuxcnc.export",
     "Finding": "orthocal.assessment.findings.finding",
     "Gauge": "orthocal.session.session",
     "GcodeError": "orthocal.errors",
@@ -214,7 +214,7 @@ if TYPE_CHECKING:
     from orthocal.estimation.problem import CalibrationProblem
     from orthocal.estimation.solvers.ipopt import NonlinearProgram
     from orthocal.export.formats import export_calibration
-    from orthocal.export.options import ExportOptions
+    from orthocal.export.linuxcnc.export import ExportOptions
     from orthocal.kinematics.workspace import Workspace
     from orthocal.measurement.files.session_file import load_plan, load_session
     from orthocal.measurement.files.write_session import write_session

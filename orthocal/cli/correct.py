@@ -106,7 +106,7 @@ def correct(
     from orthocal.calibration.file import load_calibration
     from orthocal.export.correction_field import CorrectionField
     from orthocal.export.formats import require_entering
-    from orthocal.export.options import ExportOptions
+    from orthocal.export.linuxcnc.export import ExportOptions
     from orthocal.gcode.interpreter import Interpreter
     from orthocal.gcode.program import ProgramCorrector
     from orthocal.io.files import require_writable_file, write_file

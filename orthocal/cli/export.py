@@ -1,4 +1,4 @@
-"""What others take: export."""
+"""The command export: a calibration for controllers and other programs."""
 
 from __future__ import annotations
 
@@ -24,62 +24,61 @@ def export(
         typer.Option(
             metavar="FORMAT",
             help="yaml: parameters with their units; table: corrections of the tool over a grid; "
-            "urdf: the calibrated machine as a robot folder; linuxcnc: HOME_OFFSET, or a "
-            "kinematics module where more than offsets was identified.",
+            "urdf: the calibrated machine as a robot directory; linuxcnc: HOME_OFFSET, or a "
+            "kinematics module if the calibration identified more than offsets.",
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the files; made if need be.")],
+    out: Annotated[Path, typer.Option(help="Directory for the files; created if needed.")],
     within: Annotated[
         float | None,
         typer.Option(
             metavar="UM",
-            help="linuxcnc: by how much a module may miss the calibrated machine's tool, µm; 0.1 "
-            "by default.",
+            help="linuxcnc: largest error of a module at the tool, µm; default 0.1.",
         ),
     ] = None,
     tool: Annotated[
         str | None,
         typer.Option(
             metavar="X,Y,Z",
-            help="linuxcnc: the tip that a module is made for, in the frame of the tool centre "
-            "point, mm; 0,0,0 by default.",
+            help="linuxcnc: tip of the tool for a module, in the frame of the tool centre point, "
+            "mm; default 0,0,0.",
         ),
     ] = None,
     home_offset: Annotated[
         str | None,
         typer.Option(
             metavar="VALUES",
-            help="linuxcnc: HOME_OFFSET of each joint while measuring, with commas between, mm or "
-            "degrees; without them the change alone is told.",
+            help="linuxcnc: HOME_OFFSET of each joint during the measurement, separated by commas, "
+            "mm or degrees; without it the files contain changes only.",
         ),
     ] = None,
     half_side_mm: Annotated[
         float | None,
         typer.Option(
             metavar="MM",
-            help="linuxcnc: half the side of a module's region around the zero; by default the "
-            "largest that the machine reaches, of 60 mm at most.",
+            help="linuxcnc: half the side of a module's region around the mechanical zero; default "
+            "the largest that the machine reaches, at most 60 mm.",
         ),
     ] = None,
     module: Annotated[
         bool | None,
         typer.Option(
             "--module/--offsets",
-            help="linuxcnc: a module, or HOME_OFFSET alone, whatever was identified.",
+            help="linuxcnc: write a module, or HOME_OFFSET only, whatever was identified.",
         ),
     ] = None,
     anyway: Annotated[
-        bool, typer.Option("--anyway", help="Also where the decision is not to enter it.")
+        bool, typer.Option("--anyway", help="Export even if the decision is not to enter.")
     ] = False,
 ) -> None:
-    """Write a calibration for a controller or for another program.
+    """Write a calibration for a controller or another program.
 
-    Exit code 3: the decision is not to enter it, or the machine cannot be what was asked; nothing
-    was written.
+    Exit code 3: the decision is not to enter the calibration, or the machine does not reach the
+    requested region or tolerance. Nothing is written then.
     """
     from orthocal.calibration.file import load_calibration
     from orthocal.export.formats import export_calibration
-    from orthocal.export.options import ExportOptions
+    from orthocal.export.linuxcnc.export import ExportOptions
     from orthocal.io.files import write_files
 
     result = load_calibration(calibration)
@@ -97,22 +96,22 @@ def export(
 
 
 def _home_offsets(text: str, calibration: Calibration) -> tuple[float, ...]:
-    """In SI, by the unit of each drive."""
+    """HOME_OFFSET of each joint, [m, rad]."""
     drives = calibration.robot.drives
     values = _numbers(text, "--home-offset", count=len(drives))
     return tuple(v * DRIVE_UNITS[d.unit][1] for v, d in zip(values, drives, strict=True))
 
 
 def _numbers(text: str, option: str, *, count: int) -> list[float]:
-    """Numbers with commas between."""
-    example = ",".join(["0"] * count)
+    """Numbers separated by commas."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = []
     if len(values) != count:
         raise ParameterError(
-            f"found '{text}'; expected {count} numbers with commas between, as {example}",
+            f"found '{text}'; expected {count} numbers separated by commas, such as "
+            f"{','.join(['0'] * count)}",
             where=option,
         )
     return values

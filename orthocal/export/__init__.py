@@ -1,1 +1,1 @@
-"""What others take: a calibration as files for controllers and for other programs."""
+"""Export of a calibration to controllers and other programs."""

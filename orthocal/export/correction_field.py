@@ -1,12 +1,14 @@
-"""Where a nominal controller is to be sent for a point, at the speed of a program's lines.
+"""Correction of commanded points, fast enough for the lines of a program.
 
-A controller that is nominal but for its offsets o sends the drives to ρ(p) − o for a point p; they
-belong at c(p), where the calibrated machine's tip is right (`tool_tip.py`). So it is to be sent to
-f(c(p) + o), with f the nominal forward kinematics (`corrections.py`). That takes up to a
-millisecond a point. What is added to p is smooth: in boxes of space, made as points fall into
-them, it is a polynomial between Chebyshev's points, held against the machine itself at others. A
-box that is not known well enough, or not reached as a whole, is divided; what is left at the border
-of the workspace is the machine.
+A nominal controller with offsets o sends the drives to ρ(p) − o for a point p. They must be at
+c(p), where the tip of the calibrated machine is right (`tool_tip.py`). The point to command is
+therefore f(c(p) + o), with f the nominal forward kinematics.
+
+This exact correction takes up to a millisecond per point, and it is smooth. So it is interpolated
+by a polynomial in each box of a grid, made when the first point falls into the box and checked
+against the exact correction at other points. A box that is not accurate enough, or not reachable as
+a whole, is halved. In the smallest boxes at the border of the workspace each point is corrected
+exactly.
 """
 
 from __future__ import annotations
@@ -14,103 +16,87 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
+from itertools import product
 
 import numpy as np
-from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
-from orthocal.errors import ExportError
+from orthocal.export.polynomial import Polynomial, PolynomialFit, chebyshev_line
 from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import nominal_assembly
-from orthocal.robot.model import Robot, Tcp
+from orthocal.kinematics.workspace import grid_points
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-SHARE = 0.1
-"""Part of what is asked for that the polynomials may be off."""
+ERROR_PART = 0.1
+"""Part of the tolerance for the error of the polynomials."""
 
 SAFETY = 2.0
-"""By which the largest error that was seen at other points is taken for the largest there is."""
+"""Factor of the largest error over the largest one at the checked points."""
 
 EXACT = 1e-11
-"""What the machine itself is known to, with loops closed to 1e-12 m twice, [m]."""
+"""Error of the exact correction, with loops closed to 1e-12 m twice, [m]."""
 
 BOX = 0.2
-"""Side of a box over the robot's characteristic length."""
+"""Side of a box, relative to the robot's characteristic length."""
 
 NODES = 5
-"""Of a polynomial along each axis; its degree and one."""
+"""Number of interpolation nodes along each axis, the degree plus one."""
 
-BEYOND = 0.05
-"""Part of its side by which a box is known beyond each of its faces: where all its nodes are
-reached all within is, though limits are curved."""
+MARGIN = 0.05
+"""Extension of a box beyond each face, relative to its side. If all nodes are reachable, so is the
+box, although limits are curved."""
 
 MOST_DIVISIONS = 3
-"""Boxes are halved so often; then the machine itself is asked, as where the middle of one that
-was halved is not reached."""
+"""Largest number of halvings of a box. After these, and in a halved box whose middle is out of
+reach, points are corrected exactly."""
 
-FIRST_ASKED = 8
-"""Points of which the machine itself is asked at first, then twice as many."""
+FIRST_BATCH = 8
+"""Number of points that are corrected exactly at first; each further batch is twice as large."""
 
 MOST_BOXES = 2000
+"""Largest number of boxes in memory."""
 
 CHECKS = 16
-"""Points in a box, besides those between its nodes, at which it is held against the machine."""
+"""Number of random points at which a box is checked, besides those between its nodes."""
 
 POINTS_AT_ONCE = 2048
+"""Number of points that are corrected exactly in one call."""
 
 Key = tuple[int, ...]
-"""How often a box was halved, and which one of those it is."""
+"""Number of halvings, and the indices of a box."""
 
 
-class Unknown(Enum):
-    """What is done where no polynomial serves a box."""
+class Fallback(Enum):
+    """Treatment of a box without a polynomial."""
 
     DIVIDED = "divided"
-    ASKED = "asked"
-    """The machine itself, point by point."""
+    EXACT = "exact"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Box:
-    """What is added to points of a box."""
+    """A polynomial of corrections and its error, [m]."""
 
-    middle: Array
-    half: float
-    """Half the side of where it is known, [m]."""
-    coefficients: Array
-    """Of Chebyshev polynomials, shape (NODES, ..., n_axes), [m]."""
+    correction: Polynomial
     error: float
-    """[m]"""
-
-    def __call__(self, points: Array) -> Array:
-        """Shape (k, n_axes), [m]."""
-        at = (points - self.middle) / self.half
-        result = self.coefficients
-        for k in range(at.shape[1]):
-            basis = chebyshev.chebvander(at[:, k], NODES - 1)
-            if k == 0:
-                flat = basis @ result.reshape(NODES, -1)
-                result = flat.reshape(len(at), *result.shape[1:])
-            else:
-                result = np.einsum("ni,ni...->n...", basis, result)
-        return result
 
 
 class CorrectionField:
-    """Where a nominal controller is to be sent for points of the tool.
+    """Points to command for desired points of the tool.
 
     Args:
         calibration: The calibration.
-        offsets: In the controller, shape (n_drives,), [m, rad].
-        within: By how much what follows may be off in all, of which this takes a part, [m].
-        tool: The tip in the frame of the robot's tool centre point, [m].
+        offsets: Offsets in the controller, shape (n_drives,), [m, rad].
+        within: Tolerance of the corrected path, of which the field uses a part, [m].
+        tool: Tip in the frame of the robot's tool centre point, [m].
 
     Raises:
         ExportError: If the robot's drives command no tool.
+        ParameterError: If the tip is out of range.
     """
 
     def __init__(
@@ -122,182 +108,170 @@ class CorrectionField:
         tool: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         robot = calibration.robot
-        tcp = _require_commanded(robot)
-        self.axes = tuple(tcp.coordinates)
+        self._tip = ToolTip(calibration, tool)
+        self.axes = tuple(self._tip.coordinates)
         """Indices of the axes that the drives command."""
-        self.bound = SHARE * within
-        """No point is farther off, [m]."""
+        self.bound = ERROR_PART * within
+        """Largest error of a point, [m]."""
         self._offsets = np.array(offsets, dtype=np.float64)
         self._nominal = nominal_assembly(robot)
-        self._tip = ToolTip(calibration, tool)
         self._side = BOX * robot.characteristic_length
-        self._boxes: dict[Key, _Box | Unknown] = {}
-        self._worst = EXACT
-        grid = np.cos(np.pi * np.arange(NODES) / (NODES - 1))
-        self._nodes = _tensor([grid] * len(self.axes))
-        self._fit = np.linalg.inv(chebyshev.chebvander(grid, NODES - 1))
-        self._checks = _check_points(len(self.axes))
+        self._boxes: dict[Key, _Box | Fallback] = {}
+        self._largest_error = EXACT
+        n = len(self.axes)
+        line = chebyshev_line(NODES)
+        self._nodes = grid_points(line, n)
+        self._fit = PolynomialFit(self._nodes, np.array(list(product(range(NODES), repeat=n))))
+        # interpolation errors are largest between the nodes
+        between = np.cos(np.pi * np.array([0.5, 0.5 * (NODES - 1), NODES - 1.5]) / (NODES - 1))
+        random = np.random.default_rng(0).uniform(-1.0, 1.0, (CHECKS, n))
+        self._checks = np.vstack([grid_points(between, n), random])
 
     @property
     def error(self) -> float:
-        """Largest error that is expected of the polynomials in use, [m]."""
-        return self._worst
+        """Largest estimated error of the polynomials in use, [m]."""
+        return self._largest_error
 
     def __call__(self, points: Array) -> tuple[Array, Mapping[int, str]]:
-        """Points to send the controller to.
+        """Points to command.
 
         Args:
-            points: Where the tool is to be, shape (k, 3), [m].
+            points: Desired points of the tool, shape (k, 3), [m].
 
         Returns:
-            Shape (k, 3), [m]; and index to why the machine cannot be there, for the first of those;
-            all after it are refused, too, some of them unseen.
+            Points to command, shape (k, 3), [m]; and the index of the first point out of reach with
+            the reason. All later points are refused, too, some of them without a check.
         """
         axes = np.array(self.axes, dtype=np.int64)
-        wanted = np.array(points, dtype=np.float64)[:, axes]
-        sent, asked, refused = np.full(wanted.shape, np.nan), list[int](), dict[int, str]()
+        desired = np.array(points, dtype=np.float64)[:, axes]
+        commanded, exact, refused = np.full(desired.shape, np.nan), list[int](), dict[int, str]()
         end = len(points)
-        for group, key in self._boxes_of(wanted):
-            if asked and key not in self._boxes:  # what is not reached takes long to find out
-                end = self._ask(wanted, sent, asked, refused)
-            own = group[group < end]
-            if own.size:
-                sent[own] = wanted[own] + self._add(wanted[own], own, 0, asked)
-        end = self._ask(wanted, sent, asked, refused)
+        for group, key in self._group_by_box(desired):
+            if exact and key not in self._boxes:  # making a box out of reach takes long
+                end = self._correct_exactly(desired, commanded, exact, refused)
+            group = group[group < end]
+            if group.size:
+                corrections = self._corrections(desired[group], group, 0, exact)
+                commanded[group] = desired[group] + corrections
+        end = self._correct_exactly(desired, commanded, exact, refused)
         for i in range(end, len(points)):
             refused.setdefault(i, "comes after one that is not reached")
-        sent[end:] = np.nan
+        commanded[end:] = np.nan
         result = np.array(points, dtype=np.float64)
-        result[:, axes] = sent
+        result[:, axes] = commanded
         return result, refused
 
-    def _ask(self, wanted: Array, sent: Array, asked: list[int], refused: dict[int, str]) -> int:
-        """Ask the machine itself for points up to the first that it refuses.
-
-        Args:
-            wanted: Shape (k, n_axes), [m].
-            sent: Filled with what it says, shape (k, n_axes), [m].
-            asked: Indices of the points; emptied.
-            refused: Filled with those that it refuses.
-
-        Returns:
-            The first index that is refused; k where none is.
-        """
-        end = min(refused, default=len(wanted))
-        rest, count = np.sort(np.array(asked, dtype=np.int64)), FIRST_ASKED
-        while rest.size and rest[0] < end:
-            own, rest, count = rest[:count], rest[count:], 2 * count
-            sent[own], odd = self.exactly(wanted[own])
-            refused.update({int(own[i]): reason for i, reason in odd.items()})
-            end = min(refused, default=end)
-        asked.clear()
-        return end
-
-    def _boxes_of(self, wanted: Array) -> list[tuple[Indices, Key]]:
-        """Points by the box that they are in, undivided, in the order in which they come."""
-        with np.errstate(invalid="ignore"):
-            cells = np.floor(wanted / self._side).astype(np.int64)
-        groups = np.split(*_group(cells)) if len(cells) else []
-        return [(own, (0, *cells[own[0]].tolist())) for own in sorted(groups, key=lambda g: g[0])]
-
     def exactly(self, points: Array) -> tuple[Array, Mapping[int, str]]:
-        """The same by the machine itself; coordinates that the drives command, (k, n_axes), [m]."""
+        """Exact correction of coordinates that the drives command, shape (k, n_axes), [m]."""
         result = np.full(points.shape, np.nan)
         refused: dict[int, str] = {}
         for first in range(0, len(points), POINTS_AT_ONCE):
             part = points[first : first + POINTS_AT_ONCE]
             failures: Failures = {}
             drives = self._tip.reach(part, failures=failures)[0] + self._offsets
-            good = np.array([i for i in range(len(part)) if i not in failures], dtype=np.int64)
-            beyond: Failures = {}
-            sent = self._nominal.forward(drives[good], failures=beyond)
-            result[first + good] = sent[:, list(self.axes)]
-            failures.update({int(good[i]): e for i, e in beyond.items()})
+            reached = np.array([i for i in range(len(part)) if i not in failures], dtype=np.int64)
+            nominal: Failures = {}
+            commanded = self._nominal.forward(drives[reached], failures=nominal)
+            result[first + reached] = commanded[:, list(self.axes)]
+            failures.update({int(reached[i]): e for i, e in nominal.items()})
             for i, e in failures.items():
                 refused[first + i] = e.reason
                 result[first + i] = np.nan
         return result, refused
 
-    def _add(self, points: Array, of: Indices, halved: int, asked: list[int]) -> Array:
-        """What is added to points; where the machine is to be asked, `of` goes into `asked`."""
-        side = self._side / 2**halved
-        with np.errstate(invalid="ignore"):
-            cells = np.floor(points / side).astype(np.int64)
+    def _correct_exactly(
+        self, desired: Array, commanded: Array, indices: list[int], refused: dict[int, str]
+    ) -> int:
+        """Correct points exactly up to the first one out of reach.
+
+        Args:
+            desired: Desired points, shape (k, n_axes), [m].
+            commanded: Filled with the corrected points, shape (k, n_axes), [m].
+            indices: Indices of the points; emptied.
+            refused: Filled with the points out of reach.
+
+        Returns:
+            Index of the first point out of reach; k if there is none.
+        """
+        end = min(refused, default=len(desired))
+        pending, count = np.sort(np.array(indices, dtype=np.int64)), FIRST_BATCH
+        while pending.size and pending[0] < end:
+            batch, pending, count = pending[:count], pending[count:], 2 * count
+            commanded[batch], reasons = self.exactly(desired[batch])
+            refused.update({int(batch[i]): reason for i, reason in reasons.items()})
+            end = min(refused, default=end)
+        indices.clear()
+        return end
+
+    def _group_by_box(self, desired: Array) -> list[tuple[Indices, Key]]:
+        """Points by undivided box, in the order of their first points."""
+        groups = _group(_cells(desired, self._side))
+        return sorted([(group, (0, *cell)) for group, cell in groups], key=lambda item: item[0][0])
+
+    def _corrections(
+        self, points: Array, indices: Indices, halvings: int, exact: list[int]
+    ) -> Array:
+        """Corrections of points; indices of those to correct exactly are added to `exact`."""
         result = np.empty_like(points)
-        order, starts = _group(cells)
-        for own in np.split(order, starts):
-            box = self._box((halved, *cells[own[0]].tolist()))
+        for group, cell in _group(_cells(points, self._side / 2**halvings)):
+            box = self._box((halvings, *cell))
             if isinstance(box, _Box):
-                result[own] = box(points[own])
-            elif box is Unknown.DIVIDED:
-                result[own] = self._add(points[own], of[own], halved + 1, asked)
+                result[group] = box.correction(points[group])
+            elif box is Fallback.DIVIDED:
+                result[group] = self._corrections(
+                    points[group], indices[group], halvings + 1, exact
+                )
             else:
-                asked.extend(of[own].tolist())
-                result[own] = np.nan
+                exact.extend(indices[group].tolist())
+                result[group] = np.nan
         return result
 
-    def _box(self, key: Key) -> _Box | Unknown:
-        """The box of a key, or what is to be done instead."""
+    def _box(self, key: Key) -> _Box | Fallback:
         if key not in self._boxes:
             if len(self._boxes) >= MOST_BOXES:
                 self._boxes.pop(next(iter(self._boxes)))
             box = self._boxes[key] = self._make(key)
             if isinstance(box, _Box):
-                self._worst = max(self._worst, box.error)
+                self._largest_error = max(self._largest_error, box.error)
         return self._boxes[key]
 
-    def _make(self, key: Key) -> _Box | Unknown:
-        instead = Unknown.DIVIDED if key[0] < MOST_DIVISIONS else Unknown.ASKED
+    def _make(self, key: Key) -> _Box | Fallback:
+        fallback = Fallback.DIVIDED if key[0] < MOST_DIVISIONS else Fallback.EXACT
         side = self._side / 2 ** key[0]
         middle = (np.array(key[1:]) + 0.5) * side
-        half = (0.5 + BEYOND) * side
+        half = np.full(middle.size, (0.5 + MARGIN) * side)
         nodes = middle + half * self._nodes
         corners = np.flatnonzero((np.abs(self._nodes) > 1.0 - 1e-12).all(axis=1))
         if self.exactly(middle[None])[1]:
-            return Unknown.ASKED if key[0] else instead
+            return Fallback.EXACT if key[0] else fallback
         if any(self.exactly(nodes[[i]])[1] for i in corners.tolist()):
-            return instead
-        sent, refused = self.exactly(nodes)
+            return fallback
+        commanded, refused = self.exactly(nodes)
         if refused:
-            return instead
-        count = len(self.axes)
-        coefficients = (sent - nodes).reshape([NODES] * count + [count])
-        for k in range(count):
-            coefficients = np.moveaxis(np.tensordot(self._fit, coefficients, axes=(1, k)), 0, k)
+            return fallback
+        correction = self._fit(middle, half, commanded - nodes)
         checks = middle + half * self._checks
         expected, refused = self.exactly(checks)
-        box = _Box(middle, half, np.ascontiguousarray(coefficients), 0.0)
         if refused:
-            return instead
-        seen = float(np.linalg.norm(box(checks) + checks - expected, axis=1).max())
-        error = SAFETY * seen + EXACT
-        return instead if error > self.bound else _Box(middle, half, box.coefficients, error)
+            return fallback
+        largest = float(np.linalg.norm(correction(checks) + checks - expected, axis=1).max())
+        error = SAFETY * largest + EXACT
+        return fallback if error > self.bound else _Box(correction, error)
 
 
-def _require_commanded(robot: Robot) -> Tcp:
-    if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
-        raise ExportError("the machine has no tool that its drives command")
-    return robot.tcp
+def _cells(points: Array, side: float) -> Indices:
+    """Indices of the cells that hold points, shape (k, n)."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.floor(points / side).astype(np.int64))
 
 
-def _tensor(lines: list[Array]) -> Array:
-    """All points of a grid, shape (k, n)."""
-    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))
-
-
-def _check_points(count: int) -> Array:
-    """Points between nodes, where polynomials are off most, and others, shape (k, count)."""
-    between = np.cos(np.pi * (np.array([0.5, 0.5 * (NODES - 1), NODES - 1.5])) / (NODES - 1))
-    others = np.random.default_rng(0).uniform(-1.0, 1.0, (CHECKS, count))
-    return np.vstack([_tensor([between] * count), others])
-
-
-def _group(cells: Indices) -> tuple[Indices, Indices]:
-    """Order that puts equal rows together, and where each group but the first begins."""
-    changed = (cells[1:] != cells[:-1]).any(axis=1)
-    if not changed.any():
-        return np.arange(len(cells)), np.zeros(0, dtype=np.int64)
-    order = np.lexsort(cells.T)
+def _group(cells: Indices) -> list[tuple[Indices, Key]]:
+    """Indices of equal rows, with the row."""
+    if not len(cells):
+        return []
+    order = np.arange(len(cells))
+    if (cells[1:] != cells[:-1]).any():
+        order = np.lexsort(cells.T)
     ordered = cells[order]
     starts = np.flatnonzero((ordered[1:] != ordered[:-1]).any(axis=1)) + 1
-    return order, starts
+    return [(group, tuple(cells[group[0]].tolist())) for group in np.split(order, starts)]

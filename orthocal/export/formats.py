@@ -1,48 +1,91 @@
-"""The formats that a calibration can be exported to, each a function in a file of its own."""
+"""Formats of an export; of these, the parameters (yaml) and the table of corrections."""
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Callable
 
+import yaml
+
+from orthocal.assessment.calibrated_tool import find_tool
+from orthocal.assessment.controller_entries import entered_offsets, find_entries
 from orthocal.assessment.findings.calibration import decide
 from orthocal.calibration.calibration import Calibration
-from orthocal.errors import ExportError, ParameterError
-from orthocal.export.corrections import export_corrections
-from orthocal.export.linuxcnc.export import export_linuxcnc
-from orthocal.export.options import ExportOptions
-from orthocal.export.parameters import export_parameters
+from orthocal.errors import ClosureError, ExportError, ParameterError
+from orthocal.export.linuxcnc.export import OPTIONS, ExportOptions, export_linuxcnc
 from orthocal.export.urdf import export_urdf
+from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.workspace import even_grid
+from orthocal.units import MM, format_fixed, tidy
 
-Exporter = Callable[[Calibration, ExportOptions], dict[str, str]]
-"""A calibration, and what was asked for, to the texts of files by their names."""
+POINTS_A_SIDE = 7
+"""Points along each side of the table's grid."""
 
-
-def _without_options(export: Callable[[Calibration], dict[str, str]]) -> Exporter:
-    """A format of which nothing can be asked."""
-
-    def exporter(calibration: Calibration, options: ExportOptions) -> dict[str, str]:
-        if options.asked:
-            name = OPTIONS[options.asked[0]]
-            raise ParameterError("goes with --to linuxcnc alone", where=name)
-        return export(calibration)
-
-    return exporter
+_YAML_HEAD = """\
+# Identified errors of the machine, relative to the nominal robot.
+# `enter` lists the offsets for a controller that corrects offsets of its drives only.
+"""
 
 
-EXPORTERS: dict[str, Exporter] = {
-    "yaml": _without_options(export_parameters),
-    "table": _without_options(export_corrections),
-    "urdf": _without_options(export_urdf),
-    "linuxcnc": export_linuxcnc,
+def export_parameters(calibration: Calibration) -> dict[str, str]:
+    """Text of errors.yaml: parameters with their units, and the offsets to enter as a comment.
+
+    `orthocal simulate --errors` reads the file.
+    """
+    errors = {
+        f"{p.name}_{p.edge_unit}": tidy(p.value * p.edge_factor) for p in calibration.parameters
+    }
+    enter = [
+        f"#   {e.drive}_{e.edge_unit}: {tidy(e.enter * e.edge_factor)}"
+        for e in find_entries(calibration)
+    ]
+    comment = "\n".join(["# enter:", *enter, ""]) if enter else ""
+    text = yaml.safe_dump({"errors": errors}, sort_keys=False, default_flow_style=False)
+    return {"errors.yaml": f"{_YAML_HEAD}{comment}{text}"}
+
+
+def export_corrections(calibration: Calibration) -> dict[str, str]:
+    """Text of corrections.csv: corrections of the tool over a grid, for a nominal controller.
+
+    A controller with offsets o sends the drives to ρ(p) − o for a point p. They must be at c(p),
+    the inverse kinematics of the calibrated machine. So it must be sent to p + d,
+
+        d = f(c(p) + o) − p,  f the nominal forward kinematics.
+
+    Raises:
+        ExportError: If the machine has no tool, or does not reach the grid.
+    """
+    tool, robot = find_tool(calibration), calibration.robot
+    if tool is None or robot.tcp is None:
+        raise ExportError("the machine has no tool that its drives command over a region")
+    half_side = tool.workspace.half_side or 0.0  # find_tool has a cube
+    points = even_grid(robot, half_side=half_side, points_a_side=POINTS_A_SIDE)
+    coordinates = list(robot.tcp.coordinates)
+    try:
+        drives = calibration.machine.inverse(points) + entered_offsets(calibration)
+        commanded = nominal_assembly(robot).forward(drives)[:, coordinates]
+    except ClosureError as e:
+        raise ExportError(f"the calibrated machine does not reach all of the grid: {e}") from None
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator="\n")
+    names = ["xyz"[k] for k in coordinates]
+    rows.writerow([*(f"{n}_mm" for n in names), *(f"d{n}_mm" for n in names)])
+    for point, correction in zip(points / MM, (commanded - points) / MM, strict=True):
+        rows.writerow(
+            [*(format_fixed(v, 3) for v in point), *(format_fixed(v, 6) for v in correction)]
+        )
+    return {"corrections.csv": text.getvalue()}
+
+
+EXPORTERS: dict[str, Callable[[Calibration], dict[str, str]]] = {
+    "yaml": export_parameters,
+    "table": export_corrections,
+    "urdf": export_urdf,
 }
+"""Formats without options: from a calibration to texts of files by their names."""
 
-OPTIONS = {
-    "within": "--within",
-    "tool": "--tool",
-    "home_offsets": "--home-offset",
-    "half_side": "--half-side-mm",
-    "module": "--module or --offsets",
-}
+FORMATS = (*EXPORTERS, "linuxcnc")
 
 
 def export_calibration(
@@ -52,29 +95,36 @@ def export_calibration(
     anyway: bool = False,
     options: ExportOptions | None = None,
 ) -> dict[str, str]:
-    """A calibration in some format.
+    """A calibration as files for a controller or another program.
 
     Args:
         calibration: The calibration.
         to: Name of the format.
-        anyway: Also where its decision is not to enter it.
-        options: What is asked for beside the format; nothing by default.
+        anyway: Whether to export it even if its decision is not to enter it.
+        options: Options of the format.
 
     Returns:
         Texts of files by their names.
 
     Raises:
         ParameterError: If there is no such format, or it has no such option.
-        ExportError: If its decision is not to enter it, or the machine does not reach what the
-            format needs.
+        ExportError: If its decision is not to enter it, or the machine does not reach the region
+            of the format.
     """
-    if to not in EXPORTERS:
+    if to not in FORMATS:
         raise ParameterError(
-            f"found '{to}'; expected one of {', '.join(EXPORTERS)}", where="the format"
+            f"found '{to}'; expected one of {', '.join(FORMATS)}", where="the format"
         )
     if not anyway:
         require_entering(calibration)
-    return EXPORTERS[to](calibration, options or ExportOptions())
+    options = options or ExportOptions()
+    if to not in EXPORTERS:
+        return export_linuxcnc(calibration, options)
+    if options.requested:
+        raise ParameterError(
+            "is an option of --to linuxcnc alone", where=OPTIONS[options.requested[0]]
+        )
+    return EXPORTERS[to](calibration)
 
 
 def require_entering(calibration: Calibration) -> None:

@@ -1,101 +1,127 @@
-"""A calibrated machine's tool tip: a point that is fixed to the platform, beside the robot's own.
+"""Tip of a tool on the calibrated machine, a point fixed to the platform.
 
-A controller adds a tool's offset as a constant, t in the world where the nominal platform stands in
-its zero. So the machine belongs where its tip, R(p') t beside its own point p', is at p + t. The
-platform of a calibrated machine is tilted: its tip is elsewhere than a level platform's.
+A controller adds a tool offset t as a constant, in the orientation of the nominal platform at the
+mechanical zero. The platform of a calibrated machine is tilted by R. So its tip, p' + R t for the
+tool centre point p', is at the commanded p + t for another p' than p.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.calibration.calibration import Calibration
-from orthocal.errors import ExportError
+from orthocal.errors import ExportError, ParameterError
 from orthocal.kinematics.compiled import compiled_robot, zero_poses
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import Assembly
+from orthocal.units import MM
 
 Array = NDArray[np.float64]
 
-REACHED = 1e-12
-"""By which a tip is beside where it belongs, [m]."""
+TOLERANCE = 1e-12
+"""Largest distance of a tip from its target, [m]."""
 
 MOST_STEPS = 60
 
 MOST_AT_ONCE = 1000
 
+LARGEST_COORDINATE = 10.0
+"""Largest coordinate of a tip; a larger one is in another unit, [m]."""
+
+
+def require_tip(tool: Sequence[float]) -> None:
+    """Refuse a tip out of range.
+
+    Raises:
+        ParameterError: If a coordinate is not a number, or too large.
+    """
+    if not all(abs(v) <= LARGEST_COORDINATE for v in tool):
+        raise ParameterError(
+            f"found {', '.join(f'{v / MM:g}' for v in tool)} mm; expected numbers of at most "
+            f"{LARGEST_COORDINATE / MM:g} mm",
+            where="--tool",
+        )
+
 
 class ToolTip:
-    """The tip of a tool on the calibrated machine, and the drives that bring it somewhere.
+    """Forward and inverse kinematics of a tool's tip on the calibrated machine.
 
     Args:
-        calibration: Of a robot with as many drives as coordinates of the tool that they control.
-        tool: The tip in the frame of the robot's tool centre point, shape (3,), [m].
+        calibration: Calibration of a robot whose drives command the tool.
+        tool: Tip in the frame of the robot's tool centre point, shape (3,), [m].
+
+    Raises:
+        ExportError: If the drives do not command the tool.
+        ParameterError: If the tip is out of range.
     """
 
     def __init__(self, calibration: Calibration, tool: ArrayLike = (0.0, 0.0, 0.0)) -> None:
         robot = calibration.robot
         if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
-            raise ExportError("the machine has no tool that its drives command over a region")
-        self.chosen = list(robot.tcp.coordinates)
+            raise ExportError("the machine has no tool that its drives command")
         self.tool = np.array(tool, dtype=np.float64)
+        require_tip(self.tool.tolist())
+        self.coordinates = list(robot.tcp.coordinates)
+        """Indices of the coordinates that the drives control."""
         self._assembly = Assembly(robot, fixed=calibration.errors)
         self._pose = compiled_robot(robot).pose(robot.tcp.frame)
         (zero,) = zero_poses(robot, [robot.tcp.frame])
         self.level = np.array(zero[:3, :3])
-        """Rotation of the nominal platform in its zero, shape (3, 3)."""
+        """Rotation of the nominal platform at the mechanical zero, shape (3, 3)."""
 
     def targets(self, points: Array) -> Array:
-        """Where the tip belongs for commanded points, shape (K, n), [m]."""
-        return np.asarray(points + (self.level @ self.tool)[self.chosen])
+        """Desired tips for commanded points, shape (k, n), [m]."""
+        return np.asarray(points + (self.level @ self.tool)[self.coordinates])
 
     def place(self, drives: Array, *, start: Array | None = None) -> Array:
-        """Where the tip is, shape (K, n), [m], for drive coordinates, shape (K, n)."""
+        """Tips at drive coordinates, shape (k, n), [m]."""
         return self._tips(self.poses(drives, start=start))
 
     def poses(self, drives: Array, *, start: Array | None = None) -> Array:
-        """Poses of the robot's tool centre point, shape (K, 4, 4), [1, m]."""
+        """Poses of the robot's tool centre point, shape (k, 4, 4), [1, m]."""
         parts = _parts(len(drives))
         return np.concatenate(
             [self._poses(drives[p], None if start is None else start[p]) for p in parts]
         )
 
     def reach(self, points: Array, *, failures: Failures | None = None) -> tuple[Array, Array]:
-        """Drive and passive coordinates that bring the tip where it belongs for points.
+        """Drive and passive coordinates that bring the tip to its targets.
 
         Args:
-            points: Shape (K, n), [m].
-            failures: Filled with the points that cannot be reached, which are NaN then; by default
-                the first of them raises.
+            points: Commanded points, shape (k, n), [m].
+            failures: Filled with the points out of reach, whose results are NaN. Without it the
+                first of them raises.
 
         Raises:
-            ClosureError: If one cannot be reached.
-            ExportError: If turning platforms bring the tip no nearer.
+            ClosureError: If a point is out of reach.
+            ExportError: If the iteration diverges because the platform turns too much.
         """
-        found = []
+        results = []
         for part in _parts(len(points)):
-            own: Failures | None = None if failures is None else {}
-            found.append(self._reach(points[part], own))
-            if failures is not None and own:
-                failures.update({part.start + i: e for i, e in own.items()})
-        drives, passive = (np.concatenate(part) for part in zip(*found, strict=True))
+            of_part: Failures | None = None if failures is None else {}
+            results.append(self._reach(points[part], of_part))
+            if failures is not None and of_part:
+                failures.update({part.start + i: e for i, e in of_part.items()})
+        drives, passive = (np.concatenate(part) for part in zip(*results, strict=True))
         return drives, passive
 
     def _reach(self, points: Array, failures: Failures | None) -> tuple[Array, Array]:
-        sent, targets, start = np.array(points), self.targets(points), None
+        shifted, targets, start = np.array(points), self.targets(points), None
         for _ in range(MOST_STEPS):
-            drives, passive = self._assembly.reach(sent, start=start, failures=failures)
-            good = np.isfinite(drives).all(axis=1)
-            if not self.tool.any() or not good.any():
+            drives, passive = self._assembly.reach(shifted, start=start, failures=failures)
+            reached = np.isfinite(drives).all(axis=1)
+            if not self.tool.any() or not reached.any():
                 return drives, passive
-            missing = targets[good] - self._tips(self._poses(drives[good], passive[good]))
-            if np.abs(missing).max() < REACHED:
+            missing = targets[reached] - self._tips(self._poses(drives[reached], passive[reached]))
+            if np.abs(missing).max() < TOLERANCE:
                 return drives, passive
-            sent[good] += missing
-            sent[~good] = np.nan  # refused already
+            shifted[reached] += missing
+            shifted[~reached] = np.nan  # refused already
             start = np.hstack([drives, passive])
-        raise ExportError("the platform turns too much for such a tool; give one nearer to it")
+        raise ExportError("the platform turns too much for a tool this long; use a shorter one")
 
     def _poses(self, drives: Array, start: Array | None) -> Array:
         machine = self._assembly.machine()
@@ -104,7 +130,8 @@ class ToolTip:
         return np.asarray(poses)
 
     def _tips(self, poses: Array) -> Array:
-        return np.asarray((poses[:, :3, 3] + poses[:, :3, :3] @ self.tool)[:, self.chosen])
+        tips = poses[:, :3, 3] + poses[:, :3, :3] @ self.tool
+        return np.asarray(tips[:, self.coordinates])
 
 
 def _parts(count: int) -> list[slice]:

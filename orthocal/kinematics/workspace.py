@@ -132,7 +132,7 @@ def cube(
     middle, line = tool_at_zero(robot), _lobatto_points(points_a_side)
     legendre = np.polynomial.legendre.Legendre.basis(points_a_side - 1)
     own = 1.0 / (points_a_side * (points_a_side - 1) * legendre(line) ** 2)
-    points, weights = _grid(line, middle.size), _grid(own, middle.size).prod(axis=1)
+    points, weights = grid_points(line, middle.size), grid_points(own, middle.size).prod(axis=1)
     return Workspace(
         read_only(middle + half_side * points), read_only(weights), half_side, read_only(line)
     )
@@ -151,7 +151,7 @@ def even_grid(robot: Robot, *, half_side: float, points_a_side: int) -> Array:
     """
     middle = tool_at_zero(robot)
     line = np.linspace(-half_side, half_side, points_a_side)
-    return np.asarray(middle + _grid(line, middle.size))
+    return np.asarray(middle + grid_points(line, middle.size))
 
 
 def _lobatto_points(count: int) -> Array:
@@ -163,8 +163,11 @@ def _lobatto_points(count: int) -> Array:
     return np.asarray(0.5 * (points - points[::-1]))  # the same on both sides, without rounding
 
 
-def _grid(line: Array, count: int) -> Array:
-    """All points with coordinates in a line, shape (n^count, count), the last changing first."""
+def grid_points(line: Array, count: int) -> Array:
+    """Grid of the values of a line along each of `count` coordinates, shape (n^count, count).
+
+    The last coordinate changes first.
+    """
     return np.stack(np.meshgrid(*[line] * count, indexing="ij"), axis=-1).reshape(-1, count)
 
 
@@ -181,8 +184,8 @@ def gauss_cube(robot: Robot, *, half_side: float) -> Workspace:
     middle = tool_at_zero(robot)
     count = middle.size
     nodes, own = np.polynomial.legendre.leggauss(3)
-    weights = _grid(own, count).prod(axis=1)
-    points = np.vstack([_grid(nodes, count), _grid(np.array([-1.0, 1.0]), count)])
+    weights = grid_points(own, count).prod(axis=1)
+    points = np.vstack([grid_points(nodes, count), grid_points(np.array([-1.0, 1.0]), count)])
     counted = np.append(weights / weights.sum(), np.zeros(2**count))
     return Workspace(read_only(middle + half_side * points), read_only(counted), half_side)
 

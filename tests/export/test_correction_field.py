@@ -15,7 +15,7 @@ from programs import read_polyline
 from orthocal import ExportError, calibrate, draw_errors, write_calibration
 from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.cli import main
-from orthocal.export.correction_field import CorrectionField, Unknown
+from orthocal.export.correction_field import CorrectionField, Fallback
 from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
@@ -68,7 +68,7 @@ def test_at_the_border_it_says_as_the_machine_what_is_reached(field):
 def test_the_first_point_that_is_not_reached_is_named_wherever_others_are(bad):
     """Points in any order, in boxes where the machine is asked, which are known or not yet."""
     field = CorrectionField(bad, OFFSETS, within=WITHIN)
-    field._make = lambda key: Unknown.ASKED
+    field._make = lambda key: Fallback.EXACT
     field.exactly = lambda p: (
         np.where(p > 0.1, np.nan, p + 1e-3),
         {int(i): f"{p[i][0]}" for i in np.flatnonzero((p > 0.1).any(axis=1))},

@@ -37,12 +37,11 @@ from orthocal import (
 from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.calibration.machine import Machine
 from orthocal.cli import main
-from orthocal.export.linuxcnc.approximation import approximate
+from orthocal.export.linuxcnc.approximation import approximate, rounded_up
 from orthocal.export.linuxcnc.c_source import braced, write_core
+from orthocal.export.linuxcnc.export import ExportOptions
 from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.export.linuxcnc.nominal_form import SlidesWithRods, Tangent, find_nominal_form
-from orthocal.export.linuxcnc.words import rounded_up
-from orthocal.export.options import ExportOptions
 from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.observation.simulate import load_errors
@@ -210,8 +209,8 @@ def test_without_a_tool_it_is_the_calibrated_machine(full, tmp_path):
     core = Core(tmp_path, write_core(full, found))
     points = np.random.default_rng(8).uniform(-0.06, 0.06, (10_000, 3))
     joints = drives_of(full, core.inverse(points / MM))
-    slopes = found.inverse.slopes(points)
-    off = np.linalg.solve(slopes, (joints - full.machine.inverse(points))[..., None])[..., 0]
+    jacobian = found.inverse.derivative(points)
+    off = np.linalg.solve(jacobian, (joints - full.machine.inverse(points))[..., None])[..., 0]
     assert np.linalg.norm(off, axis=1).max() < found.achieved <= WITHIN
 
 
@@ -318,8 +317,8 @@ def test_more_than_polynomials_reach_is_refused_with_what_they_do(full):
 def test_a_lower_degree_is_taken_where_less_is_asked(full, exported):
     """And what is stated is at most what was asked."""
     found = approximate(full, within=5e-6)
-    assert f"#define DEGREE {found.inverse.degree}\n" not in exported["orthocal_core.c"]
-    assert found.inverse.degree < 4
+    assert f"#define DEGREE {found.inverse.correction.degree}\n" not in exported["orthocal_core.c"]
+    assert found.inverse.correction.degree < 4
     assert 1e-7 < found.achieved <= 5e-6
     assert found.beyond > found.achieved
     # the tilt is some milliradians
@@ -346,7 +345,7 @@ def run(words):
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (["--tool", "1,2"], 2, "--tool: found '1,2'; expected 3 numbers with commas between"),
+        (["--tool", "1,2"], 2, "--tool: found '1,2'; expected 3 numbers separated by commas"),
         (["--tool", "0,0,nan"], 2, "--tool: found 0, 0, nan mm; expected numbers of at most 10000"),
         (["--tool", "0,0,1e6"], 2, "--tool: found 0, 0, 1e+06 mm; expected"),
         (["--within", "0"], 2, "--within: found 0 µm; expected more than 0"),
@@ -354,9 +353,13 @@ def run(words):
         (["--half-side-mm", "-3"], 2, "--half-side-mm: found -3 mm; expected more than 0"),
         (["--home-offset", "1;2;3"], 2, "--home-offset: found '1;2;3'; expected 3 numbers"),
         (["--home-offset", "1,2,inf"], 2, "--home-offset: expected finite numbers"),
-        (["--within", "1"], 2, "--within: is of a kinematics module, and offsets alone"),
-        (["--to", "yaml", "--tool", "0,0,0"], 2, "--tool: goes with --to linuxcnc alone"),
-        (["--to", "yaml", "--offsets"], 2, "--module or --offsets: goes with --to linuxcnc alone"),
+        (["--within", "1"], 2, "--within: is an option of a kinematics module, and the"),
+        (["--to", "yaml", "--tool", "0,0,0"], 2, "--tool: is an option of --to linuxcnc alone"),
+        (
+            ["--to", "yaml", "--offsets"],
+            2,
+            "--module or --offsets: is an option of --to linuxcnc alone",
+        ),
         (["--module", "--half-side-mm", "250"], 3, "the machine does not reach ±250 mm"),
     ],
 )
@@ -395,10 +398,10 @@ def test_home_offsets_are_told_as_what_to_add_where_the_old_are_not_known(offset
     assert list(files) == ["README.md", "joints.ini"]
     lines = files["joints.ini"]
     assert "[JOINT_0]\n# x_slide, counts up: +0.8000 mm\n" in lines
-    assert "# HOME_OFFSET = what it is now +0.8000" in lines
+    assert "# HOME_OFFSET = present value +0.8000" in lines
     assert "[JOINT_1]\n# y_slide, counts down: +0.7000 mm\n" in lines
     assert "[JOINT_2]\n# z_slide, counts down: -0.3000 mm\n" in lines
-    assert "| JOINT_1 | y_slide | down | what it is now +0.7000 | +0.7000 |" in files["README.md"]
+    assert "| JOINT_1 | y_slide | down | present value +0.7000 | +0.7000 |" in files["README.md"]
     assert "offsets_mm: [1.2, -0.8, 0.5]" in files["README.md"]
 
 
@@ -424,10 +427,10 @@ def test_a_module_leaves_home_offset_as_it_was(full, exported):
         "orthocal_core.c",
         "orthocal_core.h",
     }
-    assert "HOME_OFFSET stays as it was while measuring" in exported["README.md"]
+    assert "HOME_OFFSET remains that of the measurement" in exported["README.md"]
     assert "for a tip at 5, 0, -50 mm" in exported["README.md"]
     assert "HOME_OFFSET =" not in exported["kinematics.ini"]
-    assert "type the old lines back" in exported["README.md"]
+    assert "restore the old INI lines" in exported["README.md"]
     assert "[AXIS_Z]\nMIN_LIMIT = -60\nMAX_LIMIT = 60\n" in exported["kinematics.ini"]
     assert "# x_slide\nTYPE = LINEAR\nMIN_LIMIT = 120.4000\n" in exported["kinematics.ini"]
     stated = float(re.search(r"within ([\d.]+) µm", exported["README.md"])[1])
@@ -438,7 +441,7 @@ def test_a_module_may_be_asked_for_where_offsets_alone_are_known(offsets):
     """HOME_OFFSET that was told stays in it; nominal legs need no more than a constant."""
     options = ExportOptions(module=True, home_offsets=(0.35, 0.3, -0.02))
     files = export_calibration(offsets, "linuxcnc", options=options)
-    assert "Offsets alone were identified, and a module was asked for" in files["README.md"]
+    assert "identified offsets only; a module was requested" in files["README.md"]
     assert "(JOINT_0 350.0000, JOINT_1 300.0000, JOINT_2 -20.0000)" in files["README.md"]
     assert "HOME_OFFSET = 300.0000\n" in files["kinematics.ini"]
     assert "#define DEGREE 1\n" in files["orthocal_core.c"]
@@ -451,7 +454,7 @@ def test_offsets_alone_may_be_asked_for_where_more_is_known(full):
     options = ExportOptions(module=False, home_offsets=old)
     files = export_calibration(full, "linuxcnc", options=options)
     assert set(files) == {"README.md", "joints.ini"}
-    assert "the ones that leave the least error at\nthe tool" in files["README.md"]
+    assert "These offsets minimise the tool error" in files["README.md"]
     lines = re.findall(r"^HOME_OFFSET = (\S+)", files["joints.ini"], re.M)
     changed = np.array(lines, dtype=float) * 1e-3 - old
     ways = np.array([d.direction for d in full.robot.drives])
@@ -459,7 +462,9 @@ def test_offsets_alone_may_be_asked_for_where_more_is_known(full):
     assert np.abs(changed - ways * (full.offsets - full.active_offsets)).max() > 1e-6
     with pytest.raises(ParameterError) as e:
         export_calibration(full, "linuxcnc", options=replace(options, within=1e-6))
-    assert str(e.value) == "--within: is of a kinematics module, and --offsets asks for HOME_OFFSET"
+    assert str(e.value) == (
+        "--within: is an option of a kinematics module, and --offsets requests HOME_OFFSET"
+    )
 
 
 # ---- LinuxCNC itself

@@ -19,7 +19,7 @@ from machines import place
 
 from orthocal import calibrate, export_calibration, load_plan, simulate_session
 from orthocal.errors import ParameterError, SessionError
-from orthocal.export.options import ExportOptions
+from orthocal.export.linuxcnc.export import ExportOptions
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.measurement.motion.motion import APPROACH, plan_motion, shown_joints
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program

@@ -1,1 +1,1 @@
-"""What LinuxCNC takes: offsets as HOME_OFFSET, all other errors as a kinematics module."""
+"""Files for LinuxCNC: offsets as HOME_OFFSET, other errors as a kinematics module."""

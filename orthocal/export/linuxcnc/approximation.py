@@ -1,12 +1,17 @@
-"""A calibrated machine's inverse kinematics as few numbers, of the least degree that will do.
+"""Inverse kinematics of a calibrated machine in few numbers: a closed form and a polynomial.
 
-How good it is, is measured on points that were not fitted: within the region, on its faces, edges
-and corners. What they show is where the calibrated machine, closed by its own loops, has its tool
-when the drives are where these numbers send them.
+    q(p) = nominal(p) + f(clamp(p))
+
+f is a polynomial of the lowest total degree that meets the tolerance. Beyond the region its
+argument is clamped to the faces. The error is evaluated at points that are not fitted: inside the
+region and on its faces, edges and corners. There the calibrated machine, with its loops closed, is
+compared with the commanded point.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,75 +20,107 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ExportError
-from orthocal.export.linuxcnc.nominal_form import Tangent, find_nominal_form
-from orthocal.export.linuxcnc.polynomial import (
-    CorrectedInverse,
-    chebyshev_lattice,
-    fit_correction,
-)
-from orthocal.export.linuxcnc.words import region_words, rounded_up
+from orthocal.export.linuxcnc.nominal_form import NominalForm, Tangent, find_nominal_form
+from orthocal.export.polynomial import Polynomial, PolynomialFit, chebyshev_line, total_degree
 from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.loop_closure import find_beyond_travel
-from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.kinematics.workspace import grid_points, tool_at_zero
 from orthocal.units import MM, UM
 
 Array = NDArray[np.float64]
 
-MOST_DEGREE = {1: 14, 2: 14, 3: 10}
-"""Coordinates of the tool to the highest degree: further ones cost more than they bring."""
+LETTERS = "XYZABC"
+"""Coordinates of LinuxCNC in its order."""
 
-SPARE = 3
-"""Points a side that are fitted beyond the highest degree."""
+MOST_DEGREE = {1: 14, 2: 14, 3: 10}
+"""Number of coordinates to the highest degree; higher ones gain less than they cost."""
+
+EXTRA_NODES = 3
+"""Nodes a side beyond the highest degree."""
 
 CHECKED = 1000
-"""Points within, and as many on faces, edges and corners."""
+"""Number of checked points inside the region, and on its faces, edges and corners."""
 
 RESERVE = 1.1
-"""Between the points that are looked at an error may be somewhat larger than at them."""
+"""Factor on the largest error at the checked points."""
 
 BEYOND = 5e-3
-"""Beyond a face, where it is told what is left, [m]."""
+"""Distance beyond a face at which the error is stated, [m]."""
 
-LEVER = 10e-3
-"""By which a tool is longer than said, where it is told what that does, [m]."""
+LONGER = 10e-3
+"""Change of the tool's length of which the effect is stated, [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrectedInverse:
+    """Drive coordinates for points of the tool."""
+
+    nominal: NominalForm
+    correction: Polynomial
+    """Correction of the drive coordinates over the region, [m, rad]."""
+
+    @property
+    def lower(self) -> Array:
+        """Smallest coordinates of the region, shape (n,), [m]."""
+        return np.asarray(self.correction.middle - self.correction.half)
+
+    @property
+    def upper(self) -> Array:
+        """Largest coordinates of the region, shape (n,), [m]."""
+        return np.asarray(self.correction.middle + self.correction.half)
+
+    def __call__(self, points: Array) -> Array:
+        """Drive coordinates, shape (k, n_drives), [m, rad], for points, shape (k, n), [m]."""
+        clamped = np.clip(points, self.lower, self.upper)
+        return np.asarray(self.nominal(points)[0] + self.correction(clamped))
+
+    def derivative(self, points: Array) -> Array:
+        """∂q/∂p inside the region, shape (k, n_drives, n)."""
+        return np.asarray(self.nominal(points)[1] + self.correction.derivative(points))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approximation:
-    """Numbers that move a calibrated machine, and how well they do."""
+    """Approximate inverse kinematics with their errors."""
 
     inverse: CorrectedInverse
-    """Points of the tool to drive coordinates as the encoders give them, without offsets."""
+    """Points of the tool to drive coordinates of the encoders, without offsets."""
     tool: Array
     """Tip in the frame of the robot's tool centre point, shape (3,), [m]."""
     coordinates: tuple[int, ...]
     """World coordinates that the drives control."""
     achieved: float
-    """Largest distance of the tip from where it belongs, with the reserve between points, [m]."""
+    """Largest error of the tip at the checked points, with the reserve, [m]."""
     checked: int
-    """Points that it was measured at."""
+    """Number of checked points."""
     nominal: float | None
-    """The same of nominal kinematics with the offsets active while measuring, [m]; None where
-    the robot has no closed form."""
+    """Largest error with nominal kinematics and the offsets active during the measurement, [m];
+    None for a robot without a closed form."""
     beyond: float | None
-    """The same 5 mm beyond the faces, [m]; None where the machine does not reach that far."""
+    """Largest error 5 mm beyond the faces, [m]; None if the machine does not reach that far."""
     longer: float
-    """Largest error where the tool is 10 mm longer than said, in whichever direction, [m]."""
-
-    @property
-    def lower(self) -> Array:
-        """Least coordinates of the region, shape (n,), [m]."""
-        return np.asarray(self.inverse.middle - self.inverse.half)
+    """Largest error for a tip 10 mm farther in any direction, [m]."""
 
     @property
     def region(self) -> str:
-        """Where it holds, in words, mm."""
-        return region_words(self.coordinates, self.lower, self.upper)
+        """Limits of the region, mm: X -60 to 60, Y -60 to 60."""
+        limits = zip(self.coordinates, self.inverse.lower, self.inverse.upper, strict=True)
+        return ", ".join(
+            f"{LETTERS[k]} {millimetres([low])} to {millimetres([high])}" for k, low, high in limits
+        )
 
-    @property
-    def upper(self) -> Array:
-        """Largest coordinates of the region, shape (n,), [m]."""
-        return np.asarray(self.inverse.middle + self.inverse.half)
+
+def millimetres(values: Iterable[float]) -> str:
+    """Lengths in mm to 1 nm, separated by commas."""
+    return ", ".join(f"{round(float(v) / MM, 6) + 0.0:g}" for v in values)
+
+
+def rounded_up(value: float, digits: int = 2) -> str:
+    """Number with few digits, rounded up."""
+    if not math.isfinite(value) or value <= 0.0:
+        return f"{value:g}"
+    decimals = digits - 1 - math.floor(math.log10(value))
+    return f"{math.ceil(value * 10.0**decimals) / 10.0**decimals:.{digits}g}"
 
 
 def approximate(
@@ -93,125 +130,128 @@ def approximate(
     tool: ArrayLike = (0.0, 0.0, 0.0),
     half_side: float | None = None,
 ) -> Approximation:
-    """The inverse kinematics of least degree that keeps the tool as near as asked.
+    """Inverse kinematics of the lowest degree that meets a tolerance.
 
     Args:
         calibration: The calibration.
-        within: Largest distance of the tip from where it belongs, [m].
-        tool: The tip in the frame of the robot's tool centre point, shape (3,), [m].
-        half_side: Half the side of the region around the zero, [m]; by default the largest that
-            the machine reaches, of 60 mm at most.
+        within: Largest distance of the tip from its target, [m].
+        tool: Tip in the frame of the robot's tool centre point, shape (3,), [m].
+        half_side: Half the side of the region around the mechanical zero, [m]; by default the
+            largest that the machine reaches, at most 60 mm.
 
     Raises:
-        ExportError: If no degree does, naming what is reached; if the machine has no tool, or
-            does not reach the region.
+        ExportError: If no degree meets the tolerance, with the best error; if the machine has no
+            tool or does not reach the region.
     """
-    tip = ToolTip(calibration, tool)
-    robot = calibration.robot
+    tip, robot = ToolTip(calibration, tool), calibration.robot
     middle = tool_at_zero(robot)
-    half = np.full(middle.size, _half_side(calibration, half_side))
-    most = MOST_DEGREE[middle.size]
-    fitted = chebyshev_lattice(middle.size, most + SPARE)
-    checked = check_points(middle.size)
+    n = middle.size
+    half = np.full(n, _find_half_side(calibration) if half_side is None else half_side)
+    most = MOST_DEGREE[n]
+    nodes = grid_points(chebyshev_line(most + EXTRA_NODES), n)
+    checks = middle + half * check_points(n)
     try:
-        tip.reach(middle + half * corners(middle.size))  # soon, where it cannot be
-        drives, _ = tip.reach(middle + half * fitted)
-        for error in find_beyond_travel(robot, drives, ["a point"] * len(drives)).values():
-            raise error
-        belong, passive = tip.reach(middle + half * checked)
+        tip.reach(middle + half * corners(n))  # fails fast
+        drives, _ = tip.reach(middle + half * nodes)
+        for failure in find_beyond_travel(robot, drives, ["a point"] * len(drives)).values():
+            raise failure
+        expected, passive = tip.reach(checks)
     except ClosureError as e:
         raise ExportError(
             f"the machine does not reach ±{half[0] / MM:g} mm ({e.reason}); "
-            "give a smaller --half-side-mm"
+            "use a smaller --half-side-mm"
         ) from None
     form = find_nominal_form(robot, middle, half)
-    points = middle + half * checked
+    corrections = drives - form(middle + half * nodes)[0]
     best = np.inf
     for degree in range(1, most + 1):
-        found = fit_correction(form, middle, half, fitted, drives, degree=degree)
-        reached = RESERVE * _estimate(found, points, belong)
-        if reached <= within:
-            reached = RESERVE * _miss(tip, points, found(points), passive)
-        best = min(best, reached)
-        if reached <= within:
+        fit = PolynomialFit(nodes, total_degree(n, degree))
+        inverse = CorrectedInverse(form, fit(middle, half, corrections))
+        error = RESERVE * _estimate(inverse, checks, expected)
+        if error <= within:
+            error = RESERVE * _tip_error(tip, checks, inverse(checks), passive)
+        best = min(best, error)
+        if error <= within:
             return Approximation(
-                inverse=found,
+                inverse=inverse,
                 tool=tip.tool,
-                coordinates=tuple(tip.chosen),
-                achieved=reached,
-                checked=len(points),
+                coordinates=tuple(tip.coordinates),
+                achieved=error,
+                checked=len(checks),
                 nominal=None
                 if isinstance(form, Tangent)
-                else _miss_or_none(tip, points, form(points)[0] - calibration.active_offsets),
-                beyond=_beyond(tip, found, calibration),
-                longer=_longer(tip, belong, passive),
+                else _error_or_none(tip, checks, form(checks)[0] - calibration.active_offsets),
+                beyond=_error_beyond(tip, inverse, calibration),
+                longer=_error_of_longer_tool(tip, expected, passive),
             )
     raise ExportError(
-        f"no polynomial of a degree up to {most} keeps the tool within {within / UM:g} µm "
-        f"over ±{half[0] / MM:g} mm; the best of them reaches {rounded_up(best / UM)} µm"
+        f"no polynomial up to degree {most} keeps the tool within {within / UM:g} µm "
+        f"over ±{half[0] / MM:g} mm; the best one reaches {rounded_up(best / UM)} µm"
     )
 
 
 def check_points(n: int, *, count: int = CHECKED, seed: int = 1) -> Array:
-    """Points of a cube of ±1 within it, on its faces, edges and corners, shape (2 count + 2^n, n).
+    """Points inside a cube of ±1 and on its faces, edges and corners, shape (2 count + 2^n, n).
 
-    No fitted one is among them but the corners.
+    Only the corners are nodes of the fit.
     """
     generator = np.random.default_rng(seed)
-    within, outside = generator.uniform(-1.0, 1.0, (2, count, n))
+    inside, outside = generator.uniform(-1.0, 1.0, (2, count, n))
     pinned = generator.integers(0, n, count)
     outside[np.arange(count), pinned] = generator.choice([-1.0, 1.0], count)
     edges = generator.random((count, n)) < 0.3
     outside[edges] = generator.choice([-1.0, 1.0], int(edges.sum()))
-    return np.concatenate([within, outside, corners(n)])
+    return np.concatenate([inside, outside, corners(n)])
 
 
 def corners(n: int) -> Array:
-    """Of a cube of ±1, shape (2^n, n)."""
-    return np.stack(np.meshgrid(*[[-1.0, 1.0]] * n, indexing="ij"), axis=-1).reshape(-1, n)
+    """Corners of a cube of ±1, shape (2^n, n)."""
+    return grid_points(np.array([-1.0, 1.0]), n)
 
 
-def _half_side(calibration: Calibration, given: float | None) -> float:
-    if given is not None:
-        return given
+def _find_half_side(calibration: Calibration) -> float:
     tool = find_tool(calibration)
     if tool is None or tool.workspace.half_side is None:
         raise ExportError("the machine has no tool that its drives command over a region")
     return tool.workspace.half_side
 
 
-def _estimate(found: CorrectedInverse, points: Array, drives: Array) -> float:
-    """Largest error at the tool, to first order in that of the drives, [m]."""
-    off = np.linalg.solve(found.slopes(points), (found(points) - drives)[..., None])[..., 0]
+def _estimate(inverse: CorrectedInverse, points: Array, drives: Array) -> float:
+    """Largest error of the tip, to first order in the error of the drives, [m]."""
+    errors = (inverse(points) - drives)[..., None]
+    off = np.linalg.solve(inverse.derivative(points), errors)[..., 0]
     return float(np.linalg.norm(off, axis=1).max())
 
 
-def _miss(tip: ToolTip, points: Array, drives: Array, start: Array | None) -> float:
-    """Largest distance of the tip from where it belongs, drives being there, [m]."""
+def _tip_error(tip: ToolTip, points: Array, drives: Array, start: Array | None) -> float:
+    """Largest distance of the tip from its target at drive coordinates, [m]."""
     off = tip.place(drives, start=start) - tip.targets(points)
     return float(np.linalg.norm(off, axis=1).max())
 
 
-def _miss_or_none(tip: ToolTip, points: Array, drives: Array) -> float | None:
+def _error_or_none(tip: ToolTip, points: Array, drives: Array) -> float | None:
     try:
-        return _miss(tip, points, drives, None)
+        return _tip_error(tip, points, drives, None)
     except ClosureError:
         return None
 
 
-def _beyond(tip: ToolTip, found: CorrectedInverse, calibration: Calibration) -> float | None:
+def _error_beyond(
+    tip: ToolTip, inverse: CorrectedInverse, calibration: Calibration
+) -> float | None:
     """Largest error beyond the faces, [m]."""
-    outside = check_points(found.middle.size, count=100, seed=2)[100:]
-    points = found.middle + (found.half + BEYOND) * outside
-    drives = found(points)
+    box = inverse.correction
+    outside = check_points(box.middle.size, count=100, seed=2)[100:]
+    points = box.middle + (box.half + BEYOND) * outside
+    drives = inverse(points)
     if not np.isfinite(drives).all():
         return None
     if find_beyond_travel(calibration.robot, drives, [""] * len(drives)):
         return None
-    return _miss_or_none(tip, points, drives)
+    return _error_or_none(tip, points, drives)
 
 
-def _longer(tip: ToolTip, drives: Array, passive: Array) -> float:
-    """What a tilt makes of a longer tool, [m]."""
-    tilt = (tip.poses(drives, start=passive)[:, :3, :3] - tip.level)[:, tip.chosen]
-    return float(LEVER * np.linalg.svd(tilt, compute_uv=False).max())
+def _error_of_longer_tool(tip: ToolTip, drives: Array, passive: Array) -> float:
+    """Largest error for a tip farther from the platform, by its tilt, [m]."""
+    tilt = (tip.poses(drives, start=passive)[:, :3, :3] - tip.level)[:, tip.coordinates]
+    return float(LONGER * np.linalg.svd(tilt, compute_uv=False).max())

@@ -1,7 +1,7 @@
-"""The C sources of a kinematics module: a core in plain C99, and LinuxCNC's component around it.
+"""C sources of a kinematics module: a core in plain C99, and a LinuxCNC component around it.
 
-In the controller's units, mm and degrees, and in the directions in which its joints count. The
-component is the same for every machine, but for the coordinates that its drives command.
+Numbers are in the controller's units, mm and degrees, and in its joint directions. The component
+depends on the machine only by the coordinates that the drives command.
 """
 
 from __future__ import annotations
@@ -13,37 +13,45 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.calibration.calibration import Calibration
-from orthocal.export.linuxcnc.approximation import Approximation
+from orthocal.export.linuxcnc.approximation import (
+    LETTERS,
+    Approximation,
+    millimetres,
+    rounded_up,
+)
 from orthocal.export.linuxcnc.nominal_form import NominalForm, Tangent
-from orthocal.export.linuxcnc.words import LETTERS, as_millimetres, plain, rounded_up
 from orthocal.robot.model import Drive
+from orthocal.text import comment_safe
 from orthocal.units import DRIVE_UNITS, MM, UM
 
 Array = NDArray[np.float64]
 
+LONGEST_LINE = 90
 
-def write_core(calibration: Calibration, found: Approximation) -> dict[str, str]:
-    """orthocal_core.c and .h: of points of the tool and joints, without LinuxCNC."""
-    inverse, drives = found.inverse, calibration.robot.drives
-    counts = np.array([d.direction / DRIVE_UNITS[d.unit][1] for d in drives])
+
+def write_core(calibration: Calibration, approximation: Approximation) -> dict[str, str]:
+    """Texts of orthocal_core.c and orthocal_core.h, which need no LinuxCNC."""
+    drives, inverse = calibration.robot.drives, approximation.inverse
+    polynomial = inverse.correction
+    to_joints = np.array([d.direction / DRIVE_UNITS[d.unit][1] for d in drives])
     common = {
-        "robot": plain(calibration.robot.name),
-        "joints": ", ".join(plain(d.name) for d in drives),
+        "robot": comment_safe(calibration.robot.name),
+        "joints": ", ".join(comment_safe(d.name) for d in drives),
         "joint_units": " and ".join(dict.fromkeys(DRIVE_UNITS[d.unit][0] for d in drives)),
         "drives": len(drives),
     }
     core = {
         **common,
-        "title": plain(calibration.session.title) or "without a title",
-        "achieved": rounded_up(found.achieved / UM),
-        "region": found.region,
-        "tool": as_millimetres(found.tool),
-        "degree": inverse.degree,
-        "terms": len(inverse.exponents),
-        "middle": braced(inverse.middle / MM),
-        "half": braced(inverse.half / MM),
-        "power": braced(inverse.exponents),
-        "coefficient": braced(inverse.coefficients * counts[:, None]),
+        "title": comment_safe(calibration.session.title) or "session without a title",
+        "achieved": rounded_up(approximation.achieved / UM),
+        "region": approximation.region,
+        "tool": millimetres(approximation.tool),
+        "degree": polynomial.degree,
+        "terms": len(polynomial.exponents),
+        "middle": braced(polynomial.middle / MM),
+        "half": braced(polynomial.half / MM),
+        "exponent": braced(polynomial.exponents),
+        "coefficient": braced(polynomial.coefficients * to_joints[:, None]),
         "nominal": _write_nominal(inverse.nominal, drives, calibration.active_offsets),
     }
     return {
@@ -52,27 +60,27 @@ def write_core(calibration: Calibration, found: Approximation) -> dict[str, str]
     }
 
 
-def write_component(found: Approximation) -> dict[str, str]:
-    """orthocal_kins.c: the core as a kinematics module."""
-    carried = [k for k in range(len(LETTERS)) if k not in found.coordinates]
-    values = {"commanded": braced(found.coordinates), "carried": braced(carried)}
+def write_component(approximation: Approximation) -> dict[str, str]:
+    """Text of orthocal_kins.c, the core as a kinematics module."""
+    coordinates = approximation.coordinates
+    identity = [k for k in range(len(LETTERS)) if k not in coordinates]
+    values = {"commanded": braced(coordinates), "identity": braced(identity)}
     return {"orthocal_kins.c": _fill("orthocal_kins.c", values)}
 
 
 def _write_nominal(form: NominalForm, drives: tuple[Drive, ...], active: Array) -> str:
-    """The nominal form in joints, with the offsets that are in the controller and stay there."""
-    counts = np.array([d.direction for d in drives])
+    """Nominal form in joints, with the offsets that stay active in the controller."""
+    directions = np.array([d.direction for d in drives])
     sizes = np.array([DRIVE_UNITS[d.unit][1] for d in drives])
 
-    def show(coordinates: Array) -> Array:
-        values = coordinates + active
-        shown = np.array([d.to_joint(v) for d, v in zip(drives, values, strict=True)])
-        return np.asarray(shown / sizes)
+    def joints(coordinates: Array) -> Array:
+        values = zip(drives, coordinates + active, strict=True)
+        return np.asarray(np.array([d.to_joint(v) for d, v in values]) / sizes)
 
     if isinstance(form, Tangent):
         values = {
-            "at_middle": braced(show(form.values)),
-            "tangent": braced(form.slopes * (counts * MM / sizes)[:, None]),
+            "at_middle": braced(joints(form.values)),
+            "jacobian": braced(form.jacobian * (directions * MM / sizes)[:, None]),
         }
         return _fill("tangent.c", values)
     values = {
@@ -80,14 +88,14 @@ def _write_nominal(form: NominalForm, drives: tuple[Drive, ...], active: Array) 
         "anchor": braced(form.anchors / MM),
         "length": braced(form.lengths / MM),
         "sign": braced(form.signs),
-        "counts": braced(counts),
-        "shown": braced(show(np.zeros(len(drives)))),
+        "direction": braced(directions),
+        "at_zero": braced(joints(np.zeros(len(drives)))),
     }
     return _fill("slides.c", values)
 
 
 def braced(values: ArrayLike, *, indent: int = 4) -> str:
-    """Numbers as C has them: every digit of doubles, integers as integers, nested as the array."""
+    """C initializer of an array: integers, or doubles with all digits."""
     array = np.asarray(values)
     pad = " " * indent
     if array.ndim > 1:
@@ -98,7 +106,7 @@ def braced(values: ArrayLike, *, indent: int = 4) -> str:
     else:
         texts = [repr(float(v) + 0.0) for v in array]
     line = "{" + ", ".join(texts) + "}"
-    if len(line) <= 90:
+    if len(line) <= LONGEST_LINE:
         return line
     lines = [", ".join(texts[i : i + 3]) for i in range(0, len(texts), 3)]
     return "{\n" + ",\n".join(f"{pad}{part}" for part in lines) + f"\n{' ' * (indent - 4)}}}"

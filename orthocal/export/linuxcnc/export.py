@@ -1,6 +1,9 @@
-"""A calibration for LinuxCNC: what to type, and what to build where typing is not enough."""
+"""Export of a calibration for LinuxCNC: HOME_OFFSET, or a kinematics module."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
 
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.calibration import Calibration
@@ -8,50 +11,113 @@ from orthocal.errors import ExportError, ParameterError
 from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.export.linuxcnc.c_source import write_component, write_core
 from orthocal.export.linuxcnc.home_offsets import find_homes
-from orthocal.export.linuxcnc.ini import write_home_lines, write_module_lines
-from orthocal.export.linuxcnc.page import write_home_page, write_module_page
-from orthocal.export.options import WITHIN, ExportOptions
+from orthocal.export.linuxcnc.instructions import (
+    write_home_lines,
+    write_home_page,
+    write_module_lines,
+    write_module_page,
+)
+from orthocal.export.tool_tip import require_tip
+from orthocal.units import MM, UM
+
+WITHIN = 0.1 * UM
+"""Default tolerance of a kinematics module, [m]."""
+
+OPTIONS = {
+    "within": "--within",
+    "tool": "--tool",
+    "home_offsets": "--home-offset",
+    "half_side": "--half-side-mm",
+    "module": "--module or --offsets",
+}
+"""Fields of ExportOptions to their options on the command line."""
+
+MODULE_OPTIONS = ("within", "tool", "half_side")
+"""Options of a kinematics module alone."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportOptions:
+    """Options of an export; None selects the default.
+
+    Raises:
+        ParameterError: If a number is out of range.
+    """
+
+    within: float | None = None
+    """Largest error of a kinematics module at the tool, [m]."""
+    tool: tuple[float, float, float] | None = None
+    """Tip of the tool in the frame of the robot's tool centre point, [m]."""
+    home_offsets: tuple[float, ...] | None = None
+    """HOME_OFFSET of each joint during the measurement, [m, rad]."""
+    half_side: float | None = None
+    """Half the side of the module's region around the mechanical zero, [m]."""
+    module: bool | None = None
+    """Whether to write a kinematics module or HOME_OFFSET; by default a module if the calibration
+    identified more than offsets."""
+
+    def __post_init__(self) -> None:
+        for value, unit, symbol, option in (
+            (self.within, UM, "µm", "--within"),
+            (self.half_side, MM, "mm", "--half-side-mm"),
+        ):
+            if value is not None and not 0.0 < value < math.inf:
+                raise ParameterError(
+                    f"found {value / unit:g} {symbol}; expected more than 0", where=option
+                )
+        if self.tool is not None:
+            require_tip(self.tool)
+        if self.home_offsets is not None and not all(map(math.isfinite, self.home_offsets)):
+            raise ParameterError("expected finite numbers", where="--home-offset")
+
+    @property
+    def requested(self) -> tuple[str, ...]:
+        """Names of the fields that are not None."""
+        names = (f.name for f in fields(self))
+        return tuple(n for n in names if getattr(self, n) is not None)
 
 
 def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[str, str]:
-    """HOME_OFFSET where offsets alone were identified, or asked for; else a kinematics module.
+    """Files for LinuxCNC.
 
     Returns:
-        README.md and joints.ini; or README.md, kinematics.ini, orthocal_kins.c, orthocal_core.c and
+        README.md and joints.ini if the calibration identified offsets only, or if they are
+        requested; else README.md, kinematics.ini, orthocal_kins.c, orthocal_core.c and
         orthocal_core.h.
 
     Raises:
-        ExportError: If there is nothing to enter, or no module keeps to what was asked.
-        ParameterError: If an option is of a module and none is made, or values are missing.
+        ExportError: If there is no offset to enter, or no module meets the tolerance.
+        ParameterError: If an option of a module is given for HOME_OFFSET, or values are missing.
     """
     homes = find_homes(calibration, old=options.home_offsets)
     module = not calibration.only_offsets if options.module is None else options.module
     if not module:
-        of_module = {"within": "--within", "tool": "--tool", "half_side": "--half-side-mm"}
-        given = [of_module[name] for name in options.asked if name in of_module]
-        if given:
-            why = (
-                "offsets alone were identified: they are entered as HOME_OFFSET; give --module for "
-                "a module with nominal legs and axes"
+        unused = [OPTIONS[name] for name in options.requested if name in MODULE_OPTIONS]
+        if unused:
+            reason = (
+                "the calibration identified offsets only, which are entered as HOME_OFFSET; "
+                "--module requests a module with nominal legs and axes"
                 if options.module is None
-                else "--offsets asks for HOME_OFFSET"
+                else "--offsets requests HOME_OFFSET"
             )
-            raise ParameterError(f"is of a kinematics module, and {why}", where=given[0])
+            raise ParameterError(
+                f"is an option of a kinematics module, and {reason}", where=unused[0]
+            )
         if not find_entries(calibration):
-            raise ExportError("no offset was identified: there is nothing to enter")
+            raise ExportError("the calibration identified no offset: there is nothing to enter")
         return {
             "README.md": write_home_page(calibration, homes),
             "joints.ini": write_home_lines(homes),
         }
-    found = approximate(
+    approximation = approximate(
         calibration,
         within=WITHIN if options.within is None else options.within,
         tool=(0.0, 0.0, 0.0) if options.tool is None else options.tool,
         half_side=options.half_side,
     )
     return {
-        "README.md": write_module_page(calibration, found, homes),
-        "kinematics.ini": write_module_lines(found, homes),
-        **write_component(found),
-        **write_core(calibration, found),
+        "README.md": write_module_page(calibration, approximation, homes),
+        "kinematics.ini": write_module_lines(approximation, homes),
+        **write_component(approximation),
+        **write_core(calibration, approximation),
     }

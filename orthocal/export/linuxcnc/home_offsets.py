@@ -1,12 +1,11 @@
-"""What a controller's joints begin to count with: HOME_OFFSET and soft limits, old and new.
+"""HOME_OFFSET and soft limits of the controller's joints, before and after a calibration.
 
-Homing leaves a joint at a place, that of its switch, and calls what it shows there HOME_OFFSET.
-Where the drive really is there is not what it shows: offsets are what is missing. So, with the
-direction s in which the joint counts, of what is to be entered less what is active already,
+Homing assigns HOME_OFFSET to the joint at its switch. An offset o is the difference between the
+drive's coordinate and the one that the joint displays. With the direction s of the joint,
 
-    HOME_OFFSET_new = HOME_OFFSET_old + s (o_new − o_active),
+    HOME_OFFSET_new = HOME_OFFSET_old + s (o_new − o_active).
 
-and soft limits, which belong to places of the slide, move along.
+Soft limits belong to positions of the slide and change by the same amount.
 """
 
 from __future__ import annotations
@@ -20,50 +19,53 @@ from numpy.typing import NDArray
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ParameterError
-from orthocal.units import DRIVE_UNITS, Unit
+from orthocal.units import DRIVE_UNITS, Unit, format_fixed
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointHome:
-    """Where a joint of the controller begins to count, in its own direction."""
+    """HOME_OFFSET and soft limits of a joint."""
 
     drive: str
     unit: Unit
     direction: int
-    """1 where the joint grows with the drive's coordinate, -1 where it falls."""
+    """1 if the joint grows with the drive's coordinate, -1 if it falls."""
     change: float
-    """What to add to HOME_OFFSET, MIN_LIMIT and MAX_LIMIT, [unit]."""
+    """Change of HOME_OFFSET, MIN_LIMIT and MAX_LIMIT, [unit]."""
     old: float | None
-    """HOME_OFFSET while measuring, [unit]; None where it was not said."""
+    """HOME_OFFSET during the measurement, [unit]; None if unknown."""
     limits: tuple[float, float] | None
-    """Least and largest that the joint could show while measuring, [unit]; infinite where nothing
-    limits it. None where the session does not say which offset was active."""
+    """Soft limits during the measurement, [unit]; infinite without a limit. None if the session
+    does not state the active offsets."""
 
     @property
     def new(self) -> float | None:
-        """HOME_OFFSET to enter, [unit]; None where the old one was not said."""
+        """HOME_OFFSET to enter, [unit]; None if the old one is unknown."""
         return None if self.old is None else self.old + self.change
 
     @property
     def new_limits(self) -> tuple[float, float] | None:
-        """Limits to enter, [unit]."""
+        """Soft limits to enter, [unit]."""
         if self.limits is None:
             return None
         return self.limits[0] + self.change, self.limits[1] + self.change
 
     @property
     def joint_unit(self) -> str:
-        """Unit in which LinuxCNC has the joint: mm or deg."""
+        """Unit of the joint in LinuxCNC: mm or deg."""
         return DRIVE_UNITS[self.unit][0]
 
+    @property
+    def counting(self) -> str:
+        """Direction in which the joint counts: up or down."""
+        return "up" if self.direction > 0 else "down"
+
     def show(self, value: float, *, sign: bool = False) -> str:
-        """A value in that unit, to 0.1 µm or to a millionth of a degree."""
+        """Value in the joint's unit, to 0.1 µm or 1e-6 degrees."""
         unit, size = DRIVE_UNITS[self.unit]
-        decimals = 4 if unit == "mm" else 6
-        shown = round(value / size, decimals) + 0.0
-        return f"{shown:{'+' if sign else ''}.{decimals}f}"
+        return format_fixed(value / size, 4 if unit == "mm" else 6, sign=sign)
 
 
 def find_homes(
@@ -73,10 +75,10 @@ def find_homes(
 
     Args:
         calibration: The calibration.
-        old: HOME_OFFSET while measuring of each joint, [m, rad].
+        old: HOME_OFFSET of each joint during the measurement, [m, rad].
 
     Raises:
-        ParameterError: If there are not as many old values as drives.
+        ParameterError: If the number of old values is not that of the drives.
     """
     drives = calibration.robot.drives
     if old is not None and len(old) != len(drives):

@@ -1,17 +1,17 @@
-"""The nominal inverse kinematics in closed form, where the robot has one: found by its numbers.
+"""Closed form of a robot's nominal inverse kinematics, identified from points of its model.
 
-A slide along a unit vector u that holds the tool by a rod, or a parallelogram, of length L moves
+A slide along a unit vector u that holds the tool by a rod or a parallelogram of length L is at
 
     r = u · d + s √(L² − |d|² + (u · d)²),  d = p − a,  s = ±1,
 
-with a the tool's place where rod and slide are at their zero. The Orthoglide, where u is an axis
-and a is 0 (equation 2), linear deltas and biglides are such. Squared, this is linear in what is
-unknown,
+where a is the tool position at which rod and slide coordinate are zero. The Orthoglide (u an axis
+and a = 0, equation 2), linear deltas and biglides have this form. Squared, it is linear in the
+unknowns,
 
     2 a · p + 2 r (u · p) − 2 m r + k = |p|² + r²,  m = u · a, k = L² − |a|²,
 
-so few points of the model tell whether a drive is such a slide. Where one is not, the nominal form
-is the tangent in the middle of the region.
+so that a few points of the model identify them. For any other robot the nominal form is the tangent
+at the middle of the region.
 """
 
 from __future__ import annotations
@@ -28,21 +28,22 @@ from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
 
-SAME = 1e-9
-"""By which a closed form may differ from the model, [m]."""
+TOLERANCE = 1e-9
+"""Largest difference of the closed form from the model, [m]."""
 
-ROUNDED = 12
-"""Decimals of what is found: those after are rounding."""
+DECIMALS = 12
+"""Decimals of the identified numbers; further ones are rounding errors."""
 
 POINTS = 60
+"""Number of points for the identification."""
 
 TANGENT_STEP = 1e-3
-"""Of the differences that make the tangent, in half sides of the region."""
+"""Step of the finite differences, relative to half the side of the region."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlidesWithRods:
-    """Every drive a slide that holds the tool by a rod."""
+    """Inverse kinematics of slides that hold the tool by rods."""
 
     axes: Array
     """u, unit vectors, shape (n, n)."""
@@ -54,10 +55,7 @@ class SlidesWithRods:
     """s, shape (n,)."""
 
     def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Drive coordinates, (K, n), [m], and their slopes by the tool, (K, n, n).
-
-        NaN where a rod does not reach.
-        """
+        """Drive coordinates, (k, n), [m], and their Jacobian, (k, n, n); NaN out of reach."""
         d = points[:, None, :] - self.anchors
         along = np.einsum("kij,ij->ki", d, self.axes)
         across = d - along[..., None] * self.axes
@@ -68,19 +66,19 @@ class SlidesWithRods:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tangent:
-    """What the drives do in the middle of a region, and everywhere by its slopes."""
+    """Inverse kinematics linearised at the middle of a region."""
 
     middle: Array
     """Shape (n,), [m]."""
     values: Array
-    """Drive coordinates there, shape (n,), [m, rad]."""
-    slopes: Array
-    """Shape (n, n), [1 or rad/m]."""
+    """Drive coordinates at the middle, shape (n,), [m, rad]."""
+    jacobian: Array
+    """Derivatives of the drive coordinates, shape (n, n), [1 or rad/m]."""
 
     def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Drive coordinates, (K, n), [m, rad], and their slopes by the tool, (K, n, n)."""
-        values = self.values + (points - self.middle) @ self.slopes.T
-        return values, np.broadcast_to(self.slopes, (len(points), *self.slopes.shape))
+        """Drive coordinates, (k, n), [m, rad], and their Jacobian, (k, n, n)."""
+        values = self.values + (points - self.middle) @ self.jacobian.T
+        return values, np.broadcast_to(self.jacobian, (len(points), *self.jacobian.shape))
 
 
 NominalForm = SlidesWithRods | Tangent
@@ -90,30 +88,30 @@ def find_nominal_form(robot: Robot, middle: Array, half: Array) -> NominalForm:
     """Closed form of a robot's nominal inverse kinematics, or its tangent.
 
     Args:
-        robot: With as many drives as coordinates of the tool that they control.
-        middle: Of the region, shape (n,), [m].
-        half: Half its sides, shape (n,), [m].
+        robot: Robot whose drives command the tool.
+        middle: Middle of the region, shape (n,), [m].
+        half: Half the sides of the region, shape (n,), [m].
     """
     n = middle.size
     points = middle + half * np.random.default_rng(0).uniform(-1.0, 1.0, (POINTS, n))
     inverse = nominal_assembly(robot).inverse
     try:
         drives = inverse(points)
-    except ClosureError:  # a nominal machine need not reach all that the calibrated one does
+    except ClosureError:  # the nominal machine may not reach the region of the calibrated one
         drives = None
     if drives is not None and all(d.unit == "m" for d in robot.drives):
-        found = _as_slides(points, drives)
-        if found is not None:
-            return found
+        slides = _identify_slides(points, drives)
+        if slides is not None:
+            return slides
     step = TANGENT_STEP * half
     around = middle + np.concatenate([np.zeros((1, n)), np.diag(step), -np.diag(step)])
     values = inverse(around)
-    slopes = (values[1 : 1 + n] - values[1 + n :]) / (2.0 * step[:, None])
-    return Tangent(read_only(middle), read_only(values[0]), read_only(slopes.T))
+    columns = (values[1 : 1 + n] - values[1 + n :]) / (2.0 * step[:, None])
+    return Tangent(read_only(middle), read_only(values[0]), read_only(columns.T))
 
 
-def _as_slides(points: Array, drives: Array) -> SlidesWithRods | None:
-    """The closed form of which these are points; None if they are not."""
+def _identify_slides(points: Array, drives: Array) -> SlidesWithRods | None:
+    """Closed form of slides with rods through points; None if it does not fit them."""
     n = points.shape[1]
     parts = []
     for r in drives.T:
@@ -122,13 +120,12 @@ def _as_slides(points: Array, drives: Array) -> SlidesWithRods | None:
         scale = np.abs(rows).max(axis=0)
         x = np.linalg.lstsq(rows / scale, right, rcond=None)[0] / scale
         anchor, axis, square = x[:n], x[n : 2 * n], x[-1] + float(x[:n] @ x[:n])
-        if abs(np.linalg.norm(axis) - 1.0) > SAME or square <= 0.0:
+        if abs(np.linalg.norm(axis) - 1.0) > TOLERANCE or square <= 0.0:
             return None
         sign = np.sign(r - (points - anchor) @ axis)
         parts.append((axis, anchor, np.sqrt(square), sign[0]))
     axes, anchors, lengths, signs = (
-        read_only(np.round(np.array(p), ROUNDED) + 0.0) for p in zip(*parts, strict=True)
+        read_only(np.round(np.array(p), DECIMALS) + 0.0) for p in zip(*parts, strict=True)
     )
-    found = SlidesWithRods(axes, anchors, lengths, signs)
-    off = np.abs(found(points)[0] - drives).max()
-    return found if off < SAME else None
+    slides = SlidesWithRods(axes, anchors, lengths, signs)
+    return slides if np.abs(slides(points)[0] - drives).max() < TOLERANCE else None

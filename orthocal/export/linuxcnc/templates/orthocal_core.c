@@ -1,8 +1,7 @@
-/* Kinematics of $robot as calibrated: $title.
-   Within $achieved um of the calibrated machine over, mm:
-   $region, for a tool at $tool.
-   Beyond, the correction stays what it is at the nearest
-   face. */
+/* Calibrated kinematics of $robot: $title.
+   Largest error of the tip $achieved um over the region, mm:
+   $region, for a tip at $tool.
+   Beyond the region the correction is that of the nearest face. */
 #ifdef RTAPI
 #include "rtapi_math.h"
 #else
@@ -15,29 +14,29 @@
 #define TERMS $terms
 
 #define MOST_STEPS 30
-#define SETTLED 1e-10 /* mm */
+#define TOLERANCE 1e-10 /* mm */
 
-/* the region: its middle and half its sides, mm */
+/* middle and half the sides of the region, mm */
 static const double middle[N] = $middle;
 static const double half[N] = $half;
 
-/* powers of each term, and what it counts in each joint */
-static const unsigned char power[TERMS][N] = $power;
+/* exponents of each term, and its coefficient in each joint */
+static const unsigned char exponent[TERMS][N] = $exponent;
 static const double coefficient[N][TERMS] = $coefficient;
 
 $nominal
-static double size_of(double value)
+static double absolute(double value)
 {
     return value < 0.0 ? -value : value;
 }
 
-/* Joints at a point, and their slopes there where these are asked for. */
-static int evaluate(const double p[N], double q[N], double (*slope)[N])
+/* Joints at a point, and their Jacobian unless it is a null pointer. */
+static int evaluate(const double p[N], double q[N], double (*jacobian)[N])
 {
-    double powers[N][DEGREE + 1], by_scaled[N];
+    double powers[N][DEGREE + 1], scale[N];
     int i, j, k, t;
 
-    if (nominal(p, q, slope) != 0)
+    if (nominal(p, q, jacobian) != 0)
         return -1;
     for (k = 0; k < N; k++) {
         double x = (p[k] - middle[k]) / half[k];
@@ -45,7 +44,7 @@ static int evaluate(const double p[N], double q[N], double (*slope)[N])
 
         if (outside)
             x = x < 0.0 ? -1.0 : 1.0;
-        by_scaled[k] = outside ? 0.0 : 1.0 / half[k];
+        scale[k] = outside ? 0.0 : 1.0 / half[k];
         powers[k][0] = 1.0;
         for (j = 1; j <= DEGREE; j++)
             powers[k][j] = powers[k][j - 1] * x;
@@ -54,18 +53,18 @@ static int evaluate(const double p[N], double q[N], double (*slope)[N])
         double term = 1.0;
 
         for (k = 0; k < N; k++)
-            term *= powers[k][power[t][k]];
+            term *= powers[k][exponent[t][k]];
         for (i = 0; i < N; i++)
             q[i] += coefficient[i][t] * term;
-        for (k = 0; slope && k < N; k++) {
-            double change = power[t][k] * by_scaled[k];
+        for (k = 0; jacobian && k < N; k++) {
+            double derivative = exponent[t][k] * scale[k];
 
-            if (power[t][k] == 0)
+            if (exponent[t][k] == 0)
                 continue;
             for (j = 0; j < N; j++)
-                change *= powers[j][power[t][j] - (j == k)];
+                derivative *= powers[j][exponent[t][j] - (j == k)];
             for (i = 0; i < N; i++)
-                slope[i][k] += coefficient[i][t] * change;
+                jacobian[i][k] += coefficient[i][t] * derivative;
         }
     }
     return 0;
@@ -79,14 +78,14 @@ int orthocal_inverse(const double point[N], double joints[N])
     if (evaluate(point, q, 0) != 0)
         return -1;
     for (i = 0; i < N; i++)
-        if (!(size_of(q[i]) < 1e12))
+        if (!(absolute(q[i]) < 1e12))
             return -1;
     for (i = 0; i < N; i++)
         joints[i] = q[i];
     return 0;
 }
 
-/* x of a x = b, by elimination; -1 where a is singular. */
+/* Solution of a x = b in b, by Gaussian elimination; -1 if a is singular. */
 static int solve(double a[N][N], double b[N])
 {
     int i, j, k;
@@ -95,21 +94,21 @@ static int solve(double a[N][N], double b[N])
         int best = k;
 
         for (i = k + 1; i < N; i++)
-            if (size_of(a[i][k]) > size_of(a[best][k]))
+            if (absolute(a[i][k]) > absolute(a[best][k]))
                 best = i;
-        if (!(size_of(a[best][k]) > 1e-9))
+        if (!(absolute(a[best][k]) > 1e-9))
             return -1;
         for (j = 0; j < N; j++) {
-            double kept = a[k][j];
+            double swap = a[k][j];
 
             a[k][j] = a[best][j];
-            a[best][j] = kept;
+            a[best][j] = swap;
         }
         {
-            double kept = b[k];
+            double swap = b[k];
 
             b[k] = b[best];
-            b[best] = kept;
+            b[best] = swap;
         }
         for (i = k + 1; i < N; i++) {
             double factor = a[i][k] / a[k][k];
@@ -127,33 +126,33 @@ static int solve(double a[N][N], double b[N])
     return 0;
 }
 
-/* Newton from p, its steps within half the region. */
-static int follow(const double joints[N], double p[N])
+/* Newton iteration from p, with steps of at most half the region. */
+static int iterate(const double joints[N], double p[N])
 {
     int i, count;
 
     for (count = 0; count < MOST_STEPS; count++) {
-        double q[N], slope[N][N], largest = 0.0, allowed = 1.0;
+        double q[N], jacobian[N][N], largest = 0.0, fraction = 1.0;
 
-        if (evaluate(p, q, slope) != 0)
+        if (evaluate(p, q, jacobian) != 0)
             return -1;
         for (i = 0; i < N; i++)
             q[i] = joints[i] - q[i];
-        if (solve(slope, q) != 0)
+        if (solve(jacobian, q) != 0)
             return -1;
         for (i = 0; i < N; i++) {
-            double size = size_of(q[i]);
+            double size = absolute(q[i]);
 
             if (!(size < 1e12))
                 return -1;
             if (size > largest)
                 largest = size;
-            if (size * allowed > half[i])
-                allowed = half[i] / size;
+            if (size * fraction > half[i])
+                fraction = half[i] / size;
         }
         for (i = 0; i < N; i++)
-            p[i] += allowed * q[i];
-        if (largest < SETTLED)
+            p[i] += fraction * q[i];
+        if (largest < TOLERANCE)
             return 0;
     }
     return -1;
@@ -162,17 +161,17 @@ static int follow(const double joints[N], double p[N])
 int orthocal_forward(const double joints[N], double point[N])
 {
     double p[N];
-    int i, begin;
+    int i, attempt;
 
-    for (begin = 0; begin < 2; begin++) {
+    for (attempt = 0; attempt < 2; attempt++) {
         for (i = 0; i < N; i++) {
-            double from = point[i] - middle[i];
+            double distance = point[i] - middle[i];
 
             p[i] = middle[i];
-            if (begin == 0 && size_of(from) < half[i])
+            if (attempt == 0 && absolute(distance) < half[i])
                 p[i] = point[i];
         }
-        if (follow(joints, p) == 0) {
+        if (iterate(joints, p) == 0) {
             for (i = 0; i < N; i++)
                 point[i] = p[i];
             return 0;

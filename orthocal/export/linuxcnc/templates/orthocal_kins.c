@@ -8,9 +8,9 @@
 
 #define LETTERS 6
 
-/* coordinates that the drives command, x = 0, and those that joints after them carry as they are */
+/* coordinates that the drives command (x = 0), and those that equal the joints after the drives */
 static const int commanded[N] = $commanded;
-static const int carried[LETTERS - N] = $carried;
+static const int identity[LETTERS - N] = $identity;
 
 static double *coordinate(EmcPose *world, int letter)
 {
@@ -40,7 +40,7 @@ int kinematicsForward(const double *joints, EmcPose *world,
     for (i = 0; i < N; i++)
         *coordinate(world, commanded[i]) = point[i];
     for (i = 0; i < LETTERS - N; i++)
-        *coordinate(world, carried[i]) = joints[N + i];
+        *coordinate(world, identity[i]) = joints[N + i];
     world->u = world->v = world->w = 0.0;
     return 0;
 }
@@ -60,7 +60,7 @@ int kinematicsInverse(const EmcPose *world, double *joints,
     if (orthocal_inverse(point, joints) != 0)
         return -1;
     for (i = 0; i < LETTERS - N; i++)
-        joints[N + i] = *coordinate(&pose, carried[i]);
+        joints[N + i] = *coordinate(&pose, identity[i]);
     return 0;
 }
 

@@ -1,0 +1,214 @@
+"""Instructions for a LinuxCNC machine: lines of its INI, and a page (README.md)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from orthocal.assessment.controller_entries import entered_offsets, find_entries
+from orthocal.calibration.calibration import Calibration
+from orthocal.export.linuxcnc.approximation import (
+    BEYOND,
+    LETTERS,
+    LONGER,
+    Approximation,
+    millimetres,
+    rounded_up,
+)
+from orthocal.export.linuxcnc.home_offsets import JointHome
+from orthocal.export.linuxcnc.nominal_form import Tangent
+from orthocal.text import comment_safe
+from orthocal.units import DRIVE_UNITS, MM, UM
+
+SMALLEST_ERROR = 1e-9
+"""Smallest error that a page states, [m]."""
+
+
+def write_home_lines(homes: Sequence[JointHome]) -> str:
+    """INI lines with HOME_OFFSET, MIN_LIMIT and MAX_LIMIT of each joint."""
+    lines = ["# HOME_OFFSET and soft limits with the calibrated offsets. Keep all other lines."]
+    for i, home in enumerate(homes):
+        lines += [
+            "",
+            f"[JOINT_{i}]",
+            f"# {comment_safe(home.drive)}, counts {home.counting}: "
+            f"{home.show(home.change, sign=True)} {home.joint_unit}",
+            _line("HOME_OFFSET", home, home.new),
+            *_limit_lines(home, home.new_limits),
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def write_module_lines(approximation: Approximation, homes: Sequence[JointHome]) -> str:
+    """INI lines for the kinematics module: axes limited to the region, joints as they were."""
+    coordinates, inverse = approximation.coordinates, approximation.inverse
+    lines = [
+        "# Calibrated kinematics module. HOME_OFFSET remains that of the measurement.",
+        "",
+        "[KINS]",
+        "KINEMATICS = orthocal_kins",
+        f"JOINTS = {len(homes)}",
+        "",
+        "[TRAJ]",
+        f"COORDINATES = {''.join(LETTERS[k] for k in sorted(coordinates))}",
+        "LINEAR_UNITS = mm",
+        "ANGULAR_UNITS = degree",
+    ]
+    for k, low, high in zip(coordinates, inverse.lower, inverse.upper, strict=True):
+        lines += [
+            "",
+            f"[AXIS_{LETTERS[k]}]",
+            f"MIN_LIMIT = {millimetres([low])}",
+            f"MAX_LIMIT = {millimetres([high])}",
+        ]
+    for i, home in enumerate(homes):
+        kind = "LINEAR" if home.unit == "m" else "ANGULAR"
+        lines += ["", f"[JOINT_{i}]", f"# {comment_safe(home.drive)}", f"TYPE = {kind}"]
+        if home.old is not None:
+            lines.append(f"HOME_OFFSET = {home.show(home.old)}")
+        if home.limits is not None:
+            lines += _limit_lines(home, home.limits)
+    return "\n".join(lines) + "\n"
+
+
+def _limit_lines(home: JointHome, limits: tuple[float, float] | None) -> list[str]:
+    names = ("MIN_LIMIT", "MAX_LIMIT")
+    values = (None, None) if limits is None else limits
+    return [
+        _line(name, home, value)
+        for name, value in zip(names, values, strict=True)
+        if value is None or math.isfinite(value)
+    ]
+
+
+def _line(name: str, home: JointHome, value: float | None) -> str:
+    if value is None:
+        return f"# {name} = present value {home.show(home.change, sign=True)}"
+    return f"{name} = {home.show(value)}"
+
+
+def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str:
+    """README.md for offsets that are entered as HOME_OFFSET."""
+    std = {e.drive: e.std for e in find_entries(calibration)}
+    rows = []
+    for i, home in enumerate(homes):
+        change = home.show(home.change, sign=True)
+        if home.old is None or home.new is None:
+            entered = f"present value {change}"
+        else:
+            entered = f"{home.show(home.old)} → **{home.show(home.new)}**"
+        of_drive = std.get(home.drive, math.nan)
+        uncertainty = "" if math.isnan(of_drive) else f"± {home.show(of_drive)}"
+        cells = (
+            f"JOINT_{i}",
+            comment_safe(home.drive),
+            home.counting,
+            entered,
+            change,
+            uncertainty,
+            home.joint_unit,
+        )
+        rows.append(f"| {' | '.join(cells)} |")
+    table = "\n".join(rows)
+    unit, size = DRIVE_UNITS[homes[0].unit]
+    active = ", ".join(f"{v / size:.6g}" for v in entered_offsets(calibration))
+    scope = "The calibration identified offsets of the drives only."
+    if not calibration.only_offsets:
+        scope = (
+            "The calibration identified more than offsets. These offsets minimise the tool error\n"
+            "while nothing else is corrected."
+        )
+    return f"""\
+# {comment_safe(calibration.robot.name)}: HOME_OFFSET for LinuxCNC
+
+{scope} Enter them as HOME_OFFSET; the kinematics do not change.
+
+| section | drive | counts | HOME_OFFSET | change | one σ | unit |
+|---|---|---|---|---|---|---|
+{table}
+
+1. Copy your INI file, so that you can restore it.
+2. Enter HOME_OFFSET of the table in each section. Add the same change to MIN_LIMIT and MAX_LIMIT:
+   they belong to positions of the slide. `joints.ini` in this directory has the lines. HOME does
+   not change.
+3. Restart LinuxCNC and home every joint. The change takes effect then.
+4. Check before you move the machine: with a slide in its old position, its joint displays the old
+   value plus the change above.
+5. Measure again and run `orthocal validate`. The entered offsets are active now. State them in the
+   next session.yaml: `controller: {{offsets_{unit}: [{active}]}}`.
+
+Home slowly: homing repeats to the distance that a joint moves in one servo period at
+HOME_LATCH_VEL.
+
+All numbers are in mm and degrees. If your INI has `LINEAR_UNITS = inch`, divide lengths by 25.4.
+"""
+
+
+def write_module_page(
+    calibration: Calibration, approximation: Approximation, homes: Sequence[JointHome]
+) -> str:
+    """README.md of a kinematics module: how to build and enter it, its errors and its limits."""
+    inverse = approximation.inverse
+    polynomial = inverse.correction
+    letters = [c for k, c in enumerate(LETTERS) if k not in approximation.coordinates]
+    form = f"a polynomial of degree {polynomial.degree} ({len(polynomial.exponents)} terms a joint)"
+    if isinstance(inverse.nominal, Tangent):
+        form = f"They are {form}."
+    else:
+        form = f"They are the closed form of the nominal machine, corrected by {form}."
+    nominal = beyond = ""
+    if approximation.nominal is not None:
+        nominal = (
+            f"With nominal kinematics the error is up to {approximation.nominal / MM:.3f} mm. "
+        )
+    if approximation.beyond is not None:
+        error = rounded_up(approximation.beyond / UM)
+        beyond = f" {BEYOND / MM:g} mm beyond a face the error is up to {error} µm."
+    achieved = rounded_up(max(approximation.achieved, SMALLEST_ERROR) / UM)
+    longer = rounded_up(approximation.longer / UM)
+    drives = ", ".join(comment_safe(h.drive) for h in homes)
+    reason = "The calibration identified more than offsets."
+    if calibration.only_offsets:
+        reason = "The calibration identified offsets only; a module was requested."
+    old = [f"JOINT_{i} {h.show(h.old)}" for i, h in enumerate(homes) if h.old is not None]
+    old_values = f" ({', '.join(old)})" if old else ""
+    return f"""\
+# {comment_safe(calibration.robot.name)}: kinematics for LinuxCNC
+
+{reason} This kinematics module contains the kinematics of the calibrated machine.
+{form}
+
+**Its error is within {achieved} µm** of the calibrated machine, over {approximation.region} mm,
+for a tip at {millimetres(approximation.tool)} mm in the frame of the tool centre point.
+This is the largest error at {approximation.checked} points that were not fitted, plus 10 %.
+{nominal}The uncertainty of the calibration itself is in its report.
+
+## Build and enter
+
+1. If there is no `halcompile`: `sudo apt install linuxcnc-uspace-dev`.
+2. In this directory: `sudo halcompile --install orthocal_kins.c`. It needs all three C files.
+3. Copy your INI file, so that you can restore it. Enter the lines of `kinematics.ini` of this
+   directory.
+4. **HOME_OFFSET remains that of the measurement**{old_values}: the module contains the offsets.
+   Entered as HOME_OFFSET too, they would count twice. Soft limits of joints do not change either.
+5. Restart LinuxCNC and home every joint.
+
+Take readings for orthocal with nominal kinematics: restore the old INI lines before you measure
+again.
+
+The drives are joints 0 to {len(homes) - 1}: {drives}. Joints after them equal the coordinates
+{", ".join(letters)}.
+
+## Limits
+
+- **Region.** Beyond {approximation.region} mm the correction is that of the nearest
+  face.{beyond} `--half-side-mm` sets a larger region.
+- **Tool.** The platform is tilted. The error of a tip {LONGER / MM:g} mm farther in any direction
+  is up to {longer} µm: for another tool, export again with `--tool`. Tool offsets (G43) and work
+  offsets work as usual: LinuxCNC adds them before the kinematics.
+- **Units.** The module uses mm and degrees: `LINEAR_UNITS = mm`, `ANGULAR_UNITS = degree`.
+- If a leg does not reach a point, the module returns an error, and LinuxCNC stops.
+- The forward kinematics invert the same numbers by iteration, to less than a nanometre.
+
+`orthocal_core.c` needs no LinuxCNC: any controller that runs C99 can call it.
+"""
