@@ -1,18 +1,17 @@
-"""LinuxCNC in simulation, without a display: what it was told to do, and where its slides were.
+"""LinuxCNC in simulation, without a display: runs programs and records the slides.
 
 Debian's linuxcnc-uspace runs it and linuxcnc-uspace-dev builds modules (`.ci/run` installs both).
-Where $ORTHOCAL_LINUXCNC is `required`, as in continuous integration, their absence is a failure;
-elsewhere these tests are skipped, with the reason.
+If $ORTHOCAL_LINUXCNC is `required`, as in continuous integration, a test fails without them;
+otherwise it is skipped with the reason.
 
-Its real-time part refuses root. Where the tests run as root, it is run as `nobody`, in a folder of
-that user's. It loads modules from its own folder alone, which root may write to: there the exported
-one is installed as its page says, and taken away again; where the tests run as somebody else, runs
-with a module are skipped. One instance runs on a machine, so runs wait for each other at a lock,
-across all workers.
+The real-time part of LinuxCNC refuses root. Root runs it as `nobody`, in a directory of that user.
+LinuxCNC loads modules from its own directory only, which needs root: the exported module is
+installed there for the run, and other users skip runs with a module. Only one instance can run on a
+machine, so all workers share a lock.
 
-Each joint moves a slide in HAL: its coordinate as an encoder gives it is c = begin + s m, with the
-motor's position m from where the machine was switched on and the direction s. A home switch closes
-at a place of that slide, whatever the controller shows there.
+Each joint moves a slide in HAL. The encoder coordinate of the slide is c = begin + s m, with the
+motor's position m since power-on and the direction s. A home switch closes at a position of the
+slide, independently of the coordinate that the controller displays.
 """
 
 from __future__ import annotations
@@ -39,33 +38,33 @@ MODULES = Path("/usr/lib/linuxcnc/modules")
 MODULE = "orthocal_kins"
 
 BUSY = Path("/tmp/linuxcnc.lock")
-"""LinuxCNC's own: it runs already."""
+"""Lock file of a running LinuxCNC."""
 
 LONGEST = 60.0
-"""[s] Of a run that takes five."""
+"""Longest run, [s]; most take five."""
 
 USER = "nobody"
 
 SEARCH = 8.0
-"""[mm/s] Towards the switch."""
+"""Homing speed towards the switch, [mm/s]."""
 
 LATCH = 0.02
-"""[mm/s] Onto the switch: in a servo period of 1 ms it moves 0.02 µm."""
+"""Homing speed onto the switch, [mm/s]: 0.02 µm in a servo period of 1 ms."""
 
 BEFORE_SWITCH = 2.0
-"""[mm] Of the slides where the machine is switched on."""
+"""Distance of the slides from their switches at power-on, [mm]."""
 
 WINDOW = Path("/usr/bin/axis")
-"""Program of the window that opens programs, and has them filtered first."""
+"""LinuxCNC's window, which filters and opens programs."""
 
 PYTHON = "/usr/bin/python3"
-"""The one that LinuxCNC's window runs in."""
+"""Interpreter of LinuxCNC's window."""
 
 OPEN = """\
 import ast, json, linuxcnc, os, re, select, subprocess, sys
 
 window, ini, program, result = sys.argv[1:]
-told = []
+progress = []
 
 
 class Progress:
@@ -73,7 +72,7 @@ class Progress:
         pass
 
     def update(self, count, force=0):
-        told.append(count)
+        progress.append(count)
 
     def set_text(self, *_):
         pass
@@ -97,7 +96,7 @@ space = {"os": os, "re": re, "select": select, "sys": sys, "_": str, "t": t,
 exec(compile(ast.Module(own, []), window, "exec"), space)
 command = space["get_filter"](program)
 code, said = (None, "") if command is None else space["filter_program"](command, program, result)
-json.dump({"code": code, "said": said, "progress": told}, sys.stdout)
+json.dump({"code": code, "said": said, "progress": progress}, sys.stdout)
 """
 
 BASE = """\
@@ -269,19 +268,19 @@ except Exception as e:
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint as the controller is set up, and the slide that it moves; mm."""
+    """A joint of the controller and the slide that it moves, [mm]."""
 
     direction: int
-    """1 where the slide's coordinate grows with the joint, -1 where it falls."""
+    """1 if the slide's coordinate grows with the joint, -1 if it falls."""
     switch: float
-    """Coordinate of the slide, as its encoder gives it, where its home switch closes."""
+    """Encoder coordinate of the slide at which the home switch closes."""
     home_offset: float
     home: float
-    """What the joint shows where it goes after homing."""
+    """Joint coordinate after homing."""
 
 
 def require_linuxcnc():
-    """Skip where there is no LinuxCNC to run; fail where one must be."""
+    """Skip the test without LinuxCNC, or fail if it is required."""
     missing = [p for p in PROGRAMS if shutil.which(p) is None]
     if missing:
         _without(f"no LinuxCNC to run: there is no {' and no '.join(missing)}")
@@ -295,9 +294,9 @@ def _without(reason):
 
 @contextmanager
 def only_one():
-    """Wait for other workers' runs, and keep them out."""
+    """Hold the lock of LinuxCNC across all workers."""
     with open(Path(tempfile.gettempdir()) / "orthocal-linuxcnc.lock", "a") as lock:
-        with suppress(PermissionError):  # somebody else's
+        with suppress(PermissionError):  # of another user
             os.chmod(lock.fileno(), 0o666)
         fcntl.flock(lock, fcntl.LOCK_EX)
         if BUSY.exists():
@@ -306,7 +305,7 @@ def only_one():
 
 
 def build_module(folder, *, install=False):
-    """Build the exported module in its folder, which takes no right; or install it."""
+    """Compile the exported module in its directory, or install it."""
     how = "--install" if install else "--compile"
     done = subprocess.run(
         ["halcompile", how, f"{MODULE}.c"], cwd=folder, capture_output=True, text=True
@@ -318,7 +317,7 @@ def build_module(folder, *, install=False):
 
 @contextmanager
 def installed(folder):
-    """An exported module where LinuxCNC finds it, for as long as it takes."""
+    """Install an exported module for the duration of a run."""
     target = MODULES / f"{MODULE}.so"
     if os.geteuid() != 0:
         _without("modules are installed by root")
@@ -367,16 +366,16 @@ def run_programs(runs, joints, *, letters="XYZ", lines="", module=None):
 
 
 def filter_program(ini, program, result):
-    """What LinuxCNC's window makes of a program before it opens it, by the window's own functions.
+    """Filter a program as LinuxCNC's window does, with the window's functions.
 
     Args:
         ini: Text of the INI.
-        program: The file that somebody opens.
-        result: The file that is opened instead.
+        program: File to open.
+        result: Filtered file.
 
     Returns:
-        Exit code of the filter, None where the INI has none for such files; what it said; and how
-        far the window was told that it is, in percent.
+        Exit code of the filter, None if the INI has none for the file; its messages; and the
+        progress that the window received, in percent.
     """
     require_linuxcnc()
     if not WINDOW.exists():
@@ -388,8 +387,8 @@ def filter_program(ini, program, result):
         words = [PYTHON, "open.py", str(WINDOW), "filtered.ini", str(program), str(result)]
         done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    return found["code"], found["said"], found["progress"]
+    result = json.loads(done.stdout)
+    return result["code"], result["said"], result["progress"]
 
 
 def _write(folder, runs, joints, *, letters, lines):
@@ -432,8 +431,8 @@ def _write(folder, runs, joints, *, letters, lines):
     folder.chmod(0o755)
 
 
-def type_lines(ini, lines):
-    """An INI with lines typed into their sections, in place of those of the same name."""
+def enter_lines(ini, lines):
+    """An INI with lines entered into their sections; equal names are replaced."""
     return _as_text(_sections(ini, lines))
 
 
@@ -460,10 +459,10 @@ def _as_text(sections):
 def _run(folder):
     who = {}
     if os.geteuid() == 0:
-        found = pwd.getpwnam(USER)
-        who = {"user": found.pw_uid, "group": found.pw_gid, "extra_groups": []}
+        user = pwd.getpwnam(USER)
+        who = {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []}
         for path in (folder, *folder.iterdir()):
-            os.chown(path, found.pw_uid, found.pw_gid)
+            os.chown(path, user.pw_uid, user.pw_gid)
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "PYTHONPATH")}
     environment |= {"HOME": str(folder), "LANG": "C", "TMPDIR": str(folder)}
     with open(folder / "said.txt", "w") as said:
@@ -487,6 +486,6 @@ def _run(folder):
     reason = failed.read_text() if failed.exists() else "nothing was recorded"
     if failed.exists() or not recorded.exists():
         pytest.fail(f"{reason}\n{(folder / 'said.txt').read_text()[-3000:]}")
-    rows = np.loadtxt(recorded, ndmin=2, comments="o")  # `overrun` stands where samples are lost
+    rows = np.loadtxt(recorded, ndmin=2, comments="o")  # `overrun` marks lost samples
     assert len(rows) > 100
     return rows, [np.array(places) for places in json.loads((folder / "pauses.json").read_text())]

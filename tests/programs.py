@@ -1,4 +1,4 @@
-"""Random programs with what they mean, and programs as polylines: by other ways than orthocal's."""
+"""Random programs with their motions, and a reader of polylines, independent of orthocal."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ INCH = 25.4
 
 @dataclass
 class Move:
-    """A motion as it was meant, in mm of the machine."""
+    """A motion in machine coordinates, [mm]."""
 
     number: int
     start: np.ndarray
     end: np.ndarray
     feed: float | None
-    """In mm a minute; None for a rapid one."""
+    """[mm/min]; None for a rapid motion."""
     center: np.ndarray | None = None
     normal: np.ndarray | None = None
     angle: float = 0.0
 
     def sample(self, count):
-        """Points on it, by Rodrigues' rotation about its centre, shape (count, 3)."""
+        """Points of the motion, by Rodrigues' rotation about its centre, shape (count, 3)."""
         t = np.linspace(0.0, 1.0, count)[:, None]
         if self.center is None:
             return self.start + t * (self.end - self.start)
@@ -52,14 +52,14 @@ class Program:
 def random_program(seed, *, moves=12, box=40.0, offset=(0.0, 0.0, 0.0), inches=True):
     """A program of lines, arcs, helices and full circles in all modes."""
     rng = np.random.default_rng(seed)
-    found = Program()
+    program = Program()
     offset = np.array(offset)
     unit, absolute, plane, arc_absolute, feed = 1.0, True, 17, False, None
     at = rng.uniform(-0.5, 0.5, 3) * box
-    found.text.append("G21 G90 G17 G94 G91.1 (begins)")
-    found.text.append(f"N1 G0 {words('XYZ', at - offset, 1.0)}")
+    program.text.append("G21 G90 G17 G94 G91.1 (begins)")
+    program.text.append(f"N1 G0 {words('XYZ', at - offset, 1.0)}")
     at = written(at - offset, 1.0) + offset
-    found.moves.append(Move(1, at, at, None))
+    program.moves.append(Move(1, at, at, None))
     for number in range(2, moves + 2):
         modes = []
         if rng.random() < 0.3:
@@ -76,12 +76,12 @@ def random_program(seed, *, moves=12, box=40.0, offset=(0.0, 0.0, 0.0), inches=T
             plane = int(rng.choice([17, 18, 19]))
             modes.append(f"G{plane}")
         if modes:
-            found.text.append(" ".join(modes))
+            program.text.append(" ".join(modes))
         kind = rng.choice(["G0", "G1", "G2", "G3"], p=[0.1, 0.3, 0.3, 0.3])
-        told = ""
+        feed_word = ""
         if kind != "G0" and (feed is None or rng.random() < 0.3):
             feed = written(float(rng.uniform(100, 2000)) / unit, 1.0) * unit
-            told = f" F{feed / unit:.4f}"
+            feed_word = f" F{feed / unit:.4f}"
         base = offset if absolute else at
         normal = np.array(NORMALS[plane])
         if kind in ("G0", "G1"):
@@ -128,15 +128,15 @@ def random_program(seed, *, moves=12, box=40.0, offset=(0.0, 0.0, 0.0), inches=T
                 axes += center_words(center - center_base, i, j, unit)
             axes += f" P{turns}" if turns > 1 else ""
             end = exact
-        found.text.append(f"N{number} {kind} {axes}{told} (move {number})")
-        found.moves.append(move)
+        program.text.append(f"N{number} {kind} {axes}{feed_word} (move {number})")
+        program.moves.append(move)
         at = end
-    found.text.append("M2")
-    return found
+    program.text.append("M2")
+    return program
 
 
 def written(value, unit):
-    """A value in mm as its decimals in another unit say it."""
+    """A value in mm, rounded to six decimals in another unit."""
     return np.round(np.asarray(value) / unit, 6) * unit
 
 
@@ -149,12 +149,12 @@ def center_words(values, i, j, unit):
 
 
 def read_polyline(lines, offset=(0.0, 0.0, 0.0)):
-    """Points and feeds of a program of G0 and G1 by number of its line: mm, mm a minute.
+    """Points and feeds of a program of G0 and G1 by line number, [mm], [mm/min].
 
     Returns:
         Number to a list of (point, feed).
     """
-    found, number, at = {}, 0, np.full(3, np.nan)
+    points, number, at = {}, 0, np.full(3, np.nan)
     unit, absolute, feed, rapid = 1.0, True, None, None
     for line in lines:
         text = re.sub(r"\([^)]*\)", "", line).split(";")[0]
@@ -172,12 +172,12 @@ def read_polyline(lines, offset=(0.0, 0.0, 0.0)):
             for k, name in enumerate("XYZ"):
                 if name in moved:
                     at[k] = moved[name] * unit + (offset[k] if absolute else old[k])
-            found.setdefault(number, []).append((np.array(at), None if rapid else feed))
-    return found
+            points.setdefault(number, []).append((np.array(at), None if rapid else feed))
+    return points
 
 
 def distances(points, polyline):
-    """Of points to a polyline, shape (k,)."""
+    """Distances of points from a polyline, shape (k,)."""
     a, b = polyline[:-1], polyline[1:]
     along = b - a
     square = np.maximum(np.einsum("ij,ij->i", along, along), 1e-30)
@@ -189,7 +189,7 @@ def distances(points, polyline):
 
 
 def own_distances(points, polyline):
-    """Of points to the pieces on which they are, the same number on each, shape (k,)."""
+    """Distances of points from their segments, with equally many points each, shape (k,)."""
     each = (len(points) - 1) // (len(polyline) - 1)
     piece = np.minimum(np.arange(len(points)) // each, len(polyline) - 2)
     a, along = polyline[piece], np.diff(polyline, axis=0)[piece]

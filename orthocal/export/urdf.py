@@ -1,7 +1,7 @@
-"""The calibrated machine as a robot folder: placements corrected in its own URDF, all else as is.
+"""Calibrated machine as a robot directory: its own URDF with corrected placements.
 
-A joint's origin T becomes T · exp6(δ) · exp6(a Δρ), with its error δ, axis a and offset Δρ; so does
-that of a fixed joint whose link, a frame that closures, legs or the tool name, is off.
+The origin T of a joint becomes T · exp6(δ) · exp6(a Δρ), with its error δ, axis a and offset Δρ.
+The errors of a frame of closures, legs or the tool correct the fixed joint that places its link.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from orthocal.units import PPM, tidy
 
 Array = NDArray[np.float64]
 
-SAME = 1e-9
-"""Placements of what was written and of the calibrated machine, [m, rad]."""
+TOLERANCE = 1e-9
+"""Largest difference of a written placement from the calibrated machine, [m, rad]."""
 
 _TAG = re.compile(rb"""<[^\s/>]+(?:[^>"']|"[^"]*"|'[^']*')*>""")
 _ATTRIBUTE = r"""(?<![\w:.-]){name}\s*=\s*(?P<quote>["'])(?P<value>.*?)(?P=quote)"""
 
 
 def export_urdf(calibration: Calibration) -> dict[str, str]:
-    """The robot's URDF with the errors that were identified, and its YAML as it is.
+    """Texts of the robot's URDF with the identified errors, and of its YAML without changes.
 
-    A drive's scale has no place in a URDF: it is told in a file of its own.
+    A URDF cannot express the scale of a drive: scales are in a separate file.
 
     Raises:
-        ExportError: If an error has no place in the URDF.
+        ExportError: If the URDF cannot express an error.
     """
     robot = calibration.robot
     content, description = (read_file(p, error=RobotError) for p in (robot.urdf, robot.yaml))
@@ -51,18 +51,18 @@ def export_urdf(calibration: Calibration) -> dict[str, str]:
     text = _correct(text, _find_twists(robot, errors), robot)
     _require_same(robot.with_errors(calibration.errors), text)
     files = {robot.urdf.name: text, robot.yaml.name: description.decode()}
-    gains = [
+    scales = [
         f"{e.owner},{tidy(value / PPM)}\n"
         for name, value in errors.items()
         if (e := robot.parameters.elementary[name]).kind == "scale" and value
     ]
-    if gains:  # a drive that is sent to q goes to (1 + scale) q
-        files["scales.csv"] = "drive,scale_ppm\n" + "".join(gains)
+    if scales:  # a drive commanded to q moves to (1 + scale) q
+        files["scales.csv"] = "drive,scale_ppm\n" + "".join(scales)
     return files
 
 
 def _find_twists(robot: Robot, errors: Mapping[str, float]) -> dict[str, list[Array]]:
-    """Joint of the URDF to the twists that its origin is moved by, in order."""
+    """Joints of the URDF with the twists that displace their origins, in order."""
     twists: dict[str, Array] = {}
     offsets: dict[str, Array] = {}
     mounts = _mounts(robot)
@@ -76,48 +76,48 @@ def _find_twists(robot: Robot, errors: Mapping[str, float]) -> dict[str, list[Ar
         owner = mounts.get(e.owner) if e.of_frame else e.owner
         if owner is None:
             raise ExportError(
-                f"{name} is an error of a frame on a moving link: a URDF has no place for it"
+                f"{name} is an error of a frame on a moving link: a URDF cannot express it"
             )
         twists.setdefault(owner, np.zeros(6))[e.axis] += value
     return {
-        joint: [own[joint] for own in (twists, offsets) if joint in own]
+        joint: [of_joint[joint] for of_joint in (twists, offsets) if joint in of_joint]
         for joint in {**twists, **offsets}
     }
 
 
 def _mounts(robot: Robot) -> dict[str, str]:
-    """Link, or fixed joint, to the fixed joint that places it."""
-    found = {}
+    """Links and fixed joints, mapped to the fixed joint that places them."""
+    mounts = {}
     for joint in parse_urdf(robot.urdf).findall("joint"):
         if joint.get("type") == "fixed":
             name = str(joint.get("name"))
-            found[name] = name
-            found[str(joint.find("child").get("link"))] = name
-    return found
+            mounts[name] = name
+            mounts[str(joint.find("child").get("link"))] = name
+    return mounts
 
 
 def _correct(text: str, twists: Mapping[str, list[Array]], robot: Robot) -> str:
-    """The text with the numbers of these joints' origins moved, and no other byte changed."""
+    """URDF with displaced origins of joints, and no other byte changed."""
     content = text.encode()
     line_end = "\r\n" if b"\r\n" in content else "\n"
     changes: list[tuple[int, int, str]] = []
-    left = dict(twists)
+    pending = dict(twists)
     for name, start, origin in _find_joints(content):
-        if name not in left:
+        if name not in pending:
             continue
-        moved = left.pop(name)
-        found = _TAG.match(content, start if origin is None else origin)
-        if found is None:
+        displacements = pending.pop(name)
+        tag = _TAG.match(content, start if origin is None else origin)
+        if tag is None:
             continue
         if origin is None:
-            placed = _moved({}, moved)
-            new = "".join(f' {key}="{placed.get(key, "0 0 0")}"' for key in ("xyz", "rpy"))
-            changes.append((found.end(), found.end(), f"{line_end}    <origin{new}/>"))
+            numbers = _displaced({}, displacements)
+            new = "".join(f' {key}="{numbers.get(key, "0 0 0")}"' for key in ("xyz", "rpy"))
+            changes.append((tag.end(), tag.end(), f"{line_end}    <origin{new}/>"))
         else:
-            changes.append((*found.span(), _rewrite(found[0].decode(), moved)))
-    if left:
+            changes.append((*tag.span(), _rewrite(tag[0].decode(), displacements)))
+    if pending:
         raise ExportError(
-            f"its URDF has no joint '{next(iter(left))}' of its own to correct",
+            f"its URDF has no joint '{next(iter(pending))}' to correct",
             where=str(robot.urdf),
         )
     for first, last, changed in sorted(changes, reverse=True):
@@ -126,11 +126,11 @@ def _correct(text: str, twists: Mapping[str, list[Array]], robot: Robot) -> str:
 
 
 def _find_joints(content: bytes) -> list[tuple[str, int, int | None]]:
-    """Name of each of the robot's own joints, and where in the file it and its origin begin.
+    """Names of the robot's joints with the byte positions of their tags and origins.
 
-    What a parser sees: not what stands in comments, nor joints that other elements name.
+    A parser finds them, so that comments and joints of other elements are not included.
     """
-    found: list[tuple[str, int, int | None]] = []
+    joints: list[tuple[str, int, int | None]] = []
     path: list[str] = []
     parser = expat.ParserCreate()
 
@@ -138,41 +138,44 @@ def _find_joints(content: bytes) -> list[tuple[str, int, int | None]]:
         path.append(tag)
         at = parser.CurrentByteIndex
         if path[1:] == ["joint"]:
-            found.append((composed(attributes.get("name", "")), at, None))
-        elif path[1:] == ["joint", "origin"] and found[-1][2] is None:
-            found[-1] = (*found[-1][:2], at)
+            joints.append((composed(attributes.get("name", "")), at, None))
+        elif path[1:] == ["joint", "origin"] and joints[-1][2] is None:
+            joints[-1] = (*joints[-1][:2], at)
 
     def end(_: str) -> None:
         path.pop()
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.Parse(content, True)
-    return found
+    return joints
 
 
 def _rewrite(origin: str, twists: list[Array]) -> str:
-    """An origin element with other numbers where they are others."""
-    given = {m[0]: m[1]["value"] for m in _attributes(origin)}
-    for key, value in _moved(given, twists).items():
-        place = next((m for name, m in _attributes(origin) if name == key), None)
-        if place is not None:
-            origin = f"{origin[: place.start('value')]}{value}{origin[place.end('value') :]}"
+    """Origin element with displaced numbers; unchanged ones keep their text."""
+    numbers = {m[0]: m[1]["value"] for m in _attributes(origin)}
+    for key, value in _displaced(numbers, twists).items():
+        attribute = next((m for name, m in _attributes(origin) if name == key), None)
+        if attribute is not None:
+            start, end = attribute.span("value")
+            origin = f"{origin[:start]}{value}{origin[end:]}"
         else:
-            end = re.search(r"\s*/?>$", origin)
-            at = len(origin) if end is None else end.start()
+            closing = re.search(r"\s*/?>$", origin)
+            at = len(origin) if closing is None else closing.start()
             origin = f'{origin[:at]} {key}="{value}"{origin[at:]}'
     return origin
 
 
 def _attributes(origin: str) -> list[tuple[str, re.Match[str]]]:
-    """Its attributes of numbers, and where they stand."""
-    found = ((n, re.search(_ATTRIBUTE.format(name=n), origin, re.S)) for n in ("xyz", "rpy"))
-    return [(name, match) for name, match in found if match is not None]
+    """Matches of the attributes xyz and rpy."""
+    matches = ((n, re.search(_ATTRIBUTE.format(name=n), origin, re.S)) for n in ("xyz", "rpy"))
+    return [(name, match) for name, match in matches if match is not None]
 
 
-def _moved(given: Mapping[str, str], twists: list[Array]) -> dict[str, str]:
-    """The numbers of an origin that are others after it was moved."""
-    xyz, rpy = (np.array([float(v) for v in given.get(k, "0 0 0").split()]) for k in ("xyz", "rpy"))
+def _displaced(origin: Mapping[str, str], twists: list[Array]) -> dict[str, str]:
+    """Numbers of an origin that change by its displacement."""
+    xyz, rpy = (
+        np.array([float(v) for v in origin.get(k, "0 0 0").split()]) for k in ("xyz", "rpy")
+    )
     place = pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz)
     for twist in twists:
         place = place * pin.exp6(twist)
@@ -185,10 +188,10 @@ def _moved(given: Mapping[str, str], twists: list[Array]) -> dict[str, str]:
 
 
 def _require_same(machine: Robot, text: str) -> None:
-    """Refuse what does not load, or is another machine.
+    """Refuse a URDF that is not the calibrated machine.
 
     Raises:
-        ExportError: Naming the first joint or frame that is elsewhere.
+        ExportError: Naming the first joint or frame with another placement.
     """
     keys = load_description(machine.yaml)
     model = load_urdf(machine.urdf, content=text.encode(), joint_types=keys.joint_types)
@@ -206,6 +209,6 @@ def _require_same(machine: Robot, text: str) -> None:
                 *(m.frames[i].placement for m, i in zip((model, machine.model), ids, strict=True)),
             )
         )
-    for name, there, expected in pairs:
-        if np.abs(pin.log6(expected.inverse() * there).vector).max() > SAME:
-            raise ExportError(f"an error of '{name}' has no place in a URDF")
+    for name, written, expected in pairs:
+        if np.abs(pin.log6(expected.inverse() * written).vector).max() > TOLERANCE:
+            raise ExportError(f"a URDF cannot express an error of '{name}'")

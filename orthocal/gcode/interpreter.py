@@ -87,7 +87,7 @@ REFUSED_CODES: dict[str, tuple[str, str]] = {
     ),
     **dict.fromkeys(
         ("G38.2", "G38.3", "G38.4", "G38.5"),
-        ("is a probing motion, whose end is not known in advance", "remove it"),
+        ("is a probing motion, with an unknown end", "remove it"),
     ),
     **dict.fromkeys(
         ("G41", "G41.1", "G42", "G42.1"),
@@ -178,6 +178,8 @@ class Tools:
     def __init__(self, *, one: bool) -> None:
         self.used: list[str] = []
         """Tools that have moved, in order."""
+        self.recorded = False
+        """Whether `used` holds the loaded tool, or needs not to."""
         self._one = one
         self._selected: float | None = None
         self._loaded: float | None = None
@@ -198,7 +200,7 @@ class Tools:
             self._selected = number
         if load or not self._changed:
             self._changed |= load
-            self._loaded = self._selected
+            self._loaded, self.recorded = self._selected, False
             again = self._loaded is not None and _tool_name(self._loaded) in self.used[-1:]
             if self._one and self.used and not again and self._loaded != 0.0:
                 second = "M6 without T" if self._loaded is None else _tool_name(self._loaded)
@@ -215,10 +217,10 @@ class Tools:
         Args:
             feed: Whether it is not a rapid motion.
         """
-        if self._loaded != 0.0 and (feed or self._loaded is not None):
-            name = _tool_name(self._loaded)
-            if name not in self.used:
-                self.used.append(name)
+        self.recorded = feed or self._loaded is not None
+        name = _tool_name(self._loaded)
+        if self.recorded and self._loaded != 0.0 and name not in self.used:
+            self.used.append(name)
 
 
 def _tool_name(number: float | None) -> str:
@@ -302,8 +304,8 @@ class Interpreter:
         modes, offset, position = self.modes, self.offset, self.position
         code, unit = line.motion, modes.unit
         if (
-            not self._moved
-            or (modes.motion != 0 and (modes.motion != 1 or not modes.feed or not self.tools.used))
+            not (self._moved and self.tools.recorded)
+            or (modes.motion != 0 and (modes.motion != 1 or not modes.feed))
             or (code is not None and int(code) != modes.motion)
         ):
             return None
@@ -456,7 +458,7 @@ class Interpreter:
             elif position is None:
                 names = ", ".join(self._letters.values())
                 raise GcodeError(
-                    f"the position along {letter} is not known before this motion; expected "
+                    f"the position along {letter} is unknown before this motion; expected "
                     f"a first G0 to {names} in G90, or --start-mm",
                     where=where,
                 )
@@ -501,9 +503,9 @@ class Interpreter:
             )
         else:
             if not centers or (modes.centers_absolute and len(centers) < 2):
-                found = f"only {centers[0]}" if centers else "an arc without a centre"
+                problem = f"only {centers[0]}" if centers else "an arc without a centre"
                 raise GcodeError(
-                    f"found {found}; expected {CENTERS[i]} and {CENTERS[j]}, or R", where=where
+                    f"found {problem}; expected {CENTERS[i]} and {CENTERS[j]}, or R", where=where
                 )
             base = self.offset if modes.centers_absolute else start
             first, second = (base[k] + words.get(CENTERS[k], 0.0) * modes.unit for k in (i, j))

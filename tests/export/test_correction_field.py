@@ -1,20 +1,18 @@
-"""Corrections by polynomials against the machine, and a nominal controller that obeys them."""
+"""Correction field and corrected programs, compared with the calibrated machine."""
 
 from __future__ import annotations
 
-import io
-import sys
 from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from programs import read_polyline
+from commands import run_orthocal
+from programs import distances, read_polyline
 
 from orthocal import ExportError, calibrate, draw_errors, write_calibration
 from orthocal.assessment.controller_entries import entered_offsets
-from orthocal.cli import main
 from orthocal.export.correction_field import CorrectionField, Fallback
 from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.program import ProgramCorrector
@@ -24,8 +22,8 @@ WITHIN = 1e-6
 
 
 @pytest.fixture(scope="module")
-def bad(orthoglide):
-    """A machine with all errors at their tolerances, and offsets besides."""
+def real(orthoglide):
+    """A machine with all errors drawn from their priors, and offsets."""
     errors = draw_errors(orthoglide, ["*", "!*.offset"], seed=3)
     errors |= {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
     return SimpleNamespace(robot=orthoglide, errors=errors)
@@ -35,24 +33,23 @@ OFFSETS = np.array([1.1e-3, -0.7e-3, 0.6e-3])
 
 
 @pytest.fixture(scope="module")
-def field(bad):
-    return CorrectionField(bad, OFFSETS, within=WITHIN)
+def field(real):
+    return CorrectionField(real, OFFSETS, within=WITHIN)
 
 
-def test_it_is_the_machine_to_what_it_says(bad, field):
-    """At points that it never saw, by another assembly: real tool at the point."""
+def test_error_of_the_field_is_within_its_estimate(real, field):
+    """On the real machine, at random points."""
     points = np.random.default_rng(1).uniform(-0.06, 0.06, (300, 3))
     sent, refused = field(points)
     assert not refused
-    real, nominal = Assembly(bad.robot, fixed=bad.errors), nominal_assembly(bad.robot)
-    reached = real.forward(nominal.inverse(sent) - OFFSETS)
+    machine, nominal = Assembly(real.robot, fixed=real.errors), nominal_assembly(real.robot)
+    reached = machine.forward(nominal.inverse(sent) - OFFSETS)
     off = np.linalg.norm(reached - points, axis=1).max()
-    assert off < 1.05 * field.error < 0.1 * WITHIN  # what is sent and what is reached: a percent
+    assert off < 1.05 * field.error < 0.1 * WITHIN  # commanded and reached differ by a percent
     assert np.abs(sent - points).max() > 100e-6
 
 
-def test_at_the_border_it_says_as_the_machine_what_is_reached(field):
-    """A line that leaves the workspace."""
+def test_line_that_leaves_the_workspace_is_refused_at_the_first_point(field):
     t = np.linspace(0.0, 1.0, 40)[:, None]
     points = t * np.array([0.09, 0.05, 0.02])
     sent, refused = field(points)
@@ -65,9 +62,9 @@ def test_at_the_border_it_says_as_the_machine_what_is_reached(field):
     assert np.linalg.norm(sent[good] - expected[good], axis=1).max() < field.error
 
 
-def test_the_first_point_that_is_not_reached_is_named_wherever_others_are(bad):
-    """Points in any order, in boxes where the machine is asked, which are known or not yet."""
-    field = CorrectionField(bad, OFFSETS, within=WITHIN)
+def test_first_point_out_of_reach_is_named_in_any_order(real):
+    """With boxes of exact corrections, both before and after they are made."""
+    field = CorrectionField(real, OFFSETS, within=WITHIN)
     field._make = lambda key: Fallback.EXACT
     field.exactly = lambda p: (
         np.where(p > 0.1, np.nan, p + 1e-3),
@@ -78,7 +75,7 @@ def test_the_first_point_that_is_not_reached_is_named_wherever_others_are(bad):
         field._boxes.clear()
         points = rng.uniform(-0.3, 0.11, (rng.integers(1, 200), 3))
         truth = np.flatnonzero((points > 0.1).any(axis=1))
-        for _ in range(2):  # boxes that are known afterwards
+        for _ in range(2):  # boxes exist in the second pass
             sent, refused = field(points)
             first = min(truth, default=len(points))
             assert sorted(refused) == list(range(first, len(points)))
@@ -91,49 +88,43 @@ TOOL = np.array([20.0, -5.0, -80.0]) * 1e-3
 
 
 def tips(robot, errors, drives, tool):
-    """Where Pinocchio has the tip, its loops closed by Pinocchio, too."""
+    """Tips by Pinocchio, with loops closed by Pinocchio."""
     real = robot.with_errors(errors)
-    data, passive, found = real.model.createData(), real.zero[real.passive_index], []
+    data, passive, points = real.model.createData(), real.zero[real.passive_index], []
     for row in drives:
         passive = real.close_with_pinocchio(row, passive)
         q = real.configuration(real.joint_coordinates(row, passive))
         pin.framesForwardKinematics(real.model, data, q)
-        found.append(data.oMf[real.frame_id(real.tcp.frame)].act(tool))
-    return np.array(found)
+        points.append(data.oMf[real.frame_id(real.tcp.frame)].act(tool))
+    return np.array(points)
 
 
 def correct(field, *text):
-    """Lines of a program as they are written."""
+    """Corrected lines of a program."""
     interpreter = Interpreter("p", axes=field.axes, offsets={})
     corrector = ProgramCorrector(interpreter, field, within=WITHIN)
     return "".join(corrector.run(f"{line}\n" for line in text)).splitlines()
 
 
-def test_a_tool_s_tip_is_brought_along_the_program(bad, field):
-    """Dense samples of what is written, by a nominal controller, the real machine and Pinocchio."""
-    tilted = CorrectionField(bad, OFFSETS, within=WITHIN, tool=tuple(TOOL))
+def test_tip_of_a_tool_follows_the_program(real, field):
+    """Dense samples through a nominal controller and Pinocchio's real machine."""
+    tilted = CorrectionField(real, OFFSETS, within=WITHIN, tool=tuple(TOOL))
     begin, corner, end = np.array([[-30, -20, 5], [30, 10, -10], [5, 40, 20]]) * 1e-3
     lines = correct(tilted, "G21 G0 X-30 Y-20 Z5", "N1 G1 X30 Y10 Z-10 F500", "N2 X5 Y40 Z20")
     pieces = read_polyline(lines)
     ends = [p for number in sorted(pieces) for p, _ in pieces[number]]
     dense = np.array([a + s * (b - a) for a, b in pairwise(ends) for s in (0.0, 0.3, 0.5, 0.8)])
-    sent = nominal_assembly(bad.robot).inverse(dense * 1e-3) - OFFSETS
-    reached = tips(bad.robot, bad.errors, sent, TOOL) - TOOL
-    off = [distances_to(reached, *way) for way in ((begin, corner), (corner, end))]
+    sent = nominal_assembly(real.robot).inverse(dense * 1e-3) - OFFSETS
+    reached = tips(real.robot, real.errors, sent, TOOL) - TOOL
+    off = [distances(reached, np.array(line)) for line in ((begin, corner), (corner, end))]
     assert np.min(off, axis=0).max() < 1.02 * WITHIN
     points = np.array([begin, corner, end])
     difference = np.linalg.norm(tilted(points)[0] - field(points)[0], axis=1)
-    assert difference.min() > 20e-6  # without being told of the tool it were so far off
+    assert difference.min() > 20e-6  # error without the tool
 
 
-def distances_to(points, begin, end):
-    way = end - begin
-    along = np.clip((points - begin) @ way / (way @ way), 0.0, 1.0)
-    return np.linalg.norm(points - begin - along[:, None] * way, axis=1)
-
-
-def test_a_tool_leaves_what_cannot_be_reached_unreached(bad):
-    tilted = CorrectionField(bad, OFFSETS, within=WITHIN, tool=tuple(TOOL))
+def test_points_out_of_reach_with_a_tool(real):
+    tilted = CorrectionField(real, OFFSETS, within=WITHIN, tool=tuple(TOOL))
     points = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.01, 0.02, 0.03], [np.nan, 0.0, 0.0]])
     sent, refused = tilted.exactly(points)
     assert sorted(refused) == [1, 3]
@@ -145,11 +136,11 @@ def test_a_tool_leaves_what_cannot_be_reached_unreached(bad):
     assert sorted(tilted.exactly(many)[1]) == [1002, 1004]
 
 
-def test_a_program_brings_the_real_tool_along_its_lines_and_arcs(bad, field):
-    """Joints that a nominal controller commands between the points, through the real machine."""
+def test_real_tool_follows_lines_and_arcs(real, field):
+    """Including points of a nominal controller between the commanded ones."""
     text = ["G21 G0 X-30 Y-20 Z5", "N1 G1 X30 Y10 Z-10 F500", "N2 G3 X10 Y30 I-20 J0"]
     pieces = read_polyline(correct(field, *text))
-    real, nominal = Assembly(bad.robot, fixed=bad.errors), nominal_assembly(bad.robot)
+    machine, nominal = Assembly(real.robot, fixed=real.errors), nominal_assembly(real.robot)
     start = pieces[0][-1][0]
     for number in (1, 2):
         ends = np.array([start, *(p for p, _ in pieces[number])])
@@ -163,7 +154,7 @@ def test_a_program_brings_the_real_tool_along_its_lines_and_arcs(bad, field):
                 a + share * (ends[i * (len(ends) // 12) + 1] - a) for i, a in enumerate(chosen[:-1])
             ]
         )
-        tool = 1e3 * real.forward(nominal.inverse(between * 1e-3) - OFFSETS)
+        tool = 1e3 * machine.forward(nominal.inverse(between * 1e-3) - OFFSETS)
         if number == 1:
             a, b = np.array([-30.0, -20.0, 5.0]), np.array([30.0, 10.0, -10.0])
             along = (b - a) / np.linalg.norm(b - a)
@@ -172,10 +163,10 @@ def test_a_program_brings_the_real_tool_along_its_lines_and_arcs(bad, field):
             flat = np.hypot(tool[:, 0] - 10.0, tool[:, 1] - 10.0) - 20.0
             off = np.hypot(flat, tool[:, 2] + 10.0)
         assert off.max() < 1.02e-3  # [mm]
-    assert off.max() > 0.5e-3  # what is allowed is used by an arc
+    assert off.max() > 0.5e-3  # an arc uses its tolerance
 
 
-def test_robots_of_two_axes_and_those_without_a_tool(biglide, orthoglide):
+def test_planar_robots_and_robots_without_a_tool(biglide, orthoglide):
     drives = [d.name for d in biglide.drives]
     machine = SimpleNamespace(robot=biglide, errors={f"{drives[0]}.offset": 1e-3})
     field = CorrectionField(machine, np.zeros(2), within=WITHIN)
@@ -195,29 +186,26 @@ def test_robots_of_two_axes_and_those_without_a_tool(biglide, orthoglide):
 
 
 @pytest.fixture
-def command(experiment_2, tmp_path, monkeypatch, capsys):
-    found = calibrate(experiment_2)
-    write_calibration(found, tmp_path / "calibration.json")
+def command(experiment_2, tmp_path):
+    calibration = calibrate(experiment_2)
+    write_calibration(calibration, tmp_path / "calibration.json")
 
-    def run(text, *words):
-        source = "-" if text is None else str(tmp_path / "p.ngc")
+    def run(text, *words, typed=""):
+        source = "-" if text is None else tmp_path / "p.ngc"
         if text is not None:
-            (tmp_path / "p.ngc").write_bytes(text.encode("latin-1"))
-        monkeypatch.setattr(sys, "argv", ["orthocal", "correct", str(tmp_path), source, *words])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        out, err = capsys.readouterr()
-        return stopped.value.code, out, err.replace(str(tmp_path), "")
+            source.write_bytes(text.encode("latin-1"))
+        done = run_orthocal(tmp_path, "correct", tmp_path, source, *words, typed=typed)
+        return done.returncode, done.stdout, done.stderr.replace(str(tmp_path), "")
 
-    run.calibration = found
+    run.calibration = calibration
     return run
 
 
 PROGRAM = "G21 G0 X1 Y2 Z3\r\nG1 X5 F100 (\xe9)\r\n"
 
 
-def test_the_command_line(command, tmp_path, monkeypatch):
-    """Offsets alone need no correction once they are entered, and one as long as they are not."""
+def test_command_line(command, tmp_path):
+    """Offsets alone need a correction only until they are entered."""
     code, out, err = command(PROGRAM)
     assert code == 0
     assert out.splitlines()[0] == "G21 G0 X1.0000 Y2.0000 Z3.0000"
@@ -235,18 +223,21 @@ def test_the_command_line(command, tmp_path, monkeypatch):
     code, _, err = command(PROGRAM, "--out", str(tmp_path / "o.ngc"), "--tool=-3,0,-50.5")
     assert "For a tip at -3, 0, -50.5 mm from the tool centre point." in err
     assert (tmp_path / "o.ngc").read_bytes().endswith(b"F100 (\xe9)\r\n")
-    stream = io.TextIOWrapper(io.BytesIO(PROGRAM.encode("latin-1")))
-    monkeypatch.setattr(sys, "stdin", stream)
-    assert command(None)[0] == 0
+    assert command(None, typed=PROGRAM)[0] == 0
 
 
-def test_a_line_that_is_too_long_in_bytes_is_not_read_as_two(command, monkeypatch):
-    """What stands behind the place where it would be cut is a comment, not a motion."""
+def test_several_tools_without_a_tip_are_reported(command):
+    code, _, err = command("T1 M6\n" + PROGRAM + "T2 M6\nG1 X6\n")
+    assert code == 0
+    assert "Several tools (T1, T2) and no --tool" in err
+    assert "Several tools" not in command("T1 M6\n" + PROGRAM)[2]
+
+
+def test_line_that_is_too_long_in_bytes_is_not_read_as_two(command):
+    """The text after the longest line is a comment, not a motion."""
     line = "X1" + " " * 900 + "Y2 ;" + "é" * 48 + "G91 G0 X5\n"
     assert len(line[:-9].encode()) == 1003 > 1000 > len(line)
-    stream = io.TextIOWrapper(io.BytesIO(("G21 G0 X1 Y2 Z3\n" + line).encode()))
-    monkeypatch.setattr(sys, "stdin", stream)
-    code, out, err = command(None)
+    code, out, err = command(None, typed="G21 G0 X1 Y2 Z3\n" + line)
     assert (code, out) == (2, "")
     assert err.startswith("orthocal: standard input:2: has 1002 characters; expected at most 1000")
 
@@ -257,6 +248,11 @@ def test_a_line_that_is_too_long_in_bytes_is_not_read_as_two(command, monkeypatc
         ("", (), "/p.ngc: is empty; expected a program"),
         (PROGRAM + "G1 X300", (), "/p.ngc:3: the machine cannot make this motion: it cannot be"),
         (PROGRAM + "G54", (), "/p.ngc:3: found G54, whose zero in machine coordinates is not"),
+        (
+            "T1 M6\n" + PROGRAM + "T2 M6\n",
+            ("--tool", "0,0,-50"),
+            "/p.ngc:4: found T2 after motions of T1, and --tool gives one tip; expected one tool",
+        ),
         (PROGRAM, ("--work-offset-mm", "1,2"), "--work-offset-mm: found '1,2'; expected X,Y,Z"),
         (PROGRAM, ("--work-offset-mm", "G53=1,2,3"), "--work-offset-mm: found 'G53=1,2,3'"),
         (PROGRAM, ("--tool", "1,2"), "--tool: found '1,2'; expected X,Y,Z"),
@@ -264,7 +260,7 @@ def test_a_line_that_is_too_long_in_bytes_is_not_read_as_two(command, monkeypatc
         (PROGRAM, ("--start-mm", "1,2,q"), "--start-mm: Z is 'q'; expected a number"),
     ],
 )
-def test_what_is_refused_leaves_nothing(command, tmp_path, text, words, message):
+def test_refused_programs_write_nothing(command, tmp_path, text, words, message):
     code, out, err = command(text, *words, "--out", str(tmp_path / "o.ngc"))
     assert (code, out) == (2, "")
     assert err.startswith(f"orthocal: {message}")

@@ -1,4 +1,4 @@
-"""Exports by what they do: a nominal controller that obeys them, and the real machine's tool."""
+"""Exported tables, parameters and URDFs, compared with the calibrated machine."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from commands import run_orthocal
 
 from orthocal import (
     ExportError,
@@ -23,14 +24,13 @@ from orthocal import (
     write_calibration,
 )
 from orthocal.assessment.controller_entries import entered_offsets
-from orthocal.cli import main
 from orthocal.export.urdf import _correct, _find_twists
 from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
 from orthocal.observation.simulate import load_errors
 from orthocal.robot.parameters import ElementaryError
 
 ROUNDED = 0.5e-9 * np.sqrt(3.0) * 1.5
-"""[m] Corrections are written to 1e-6 mm."""
+"""Rounding of corrections to 1e-6 mm, [m]."""
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +39,8 @@ def full(root):
 
 
 @pytest.fixture(scope="module")
-def turned(root):
-    """A machine whose setup zy was read with the wrong sign: not to be entered."""
+def reversed_sign(root):
+    """A calibration with a reversed sign in setup zy, which is not to be entered."""
     from dataclasses import replace
 
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
@@ -50,8 +50,8 @@ def turned(root):
     return calibrate(replace(session, readings=tuple(rows)))
 
 
-def test_corrections_bring_the_real_tool_where_it_is_wanted(full):
-    """Without them it is off by tenths of a millimetre; by another assembly than the export's."""
+def test_corrections_bring_the_tool_to_its_targets(full):
+    """On the calibrated machine; without them the errors are tenths of a millimetre."""
     text = export_calibration(full, "table")["corrections.csv"]
     rows = list(csv.DictReader(io.StringIO(text)))
     point, change = (
@@ -66,12 +66,12 @@ def test_corrections_bring_the_real_tool_where_it_is_wanted(full):
     assert np.abs(uncorrected - point).max() > 50e-6
 
 
-def test_corrections_of_offsets_alone_are_none(experiment_2):
+def test_corrections_of_offsets_alone_are_zero(experiment_2):
     text = export_calibration(calibrate(experiment_2), "table")["corrections.csv"]
     assert {r[f"d{k}_mm"] for r in csv.DictReader(io.StringIO(text)) for k in "xyz"} == {"0.000000"}
 
 
-def test_parameters_are_read_again_as_they_were(full, tmp_path):
+def test_parameters_round_trip(full, tmp_path):
     path = tmp_path / "errors.yaml"
     path.write_text(export_calibration(full, "yaml")["errors.yaml"])
     again = load_errors(path, full.robot)
@@ -81,34 +81,23 @@ def test_parameters_are_read_again_as_they_were(full, tmp_path):
     assert "#   x_slide_mm: " in path.read_text()
 
 
-def test_what_is_not_to_be_entered_is_not_exported_unless_told_so(turned, tmp_path, capsys):
+def test_export_needs_anyway_if_the_decision_is_not_to_enter(reversed_sign, tmp_path):
     with pytest.raises(ExportError, match="Do not enter these"):
-        export_calibration(turned, "yaml")
-    assert "errors.yaml" in export_calibration(turned, "yaml", anyway=True)
-    file = write_calibration(turned, tmp_path / "calibration.json")
-    words = ["export", str(file), "--to", "yaml", "--out", str(tmp_path / "out")]
-    assert run(words) == 3
-    assert "Do not enter these" in capsys.readouterr().err
+        export_calibration(reversed_sign, "yaml")
+    assert "errors.yaml" in export_calibration(reversed_sign, "yaml", anyway=True)
+    file = write_calibration(reversed_sign, tmp_path / "calibration.json")
+    words = ["export", file, "--to", "yaml", "--out", "out"]
+    refused = run_orthocal(tmp_path, *words)
+    assert refused.returncode == 3
+    assert "Do not enter these" in refused.stderr
     assert not (tmp_path / "out").exists()
-    assert run([*words, "--anyway"]) == 0
+    assert run_orthocal(tmp_path, *words, "--anyway").returncode == 0
     assert (tmp_path / "out/errors.yaml").exists()
 
 
-def test_unknown_formats_and_machines_without_a_tool(experiment_2):
+def test_unknown_format_is_refused(experiment_2):
     with pytest.raises(ParameterError, match="found 'xml'; expected one of yaml, table"):
         export_calibration(calibrate(experiment_2), "xml")
-
-
-def run(words):
-    import sys
-
-    old, sys.argv = sys.argv, ["orthocal", *words]
-    try:
-        main()
-    except SystemExit as e:
-        return e.code
-    finally:
-        sys.argv = old
 
 
 def written(files, folder):
@@ -118,8 +107,7 @@ def written(files, folder):
     return folder
 
 
-def test_the_urdf_is_the_calibrated_machine(full, tmp_path):
-    """Loaded anew, with its own closures: its tool is where the calibrated machine's is."""
+def test_urdf_is_the_calibrated_machine(full, tmp_path):
     files = export_calibration(full, "urdf")
     robot = load_robot(written(files, tmp_path / "real"))
     scales = {r["drive"]: r["scale_ppm"] for r in csv.DictReader(io.StringIO(files["scales.csv"]))}
@@ -131,14 +119,14 @@ def test_the_urdf_is_the_calibrated_machine(full, tmp_path):
     assert np.abs(expected - points).max() > 1e-3
 
 
-def test_nothing_but_origins_changes_in_it(full):
+def test_urdf_changes_in_origins_only(full):
     text = export_calibration(full, "urdf")["orthoglide.urdf"]
     before = full.robot.urdf.read_text()
     origin = re.compile(r'(<origin) xyz="[^"]*" rpy="[^"]*"')
     assert origin.sub(r"\1", text) == origin.sub(r"\1", before)
     assert text != before
     changed = [a for a, b in zip(text.splitlines(), before.splitlines(), strict=True) if a != b]
-    # idle errors stay 0; visuals are where they were
+    # unobservable errors are 0; visuals do not change
     assert 20 < len(changed) < 40
 
 
@@ -153,7 +141,7 @@ def test_nothing_but_origins_changes_in_it(full):
         ("<a b='>'/><origin rpy='0 0 0.0'/>", "<origin rpy='0 0 0.0' xyz=\"0.001 0 0\"/><parent"),
     ],
 )
-def test_any_way_to_write_an_origin_is_understood(orthoglide, origin, shape):
+def test_all_forms_of_an_origin_are_rewritten(orthoglide, origin, shape):
     text = (
         f'<robot><!-- <joint name="a" type="fixed"></joint> -->'
         f'<transmission><joint name="a" type="x"><origin/></joint></transmission>'
@@ -161,16 +149,16 @@ def test_any_way_to_write_an_origin_is_understood(orthoglide, origin, shape):
         f'<transmission><joint name="a"/></transmission></robot>'
     )
     twist = np.array([1e-3, 0, 0, 0, 0, 0])
-    found = _correct(text, {"a": [twist]}, orthoglide)
-    assert shape in found
-    assert found.count("<joint") == text.count("<joint")
-    assert found.endswith('<transmission><joint name="a"/></transmission></robot>')
-    with pytest.raises(ExportError, match="has no joint 'c' of its own to correct"):
+    corrected = _correct(text, {"a": [twist]}, orthoglide)
+    assert shape in corrected
+    assert corrected.count("<joint") == text.count("<joint")
+    assert corrected.endswith('<transmission><joint name="a"/></transmission></robot>')
+    with pytest.raises(ExportError, match="has no joint 'c' to correct"):
         _correct(text, {"c": [twist]}, orthoglide)
 
 
-def test_all_but_the_numbers_stays_byte_for_byte(full, tmp_path):
-    """As others write it: a mark, carriage returns, single quotes, comments, others' tags."""
+def test_urdf_is_preserved_byte_for_byte_but_numbers(full, tmp_path):
+    """With a byte order mark, carriage returns, single quotes, comments and foreign elements."""
     folder = tmp_path / "orthoglide"
     shutil.copytree(full.robot.folder, folder)
     urdf = folder / "orthoglide.urdf"
@@ -187,7 +175,7 @@ def test_all_but_the_numbers_stays_byte_for_byte(full, tmp_path):
     numbers = re.compile(rb"(?<=xyz=')[^']*|(?<=rpy=')[^']*")
     assert after != before
     assert numbers.sub(b"", after) == numbers.sub(b"", before)
-    # and of the numbers none but those of joints that are off
+    # only numbers of joints with errors change
     changed = [
         (a, b)
         for a, b in zip(numbers.findall(after), numbers.findall(before), strict=True)
@@ -203,20 +191,20 @@ OTHERS = """\
   <joint name='x_slide' type='fixed'><origin xyz='8 8 8'/></joint>
 </gazebo>
 """
-"""What is no joint of the robot's own, though it says so."""
+"""Elements named joint that are not joints of the robot."""
 
 
-def test_an_offset_moves_its_drives_origin(root, tmp_path):
+def test_offset_displaces_the_origin_of_its_drive(root, tmp_path):
     session = load_session(root / "examples/table1/experiment-2")
-    found = calibrate(session)
-    files = export_calibration(found, "urdf")
+    calibration = calibrate(session)
+    files = export_calibration(calibration, "urdf")
     assert set(files) == {"orthoglide.urdf", "orthoglide.yaml"}
     robot = load_robot(written(files, tmp_path / "real"))
     tool = Assembly(robot).forward(robot.drive_zero)
-    assert np.abs(tool - found.machine.forward(robot.drive_zero)).max() < 1e-9
+    assert np.abs(tool - calibration.machine.forward(robot.drive_zero)).max() < 1e-9
 
 
-def test_an_error_of_a_frame_on_a_moving_link_has_no_place(orthoglide):
+def test_error_of_a_frame_on_a_moving_link_is_refused(orthoglide):
     error = ElementaryError("frame.x_crossbar.x", "translation", "x_crossbar", True, 0, "m")
     parameters = SimpleNamespace(elementary={error.name: error})
     robot = SimpleNamespace(parameters=parameters, urdf=orthoglide.urdf, model=orthoglide.model)

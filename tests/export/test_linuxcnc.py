@@ -1,4 +1,4 @@
-"""LinuxCNC's files by what they do: compiled, run, put through the machine that was calibrated."""
+"""Exports for LinuxCNC, compiled and run, compared with the calibrated machine."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
+from commands import run_orthocal
 from linuxcnc import (
     Joint,
     build_module,
+    enter_lines,
     filter_program,
     require_linuxcnc,
     run_program,
-    type_lines,
 )
+from programs import distances as polyline_distances
 
 from orthocal import (
     ExportError,
@@ -36,7 +38,6 @@ from orthocal import (
 )
 from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.calibration.machine import Machine
-from orthocal.cli import main
 from orthocal.export.linuxcnc.approximation import approximate, rounded_up
 from orthocal.export.linuxcnc.c_source import braced, write_core
 from orthocal.export.linuxcnc.export import ExportOptions
@@ -50,18 +51,18 @@ from orthocal.robot.loading import packaged_robots
 MM = 1e-3
 
 WITHIN = 0.05e-6
-"""[m] What modules of these tests are asked for."""
+"""Tolerance of the modules, [m]."""
 
 TOOL = (5 * MM, 0.0, -50 * MM)
 
 ACTIVE = np.array([0.4, -0.1, 0.2]) * MM
 
 PATH = 0.5e-6
-"""[m] From the path: 0.05 µm of the module, 0.04 of homing, 0.03 of the interpolator, which takes
-a sixth of the neighbours into each point, and LinuxCNC's own rounding."""
+"""Tolerance of the path, [m]: 0.05 µm of the module, 0.04 of homing, 0.03 of the interpolator,
+which smooths each point with its neighbours, and rounding by LinuxCNC."""
 
-TYPED = 0.2e-6
-"""[m] HOME_OFFSET is typed to 0.1 µm, and homing repeats to 0.02 µm; three drives."""
+ENTERED = 0.2e-6
+"""Tolerance of HOME_OFFSET, [m]: entered to 0.1 µm, homing repeats to 0.02 µm; three drives."""
 
 
 # ---- machines
@@ -69,7 +70,7 @@ TYPED = 0.2e-6
 
 @pytest.fixture(scope="module")
 def mixed(root, tmp_path_factory):
-    """An Orthoglide whose joints count up, down and from nought."""
+    """An Orthoglide with three joint conventions."""
     folder = tmp_path_factory.mktemp("robots") / "orthoglide"
     shutil.copytree(packaged_robots()["orthoglide"], folder)
     file = folder / "orthoglide.yaml"
@@ -86,12 +87,12 @@ def mixed(root, tmp_path_factory):
 
 
 def calibrated(root, folder, example, truth, model, *, active=ACTIVE):
-    """A machine with given errors, read without noise while some offsets were active."""
+    """Calibration of exact readings of a machine with errors and active offsets."""
     text = (root / f"examples/{example}/plan.yaml").read_text()
-    told = ", ".join(f"{v / MM:g}" for v in active)
+    listed = ", ".join(f"{v / MM:g}" for v in active)
     for old, new in {
         "robot: orthoglide": f"robot: {folder}",
-        "offsets_mm: [0, 0, 0]": f"offsets_mm: [{told}]",
+        "offsets_mm: [0, 0, 0]": f"offsets_mm: [{listed}]",
     }.items():
         assert old in text
         text = text.replace(old, new)
@@ -117,13 +118,13 @@ def offsets(root, mixed):
 
 @pytest.fixture(scope="module")
 def exported(full):
-    """Files of a module for a tool, counting as LinuxCNC's joints do."""
+    """Files of a module for a tool."""
     options = ExportOptions(within=WITHIN, tool=TOOL)
     return export_calibration(full, "linuxcnc", anyway=True, options=options)
 
 
 def machine_of(robot, errors):
-    """A machine that was not calibrated from readings, but is known."""
+    """A stand-in for the calibration of a machine with known errors."""
     n = len(robot.drives)
     return SimpleNamespace(
         robot=robot,
@@ -138,7 +139,7 @@ def machine_of(robot, errors):
 
 
 class Core:
-    """orthocal_core.c, compiled as any C compiler does."""
+    """orthocal_core.c, compiled with strict warnings."""
 
     def __init__(self, folder, files):
         if shutil.which("gcc") is None:
@@ -156,29 +157,29 @@ class Core:
         )
         assert done.returncode == 0, done.stderr
         used = subprocess.run(["nm", "-u", "core.so"], cwd=folder, capture_output=True, text=True)
-        # weak ones and the C library's own frame aside, nothing but a root is asked of others
-        asked = {line.split()[1] for line in used.stdout.splitlines() if line.split()[0] == "U"}
-        assert {name.split("@")[0] for name in asked} <= {"sqrt", "__stack_chk_fail"}
+        # besides weak symbols and the stack protector the core needs sqrt only
+        needed = {line.split()[1] for line in used.stdout.splitlines() if line.split()[0] == "U"}
+        assert {name.split("@")[0] for name in needed} <= {"sqrt", "__stack_chk_fail"}
         self.n = int(re.search(r"#define ORTHOCAL_DRIVES (\d)", files["orthocal_core.h"])[1])
         self.library = ctypes.CDLL(str(folder / "core.so"))
         self.type = ctypes.c_double * self.n
 
     def inverse(self, points, *, untouched=7.0):
-        """Joints in mm or degrees, (K, n), NaN where it says no, for points in mm."""
+        """Joints in mm or degrees, (k, n), for points in mm; NaN for those that are refused."""
         return self._each(self.library.orthocal_inverse, points, lambda p: [untouched] * self.n)
 
     def forward(self, joints, *, start):
         return self._each(self.library.orthocal_forward, joints, lambda _: start)
 
-    def _each(self, function, rows, begin):
-        found = []
+    def _each(self, function, rows, start):
+        results = []
         for row in rows:
-            result = self.type(*begin(row))
+            result = self.type(*start(row))
             if function(self.type(*row), result) != 0:
-                assert list(result) == list(begin(row))
+                assert list(result) == list(start(row))
                 result = [np.nan] * self.n
-            found.append(list(result))
-        return np.array(found)
+            results.append(list(result))
+        return np.array(results)
 
 
 @pytest.fixture(scope="module")
@@ -187,35 +188,35 @@ def core(tmp_path_factory, exported):
 
 
 def drives_of(calibration, joints):
-    """Coordinates as the encoders give them, [m], of LinuxCNC's joints, mm."""
-    shown = zip(calibration.robot.drives, (joints * MM).T, ACTIVE, strict=True)
-    return np.stack([d.from_joint(j) - active for d, j, active in shown], axis=-1)
+    """Drive coordinates of the encoders, [m], for LinuxCNC's joints, mm."""
+    columns = zip(calibration.robot.drives, (joints * MM).T, ACTIVE, strict=True)
+    return np.stack([d.from_joint(j) - active for d, j, active in columns], axis=-1)
 
 
-def test_the_core_brings_the_tip_where_it_belongs(full, core):
+def test_core_reaches_the_targets_of_the_tip(full, core):
     points = np.random.default_rng(7).uniform(-0.06, 0.06, (2000, 3))
     tip = ToolTip(full, TOOL)
     reached = tip.place(drives_of(full, core.inverse(points / MM)))
     off = np.linalg.norm(reached - (points + TOOL), axis=1)
     assert off.max() < WITHIN
-    # its error is in these numbers: without the tilt it were tens of micrometres
+    # a level platform needs other drive coordinates
     level = full.machine.inverse(points[:200])
     assert np.abs(drives_of(full, core.inverse(points[:200] / MM)) - level).max() > 20e-6
 
 
-def test_without_a_tool_it_is_the_calibrated_machine(full, tmp_path):
-    """10,000 points that nobody has fitted or looked at."""
-    found = approximate(full, within=WITHIN)
-    core = Core(tmp_path, write_core(full, found))
+def test_core_without_a_tool_equals_the_calibrated_machine(full, tmp_path):
+    """At 10,000 points that were neither fitted nor checked."""
+    approximation = approximate(full, within=WITHIN)
+    core = Core(tmp_path, write_core(full, approximation))
     points = np.random.default_rng(8).uniform(-0.06, 0.06, (10_000, 3))
     joints = drives_of(full, core.inverse(points / MM))
-    jacobian = found.inverse.derivative(points)
+    jacobian = approximation.inverse.derivative(points)
     off = np.linalg.solve(jacobian, (joints - full.machine.inverse(points))[..., None])[..., 0]
-    assert np.linalg.norm(off, axis=1).max() < found.achieved <= WITHIN
+    assert np.linalg.norm(off, axis=1).max() < approximation.achieved <= WITHIN
 
 
-def test_the_tip_is_where_pinocchio_has_it(full, core):
-    """By placements of a robot with these errors, its loops closed by Pinocchio."""
+def test_tip_equals_pinocchio(full, core):
+    """With placements of a robot with these errors, and loops closed by Pinocchio."""
     robot = full.robot.with_errors(full.errors)
     points = np.random.default_rng(9).uniform(-0.06, 0.06, (8, 3))
     data, passive = robot.model.createData(), robot.zero[robot.passive_index]
@@ -227,16 +228,16 @@ def test_the_tip_is_where_pinocchio_has_it(full, core):
         assert np.linalg.norm(place.act(np.array(TOOL)) - point - TOOL) < WITHIN
 
 
-def test_forward_undoes_inverse(core):
+def test_forward_inverts_inverse(core):
     points = np.random.default_rng(10).uniform(-60.0, 60.0, (2000, 3))
     for start in ([0.0, 0.0, 0.0], [55.0, -55.0, 55.0], [1e9, float("nan"), -1e9]):
         assert np.abs(core.forward(core.inverse(points), start=start) - points).max() < 1e-9
-    # also somewhat outside, where what is added no longer changes
+    # outside the region the correction is constant
     outside = points * 1.4
     assert np.abs(core.forward(core.inverse(outside), start=[0.0] * 3) - outside).max() < 1e-9
 
 
-def test_beyond_the_region_what_is_added_is_that_of_the_nearest_face(full, core):
+def test_correction_beyond_the_region_is_that_of_the_nearest_face(full, core):
     form = find_nominal_form(full.robot, np.zeros(3), np.full(3, 0.06))
     outside = np.array([[75.0, 10.0, -80.0], [-61.0, 0.0, 0.0], [0.0, 70.0, 20.0]])
     added = [
@@ -247,8 +248,7 @@ def test_beyond_the_region_what_is_added_is_that_of_the_nearest_face(full, core)
     assert np.abs(added[0]).max() > 0.1 * MM
 
 
-def test_what_has_no_answer_gets_none(core):
-    """And leaves what was there."""
+def test_core_refuses_points_and_joints_out_of_reach(core):
     nan, inf = float("nan"), float("inf")
     rows = [[nan, 0, 0], [0, inf, 0], [0, 400.0, 0], [1e200, 1e200, 1e200]]
     assert np.isnan(core.inverse(rows)).all()
@@ -256,20 +256,20 @@ def test_what_has_no_answer_gets_none(core):
     assert np.isnan(core.forward(rows, start=[1.0, 2.0, 3.0])).all()
 
 
-def test_robots_with_slides_and_rods_are_found_by_their_numbers(orthoglide, biglide, fivebar):
+def test_slides_with_rods_are_identified(orthoglide, biglide, fivebar):
     form = find_nominal_form(orthoglide, np.zeros(3), np.full(3, 0.06))
     assert isinstance(form, SlidesWithRods)
     assert np.array_equal(form.axes, np.eye(3))
     assert np.array_equal(form.anchors, np.zeros((3, 3)))
     assert np.array_equal(form.lengths, [0.31025] * 3)
-    found = find_nominal_form(biglide, tool_at_zero(biglide), np.full(2, 0.03))
-    assert isinstance(found, SlidesWithRods)
-    assert found.lengths == pytest.approx([0.2, 0.2])
+    form = find_nominal_form(biglide, tool_at_zero(biglide), np.full(2, 0.03))
+    assert isinstance(form, SlidesWithRods)
+    assert form.lengths == pytest.approx([0.2, 0.2])
 
 
 @pytest.mark.parametrize("name", ["biglide", "fivebar"])
-def test_any_robot_with_a_tool_gets_a_core(root, tmp_path, name):
-    """Slides of a planar robot in closed form; motors, which have none here, by numbers alone."""
+def test_core_of_planar_robots(root, tmp_path, name):
+    """Slides have a closed form, motors a tangent."""
     folder = tmp_path / name
     shutil.copytree(root / "tests/robots" / name, folder)
     errors = {"x_slide.offset": 1e-3, "y_tip.x": 2e-4} if name == "biglide" else {}
@@ -283,9 +283,11 @@ def test_any_robot_with_a_tool_gets_a_core(root, tmp_path, name):
     robot = load_robot(folder)
     errors = {k: v for k, v in errors.items() if k in robot.parameters.elementary}
     known = machine_of(robot, errors)
-    found = approximate(known, within=1e-7, half_side=0.02)
-    assert isinstance(found.inverse.nominal, Tangent if name == "fivebar" else SlidesWithRods)
-    files = write_core(known, found)
+    approximation = approximate(known, within=1e-7, half_side=0.02)
+    assert isinstance(
+        approximation.inverse.nominal, Tangent if name == "fivebar" else SlidesWithRods
+    )
+    files = write_core(known, approximation)
     assert "*/ known" not in files["orthocal_core.c"]
     core = Core(tmp_path, files)
     points = tool_at_zero(robot) + np.random.default_rng(1).uniform(-0.02, 0.02, (500, 2))
@@ -297,49 +299,39 @@ def test_any_robot_with_a_tool_gets_a_core(root, tmp_path, name):
     assert np.abs(reached - points).max() < 1e-7
 
 
-def test_numbers_are_written_with_every_digit():
+def test_braced_writes_all_digits():
     values = np.random.default_rng(0).normal(size=(3, 20))
     read = [float(v) for v in re.findall(r"[-+.\de]+", braced(values))]
     assert np.array_equal(np.reshape(read, values.shape), values)
     assert braced(np.array([1, 2])) == "{1, 2}"
 
 
-# ---- what is refused
+# ---- refusals and options
 
 
-def test_more_than_polynomials_reach_is_refused_with_what_they_do(full):
+def test_unreachable_tolerance_is_refused_with_the_best_error(full):
     with pytest.raises(ExportError, match=r"within 1e-09 µm over ±60 mm; the best .* reaches"):
         approximate(full, within=1e-15)
     with pytest.raises(ExportError, match=r"does not reach ±150 mm \(.*smaller --half-side-mm"):
         approximate(full, within=1e-6, half_side=0.15)
 
 
-def test_a_lower_degree_is_taken_where_less_is_asked(full, exported):
-    """And what is stated is at most what was asked."""
-    found = approximate(full, within=5e-6)
-    assert f"#define DEGREE {found.inverse.correction.degree}\n" not in exported["orthocal_core.c"]
-    assert found.inverse.correction.degree < 4
-    assert 1e-7 < found.achieved <= 5e-6
-    assert found.beyond > found.achieved
-    # the tilt is some milliradians
-    assert 1e-6 < found.longer < 100e-6
-    assert found.nominal > 1 * MM
+def test_larger_tolerance_gives_a_lower_degree(full, exported):
+    approximation = approximate(full, within=5e-6)
+    assert (
+        f"#define DEGREE {approximation.inverse.correction.degree}\n"
+        not in exported["orthocal_core.c"]
+    )
+    assert approximation.inverse.correction.degree < 4
+    assert 1e-7 < approximation.achieved <= 5e-6
+    assert approximation.beyond > approximation.achieved
+    # the tilt is a few milliradians
+    assert 1e-6 < approximation.longer < 100e-6
+    assert approximation.nominal > 1 * MM
 
 
-def test_numbers_are_never_rounded_to_less():
+def test_rounded_up():
     assert [rounded_up(v) for v in (0.02801, 0.028, 12.1, 1.0)] == ["0.029", "0.028", "13", "1"]
-
-
-def run(words):
-    import sys
-
-    old, sys.argv = sys.argv, ["orthocal", *map(str, words)]
-    try:
-        main()
-    except SystemExit as e:
-        return e.code
-    finally:
-        sys.argv = old
 
 
 @pytest.mark.parametrize(
@@ -363,26 +355,26 @@ def run(words):
         (["--module", "--half-side-mm", "250"], 3, "the machine does not reach ±250 mm"),
     ],
 )
-def test_bad_options_are_named(offsets, tmp_path, capsys, words, code, message):
+def test_bad_options_are_named(offsets, tmp_path, words, code, message):
     file = write_calibration(offsets, tmp_path / "calibration.json")
     to = [] if "--to" in words else ["--to", "linuxcnc"]
-    assert run(["export", file, *to, "--out", tmp_path / "out", "--anyway", *words]) == code
-    assert message in " ".join(capsys.readouterr().err.split())
+    done = run_orthocal(tmp_path, "export", file, *to, "--out", "out", "--anyway", *words)
+    assert done.returncode == code
+    assert message in " ".join(done.stderr.split())
     assert not (tmp_path / "out").exists()
 
 
 # ---- HOME_OFFSET
 
 
-def test_home_offset_follows_direction_and_what_is_active(offsets):
-    """By hand: the slide at its switch shows what it did, and what was missing."""
+def test_home_offset_follows_direction_and_active_offsets(offsets):
+    """Hand calculation of HOME_OFFSET and limits."""
     old = (0.35, 0.3, 0.02)
     homes = find_homes(offsets, old=old)
-    missing = np.array(list(OFFSETS.values())) - ACTIVE
-    change = missing * [1, -1, -1]
+    change = (np.array(list(OFFSETS.values())) - ACTIVE) * [1, -1, -1]
     assert [h.change for h in homes] == pytest.approx(change, abs=1e-9)
     assert [h.new for h in homes] == pytest.approx(np.array(old) + change, abs=1e-9)
-    # a place of the slide that is a limit: travel 120 ... 390 mm as the encoders count
+    # travel from 120 to 390 mm of the encoders
     for home, drive, active, now in zip(
         homes, offsets.robot.drives, ACTIVE, OFFSETS.values(), strict=True
     ):
@@ -393,7 +385,7 @@ def test_home_offset_follows_direction_and_what_is_active(offsets):
         )
 
 
-def test_home_offsets_are_told_as_what_to_add_where_the_old_are_not_known(offsets):
+def test_unknown_home_offsets_are_written_as_changes(offsets):
     files = export_calibration(offsets, "linuxcnc")
     assert list(files) == ["README.md", "joints.ini"]
     lines = files["joints.ini"]
@@ -405,21 +397,20 @@ def test_home_offsets_are_told_as_what_to_add_where_the_old_are_not_known(offset
     assert "offsets_mm: [1.2, -0.8, 0.5]" in files["README.md"]
 
 
-def test_home_offsets_and_limits_are_lines_to_type(offsets, tmp_path):
+def test_home_offsets_and_limits_are_ini_lines(offsets, tmp_path):
     file = write_calibration(offsets, tmp_path / "calibration.json")
-    words = ["export", file, "--to", "linuxcnc", "--out", tmp_path / "out"]
-    assert run([*words, "--home-offset", "350,300.5,-20"]) == 0
-    typed = type_lines("[JOINT_1]\nHOME = 3\n", (tmp_path / "out/joints.ini").read_text())
-    assert "[JOINT_0]\nHOME_OFFSET = 350.8000\nMIN_LIMIT = 121.2000\nMAX_LIMIT = 391.2000" in typed
-    # joint 620.5 - c: its limits change places
-    assert "[JOINT_1]\nHOME = 3\nHOME_OFFSET = 301.2000\nMIN_LIMIT = 231.3000\n" in typed
-    assert "[JOINT_2]\nHOME_OFFSET = -20.3000\n" in typed
+    words = ["export", file, "--to", "linuxcnc", "--out", "out"]
+    assert run_orthocal(tmp_path, *words, "--home-offset", "350,300.5,-20").returncode == 0
+    ini = enter_lines("[JOINT_1]\nHOME = 3\n", (tmp_path / "out/joints.ini").read_text())
+    assert "[JOINT_0]\nHOME_OFFSET = 350.8000\nMIN_LIMIT = 121.2000\nMAX_LIMIT = 391.2000" in ini
+    # joint 620.5 - c: the limits swap
+    assert "[JOINT_1]\nHOME = 3\nHOME_OFFSET = 301.2000\nMIN_LIMIT = 231.3000\n" in ini
+    assert "[JOINT_2]\nHOME_OFFSET = -20.3000\n" in ini
     page = (tmp_path / "out/README.md").read_text()
     assert "300.5000 → **301.2000**" in page
 
 
-def test_a_module_leaves_home_offset_as_it_was(full, exported):
-    """It says so, with limits as they were; what it promises is in its page and in its source."""
+def test_module_files_state_tool_limits_and_error(full, exported):
     assert set(exported) == {
         "README.md",
         "kinematics.ini",
@@ -437,8 +428,8 @@ def test_a_module_leaves_home_offset_as_it_was(full, exported):
     assert 0.0 < stated <= WITHIN * 1e6
 
 
-def test_a_module_may_be_asked_for_where_offsets_alone_are_known(offsets):
-    """HOME_OFFSET that was told stays in it; nominal legs need no more than a constant."""
+def test_module_of_offsets_alone(offsets):
+    """The correction of nominal legs is constant; HOME_OFFSET does not change."""
     options = ExportOptions(module=True, home_offsets=(0.35, 0.3, -0.02))
     files = export_calibration(offsets, "linuxcnc", options=options)
     assert "identified offsets only; a module was requested" in files["README.md"]
@@ -448,8 +439,8 @@ def test_a_module_may_be_asked_for_where_offsets_alone_are_known(offsets):
     assert "within 0.001 µm" in files["README.md"]
 
 
-def test_offsets_alone_may_be_asked_for_where_more_is_known(full):
-    """What is entered where legs and axes stay as they are, not the machine's own offsets."""
+def test_offsets_of_a_complete_model(full):
+    """Offsets that minimise the tool error, not the identified ones."""
     old = (0.35, 0.3, -0.02)
     options = ExportOptions(module=False, home_offsets=old)
     files = export_calibration(full, "linuxcnc", options=options)
@@ -476,14 +467,8 @@ def from_circle(points, centre, radius):
     return np.hypot(across, points[:, 2] - centre[2])
 
 
-def from_line(points, begin, end):
-    begin, way = np.array(begin), np.array(end) - np.array(begin)
-    along = np.clip((points - begin) @ way / (way @ way), 0.0, 1.0)
-    return np.linalg.norm(points - begin - along[:, None] * way, axis=1)
-
-
 def joints_at_switch(calibration, switch):
-    """HOME_OFFSET while measuring of slides whose switches close there, [m]."""
+    """HOME_OFFSET during the measurement of joints with switches at these slides, [m]."""
     places = zip(calibration.robot.drives, switch, ACTIVE, strict=True)
     return [float(d.to_joint(s + active)) for d, s, active in places]
 
@@ -499,7 +484,7 @@ def joints_of(calibration, home_offsets):
 
 
 def test_linuxcnc_follows_a_path_with_the_exported_module(full, tmp_path):
-    """A circle off centre and lines in space: where the calibrated machine had its tool."""
+    """The calibrated machine follows a circle off centre and lines in space."""
     require_linuxcnc()
     files = export_calibration(full, "linuxcnc", anyway=True, options=ExportOptions(within=WITHIN))
     for name, text in files.items():
@@ -517,24 +502,24 @@ def test_linuxcnc_follows_a_path_with_the_exported_module(full, tmp_path):
     )
 
     def distances(points):
-        lines = [from_line(points, *ends) for ends in pairwise(corners)]
+        lines = [polyline_distances(points, np.array(ends)) for ends in pairwise(corners)]
         return np.array([from_circle(points, centre, radius), *lines]) * MM
 
     pieces = distances(full.machine.forward(slides[::5] * MM) / MM)
     assert pieces.min(axis=0).max() < PATH
     assert (np.count_nonzero(pieces < PATH, axis=1) > [150, 100, 80]).all()
-    # with nominal kinematics these slides would be far from it: the errors are no small ones
+    # the errors of the machine are large
     nominal = Machine(full.robot, {}).forward(slides[::5] * MM + ACTIVE) / MM
     assert distances(nominal).min(axis=0).max() > 1.0 * MM
 
 
 FILTERED = 0.3
-"""[µm] By how much a program that is filtered in these tests may be off."""
+"""Tolerance of filtered programs, [µm]."""
 
 
 @pytest.fixture
 def filtered(root, full, tmp_path):
-    """A program as LinuxCNC's window opens it, with the lines of the page on controllers."""
+    """A function that opens a program as LinuxCNC's window does, with the INI lines of the docs."""
     write_calibration(full, tmp_path / "calibration.json")
     page = (root / "docs/controllers.md").read_text()
     ini = re.search(r"(?m)(?:^    .+\n)+", page[page.index("    [FILTER]") :])[0]
@@ -558,8 +543,8 @@ def filtered(root, full, tmp_path):
     return open_program
 
 
-def test_linuxcnc_runs_what_its_window_has_had_filtered(root, mixed, full, filtered, tmp_path):
-    """With nominal kinematics; a circle and lines, where the calibrated machine had its tip."""
+def test_linuxcnc_follows_a_path_with_a_filtered_program(root, mixed, full, filtered, tmp_path):
+    """With nominal kinematics, the tip of the calibrated machine follows a circle and lines."""
     centre, radius = (10.0, -8.0, 15.0), 10.0
     corners = [(20.0, -8.0, 15.0), (-20.0, 10.0, -15.0), (-15.0, -20.0, 10.0)]
     program = [
@@ -587,51 +572,52 @@ def test_linuxcnc_runs_what_its_window_has_had_filtered(root, mixed, full, filte
     points = tip.place(slides[::5] * MM) / MM - np.array(TOOL) / MM
 
     def distances(points):
-        lines = [from_line(points, *ends) for ends in pairwise(corners)]
+        lines = [polyline_distances(points, np.array(ends)) for ends in pairwise(corners)]
         return np.array([from_circle(points, centre, radius), *lines]) * MM
 
     pieces = distances(points)
     assert pieces.min(axis=0).max() < FILTERED * 1e-6 + PATH
     assert (np.count_nonzero(pieces < FILTERED * 1e-6 + PATH, axis=1) > [150, 80, 60]).all()
-    # as it was written it would be far off
+    # without the filter the errors are large
     unfiltered = Machine(full.robot, {}).forward(slides[::5] * MM + ACTIVE) / MM
     assert distances(unfiltered).min(axis=0).max() > 1.0 * MM
 
 
-def test_linuxcnc_s_window_opens_nothing_where_the_filter_refuses(filtered):
-    """And shows why."""
+def test_linuxcnc_window_shows_why_a_program_is_refused(filtered):
     code, said, _, text = filtered(["G21 G0 X0 Y0 Z0", "G81 X1 Z-1 R1 F100"])
     assert (code, text) == (2, "")
     assert said.startswith("orthocal: ")
     assert "part.ngc:2: found G81, which is a canned cycle" in said
     assert said.count("\n") == 1
-    # a name that the INI has no line for is opened as it is
+    # file names without a filter in the INI
     assert filtered(["G0 X0 Y0 Z0"], name="part.nc")[0] is None
     assert filtered(["G0 X0 Y0 Z0"], name="PART.NGC")[0] is None
 
 
-def test_the_home_offset_that_was_typed_brings_the_tool_where_it_is_sent(offsets):
-    """One joint counts up and two count down; before it was typed the tool was elsewhere."""
+def test_linuxcnc_reaches_the_target_with_the_exported_home_offset(offsets):
+    """With one joint that counts up and two that count down."""
     require_linuxcnc()
     old = joints_at_switch(offsets, SWITCH)
     real = Machine(offsets.robot, OFFSETS)
     point = np.array([20.0, -15.0, 30.0]) * MM
     options = ExportOptions(home_offsets=tuple(old))
-    typed = export_calibration(offsets, "linuxcnc", options=options)["joints.ini"]
+    entered = export_calibration(offsets, "linuxcnc", options=options)["joints.ini"]
     reached = []
-    for lines in ("", typed):
-        sent = Machine(offsets.robot, {}).inverse(point)  # as a nominal controller does
-        shown = [float(d.to_joint(r)) / MM for d, r in zip(offsets.robot.drives, sent, strict=True)]
-        go = " ".join(f"{letter}{v:.7f}" for letter, v in zip("XYZ", shown, strict=True))
-        program = [f"G21 G90 G1 {go} F6000", "G4 P0.15"]
+    for lines in ("", entered):
+        drives = Machine(offsets.robot, {}).inverse(point)  # nominal kinematics
+        joints = [
+            float(d.to_joint(r)) / MM for d, r in zip(offsets.robot.drives, drives, strict=True)
+        ]
+        words = " ".join(f"{letter}{v:.7f}" for letter, v in zip("XYZ", joints, strict=True))
+        program = [f"G21 G90 G1 {words} F6000", "G4 P0.15"]
         slides = run_program(program, joints_of(offsets, old), lines=lines)
         reached.append(real.forward(slides[-1] * MM))
     before, after = (np.linalg.norm(r - point) for r in reached)
-    assert after < TYPED
+    assert after < ENTERED
     assert before > 0.5 * MM
 
 
-def test_the_module_is_built_without_a_warning(exported, tmp_path):
+def test_module_is_built_without_warnings(exported, tmp_path):
     require_linuxcnc()
     for name, text in exported.items():
         (tmp_path / name).write_text(text)

@@ -327,8 +327,8 @@ def test_second_tool_is_refused_with_a_tip(text, number, message):
 
 def test_position_and_first_motion_must_be_known():
     for text, message in (
-        (["G21 F1 G1 X1"], "the position along Y is not known before this motion; expected a"),
-        (["G91 G0 X1 Y1 Z1"], "the position along X is not known"),
+        (["G21 F1 G1 X1"], "the position along Y is unknown before this motion; expected a"),
+        (["G91 G0 X1 Y1 Z1"], "the position along X is unknown"),
         (["F1 G1 X1 Y1 Z1"], "found G1 as the first motion, from a position that is not on"),
     ):
         with pytest.raises(GcodeError, match=message):
