@@ -424,7 +424,7 @@ def test_module_files_state_tool_limits_and_error(full, exported):
     assert "restore the old INI lines" in exported["README.md"]
     assert "[AXIS_Z]\nMIN_LIMIT = -60\nMAX_LIMIT = 60\n" in exported["kinematics.ini"]
     assert "# x_slide\nTYPE = LINEAR\nMIN_LIMIT = 120.4000\n" in exported["kinematics.ini"]
-    stated = float(re.search(r"within ([\d.]+) µm", exported["README.md"])[1])
+    stated = float(re.search(r"at most ([\d.]+) µm", exported["README.md"])[1])
     assert 0.0 < stated <= WITHIN * 1e6
 
 
@@ -436,7 +436,7 @@ def test_module_of_offsets_alone(offsets):
     assert "(JOINT_0 350.0000, JOINT_1 300.0000, JOINT_2 -20.0000)" in files["README.md"]
     assert "HOME_OFFSET = 300.0000\n" in files["kinematics.ini"]
     assert "#define DEGREE 1\n" in files["orthocal_core.c"]
-    assert "within 0.001 µm" in files["README.md"]
+    assert "at most 0.001 µm" in files["README.md"]
 
 
 def test_offsets_of_a_complete_model(full):

@@ -153,9 +153,9 @@ def write_module_page(
     letters = [c for k, c in enumerate(LETTERS) if k not in approximation.coordinates]
     form = f"a polynomial of degree {polynomial.degree} ({len(polynomial.exponents)} terms a joint)"
     if isinstance(inverse.nominal, Tangent):
-        form = f"They are {form}."
+        form = f"The inverse kinematics are {form}."
     else:
-        form = f"They are the closed form of the nominal machine, corrected by {form}."
+        form = f"The inverse kinematics are the nominal closed form, corrected by\n{form}."
     nominal = beyond = ""
     if approximation.nominal is not None:
         nominal = (
@@ -175,10 +175,10 @@ def write_module_page(
     return f"""\
 # {comment_safe(calibration.robot.name)}: kinematics for LinuxCNC
 
-{reason} This kinematics module contains the kinematics of the calibrated machine.
+{reason} This module contains the kinematics of the calibrated machine.
 {form}
 
-**Its error is within {achieved} µm** of the calibrated machine, over {approximation.region} mm,
+**The error at the tool is at most {achieved} µm** over {approximation.region} mm,
 for a tip at {millimetres(approximation.tool)} mm in the frame of the tool centre point.
 This is the largest error at {approximation.checked} points that were not fitted, plus 10 %.
 {nominal}The uncertainty of the calibration itself is in its report.
