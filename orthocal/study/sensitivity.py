@@ -134,12 +134,15 @@ def _at_points(session: Session, points: Array) -> Session:
     postures = {
         n: Posture(n, "tcp_mm", p, d) for n, p, d in zip(names, points, drives, strict=True)
     }
+    aligned_at = session.alignment_postures
+    setups = {n: replace(s, aligned_at=aligned_at[n]) for n, s in session.setups.items()}
+    alignment = {n: session.postures[n] for n in aligned_at.values()}
     readings = tuple(
         Reading(setup, posture, None, 1, 0.0, None)
         for setup in session.setups
         for posture in postures
     )
-    return replace(session, postures=postures, readings=readings)
+    return replace(session, setups=setups, postures={**postures, **alignment}, readings=readings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
