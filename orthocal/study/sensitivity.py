@@ -61,13 +61,17 @@ class SensitivityStudy(Study):
         seen: dict[tuple[str, str], Array] = {}
         setups, postures = list(session.setups), list(session.postures)
         o = problem.observations
+        read = {postures[i] for i in o.posture}
         if session.robot.tcp is not None:
             names = problem.machine_selection.names
             tool = ToolSensitivity(session.robot, free=names)(problem.drives, names=postures)
             for posture, slopes in zip(
                 postures, tool * problem.theta_scale[: len(names)], strict=True
             ):
-                seen.update({(posture, word): row for word, row in zip(TOOL, slopes, strict=True)})
+                if posture in read:
+                    seen.update(
+                        {(posture, word): row for word, row in zip(TOOL, slopes, strict=True)}
+                    )
         for i in range(o.size):
             key = postures[o.posture[i]], setups[o.setup[i]]
             seen.setdefault(key, jacobian[i, : problem.n_machine] * problem.noise[i])
