@@ -277,14 +277,18 @@ def _predict(
 ) -> Iterator[Stop]:
     """Stops with predicted readings, and with the reason to lift the plunger where there is one."""
     points, drives, passive = (np.concatenate(part) for part in zip(*paths, strict=True))
-    names = [str(i) for i in range(len(points))]
+    names = [f"sample {i}" for i in range(len(points))]
+    aligned = session.postures[session.alignment_postures[setup]]
+    at_alignment = nominal_assembly(session.robot).close(aligned.drives + session.active_offsets)
+    passive = np.vstack([passive, at_alignment])
     sampled = replace(
         session,
         postures={
             n: Posture(n, "tcp_mm", p, d - session.active_offsets)
             for n, p, d in zip(names, points, drives, strict=True)
-        },
-        setups={setup: session.setups[setup]},
+        }
+        | {aligned.name: aligned},
+        setups={setup: replace(session.setups[setup], aligned_at=aligned.name)},
         readings=tuple(Reading(setup, n, None, 1, 0.0, None) for n in names),
     )
     observations = build_observations(sampled)
