@@ -277,8 +277,8 @@ def _predict(
 ) -> Iterator[Stop]:
     """Stops with predicted readings, and with the reason to lift the plunger where there is one."""
     points, drives, passive = (np.concatenate(part) for part in zip(*paths, strict=True))
-    names = [f"sample {i}" for i in range(len(points))]
     aligned = session.postures[session.alignment_postures[setup]]
+    names = [f"{aligned.name} {i}" for i in range(len(points))]  # none is the posture's own
     at_alignment = nominal_assembly(session.robot).close(aligned.drives + session.active_offsets)
     passive = np.vstack([passive, at_alignment])
     sampled = replace(
