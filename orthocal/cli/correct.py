@@ -15,7 +15,7 @@ from typing import IO, TYPE_CHECKING, Annotated, BinaryIO
 
 import typer
 
-from orthocal.cli.options import CalibrationPath, app
+from orthocal.cli.options import CalibrationPath, app, read_vector
 from orthocal.cli.printing import put_note, put_part
 from orthocal.errors import GcodeError, OutputError, ParameterError
 from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
@@ -112,8 +112,8 @@ def correct(
     from orthocal.io.files import require_writable_file, write_file
 
     zeros = _read_offsets(work_offset or [])
-    position = None if start is None else _read_vector(start, "--start-mm")
-    tip = ExportOptions(tool=None if tool is None else _read_vector(tool, "--tool")).tool
+    position = None if start is None else read_vector(start, "--start-mm")
+    tip = ExportOptions(tool=None if tool is None else read_vector(tool, "--tool")).tool
     if out is not None:
         require_writable_file(out)
     result = load_calibration(calibration)
@@ -229,21 +229,8 @@ def _read_offsets(texts: list[str]) -> dict[str, Vector]:
             )
         if name in offsets:
             raise ParameterError(f"found {name} twice", where=option)
-        offsets[name] = _read_vector(values, option)
+        offsets[name] = read_vector(values, option)
     return offsets
-
-
-def _read_vector(text: str, option: str) -> Vector:
-    from orthocal.io.documents import parse_number
-
-    parts = text.split(",")
-    if len(parts) != 3:
-        raise ParameterError(f"found '{text}'; expected X,Y,Z", where=option)
-    x, y, z = (
-        parse_number(part.strip(), where=option, name=name, error=ParameterError) * MM
-        for part, name in zip(parts, "XYZ", strict=True)
-    )
-    return (x, y, z)
 
 
 def _describe(summary: Summary, field: CorrectionField, within: float) -> str:

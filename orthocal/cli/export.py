@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orthocal.cli.options import CalibrationPath, app
+from orthocal.cli.options import CalibrationPath, app, read_numbers, read_vector
 from orthocal.cli.printing import put_note
-from orthocal.errors import ParameterError
 from orthocal.units import DRIVE_UNITS, MM, UM
 
 if TYPE_CHECKING:
@@ -82,10 +81,9 @@ def export(
     from orthocal.io.files import write_files
 
     result = load_calibration(calibration)
-    tip = None if tool is None else _numbers(tool, "--tool", count=3)
     options = ExportOptions(
         within=None if within is None else within * UM,
-        tool=None if tip is None else (tip[0] * MM, tip[1] * MM, tip[2] * MM),
+        tool=None if tool is None else read_vector(tool, "--tool"),
         home_offsets=None if home_offset is None else _home_offsets(home_offset, result),
         half_side=None if half_side_mm is None else half_side_mm * MM,
         module=module,
@@ -98,20 +96,5 @@ def export(
 def _home_offsets(text: str, calibration: Calibration) -> tuple[float, ...]:
     """HOME_OFFSET of each joint, [m, rad]."""
     drives = calibration.robot.drives
-    values = _numbers(text, "--home-offset", count=len(drives))
+    values = read_numbers(text, "--home-offset", [d.name for d in drives])
     return tuple(v * DRIVE_UNITS[d.unit][1] for v, d in zip(values, drives, strict=True))
-
-
-def _numbers(text: str, option: str, *, count: int) -> list[float]:
-    """Numbers separated by commas."""
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != count:
-        raise ParameterError(
-            f"found '{text}'; expected {count} numbers separated by commas, such as "
-            f"{','.join(['0'] * count)}",
-            where=option,
-        )
-    return values

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from orthocal.errors import ClosureError, ParameterError, SessionError
+from orthocal.units import MM
 
 if TYPE_CHECKING:
     from orthocal.kinematics.workspace import Workspace
@@ -139,3 +140,35 @@ def require_cube(robot: Robot, half_side_mm: float) -> Workspace:
             where="--half-side-mm",
         ) from None
     return found
+
+
+def read_numbers(text: str, option: str, names: Sequence[str]) -> tuple[float, ...]:
+    """Numbers of an option, separated by commas.
+
+    Args:
+        text: Value of the option.
+        option: Name of the option, for messages.
+        names: Names of the numbers.
+
+    Raises:
+        ParameterError: If the number of values is another one, or a value is not finite.
+    """
+    from orthocal.io.documents import parse_number
+
+    parts = text.split(",")
+    if len(parts) != len(names):
+        raise ParameterError(f"found '{text}'; expected {','.join(names)}", where=option)
+    return tuple(
+        parse_number(part.strip(), where=option, name=name, error=ParameterError)
+        for part, name in zip(parts, names, strict=True)
+    )
+
+
+def read_vector(text: str, option: str) -> tuple[float, float, float]:
+    """Coordinates X,Y,Z of an option in mm, [m].
+
+    Raises:
+        ParameterError: If they are not three finite numbers.
+    """
+    x, y, z = read_numbers(text, option, "XYZ")
+    return (x * MM, y * MM, z * MM)

@@ -337,14 +337,22 @@ def test_rounded_up():
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (["--tool", "1,2"], 2, "--tool: found '1,2'; expected 3 numbers separated by commas"),
-        (["--tool", "0,0,nan"], 2, "--tool: found 0, 0, nan mm; expected numbers of at most 10000"),
+        (["--tool", "1,2"], 2, "--tool: found '1,2'; expected X,Y,Z"),
+        (["--tool", "0,0,nan"], 2, "--tool: Z is 'nan'; expected a finite number"),
         (["--tool", "0,0,1e6"], 2, "--tool: found 0, 0, 1e+06 mm; expected"),
         (["--within", "0"], 2, "--within: found 0 µm; expected more than 0"),
         (["--within", "nan"], 2, "--within: found nan µm"),
         (["--half-side-mm", "-3"], 2, "--half-side-mm: found -3 mm; expected more than 0"),
-        (["--home-offset", "1;2;3"], 2, "--home-offset: found '1;2;3'; expected 3 numbers"),
-        (["--home-offset", "1,2,inf"], 2, "--home-offset: expected finite numbers"),
+        (
+            ["--home-offset", "1;2;3"],
+            2,
+            "--home-offset: found '1;2;3'; expected x_slide,y_slide,z_slide",
+        ),
+        (
+            ["--home-offset", "1,2,inf"],
+            2,
+            "--home-offset: z_slide is 'inf'; expected a finite number",
+        ),
         (["--within", "1"], 2, "--within: is an option of a kinematics module, and the"),
         (["--to", "yaml", "--tool", "0,0,0"], 2, "--tool: is an option of --to linuxcnc alone"),
         (
