@@ -79,9 +79,9 @@ def test_a_server_that_can_open_no_more_turns_visitors_away_quietly():
         assert process.stderr.read() == ""
 
 
-def get(port, path="/", host="127.0.0.1"):
+def get(port, path="/", host="127.0.0.1", headers=None):
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
-    connection.request("GET", path, headers={"Host": f"{host}:{port}"})
+    connection.request("GET", path, headers={"Host": f"{host}:{port}", **(headers or {})})
     answer = connection.getresponse()
     text = answer.read().decode(errors="replace")
     connection.close()
@@ -179,24 +179,45 @@ def test_page_viewer_and_commands_come_from_the_server(scene):
     assert not is_open(live.port)
 
 
-def test_answers_only_to_its_own_name(scene):
-    """A page from elsewhere that has a name resolve to 127.0.0.1 gets nothing."""
+def test_other_host_names_are_refused(scene):
+    """A page from elsewhere whose host name resolves to 127.0.0.1 gets nothing."""
     with LiveScene(scene) as live:
         assert get(live.port, host="localhost")[0] == 200
         assert get(live.port, host="evil.example")[0] == 404
 
-        async def listen(origin):
-            request = HTTPRequest(
-                f"ws://127.0.0.1:{live.port}/commands", headers={"Origin": origin}
-            )
+
+@pytest.mark.parametrize("name", ["Origin", "Sec-Websocket-Origin"])
+@pytest.mark.parametrize(
+    ("origin", "accepted"),
+    [
+        ("http://127.0.0.1:{port}", True),
+        ("https://127.0.0.1:{port}", False),
+        ("ftp://127.0.0.1:{port}", False),
+        ("http://127.0.0.1:{port}/", False),
+        ("http://localhost:{port}", False),
+        ("http://127.0.0.1", False),
+        ("http://evil.example", False),
+        ("null", False),
+    ],
+)
+def test_page_and_commands_are_for_the_same_origin_alone(scene, name, origin, accepted):
+    with LiveScene(scene) as live:
+        headers = {name: origin.format(port=live.port), "Sec-Fetch-Site": "same-origin"}
+
+        async def first_command():
+            request = HTTPRequest(f"ws://127.0.0.1:{live.port}/commands", headers=headers)
             connection = await websocket_connect(request)
             first = await connection.read_message()
             await hang_up(connection)
             return umsgpack.unpackb(first)
 
-        assert asyncio.run(listen(f"http://127.0.0.1:{live.port}"))["type"] == "delete"
-        with pytest.raises(HTTPClientError, match="403"):
-            asyncio.run(listen("http://evil.example"))
+        for path in ("/", "/main.min.js"):
+            assert get(live.port, path, headers=headers)[0] == (200 if accepted else 403)
+        if accepted:
+            assert asyncio.run(first_command())["type"] == "delete"
+        else:
+            with pytest.raises(HTTPClientError, match="403"):
+                asyncio.run(first_command())
 
 
 def test_what_is_added_later_is_sent_at_once(orthoglide):
@@ -238,7 +259,7 @@ def test_listens_on_loopback_only(scene):
 def test_two_views_find_two_ports(scene):
     with LiveScene(scene) as one, LiveScene(scene) as two:
         assert one.port != two.port
-        with pytest.raises(OrthocalError, match=f"port {one.port} of 127.0.0.1 cannot be had"):
+        with pytest.raises(OrthocalError, match=f"cannot listen on port {one.port} of 127.0.0.1"):
             LiveScene(scene, port=one.port)
     assert not is_open(one.port)
     assert not is_open(two.port)
