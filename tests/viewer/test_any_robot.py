@@ -84,7 +84,7 @@ def test_its_drives_are_moved_and_no_further_than_the_machine_is_large(robot):
 def test_what_is_found_and_what_is_free_is_said(robot):
     facts = " ".join(draw_scene(robot).facts)
     found = [d.name for d in robot.drives if d.zero_found]
-    assert ("Found when the loops were closed, not given" in facts) == bool(found)
+    assert ("Computed by closing the loops" in facts) == bool(found)
     assert all(name in facts for name in found)
     free = count_free_motions(robot)
     assert (f"The loops leave {free} passive motion" in facts) == bool(free)

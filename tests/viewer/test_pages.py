@@ -231,7 +231,7 @@ def test_measurement_plays(browser, page):
             changed = np.abs(pictures[one].astype(int) - pictures[two].astype(int)).max(axis=-1)
             assert (changed > 40).mean() > 0.005
         assert captions[1].startswith("x_max, leg x: ")
-        assert captions[2].startswith("y_min, leg y: taken off what is read at y_max")
+        assert captions[2].startswith("y_min, leg y: subtracted from the readings at y_max")
         found.page.evaluate("viewer.animator.reset()")
         found.page.click("#bar button")
         found.wait_for("viewer.animator.time > 2.5")

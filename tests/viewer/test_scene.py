@@ -25,9 +25,8 @@ from orthocal.observation.simulate import simulate_session
 from orthocal.output.scene import drawing, readings, tool_errors
 from orthocal.output.scene.deviations import measure_deviations
 from orthocal.sensors.leg_indicator import DIRECTIONS
-from orthocal.viewer import stage
-from orthocal.viewer.motion import FRAMES_A_SECOND
-from orthocal.viewer.scene import round_scale
+from orthocal.viewer import machine as machine_scene
+from orthocal.viewer.scene import FRAME_RATE, round_scale
 from orthocal.viewer.shapes import arrow_parts, head_length
 
 
@@ -176,8 +175,8 @@ def test_machine_without_deviation_needs_no_ghost(root):
     scene = draw_scene(calibrate(session))
     assert not links(scene, drawing.GHOST)
     assert scene.exaggeration == 1.0
-    assert "where the controller takes it to be" in " ".join(scene.facts)
-    assert "No gauge has seen any deviation" in scene.headline
+    assert "where the controller assumes it" in " ".join(scene.facts)
+    assert "No gauge shows a deviation" in scene.headline
 
 
 def test_offsets_that_are_active_are_in_the_ghost(root):
@@ -198,7 +197,7 @@ def test_offsets_that_are_active_are_in_the_ghost(root):
 def test_leg_lines_go_from_root_to_tip(scene, calibration):
     """Through what is drawn: both ends belong to links that are."""
     root = world(scene, f"{drawing.SOLID}/x_yoke")[:3, 3]
-    line = scene.pose(f"{stage.LINES}/leg x")
+    line = scene.pose(f"{machine_scene.LINES}/leg x")
     assert line[:3, 3] == pytest.approx(root, abs=KINEMATICS)
     assert np.linalg.norm(line[:3, 2]) == pytest.approx(
         calibration.robot.legs["x"].length, abs=1e-3
@@ -237,7 +236,7 @@ def test_arrow_that_is_shorter_than_its_head_is_a_smaller_head():
 def test_gauges_touch_the_leg_at_their_section(scene, calibration):
     for setup in calibration.setups:
         tip = scene.pose(f"{readings.GAUGES}/{setup.name}")[:3, 3]
-        line = scene.pose(f"{stage.LINES}/leg {setup.sensor.leg}")
+        line = scene.pose(f"{machine_scene.LINES}/leg {setup.sensor.leg}")
         along = line[:3, 2] / np.linalg.norm(line[:3, 2])
         off = tip - line[:3, 3]
         assert np.linalg.norm(off - (off @ along) * along) < KINEMATICS
@@ -377,7 +376,7 @@ def test_no_joint_leaps_between_two_frames(scene):
     times, values = animation(scene)[f"{drawing.SOLID}/platform"]["position"]
     assert np.abs(np.diff(values, axis=0)).max() < 0.03
     assert np.diff(times).max() < 2.0
-    assert times[-1] * FRAMES_A_SECOND > 100
+    assert times[-1] * FRAME_RATE > 100
 
 
 # ---- errors of the tool
@@ -391,7 +390,7 @@ def test_errors_of_the_tool_are_those_of_the_calibration(full):
     targets = whole.targets[corners]
     for node, deviation in (
         (tool_errors.TOOL_NOW, whole.align(whole.deviation)[corners]),
-        (tool_errors.TOOL_LEFT, whole.align(whole.error_after_offsets)[corners]),
+        (tool_errors.TOOL_ENTERED, whole.align(whole.error_after_offsets)[corners]),
     ):
         for i in (0, 13, 26):
             pose = scene.pose(f"{node}/point {i + 1}")
@@ -405,8 +404,8 @@ def test_errors_of_the_tool_are_those_of_the_calibration(full):
     told = [e.text for e in scene.legend if e.nodes[0].startswith("Tool error")]
     assert len(told) == 3
     assert all(text.endswith(f"(× {scene.tool_scale:g})") for text in told)
-    assert scene.steps[0].caption == "Overview at the zero"  # no gauge is there
-    ball = scene.pose(f"{tool_errors.TOOL_UNKNOWN}/point 5")[:3, :3]
+    assert scene.steps[0].caption == "Overview at the mechanical zero"  # no gauge is shown
+    ball = scene.pose(f"{tool_errors.TOOL_UNCERTAINTY}/point 5")[:3, :3]
     assert ball @ ball.T == pytest.approx(
         scene.tool_scale**2 * whole.after.aligned_covariance[corners[4]], rel=1e-6, abs=1e-16
     )
@@ -420,7 +419,7 @@ def test_what_is_shown_at_first_can_be_chosen(calibration):
             if c["type"] == "set_property" and c["property"] == "visible" and not c["value"]
         }
 
-    assert hidden(draw_scene(calibration)) == {tool_errors.TOOL_NOW, tool_errors.TOOL_UNKNOWN}
+    assert hidden(draw_scene(calibration)) == {tool_errors.TOOL_NOW, tool_errors.TOOL_UNCERTAINTY}
     assert hidden(draw_scene(calibration, show="tool")) == {
         *(readings.GAUGES, readings.BEFORE, readings.AFTER)
     }
@@ -460,13 +459,13 @@ def test_robots_without_visuals_are_drawn_as_sticks(root, name):
 def test_posture_must_be_one_of_the_session(calibration, orthoglide):
     with pytest.raises(ParameterError, match=r"'x_mx' is not a posture; postures: x_max, x_min"):
         draw_scene(calibration, posture="x_mx")
-    with pytest.raises(ParameterError, match="a robot alone has no postures"):
+    with pytest.raises(ParameterError, match="a robot has no postures"):
         draw_scene(orthoglide, posture="zero")
 
 
 def test_only_a_calibrated_machine_deviates(experiment_2, orthoglide):
     for subject in (experiment_2, orthoglide):
-        with pytest.raises(ParameterError, match="only a calibration has a machine that deviates"):
+        with pytest.raises(ParameterError, match="applies to a calibration only"):
             draw_scene(subject, exaggeration=2.0)
 
 
@@ -487,7 +486,7 @@ def test_arrows_at_one_place_stand_beside_each_other(scene):
 @pytest.mark.parametrize("posture", [None, "x_max", "x_min"])
 def test_arrows_do_not_reach_through_the_ground(calibration, posture):
     scene = draw_scene(calibration, posture=posture)
-    ground = scene.pose(stage.GROUND)[2, 3]
+    ground = scene.pose(machine_scene.GROUND)[2, 3]
     for row in calibration.residuals:
         pose = scene.pose(f"{readings.BEFORE}/{row.setup}")
         shown = posture is None or row.posture == posture
@@ -499,15 +498,15 @@ def test_a_scene_of_the_tool_says_how_far_it_is_off(calibration):
     scene = draw_scene(calibration, show="tool")
     found = assess_tool(calibration)
     largest = np.linalg.norm(found.align(found.deviation), axis=1).max() * 1e6
-    assert scene.headline.startswith(f"The tool is up to {largest:.0f} µm off where it is sent")
+    assert scene.headline.startswith(f"Tool error now: up to {largest:.0f} µm over ±60 mm")
     # with errors as far beyond their tolerances as what remains of the readings says
     covariance = error_covariance(calibration, excess=find_excess(calibration))
     known = measure_uncertainty(found.jacobian, covariance, found.workspace, found.targets)
     known = known.sizes.aligned.largest
     assert known > 1.2 * found.after.sizes.aligned.largest
-    assert f"known to {known * 1e6:.0f} µm or better" in scene.headline
-    (told,) = (e.text for e in scene.legend if e.nodes == (tool_errors.TOOL_UNKNOWN,))
-    assert "errors 2.1 × tolerances" in told
+    assert f"With all corrected: {known * 1e6:.0f} µm or less" in scene.headline
+    (told,) = (e.text for e in scene.legend if e.nodes == (tool_errors.TOOL_UNCERTAINTY,))
+    assert "errors at 2.1 × tolerances" in told
 
 
 def test_only_machines_sessions_and_calibrations_are_drawn():

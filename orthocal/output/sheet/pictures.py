@@ -27,7 +27,7 @@ from orthocal.output.sheet.gauge_position import (
 from orthocal.output.text.layout import short_name
 from orthocal.robot.model import Robot
 from orthocal.units import MM
-from orthocal.viewer.stage import VIEW
+from orthocal.viewer.machine import VIEW
 from orthocal.viewer.visuals import Visual
 
 Array = NDArray[np.float64]
