@@ -300,7 +300,7 @@ def test_report_opens_and_asks_for_nothing(browser, report):
     with visit(browser, report.as_uri(), size=(1000, 900)) as found:
         assert found.page.title().startswith("Calibration of orthoglide")
         text = found.page.inner_text("body")
-        for expected in ("x_slide", "-0.527", "What it means", "SHA-256"):
+        for expected in ("x_slide", "-0.527", "Findings", "SHA-256"):
             assert expected in text
         found.page.locator("iframe").scroll_into_view_if_needed()
         frame = found.page.frame_locator("iframe")

@@ -51,7 +51,7 @@
     box.type = "checkbox";
     box.checked = entry.shown;
     marks[entry.mark](makeSvg("svg", label, { width: 26, height: 12 }), entry.colour);
-    make("span", label, entry.text);
+    make("span", label, entry.text.replaceAll("× ", "×\u00a0"));
     box.addEventListener("change", () => entry.nodes.forEach((n) => show(n, box.checked)));
     return { box, nodes: entry.nodes.map(split) };
   });
