@@ -15,6 +15,7 @@ from PIL import Image
 
 from orthocal import LiveScene, calibrate, draw_scene, load_robot, load_session, write_report
 from orthocal.measurement.files.session_file import load_plan
+from orthocal.output.report.parameter_plots import plot_correlations
 from orthocal.viewer.browser import take_picture
 
 EXPECTED = ("zx −1.140 → −0.130 mm", "x_max − x_min", "Before: measured − nominal", "leg z")
@@ -323,6 +324,27 @@ def test_report_is_as_wide_as_its_window(browser, report):
                 box = figure.bounding_box()
                 assert box["x"] >= 0
                 assert box["x"] + box["width"] <= size[0] + 1
+
+
+def test_no_text_of_a_plot_is_cut_off(browser, root, tmp_path):
+    """Browsers may draw text wider than matplotlib does, here the names of 40 parameters."""
+    calibration = calibrate(load_session(root / "examples/workshop"), "full")
+    path = tmp_path / "plot.html"
+    path.write_text(plot_correlations(calibration), encoding="utf-8")
+    with visit(browser, path.as_uri()) as found:
+        texts = found.page.evaluate(
+            """() => {
+                 const svg = document.querySelector('svg').getBoundingClientRect();
+                 return [...document.querySelectorAll('svg text')].map((text) => {
+                   const box = text.getBoundingClientRect();
+                   return [box.left - svg.left, box.top - svg.top,
+                           svg.right - box.right, svg.bottom - box.bottom, text.textContent];
+                 });
+               }"""
+        )
+    assert len(texts) > 80
+    for *gaps, text in texts:
+        assert min(gaps) >= 0.0, text
 
 
 def test_report_prints(browser, report, tmp_path):

@@ -35,6 +35,9 @@ ROW_HEIGHT = 0.17
 HEAD = 0.48
 """Height of title and legend together, [inch]."""
 
+PADDING = 0.1
+"""Distance of text from the border, [inch]; browsers draw text wider than matplotlib expects."""
+
 BEFORE, AFTER, UNSEEN, BAND = "#E69F00", "#0072B2", "#009E73", "#DDDDDD"
 
 _STYLE: dict[Any, Any] = {
@@ -165,7 +168,10 @@ def open_figure(height: float, title: str, *, legend: bool = True) -> Figure:
     head = HEAD if legend else 0.7 * HEAD
     height += head
     below = (0.0, 0.0, 1.0, 1.0 - head / height)
-    figure = Figure(figsize=(WIDTH, height), layout=ConstrainedLayoutEngine(rect=below))
+    figure = Figure(
+        figsize=(WIDTH, height),
+        layout=ConstrainedLayoutEngine(rect=below, w_pad=PADDING, h_pad=PADDING),
+    )
     bold = {"fontsize": 10.0, "fontweight": "bold", "verticalalignment": "top"}
     figure.text(0.01, 1.0 - 0.06 / height, title, bold)
     figure.set_label(title)
