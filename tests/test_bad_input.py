@@ -1527,12 +1527,12 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "schema-other",
-        f"{CALIBRATION}: schema is 'orthocal/calibration/9'; expected 'orthocal/calibration/5'",
-        swap(FILE, "orthocal/calibration/5", "orthocal/calibration/9"),
+        f"{CALIBRATION}: schema is 'orthocal/calibration/9'; expected 'orthocal/calibration/6'",
+        swap(FILE, "orthocal/calibration/6", "orthocal/calibration/9"),
     ),
     calibration(
         "schema-missing",
-        f"{CALIBRATION}: schema: is missing; expected 'orthocal/calibration/5'",
+        f"{CALIBRATION}: schema: is missing; expected 'orthocal/calibration/6'",
         write(FILE, "{}"),
     ),
     calibration(

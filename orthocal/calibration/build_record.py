@@ -328,6 +328,7 @@ def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
         for i, (name, real) in enumerate(zip(o.zero_setup, o.zero_real, strict=True))
         if real
     }
+    aligned_at = fit.problem.session.alignment_postures
     return tuple(
         SetupRecord(
             s.name,
@@ -335,6 +336,7 @@ def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
             gauge=s.gauge,
             active=None if s.active is None else tuple(s.active.tolist()),
             zero=zeros.get(s.name),
+            aligned_at=aligned_at[s.name],
         )
         for s in fit.problem.session.setups.values()
     )

@@ -133,6 +133,12 @@ def require_rows(
                     where=f"{prefix}postures[{i}].{key}",
                 )
     posture_names, setup_names = {p.name for p in postures}, {s.name for s in setups}
+    for i, setup in enumerate(setups):
+        if setup.aligned_at not in posture_names:
+            raise CalibrationFileError(
+                f"'{setup.aligned_at}' is not among the file's postures",
+                where=f"{prefix}setups[{i}].aligned_at",
+            )
     for i, row in enumerate(residuals):
         for key, name, kind, among in (
             ("setup", row.setup, "setups", setup_names),

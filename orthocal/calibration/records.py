@@ -186,6 +186,8 @@ class SetupRecord:
     """Offsets active in the controller, [m, rad], where they were not those of the session."""
     zero: Number | None
     """Estimated zero of the gauge, [m]; None where only differences were given."""
+    aligned_at: str
+    """Posture in which the operator aligned the gauge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -142,11 +142,17 @@ def _rename(session: Session, label: str) -> Session:
     def named(name: str) -> str:
         return f"{label}/{name}" if name else label
 
-    active = session.active_offsets
+    active, aligned_at = session.active_offsets, session.alignment_postures
 
     def setup(s: Setup) -> Setup:
         own = active if s.active is None else s.active
-        return replace(s, name=named(s.name), gauge=named(s.gauge), active=own)
+        return replace(
+            s,
+            name=named(s.name),
+            gauge=named(s.gauge),
+            active=own,
+            aligned_at=named(aligned_at[s.name]),
+        )
 
     def posture(p: Posture) -> Posture:
         return replace(p, name=named(p.name))

@@ -1,9 +1,13 @@
-"""How gauges are set by what is there: a ball is put over the rod that one sees, on no drawing.
+"""Manual alignment of gauges: the operator centres a ball on the actual rod, by eye.
 
-What a hand sets by its eye counts from where the real machine has it in the first posture of the
-setup. How far that is from the drawing follows the machine's errors, to first order: what is left
-of that, some hundredths of a millimetre for offsets of millimetres, is far less than a hand's
-tolerance.
+A nuisance parameter that the operator aligns counts from where the actual machine has the rod in
+the posture in which the gauge was aligned (`Session.alignment_postures`):
+
+    c = c_nominal + ν + S (θ − θ_active)
+
+with S the sensitivity of the rod's position in that posture and θ_active the offsets that the
+controller already applies. S is taken at the nominal machine. The terms of second order are some
+hundredths of a millimetre for offsets of millimetres, far less than the alignment tolerance.
 """
 
 from __future__ import annotations
@@ -61,7 +65,7 @@ def find_setting(session: Session) -> Setting:
     """How the gauges of a session were set.
 
     Raises:
-        ClosureError: If the nominal machine cannot reach a setup's first posture.
+        ClosureError: If the nominal machine cannot reach an alignment posture.
     """
     known, errors = sensor_unknowns(session), compiled_robot(session.robot).errors
     slopes = np.zeros((len(known.parameters), len(errors.names)))
@@ -76,15 +80,15 @@ def find_setting(session: Session) -> Setting:
 
 
 def _list_looks(session: Session, known: SensorUnknowns) -> Iterator[_Look]:
-    first = {r.setup: r.posture for r in reversed(session.readings)}
+    aligned_at = session.alignment_postures
     active = session.robot.drive_zero - session.zero_drives
     for i, setup in enumerate(session.setups.values()):
-        if setup.name not in first:
+        if not known.of_setup[i]:  # it has no readings
             continue
         seen = setup.sensor.set_by(session.robot)
         for index, unknown in zip(known.of_setup[i], setup.sensor.unknowns, strict=True):
             if unknown.name in seen:
-                posture = session.postures[first[setup.name]]
+                posture = session.postures[aligned_at[setup.name]]
                 yield _Look(
                     unknown=index,
                     setup=replace(setup, sensor=seen[unknown.name], active=None),

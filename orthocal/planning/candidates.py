@@ -200,6 +200,7 @@ def measure_candidates(
     owners = [name.rpartition(".")[0] for name in problem.free]
     common = [i for i, owner in enumerate(owners) if i < n or owner not in private]
     kinds, taken, set_by = [], [], _list_set_by(session, problem)
+    aligned_at = session.alignment_postures
     for k, name in enumerate(session.setups):
         rows = np.flatnonzero(o.setup == k)
         if rows.size < FEWEST:
@@ -211,7 +212,8 @@ def measure_candidates(
             answers = jacobian[rows, index] / problem.theta_scale[index]
             moves = np.zeros_like(slopes)
             moves[:, :n] = seen - seen.mean(axis=0)
-            slopes -= np.outer(answers, moves[0])  # the first is where the session begins it
+            at = [session.readings[i].posture for i in rows].index(aligned_at[name])
+            slopes -= np.outer(answers, moves[at])  # that is where the session aligns it
             by_hand.append(HandSet(answers, moves))
         spread = mine @ mine.T
         unknown = spare_range * _unknown_differences(slopes, spread)
@@ -420,11 +422,4 @@ def _touching(session: Session) -> Session:
             "fewer sections or places",
             where="plan",
         )
-    used = {r.setup for r in readings}
-    stands = {r.posture for r in readings}
-    return replace(
-        session,
-        readings=readings,
-        setups={n: s for n, s in session.setups.items() if n in used},
-        postures={n: p for n, p in session.postures.items() if n in stands},
-    )
+    return replace(session, readings=readings).select(readings)

@@ -258,7 +258,7 @@ def build_session(
         rows = [source.readings[i] for i in kind.rows[list(opened.chosen)]]
         points = np.array([source.postures[r.posture].values for r in rows])
         order = order_postures(points)
-        setups[name] = replace(old, name=name)
+        setups[name] = replace(old, name=name, aligned_at=rows[0].posture)
         readings += [replace(rows[i], setup=name) for i in order]
         readings.append(replace(rows[0], setup=name, cycle=2))
         used.update((r.posture, source.postures[r.posture]) for r in rows)

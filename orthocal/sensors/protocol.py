@@ -103,6 +103,9 @@ class SetupKeys(BaseModel):
     """Which of the session's gauges; needed where there are several."""
     postures: Annotated[list[Name], Field(min_length=1)] | None = None
     """In a plan: the postures it is to be read in; all by default."""
+    aligned_at: Name | None = None
+    """Posture in which the operator aligned the gauge; by default the mechanical zero if the setup
+    reads it, otherwise the posture nearest to it."""
 
 
 class Sensor(Protocol):
@@ -149,8 +152,8 @@ class Sensor(Protocol):
     def set_by(self, robot: Robot) -> Mapping[str, Sensor]:
         """Unknowns that a hand sets by what it sees, by their names: what it sees.
 
-        Such an unknown counts from what that other sensor would show in the first posture of the
-        setup, less what it would show on the machine as drawn.
+        Such an unknown counts from what that other sensor would show in the alignment posture of
+        the setup, less what it would show on the nominal machine.
         """
 
     def expression(self, view: View, robot: Robot) -> ca.SX:

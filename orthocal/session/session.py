@@ -23,6 +23,9 @@ from orthocal.units import MM
 
 Array = NDArray[np.float64]
 
+ALIKE = 9
+"""Decimals to which distances of postures from the mechanical zero are compared, [m, rad]."""
+
 
 @dataclass(frozen=True, slots=True)
 class Purpose:
@@ -70,6 +73,9 @@ class Setup:
     active: Array | None = None
     """Offsets that were active in the controller while it stood, shape (n_drives,), [m, rad]; those
     of the session where not given."""
+    aligned_at: str | None = None
+    """Posture in which the operator aligned the gauge; None for the rule of
+    `Session.alignment_postures`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,6 +155,30 @@ class Session:
         return np.asarray(self.robot.drive_zero - np.array(active))
 
     @property
+    def alignment_postures(self) -> dict[str, str]:
+        """Posture in which the operator aligned the gauge, by setup.
+
+        The one that the setup states (`aligned_at`); otherwise, of the postures that the setup
+        reads, the one nearest to the mechanical zero in drive coordinates, the first in the order
+        of `postures` among equals. It does not depend on the order of the readings. A setup without
+        readings counts as one that reads all postures.
+        """
+        order = {name: i for i, name in enumerate(self.postures)}
+        read: dict[str, set[int]] = {name: set() for name in self.setups}
+        for r in self.readings:
+            read[r.setup].update(order[p] for p in (r.posture, r.minus) if p is not None)
+        names, drives = list(order), np.array([p.drives for p in self.postures.values()])
+        found = {}
+        for setup, zero in zip(self.setups.values(), self.zero_drives, strict=True):
+            if setup.aligned_at is not None:
+                found[setup.name] = setup.aligned_at
+                continue
+            among = np.array(sorted(read[setup.name]) or range(len(names)))
+            distances = np.linalg.norm(drives[among] - zero, axis=1).round(ALIKE)
+            found[setup.name] = names[among[int(distances.argmin())]]
+        return found
+
+    @property
     def values(self) -> Array:
         """All readings, shape (n_readings,), [m]."""
         return np.array([r.value for r in self.readings])
@@ -180,6 +210,22 @@ class Session:
             + (paragraph(f"Source: {self.source}") if self.source else "")
             + table(headers, rows, left=2)
             + paragraph(about)
+        )
+
+    def select(self, readings: Sequence[Reading]) -> Session:
+        """The same session with some of its readings, and the setups and postures they need.
+
+        Gauges stay aligned where they were (`alignment_postures` of the whole session).
+        """
+        read = {r.setup for r in readings}
+        aligned_at = {n: p for n, p in self.alignment_postures.items() if n in read}
+        used = {p for r in readings for p in (r.posture, r.minus)} | set(aligned_at.values())
+        return replace(
+            self,
+            readings=tuple(readings),
+            setups={n: replace(self.setups[n], aligned_at=p) for n, p in aligned_at.items()},
+            postures={n: p for n, p in self.postures.items() if n in used},
+            sha256="",
         )
 
     def with_controller(self, offsets: ArrayLike) -> Session:

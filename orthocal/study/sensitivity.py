@@ -61,13 +61,17 @@ class SensitivityStudy(Study):
         seen: dict[tuple[str, str], Array] = {}
         setups, postures = list(session.setups), list(session.postures)
         o = problem.observations
+        read = {postures[i] for i in o.posture}
         if session.robot.tcp is not None:
             names = problem.machine_selection.names
             tool = ToolSensitivity(session.robot, free=names)(problem.drives, names=postures)
             for posture, slopes in zip(
                 postures, tool * problem.theta_scale[: len(names)], strict=True
             ):
-                seen.update({(posture, word): row for word, row in zip(TOOL, slopes, strict=True)})
+                if posture in read:
+                    seen.update(
+                        {(posture, word): row for word, row in zip(TOOL, slopes, strict=True)}
+                    )
         for i in range(o.size):
             key = postures[o.posture[i]], setups[o.setup[i]]
             seen.setdefault(key, jacobian[i, : problem.n_machine] * problem.noise[i])
@@ -134,12 +138,15 @@ def _at_points(session: Session, points: Array) -> Session:
     postures = {
         n: Posture(n, "tcp_mm", p, d) for n, p, d in zip(names, points, drives, strict=True)
     }
+    aligned_at = session.alignment_postures
+    setups = {n: replace(s, aligned_at=aligned_at[n]) for n, s in session.setups.items()}
+    alignment = {n: session.postures[n] for n in aligned_at.values()}
     readings = tuple(
         Reading(setup, posture, None, 1, 0.0, None)
         for setup in session.setups
         for posture in postures
     )
-    return replace(session, postures=postures, readings=readings)
+    return replace(session, setups=setups, postures={**postures, **alignment}, readings=readings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

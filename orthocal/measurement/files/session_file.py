@@ -263,7 +263,13 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
     for name, (setup, sensor) in read.items():
         where = f"{file}: setups.{name}"
         sensor.require_fit(robot, where=where)
-        setups[name] = Setup(name, sensor, _gauge_of(setup, gauges, where))
+        if setup.aligned_at is not None and setup.aligned_at not in keys.postures:
+            raise SessionError(
+                f"'{setup.aligned_at}' is not a posture; postures: {', '.join(keys.postures)}",
+                where=f"{where}.aligned_at",
+            )
+        gauge = _gauge_of(setup, gauges, where)
+        setups[name] = Setup(name, sensor, gauge, aligned_at=setup.aligned_at)
     _check_shared(setups, str(file))
     _check_planned_postures(file, keys, read)
     return Session(

@@ -43,8 +43,13 @@ def session_document(session: Session, *, readings: str = "readings.csv") -> dic
         document["controller"] = _offsets_document(session)
     if calibration := _calibration_document(session):
         document["calibration"] = calibration
+    aligned_at = session.alignment_postures
     document["setups"] = {
-        s.name: {**write_sensor(s.sensor), **({"gauge": s.gauge} if s.gauge else {})}
+        s.name: {
+            **write_sensor(s.sensor),
+            **({"gauge": s.gauge} if s.gauge else {}),
+            "aligned_at": aligned_at[s.name],
+        }
         for s in session.setups.values()
     }
     document["readings"] = readings
