@@ -29,7 +29,7 @@ NEAR_HINGE = 0.012
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaugePosition:
-    """Position of a gauge in the postures that it reads."""
+    """Position of a gauge in the alignment posture and in those that it reads."""
 
     setup: Setup
     leg: Leg | None
@@ -37,18 +37,22 @@ class GaugePosition:
     rod: Rod | None
     """The touched rod; None for the line between the rods and for other sensors."""
     contact: Contact
-    """Contact in the K postures of the setup."""
+    """Contact in the K postures of the setup, the alignment posture included."""
     poses: Mapping[str, Array]
-    """Poses of the links and of the leg's frames in the first posture, shape (4, 4), [m]."""
-    first: int
-    """Index of the first posture in `contact`."""
+    """Poses of the links and of the leg's frames in the alignment posture, shape (4, 4), [m]."""
+    alignment: str
+    """Posture in which the operator aligns the gauge."""
+    drives: Array
+    """Nominal drive coordinates of the alignment posture, shape (n_drives,), [m, rad]."""
+    aligned: int
+    """Index of the alignment posture in `contact`."""
     tool_path: Array
     """Tool points of all stops, in order, shape (n, 3); (0, 3) without a tool, [m]."""
     hinge_distances: Array
     """Distance of the contact from the rod's hinge at the drive, shape (K,), [m]."""
     lateral_offset: Array
-    """From the rod's axis to the tip, across rod and plunger, in the first posture, shape (3,),
-    [m]."""
+    """From the rod's axis to the tip, across rod and plunger, in the alignment posture, shape
+    (3,), [m]."""
 
     @property
     def tip(self) -> TouchingTip | None:
@@ -57,11 +61,11 @@ class GaugePosition:
 
     @property
     def point(self) -> Array:
-        """Point of contact in the first posture, shape (3,), [m]."""
-        return np.asarray(self.contact.points[self.first])
+        """Point of contact in the alignment posture, shape (3,), [m]."""
+        return np.asarray(self.contact.points[self.aligned])
 
     def origin(self, frame: str) -> Array:
-        """Origin of a frame in the first posture, shape (3,), [m]."""
+        """Origin of a frame in the alignment posture, shape (3,), [m]."""
         return np.asarray(self.poses[frame][:3, 3])
 
     @property
@@ -93,40 +97,44 @@ def find_gauge_position(
     robot, setup = session.robot, session.setups[motion.setup]
     leg, rod = _find_touched(robot, setup)
     names, contact = contacts[motion.setup]
-    first = motion.stops[0]
-    index = names.index(first.posture)
+    alignment = session.alignment_postures[motion.setup]
+    aligned = names.index(alignment)
+    drives = np.array([session.postures[n].drives + session.active_offsets for n in names])
+    q = np.array([passive[n] for n in names])
     rods = [] if leg is None else list(leg.rods.values())
     ends = [frame for r in rods for frame in (r.root, r.tip)]
     ends += [] if leg is None else [leg.root, leg.tip]
     wanted = tuple(dict.fromkeys([*links, *ends]))
-    poses = place_frames(robot, first.drives[None], passive[first.posture][None], wanted)
+    poses = place_frames(robot, drives[aligned][None], q[aligned][None], wanted)
     hinge_distances, lateral_offset = np.full(len(names), np.nan), np.zeros(3)
     if rod is not None:
-        drives = np.array([session.postures[n].drives + session.active_offsets for n in names])
-        q = np.array([passive[n] for n in names])
         frames = place_frames(robot, drives, q, (rod.root, rod.tip))
         roots, tips = (frames[f][:, :3, 3] for f in (rod.root, rod.tip))
         axes = (tips - roots) / np.linalg.norm(tips - roots, axis=1)[:, None]
         hinge_distances = np.einsum("ki,ki->k", contact.points - roots, axes)
         if contact.tip is None or contact.tip.edge is None:
-            normal = contact.points[index] - roots[index] - hinge_distances[index] * axes[index]
-            across = np.cross(axes[index], contact.direction)
+            normal = contact.points[aligned] - roots[aligned]
+            normal -= hinge_distances[aligned] * axes[aligned]
+            across = np.cross(axes[aligned], contact.direction)
             across /= np.linalg.norm(across)
             # the centre of a ball is both radii away from the rod's axis
             radius = 0.0 if contact.tip is None else contact.tip.radius
             lateral_offset = (1.0 + radius / rod.radius) * float(normal @ across) * across
     tool_path = np.zeros((0, 3))
     if robot.tcp is not None:
-        drives = np.array([s.drives for s in motion.stops])
-        q = np.array([passive[s.posture] for s in motion.stops])
-        tool_path = place_frames(robot, drives, q, (robot.tcp.frame,))[robot.tcp.frame][:, :3, 3]
+        way = np.array([s.drives for s in motion.stops])
+        on_way = np.array([passive[s.posture] for s in motion.stops])
+        tool = robot.tcp.frame
+        tool_path = place_frames(robot, way, on_way, (tool,))[tool][:, :3, 3]
     return GaugePosition(
         setup=setup,
         leg=leg,
         rod=rod,
         contact=contact,
         poses={name: pose[0] for name, pose in poses.items()},
-        first=index,
+        alignment=alignment,
+        drives=drives[aligned],
+        aligned=aligned,
         tool_path=tool_path,
         hinge_distances=hinge_distances,
         lateral_offset=lateral_offset,

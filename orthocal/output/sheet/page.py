@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib import resources
 
 import numpy as np
@@ -22,7 +23,7 @@ from orthocal.output.sheet.gauge_position import (
 from orthocal.output.sheet.pictures import draw_machine, draw_section
 from orthocal.output.text.layout import counted
 from orthocal.robot.model import Robot
-from orthocal.session.session import Gauge, Session
+from orthocal.session.session import Gauge, Reading, Session
 from orthocal.units import DRIVE_UNITS, MM
 from orthocal.viewer.visuals import load_visuals
 
@@ -55,7 +56,7 @@ def sheet_files(session: Session, *, options: ProgramOptions | None = None) -> d
         programs = {program_name(m): write_program(session, m, options) for m in motions}
     visuals = load_visuals(session.robot)
     links = tuple(dict.fromkeys(v.link for v in visuals))
-    contacts, passive = locate_contacts(session), _close_loops(session)
+    contacts, passive = locate_contacts(_with_alignment(session)), _close_loops(session)
     setups = []
     for motion in motions:
         gauge = find_gauge_position(session, motion, contacts, passive, links)
@@ -73,6 +74,12 @@ def sheet_files(session: Session, *, options: ProgramOptions | None = None) -> d
         f"{''.join(setups)}\n{_afterwards()}\n</body>\n</html>\n"
     )
     return {SHEET: page, **programs}
+
+
+def _with_alignment(session: Session) -> Session:
+    """A session whose setups also read the postures in which their gauges are aligned."""
+    extra = [Reading(s, p, None, 1, 0.0, None) for s, p in session.alignment_postures.items()]
+    return replace(session, readings=(*session.readings, *extra))
 
 
 def _close_loops(session: Session) -> dict[str, Array]:
@@ -122,8 +129,8 @@ def _front(
         f"{_approach(robot, motions[0].side)}. The programs do this. Do the same if you jog.",
         "Keep the tip on its rod from the first reading of a setup to the last. Lift the plunger "
         "only where the sheet says so.",
-        "Do not touch the gauge after you have set its gauge zero: not the bezel, not the stand, "
-        "not the arm. If it was bumped, start that setup again.",
+        "Do not touch bezel, stand or arm of the gauge after you have set the gauge zero. If the "
+        "gauge was bumped, start that setup again.",
         "Write down what the dial shows, with its sign. Estimate the last digit. If you took no "
         "reading, leave the box empty.",
     ]
@@ -146,7 +153,7 @@ def _front(
 
 
 def _programs(options: ProgramOptions | None) -> str:
-    """How to run the programs."""
+    """Advice for running the programs."""
     shift = (options or ProgramOptions()).shift_mm
     offset = "no work offset"
     if any(shift):
@@ -189,7 +196,7 @@ def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[
         target = f"rod {gauge.rod.name} of leg {gauge.leg.name}"
         reach = gauge.hinge_distances / MM
         contact = (
-            f"Its {name_tip(gauge.tip)} touches {_across(gauge)}, {reach[gauge.first]:.1f} mm "
+            f"Its {name_tip(gauge.tip)} touches {_across(gauge)}, {reach[gauge.aligned]:.1f} mm "
             f"from the hinge at the drive ({reach.min():.0f} to {reach.max():.0f} mm as the leg "
             "moves). "
         )
@@ -198,19 +205,25 @@ def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[
         contact = "Its tip touches the line between the rods. "
     else:
         target = " ".join(gauge.setup.sensor.place).strip()
+    start = f"{first.posture}: {_joint_list(session.robot, first.drives)}"
+    go = [f"Move to the first posture, {start}."]
+    align = "Move to the alignment posture"
+    if gauge.alignment == first.posture:
+        align, go = f"{align}, which is also the first posture", []
     return [
-        f"Move to the first posture, {first.posture}: {_joint_list(session.robot, first.drives)}.",
+        f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}.",
         f"Mount the gauge on the base, on the {side} side of {target}. Point its plunger to "
         f"{opposite}. {contact}Contact in world coordinates: ({place}) mm.",
         f"Push the plunger in by hand, towards {side}. The dial must grow. If it falls, write "
         "every reading of this setup with reversed sign.",
+        *go,
         _gauge_zero(session.gauges[gauge.setup.gauge], first),
         "Take the readings in the order below. The line numbers are those of readings.csv.",
     ]
 
 
 def _across(gauge: GaugePosition) -> str:
-    """Where across the rod the tip touches in the first posture."""
+    """Lateral position of the tip on the rod in the alignment posture."""
     offset = float(np.linalg.norm(gauge.lateral_offset))
     if offset <= VISIBLE:
         return "the middle of the rod"
@@ -358,7 +371,7 @@ def _active_offsets(session: Session) -> str:
 
 
 def _count_outwards(robot: Robot) -> str:
-    """How the joint numbers change when the sliders move outwards."""
+    """Direction in which the joint numbers change if the sliders move outwards."""
     verbs = {1: "grow", -1: "fall"}
     if len({d.direction for d in robot.drives}) == 1:
         return verbs[robot.drives[0].direction]

@@ -346,7 +346,7 @@ class _View:
 
 
 def draw_machine(robot: Robot, visuals: Sequence[Visual], gauge: GaugePosition) -> str:
-    """Picture of the machine in the first posture of a setup, with its gauge."""
+    """Picture of the machine in the alignment posture of a setup, with its gauge."""
     shapes = [(visual, _visual_points(visual, gauge.poses[visual.link])) for visual in visuals]
     reach = 0.32 * float(np.ptp(np.concatenate([p for _, p in shapes]), axis=0).max())
     dial = gauge.point + reach * gauge.contact.direction
@@ -545,7 +545,7 @@ def _free_corner(points: Array) -> Array:
 
 
 def _tip_centre(gauge: GaugePosition) -> Array:
-    """Centre of a ball, else the point of contact, in the first posture, shape (3,), [m]."""
+    """Centre of a ball, else the point of contact, in the alignment posture, shape (3,), [m]."""
     if gauge.rod is None or gauge.tip is None or gauge.tip.edge is not None:
         return gauge.point
     axis = _cut(gauge, gauge.rod.root, gauge.rod.tip, gauge.contact.along)

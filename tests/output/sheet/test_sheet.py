@@ -121,7 +121,7 @@ def test_stated_contact_is_on_the_rod(small, page):
     assert "ball of 3 mm diameter touches the middle of the rod, 125.0 mm from" in text
 
 
-def test_lateral_offset_in_the_first_posture_is_stated(small):
+def test_lateral_offset_in_the_alignment_posture_is_stated(small):
     """Distance of a tip that is centred in the mechanical zero from Pinocchio's rod."""
     readings = [r for r in small.readings if r.setup == "<b>yx" and r.posture == "<out>"]
     session = replace(small, readings=tuple(readings))
@@ -139,6 +139,25 @@ def test_lateral_offset_in_the_first_posture_is_stated(small):
     found = re.search(r"touches the rod (\d+\.\d) mm off its middle, towards", text)
     assert float(found[1]) == pytest.approx(abs(aside), abs=ROUNDED_PLACE)
     assert abs(aside) > 1.0
+
+
+def test_alignment_posture_comes_before_the_first(small):
+    """The operator aligns the gauge there, then moves on and sets the gauge zero."""
+    setups = {**small.setups, "zx": replace(small.setups["zx"], aligned_at="in&")}
+    (section,) = [
+        s
+        for s in sections(etree.HTML(sheet_files(replace(small, setups=setups))["sheet.html"]))
+        if words(s.find("h2")).endswith(": zx")
+    ]
+    steps = [words(li) for li in section.xpath(".//ol/li")]
+    joints = next(row[3:6] for row in rows(section) if row[1] == "in&")
+    assert steps[0].startswith(f"Move to the alignment posture, in&: x_slide {joints[0]} mm")
+    assert steps[3].startswith("Move to the first posture, zero: x_slide 0.000 mm")
+    assert "gauge zero" in steps[4]
+    section = sections(etree.HTML(sheet_files(small)["sheet.html"]))[2]
+    steps = [words(li) for li in section.xpath(".//ol/li")]
+    assert steps[0].startswith("Move to the alignment posture, which is also the first posture")
+    assert "gauge zero" in steps[3]
 
 
 def test_steps_say_how_to_mount_and_set_the_gauge(page):
@@ -165,7 +184,7 @@ def test_front_page_states_zero_travel_and_approach(page):
     assert (
         "towards larger numbers of x_slide, smaller numbers of y_slide, smaller numbers of z_slide"
     ) in text
-    assert "Do not touch the gauge after you have set its gauge zero" in text
+    assert "Do not touch bezel, stand or arm of the gauge after" in text
     assert "into it: controller: {offsets_mm: [0, 0, 0]}." in text
     assert words(page.findall(".//code")[-1]) == "orthocal calibrate ."
     assert "`" not in text
