@@ -19,7 +19,7 @@ from orthocal.assessment.tool_error import ToolAccuracy, assess_tool, find_exces
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.io.files import write_file
-from orthocal.io.html import escape, heading, items, paragraph, table
+from orthocal.io.html import escape, heading, items, page, paragraph, table
 from orthocal.output.report.parameter_plots import (
     plot_correlations,
     plot_linearised,
@@ -78,10 +78,6 @@ GLOSSARY = (
 )
 """Terms of the report that a machine builder may not know."""
 
-_POLICY = (
-    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
-)
-
 
 def build_report(calibration: Calibration) -> str:
     """Report of a calibration as a self-contained HTML page.
@@ -112,15 +108,8 @@ def build_report(calibration: Calibration) -> str:
     )
     head = to_markup(render_heading(calibration, effort=False))
     style = (resources.files("orthocal.output.report") / "report.css").read_text(encoding="utf-8")
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
-        f'<title>{escape(title)}</title>\n<link rel="icon" href="data:,">\n'
-        f"<style>\n{style}</style>\n</head>\n<body>\n"
-        f"<header>{heading('Calibration report', level=1)}{head}"
-        f"<nav>{links}</nav></header>\n<main>{body}</main>\n</body>\n</html>\n"
-    )
+    header = f"<header>{heading('Calibration report', level=1)}{head}<nav>{links}</nav></header>"
+    return page(title, style, f"{header}\n<main>{body}</main>", scripts=True)
 
 
 def write_report(calibration: Calibration, path: str | Path) -> Path:

@@ -8,7 +8,7 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.io.html import escape, heading, paragraph, prose, table
+from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.measurement.motion.motion import SetupMotion, Stop, plan_motion, shown_joints
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
@@ -34,8 +34,6 @@ SHEET = "sheet.html"
 
 VISIBLE = 5e-5
 """Smallest distance that the sheet mentions and smallest deflection that a dial shows, [m]."""
-
-_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
 def sheet_files(session: Session, *, options: ProgramOptions | None = None) -> dict[str, str]:
@@ -64,16 +62,9 @@ def sheet_files(session: Session, *, options: ProgramOptions | None = None) -> d
         setups.append(_setup(session, motion, gauge, pictures, with_program=bool(programs)))
     title = f"Measuring sheet: {session.robot.name}, {session.title}"
     style = (resources.files("orthocal.output.sheet") / "sheet.css").read_text(encoding="utf-8")
-    page = (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
-        f'<title>{escape(title)}</title>\n<link rel="icon" href="data:,">\n'
-        f"<style>\n{style}</style>\n</head>\n<body>\n"
-        f"{_front(session, motions, options if programs else None, with_programs=bool(programs))}\n"
-        f"{''.join(setups)}\n{_afterwards()}\n</body>\n</html>\n"
-    )
-    return {SHEET: page, **programs}
+    front = _front(session, motions, options, with_programs=bool(programs))
+    body = "\n".join([front, "".join(setups), _afterwards()])
+    return {SHEET: page(title, style, body), **programs}
 
 
 def _with_alignment(session: Session) -> Session:
