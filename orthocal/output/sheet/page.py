@@ -191,6 +191,8 @@ def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[
             f"from the hinge at the drive ({reach.min():.0f} to {reach.max():.0f} mm as the leg "
             "moves). "
         )
+        if gauge.tip is not None and gauge.tip.edge is None:
+            contact += "Align the ball by eye: half a millimetre is good enough. "
     elif gauge.leg is not None:
         target = f"leg {gauge.leg.name}"
         contact = "Its tip touches the line between the rods. "

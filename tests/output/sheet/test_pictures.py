@@ -33,7 +33,7 @@ TIPS = (
 
 @pytest.fixture(scope="module")
 def plan(tmp_path_factory):
-    """Every leg, direction, rod and tip; balls are off the middle of the rod in `out`."""
+    """Every leg, direction, rod and tip; aligned in `out`, where balls are off the middle."""
     setups = [
         f"  s{i}: {{leg: {leg}, direction: {way}, section: {{fraction: {at}}}{tip}}}"
         for i, (leg, way, at, tip) in enumerate(
@@ -45,7 +45,7 @@ def plan(tmp_path_factory):
     path = tmp_path_factory.mktemp("plan") / "plan.yaml"
     path.write_text(
         "robot: orthoglide\ngauge: {range_mm: [-5, 5]}\n"
-        "postures:\n  out: {tcp_mm: [2, -3, 3]}\n  zero: {tcp_mm: [0, 0, 0]}\n"
+        "postures:\n  out: {tcp_mm: [2, -3, 3]}\n  far: {tcp_mm: [3, -4, 4]}\n"
         "setups:\n" + "\n".join(setups) + "\n"
     )
     return load_plan(path)
@@ -69,6 +69,8 @@ def overlap(one, other):
 def test_no_label_overlaps_another_or_the_border(plan, drawn):
     pictures, _ = drawn
     assert len(pictures) == 2 * len(plan.setups) == 2 * 50
+    texts = [label.text for picture in pictures for label in picture.labels]
+    assert sum("off centre" in text for text in texts) == 20
     for picture in pictures:
         placed = picture.place_labels()
         assert len(placed) == len(picture.labels)
