@@ -103,14 +103,18 @@ def draw_readings(
         contact = contacts[setup.name]
         rows = [next((r for r in s.rows if r.setup == setup.name), None) for s in stops]
         gauge = _draw_gauge(drawing, setup, contact, dial)
+        # gauges of other legs are not there: their contacts move sideways
+        present = np.array([s.place is None or s.place == setup.sensor.place for s in stops])
+        if not present.all():
+            scene.track(gauge, "visible", "bool", timeline.times[timeline.stops], present)
         # arrows of gauges with the same contact are beside each other
         beside = sum(float(np.linalg.norm(contact.points[0] - p)) < dial for p in points)
         points.append(contact.points[0])
+        distance = (FIRST_ARROW + NEXT_ARROW * beside) * dial
         tips = [contact.points[0] for _ in stops]
         for node in nodes:
+            foot = contact.points[0] + (distance if node == AFTER else -distance) * contact.along
             lengths = [_deviation(row, node) * scene.arrow_scale for row in rows]
-            side = (1.0 if node == AFTER else -1.0) * (FIRST_ARROW + NEXT_ARROW * beside) * dial
-            foot = contact.points[0] + side * contact.along
             draw_arrow(
                 scene,
                 f"{node}/{node_name(setup.name)}",
@@ -124,29 +128,11 @@ def draw_readings(
             drawing.lower_ground(min(float(end[2]) for end in ends))
             if node == BEFORE:
                 tips = ends
-        # gauges of other legs are not there: their contacts move sideways
-        present = np.array([s.place is None or s.place == setup.sensor.place for s in stops])
-        if not present.all():
-            scene.track(gauge, "visible", "bool", timeline.times[timeline.stops], present)
-        texts = [
-            ""
-            if row is None or (animated and stop is stops[0] and setup.name not in labelled)
-            else _label(row, measured)
-            for row, stop in zip(rows, stops, strict=True)
-        ]
-        middle = contact.points[0] + dial_distance(dial) * contact.direction
-        rim = [middle + r * axis for axis in np.eye(3) for r in (-dial, dial)]
-        scene.labels.append(
-            Label(
-                (to_triple(middle),),
-                tuple(texts),
-                gauge,
-                rank=max(abs(r.before) for r in measured.rows if r.setup == setup.name),
-                uncovered=tuple(
-                    tuple(to_triple(p) for p in (contact.points[0], tip, *rim)) for tip in tips
-                ),
-            )
-        )
+        texts = ["" if row is None else _label(row, measured) for row in rows]
+        if animated and setup.name not in labelled:  # the overview is the first and last stop
+            texts = ["" if s is stops[0] else t for s, t in zip(stops, texts, strict=True)]
+        rank = max(abs(r.before) for r in measured.rows if r.setup == setup.name)
+        scene.labels.append(_label_gauge(gauge, contact, dial, texts, tips, rank))
     _explain(scene, nodes, shown)
     overview = _overview(measured, shown)
     captions = [
@@ -188,6 +174,30 @@ def _draw_gauge(drawing: MachineScene, setup: Setup, contact: Contact, dial: flo
         edge=None if tip is None or tip.edge is None else tip.width * tip.edge,
     )
     return node
+
+
+def _label_gauge(
+    node: str,
+    contact: Contact,
+    dial: float,
+    texts: Sequence[str],
+    tips: Sequence[Array],
+    rank: float,
+) -> Label:
+    """Label of a gauge that covers neither its dial nor its contact nor the tip of its arrow.
+
+    Args:
+        node: Node of the gauge.
+        contact: Contact of the gauge.
+        dial: Radius of the dial, [m].
+        texts: Text at every stop.
+        tips: Tip of the arrow at every stop, shape (3,), [m].
+        rank: Rank of the label.
+    """
+    middle = contact.points[0] + dial_distance(dial) * contact.direction
+    rim = [middle + r * axis for axis in np.eye(3) for r in (-dial, dial)]
+    around = [tuple(map(to_triple, (contact.points[0], tip, *rim))) for tip in tips]
+    return Label((to_triple(middle),), tuple(texts), node, rank=rank, uncovered=tuple(around))
 
 
 def _labelled_setups(

@@ -112,14 +112,8 @@ def find_gauge_position(
         roots, tips = (frames[f][:, :3, 3] for f in (rod.root, rod.tip))
         axes = (tips - roots) / np.linalg.norm(tips - roots, axis=1)[:, None]
         hinge_distances = np.einsum("ki,ki->k", contact.points - roots, axes)
-        if contact.tip is None or contact.tip.edge is None:
-            normal = contact.points[aligned] - roots[aligned]
-            normal -= hinge_distances[aligned] * axes[aligned]
-            across = np.cross(axes[aligned], contact.direction)
-            across /= np.linalg.norm(across)
-            # the centre of a ball is both radii away from the rod's axis
-            radius = 0.0 if contact.tip is None else contact.tip.radius
-            lateral_offset = (1.0 + radius / rod.radius) * float(normal @ across) * across
+        normals = contact.points - roots - hinge_distances[:, None] * axes
+        lateral_offset = _find_lateral_offset(rod, contact, normals[aligned], axes[aligned])
     tool_path = np.zeros((0, 3))
     if robot.tcp is not None:
         way = np.array([s.drives for s in motion.stops])
@@ -139,6 +133,24 @@ def find_gauge_position(
         hinge_distances=hinge_distances,
         lateral_offset=lateral_offset,
     )
+
+
+def _find_lateral_offset(rod: Rod, contact: Contact, normal: Array, axis: Array) -> Array:
+    """Vector from the plane of rod and plunger to the centre of the tip, shape (3,), [m].
+
+    Args:
+        rod: The touched rod.
+        contact: The contact.
+        normal: Vector from the rod's axis to the point of contact, shape (3,), [m].
+        axis: Unit vector along the rod, shape (3,).
+    """
+    if contact.tip is not None and contact.tip.edge is not None:
+        return np.zeros(3)
+    across = np.cross(axis, contact.direction)
+    across /= np.linalg.norm(across)
+    # the centre of a ball is both radii away from the rod's axis
+    radius = 0.0 if contact.tip is None else contact.tip.radius
+    return np.asarray((1.0 + radius / rod.radius) * float(normal @ across) * across)
 
 
 def _find_touched(robot: Robot, setup: Setup) -> tuple[Leg | None, Rod | None]:
