@@ -1,7 +1,7 @@
-"""Pages in a real browser: headless Chromium without a network, driven by Playwright.
+"""Pages in headless Chromium without a network, driven by Playwright.
 
-Where $ORTHOCAL_BROWSER is `required`, as in continuous integration, a browser that is missing is a
-failure; elsewhere these tests are skipped, with the reason.
+A missing browser is a failure if $ORTHOCAL_BROWSER is `required`, as in continuous integration;
+otherwise the tests are skipped.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from orthocal.errors import OrthocalError
 from orthocal.viewer.browser import chromium_flags, find_chromium
 
 PATIENCE = 60.0
-"""[s] Until something that must happen has happened."""
+"""Longest wait for an expected event, [s]."""
 
 SIZES = ((1400, 900), (800, 600))
 
 SMALL = (480, 360)
-"""Where no size is asked about: a page is drawn by software here, a pixel at a time."""
+"""Size for tests that do not depend on it: pages are drawn by software, which is slow."""
 
 COARSE = "--disable_chromium_framebuffer_multisample"
-"""Edges need not be smooth here: each pixel would be drawn four times."""
+"""Flag that turns anti-aliasing off, which would draw each pixel four times."""
 
 
 @dataclass
 class Visit:
-    """A page that was opened, and all that it said and asked for."""
+    """An open page with its messages and requests."""
 
     page: object
     messages: list[str] = field(default_factory=list)
     requests: list[str] = field(default_factory=list)
 
     def wait_for(self, expression, *, frame=None):
-        """Until an expression of JavaScript is true; pages forbid the eval of Playwright's own."""
+        """Wait until a JavaScript expression is true; pages forbid Playwright's own function."""
         end = time.monotonic() + PATIENCE
         while not (frame or self.page).evaluate(expression):
             if time.monotonic() > end:
@@ -49,10 +49,9 @@ class Visit:
             time.sleep(0.02)
 
     def wait_until_drawn(self, *, frame=None):
-        """Until all that the page was given is drawn.
+        """Wait until the page has been drawn after loading.
 
-        The viewer draws where something has changed, so a page may well be drawn once and rest: it
-        is asked to draw once more after it was loaded, and that is waited for.
+        The viewer draws only after a change, so that one more drawing is requested.
         """
         self.wait_for("document.readyState === 'complete' && 'viewer' in window", frame=frame)
         drawn = "Number(document.documentElement.dataset.rendered || 0)"
@@ -60,17 +59,17 @@ class Visit:
         self.wait_for(f"{drawn} > {seen}", frame=frame)
 
     def picture(self):
-        """What is to be seen, shape (height, width, 3)."""
+        """Screenshot of the page, shape (height, width, 3)."""
         return np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB"))
 
     def canvas(self):
-        """What the 3-D viewer draws, shape (height, width, 4)."""
+        """Image of the 3-D canvas, shape (height, width, 4)."""
         data = self.page.evaluate("viewer.capture_image()").split(",", 1)[1]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGBA"))
 
 
 def require_browser():
-    """Path of Chromium, or why there is none."""
+    """Path of Chromium; skip or fail without it."""
     try:
         import playwright.sync_api  # noqa: F401
 
@@ -98,7 +97,7 @@ def open_browser():
 
 @contextmanager
 def visit(browser, url, *, size=SIZES[0], online=False):
-    """Open a page without a network; online: one on this machine."""
+    """Open a page without a network, or `online` from a server on this machine."""
     context = browser.new_context(
         viewport={"width": size[0], "height": size[1]}, offline=not online
     )

@@ -1976,7 +1976,7 @@ VIEW_CASES = [
     ),
     Case(
         "view-posture-of-a-robot",
-        "posture: a robot alone has no postures; it takes a session",
+        "posture: a robot has no postures; name a session",
         command="view orthoglide --html {tmp}/a.html --posture zero",
     ),
     Case(
@@ -2020,12 +2020,12 @@ VIEW_CASES = [
     ),
     Case(
         "view-show-of-a-session",
-        "show: only a calibration has a choice of what is shown",
+        "show: applies to a calibration only",
         command=VIEW + " --show tool",
     ),
     Case(
         "view-exaggerate-a-session",
-        "exaggeration: only a calibration has a machine that deviates from another",
+        "exaggeration: applies to a calibration only",
         command=VIEW + " --exaggerate 3",
     ),
     Case(

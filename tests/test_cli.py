@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from orthocal import __version__, cli, load_calibration, load_session
-from orthocal.output.report import parameter_plots, reading_plots, tool_map
+from orthocal.output.report.figure import Plot
 
 
 def run(monkeypatch, capsys, *words):
@@ -34,8 +34,7 @@ def plots(request, monkeypatch):
     """Plots are drawn where a page is looked at, and in tests of their own; they take seconds."""
     if request.function is test_calibrate_prints_and_writes:
         return
-    for module in (parameter_plots, reading_plots, tool_map):
-        monkeypatch.setattr(module, "render_figure", lambda name, *_: f'<svg id="{name}"/>')
+    monkeypatch.setattr(Plot, "__call__", lambda plot, *_, **__: f'<svg id="{plot.name}"/>')
 
 
 @pytest.fixture
@@ -71,7 +70,7 @@ def test_calibrate_prints_and_writes(orthocal, experiment, tmp_path):
     found = load_calibration(folder)
     assert found["x_slide.offset"].value == pytest.approx(-0.5268e-3, abs=5e-6)
     assert {p.name for p in folder.iterdir()} == {"calibration.json", "report.html"}
-    assert "What to enter, and can it be believed?" in (folder / "report.html").read_text()
+    assert "Values to enter" in (folder / "report.html").read_text()
 
 
 def test_report_is_written_beside_its_calibration_or_where_asked(orthocal, calibrated, tmp_path):

@@ -1,4 +1,4 @@
-"""Paper and programs to measure by: sheet."""
+"""The command `sheet`."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ def sheet(
     session: Annotated[
         Path,
         typer.Argument(
-            metavar="SESSION", help="A plan or session: session.yaml, or the folder that holds it."
+            metavar="SESSION", help="Plan or session: session.yaml, or the directory that holds it."
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Folder for it; by default that of the session.")
+        Path | None, typer.Option(help="Output directory; default: the directory of the session.")
     ] = None,
-    feed: Annotated[float, typer.Option(help="From posture to posture, mm/min.")] = 600.0,
+    feed: Annotated[float, typer.Option(help="Feed between postures, mm/min.")] = 600.0,
     approach_feed: Annotated[
-        float, typer.Option(help="On the last millimetres to a posture, mm/min.")
+        float, typer.Option(help="Feed over the last millimetres to a posture, mm/min.")
     ] = 120.0,
     shift_mm: Annotated[
         str,
@@ -38,9 +38,12 @@ def sheet(
             help="Machine coordinates (G53) of the world's origin, mm.",
         ),
     ] = "0,0,0",
-    force: Annotated[bool, typer.Option("--force", help="Write over what is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
 ) -> None:
-    """A measuring sheet to print, and G-code for each setup with a pause at each reading."""
+    """Write a measuring sheet to print and one G-code program per setup.
+
+    The programs pause at each reading.
+    """
     from orthocal.io.documents import parse_number
     from orthocal.io.files import exists, is_folder, require_writable, write_files
     from orthocal.measurement.files.session_file import load_plan
@@ -65,12 +68,12 @@ def sheet(
             raise SessionError("is there already; --force writes over it", where=str(folder / name))
     write_files(folder, files)
     programs = len(files) - 1
-    more = f" and {programs} programs" if programs else "; its drives command no tool: no programs"
+    more = f" and {programs} programs" if programs else "; no programs: the drives control no tool"
     put_note(f"Wrote {folder / 'sheet.html'} to print{more}")
 
 
 def sheet_or_nothing(session: Session) -> dict[str, str]:
-    """The measuring sheet and its programs; nothing, and why, where there cannot be one."""
+    """Files of the measuring sheet; none, with a note on stderr, if it cannot be made."""
     files, problem = sheet_or_problem(session)
     if problem:
         put_note(problem)
@@ -78,7 +81,7 @@ def sheet_or_nothing(session: Session) -> dict[str, str]:
 
 
 def sheet_or_problem(session: Session) -> tuple[dict[str, str], str]:
-    """The same, and what is to be told where there cannot be one."""
+    """Files of the measuring sheet, or none and the reason."""
     from orthocal.output.sheet.page import sheet_files
 
     try:

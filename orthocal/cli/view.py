@@ -1,4 +1,4 @@
-"""What can be looked at: report, view."""
+"""The commands `report` and `view`."""
 
 from __future__ import annotations
 
@@ -23,18 +23,17 @@ def report(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="A page, or a folder that is there; else report.html beside the calibration."
+            help="Page, or existing directory; default: report.html beside the calibration."
         ),
     ] = None,
 ) -> None:
-    """Write a calibration as one page: what to enter, how far to believe it, and why."""
+    """Write the report of a calibration: what to enter, how accurate it is, and why."""
     from orthocal.calibration.file import load_calibration
     from orthocal.io.files import is_folder, require_writable_file
     from orthocal.output.report.page import write_report
 
     result = load_calibration(calibration)
-    folder = Path() if result.path is None else result.path.parent
-    target = folder if out is None else out
+    target = out or (Path() if result.path is None else result.path.parent)
     if is_folder(target):
         target = target / "report.html"
     require_writable_file(target, kinds=(".html", ".htm"))
@@ -47,41 +46,43 @@ def view(
         str,
         typer.Argument(
             metavar="SESSION|CALIBRATION|ROBOT",
-            help="session.yaml, calibration.json, a folder that holds one, or a robot.",
+            help="session.yaml, calibration.json, a directory that holds one, or a robot.",
         ),
     ],
     html: Annotated[
-        Path | None, typer.Option(help="Write one page that opens without network and server.")
+        Path | None, typer.Option(help="Write a page that needs neither network nor server.")
     ] = None,
     png: Annotated[
-        Path | None, typer.Option(help="Write a picture, by a Chromium that is installed.")
+        Path | None, typer.Option(help="Write a picture; needs an installed Chromium.")
     ] = None,
     size: Annotated[
-        str, typer.Option(metavar="WIDTHxHEIGHT", help="Of the picture, in pixels.")
+        str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the picture, in pixels.")
     ] = "1400x900",
     posture: Annotated[
         str | None,
-        typer.Option(help="Stand there, with what was read there; else the whole measurement."),
+        typer.Option(help="Show this posture and its readings; default: the whole measurement."),
     ] = None,
     exaggerate: Annotated[
         float | None,
         typer.Option(
             metavar="FACTOR",
-            help="How many times its size the machine's deviation is drawn; 1 for true scale.",
+            help="Factor that enlarges the deviation of the machine; 1 for true scale.",
         ),
     ] = None,
     show: Annotated[
         str | None,
-        typer.Option(metavar="readings|tool|all", help="What of a calibration is shown at first."),
+        typer.Option(
+            metavar="readings|tool|all", help="What the scene of a calibration shows at first."
+        ),
     ] = None,
     port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Where to listen; else one that is free.")
+        int | None, typer.Option(min=1, max=65535, help="Port to listen on; default: a free one.")
     ] = None,
-    browse: Annotated[bool, typer.Option("--open", help="Open the browser, too.")] = False,
+    browse: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
 ) -> None:
-    """Look at a machine, its measurement and its calibration in 3-D.
+    """Show a machine, its measurement or its calibration in 3-D.
 
-    Without --html and --png on a server that only this machine reaches, until Ctrl-C.
+    Without --html and --png, a server shows it to browsers on this machine until Ctrl-C.
     """
     from orthocal.io.files import require_writable_file
     from orthocal.output.scene.drawing import draw_scene
@@ -104,7 +105,7 @@ def view(
 
 
 def _serve(scene: Scene, port: int | None, browse: bool) -> None:
-    """Show a scene until Ctrl-C."""
+    """Serve a scene until Ctrl-C."""
     from orthocal.viewer.live import LiveScene
 
     with LiveScene(scene, port=port) as live:

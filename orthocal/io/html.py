@@ -11,6 +11,28 @@ from orthocal.text import printable
 TYPED = re.compile("`([^`\n]+)`")
 
 
+_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data: blob:"
+
+
+def page(title: str, style: str, body: str, *, scripts: bool = False) -> str:
+    """A self-contained page that loads nothing from elsewhere.
+
+    Args:
+        title: Title of the page.
+        style: Style sheet.
+        body: Content of the body, HTML.
+        scripts: Whether the page, or a frame in it, may run scripts.
+    """
+    policy = f"{_POLICY}; script-src 'unsafe-inline'" if scripts else _POLICY
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        f'<title>{escape(title)}</title>\n<link rel="icon" href="data:,">\n'
+        f"<style>\n{style}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
 def escape(text: str) -> str:
     """A text as HTML that shows it: no markup, and no character that turns others about."""
     return html.escape(printable(text, keep="\n"))

@@ -1,1 +1,1 @@
-"""The machine to look at: scenes for meshcat, live, as a page and as a picture."""
+"""Scenes of machines with meshcat: shapes, pages, live server and pictures."""

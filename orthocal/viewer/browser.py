@@ -1,4 +1,4 @@
-"""Pictures of pages, by a Chromium where there is one."""
+"""Pictures of pages, taken by Chromium."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 
 FLAGS = (
     "--headless",
-    "--use-gl=angle",  # WebGL by software: no graphics card is needed
+    "--use-gl=angle",  # WebGL without a graphics card
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
-    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",  # a page may ask nobody else
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",  # no network
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-quic",
@@ -29,10 +29,10 @@ FLAGS = (
 )
 
 PAGE_TIME_MS = 4000
-"""Time by the page's clock until the picture is taken."""
+"""Time on the clock of the page before the picture is taken, [ms]."""
 
 PATIENCE = 120.0
-"""Seconds until a browser that does not answer is stopped."""
+"""Time before a browser that does not answer is stopped, [s]."""
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -41,50 +41,50 @@ def find_chromium() -> str:
     """Path of a Chromium: $ORTHOCAL_CHROMIUM, or the first on the PATH.
 
     Raises:
-        OrthocalError: If there is none.
+        OrthocalError: If Chromium is not installed.
     """
-    given = os.environ.get("ORTHOCAL_CHROMIUM")
-    found = next((p for n in ([given] if given else NAMES) if (p := shutil.which(n))), None)
-    if found is None:
-        tried = f"'{given}' ($ORTHOCAL_CHROMIUM)" if given else ", ".join(NAMES)
+    named = os.environ.get("ORTHOCAL_CHROMIUM")
+    path = next((p for n in ([named] if named else NAMES) if (p := shutil.which(n))), None)
+    if path is None:
+        tried = f"'{named}' ($ORTHOCAL_CHROMIUM)" if named else ", ".join(NAMES)
         raise OrthocalError(
-            f"a picture needs Chromium, and there is none ({tried}). Install it (Debian: `apt-get "
-            "install chromium`), or write the page with --html and open it in any browser",
+            f"a picture needs Chromium, and there is none ({tried}). Install it (Debian: "
+            "`apt-get install chromium`), or write the page with --html and open it in a browser",
             where="--png",
         )
-    return found
+    return path
 
 
 def chromium_flags() -> tuple[str, ...]:
-    """Flags of a Chromium that draws WebGL without a screen and asks no network."""
+    """Flags with which Chromium draws WebGL without a screen and without a network."""
     root = hasattr(os, "geteuid") and os.geteuid() == 0
-    return (*FLAGS, "--no-sandbox") if root else FLAGS  # its sandbox refuses root
+    return (*FLAGS, "--no-sandbox") if root else FLAGS  # the sandbox does not work for root
 
 
 def take_picture(page: str, path: str | Path, *, width: int = 1400, height: int = 900) -> Path:
-    """Write a picture of a page that holds all it needs.
+    """Write a picture of a self-contained page.
 
     Args:
-        page: HTML.
-        path: A PNG file.
-        width: [px].
-        height: [px].
+        page: The page, HTML.
+        path: The PNG file.
+        width: Width, [px].
+        height: Height, [px].
 
     Raises:
-        OrthocalError: If there is no Chromium, or it takes no picture.
-        OutputError: If it, or the page that it is taken of, cannot be written.
+        OrthocalError: If Chromium is missing or takes no picture.
+        OutputError: If the picture or its page cannot be written.
     """
     with raised_interrupt():
         try:
             data = _photograph(find_chromium(), page, Path(path), width, height)
         except OSError as e:
-            raise OutputError(f"no page can be written for Chromium: {e}", where="--png") from None
+            raise OutputError(f"cannot write the page for Chromium: {e}", where="--png") from None
     write_file(Path(path), data)
     return Path(path)
 
 
 def _photograph(chromium: str, page: str, path: Path, width: int, height: int) -> bytes:
-    """A picture of a page, as PNG; the path is for messages."""
+    """Picture of a page as PNG; `path` is named in messages."""
     with tempfile.TemporaryDirectory(prefix="orthocal-", ignore_cleanup_errors=True) as folder:
         source, picture = Path(folder) / "page.html", Path(folder) / "page.png"
         source.write_text(page, encoding="utf-8")
@@ -104,7 +104,7 @@ def _photograph(chromium: str, page: str, path: Path, width: int, height: int) -
                 f"{chromium} took no picture in {PATIENCE:g} s", where=str(path)
             ) from None
         except OSError as e:
-            raise OrthocalError(f"{chromium} cannot be run: {e.strerror}", where="--png") from None
+            raise OrthocalError(f"cannot run {chromium}: {e.strerror}", where="--png") from None
         data = picture.read_bytes() if picture.is_file() else b""
         if not data.startswith(_SIGNATURE):
             words = done.stderr.decode(errors="replace").strip().splitlines()
@@ -114,10 +114,10 @@ def _photograph(chromium: str, page: str, path: Path, width: int, height: int) -
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Width and height of WIDTHxHEIGHT, [px].
+    """Width and height from a text WIDTHxHEIGHT, [px].
 
     Raises:
-        OrthocalError: If it is not two whole numbers of 100 to 8000.
+        OrthocalError: If the text is not two integers from 100 to 8000.
     """
     parts = text.lower().split("x")
     if len(parts) == 2 and all(p.isascii() and p.isdigit() for p in parts):

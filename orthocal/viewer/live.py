@@ -1,7 +1,7 @@
-"""A scene live in a browser, from a server that only this machine reaches.
+"""Live scenes: a web server in this process that only this machine can reach.
 
-The server lives in this process, so it ends with it, however that ends. It listens on 127.0.0.1
-and answers only those who ask for it by that name: a page from elsewhere cannot read along.
+The server ends with the process, however the process ends. It listens on 127.0.0.1 and answers
+only requests for that name from its own pages, so that no other web page can read the scene.
 """
 
 from __future__ import annotations
@@ -30,18 +30,32 @@ FIRST_PORT = 7000
 PORTS_TRIED = 100
 
 PAUSE = 0.1
-"""Time until the next visitor is looked at where there is no descriptor for any, [s]."""
+"""Delay before the next connection if the process has no free file descriptor, [s]."""
 
 _EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
-_HOSTS = r"(localhost|127\.0\.0\.1)"  # tornado takes the port off
+_HOSTS = r"(localhost|127\.0\.0\.1)"  # tornado removes the port
 
 
-class _Page(tornado.web.RequestHandler):
-    """The scene's page."""
+class _SameOrigin(tornado.web.RequestHandler):
+    """A handler that refuses requests from pages of other origins.
 
-    def initialize(self, scene: Scene) -> None:
-        self.scene = scene
+    Tornado's own check compares the host alone, and trusts `Sec-Fetch-Site`; this one also
+    compares the scheme, and runs for every request before the handler does.
+    """
+
+    def initialize(self, scene: Scene, listeners: set[_Commands]) -> None:
+        self.scene, self.listeners = scene, listeners
+
+    def prepare(self) -> None:
+        headers = self.request.headers
+        for name in ("Origin", "Sec-Websocket-Origin"):
+            if headers.get(name, f"http://{self.request.host}") != f"http://{self.request.host}":
+                raise tornado.web.HTTPError(403)
+
+
+class _Page(_SameOrigin):
+    """The page of the scene."""
 
     def get(self) -> None:
         self.set_header("Cache-Control", "no-store")
@@ -49,8 +63,8 @@ class _Page(tornado.web.RequestHandler):
         self.finish(self.scene.to_live_html())
 
 
-class _Viewer(tornado.web.RequestHandler):
-    """Meshcat's viewer, from memory: it opens no file that there may be no descriptor for."""
+class _Viewer(_SameOrigin):
+    """meshcat's viewer, sent from memory: a file would need a free descriptor."""
 
     def get(self) -> None:
         self.set_header("Content-Type", "text/javascript; charset=utf-8")
@@ -58,9 +72,9 @@ class _Viewer(tornado.web.RequestHandler):
 
 
 class _Listener(socket.socket):
-    """A listening socket that turns visitors away where the process may open no more files.
+    """A listening socket that closes new connections if the process has no free descriptor.
 
-    Else the server would be told of the same visitor again and again, and say so each time.
+    Otherwise the event loop would report the same connection again and again.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:  # noqa: ANN401 - as the socket's
@@ -68,44 +82,42 @@ class _Listener(socket.socket):
         self._spare = os.open(os.devnull, os.O_RDONLY)
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Take the next visitor in."""
+        """Accept a connection, or close it if no descriptor is free."""
         try:
             return super().accept()
         except OSError as e:
             if e.errno not in _EXHAUSTED:
                 raise
-        self._turn_away()
-        raise BlockingIOError  # as if there were nobody
+        self._refuse()
+        raise BlockingIOError  # as if there were no connection
 
     def close(self) -> None:
-        """Close it, and what it kept in reserve."""
-        if self._spare >= 0:
-            os.close(self._spare)
-            self._spare = -1
+        """Close the socket and the spare descriptor."""
+        self._free_spare()
         super().close()
 
-    def _turn_away(self) -> None:
-        """Take a visitor in by the descriptor that was kept for this, and show the way out."""
-        if self._spare >= 0:
-            os.close(self._spare)
-            self._spare = -1
+    def _refuse(self) -> None:
+        """Accept a connection with the spare descriptor and close it."""
+        self._free_spare()
         with suppress(OSError):
             super().accept()[0].close()
         try:
             self._spare = os.open(os.devnull, os.O_RDONLY)
         except OSError:
-            time.sleep(PAUSE)  # somebody else has taken it: not again at once
+            time.sleep(PAUSE)  # another thread has used the descriptor
+
+    def _free_spare(self) -> None:
+        if self._spare >= 0:
+            os.close(self._spare)
+            self._spare = -1
 
 
-class _Commands(tornado.websocket.WebSocketHandler):
-    """The scene's commands, all that there are and then those that follow."""
-
-    def initialize(self, scene: Scene, listeners: set[_Commands]) -> None:
-        self.scene, self.listeners = scene, listeners
+class _Commands(_SameOrigin, tornado.websocket.WebSocketHandler):
+    """The commands of the scene: all so far, then each new one."""
 
     def check_origin(self, origin: str) -> bool:
-        """Whether the page that asks came from here."""
-        return origin == f"http://{self.request.host}"
+        """Accept the origin: `prepare` has checked it."""
+        return True
 
     async def open(self, *args: str, **kwargs: str) -> None:
         self.sent, self.lock = 0, asyncio.Lock()
@@ -113,7 +125,7 @@ class _Commands(tornado.websocket.WebSocketHandler):
         await self.catch_up()
 
     async def catch_up(self) -> None:
-        """Send what has not been sent yet."""
+        """Send the commands that have not been sent yet."""
         async with self.lock:
             try:
                 for data in self.scene.pack(self.sent):
@@ -123,24 +135,24 @@ class _Commands(tornado.websocket.WebSocketHandler):
                 self.listeners.discard(self)
 
     def on_message(self, message: str | bytes) -> None:
-        """A page has nothing to say."""
+        """Ignore messages of the page."""
 
     def on_close(self) -> None:
         self.listeners.discard(self)
 
 
 class LiveScene:
-    """A scene on a server of this process; a context manager, too.
+    """A web server that shows a scene; also a context manager.
 
-    What is added to the scene after that, by `scene.visualizer`, shows at once.
+    Commands that are added later by `scene.visualizer` show at once.
 
     Args:
-        scene: What to show.
-        port: Where to listen; by default the first free one from 7000 on.
+        scene: The scene.
+        port: Port to listen on; by default the first free one from 7000 on.
 
     Raises:
         OrthocalError: If no port is free.
-        TypeError: If that is no scene.
+        TypeError: If `scene` is not a Scene.
     """
 
     def __init__(self, scene: Scene, *, port: int | None = None) -> None:
@@ -149,7 +161,7 @@ class LiveScene:
         if port is not None and not (isinstance(port, int) and 0 <= port < 2**16):
             raise ValueError(f"the port is {port!r}; expected 0 to 65535")
         self.scene = scene
-        self._parent = os.getppid()  # it may have ended before anybody waits
+        self._parent = os.getppid()  # it may end before `wait` is called
         self._socket = _listen(port)
         self.port = int(self._socket.getsockname()[1])
         self._ready = threading.Event()
@@ -164,7 +176,7 @@ class LiveScene:
         return f"http://{ADDRESS}:{self.port}/"
 
     def wait(self) -> None:
-        """Serve until Ctrl-C, until the process is asked to end, or what started it has ended."""
+        """Serve until Ctrl-C, a request to terminate, or the end of the parent process."""
         ended = threading.Event()
         previous = {
             number: signal.signal(number, lambda *_: ended.set())
@@ -178,7 +190,7 @@ class LiveScene:
                 signal.signal(number, handler)
 
     def close(self) -> None:
-        """End the server; the port is free again."""
+        """Stop the server and free its port."""
         if self._loop is not None and self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
@@ -202,16 +214,16 @@ class LiveScene:
         loop.call_soon(server.add_socket, self._socket)
         loop.call_soon(self._ready.set)
 
-        def tell() -> None:
+        def send() -> None:
             for listener in tuple(listeners):
                 task = loop.create_task(listener.catch_up())
-                tasks.add(task)  # the loop itself holds none
+                tasks.add(task)  # the loop keeps no reference
                 task.add_done_callback(tasks.discard)
 
         tasks: set[asyncio.Task[None]] = set()
 
         def change() -> None:
-            loop.call_soon_threadsafe(tell)
+            loop.call_soon_threadsafe(send)
 
         self.scene.listeners.append(change)
         try:
@@ -222,18 +234,19 @@ class LiveScene:
             for listener in tuple(listeners):
                 listener.close()
             loop.run_until_complete(server.close_all_connections())
-            left = asyncio.all_tasks(loop)
-            for task in left:
+            pending = asyncio.all_tasks(loop)
+            for task in pending:
                 task.cancel()
-            loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
+            loop.run_until_complete(asyncio.gather(*pending, return_exceptions=True))
             loop.close()
 
 
 def _application(scene: Scene, listeners: set[_Commands]) -> tornado.web.Application:
+    shared = {"scene": scene, "listeners": listeners}
     handlers: list[Any] = [
-        (r"/", _Page, {"scene": scene}),
-        (r"/commands", _Commands, {"scene": scene, "listeners": listeners}),
-        (r"/main\.min\.js", _Viewer),
+        (r"/", _Page, shared),
+        (r"/commands", _Commands, shared),
+        (r"/main\.min\.js", _Viewer, shared),
     ]
     application = tornado.web.Application(log_function=lambda _: None)
     application.add_handlers(_HOSTS, handlers)
@@ -242,19 +255,19 @@ def _application(scene: Scene, listeners: set[_Commands]) -> tornado.web.Applica
 
 
 def _listen(port: int | None) -> socket.socket:
-    tried = [port] if port is not None else range(FIRST_PORT, FIRST_PORT + PORTS_TRIED)
+    candidates = [port] if port is not None else range(FIRST_PORT, FIRST_PORT + PORTS_TRIED)
     reason = ""
-    for candidate in tried:
+    for candidate in candidates:
         try:
-            made = socket.create_server((ADDRESS, candidate), backlog=128)
-            found = _Listener(fileno=made.detach())
+            server = socket.create_server((ADDRESS, candidate), backlog=128)
+            listener = _Listener(fileno=server.detach())
         except OSError as e:
             reason = str(e.strerror)
             continue
-        found.setblocking(False)
-        return found
+        listener.setblocking(False)
+        return listener
     if port is not None:
-        raise OrthocalError(f"port {port} of {ADDRESS} cannot be had: {reason}", where="port")
+        raise OrthocalError(f"cannot listen on port {port} of {ADDRESS}: {reason}", where="port")
     raise OrthocalError(
         f"no port of {ADDRESS} from {FIRST_PORT} to {FIRST_PORT + PORTS_TRIED - 1} is free",
         where="port",

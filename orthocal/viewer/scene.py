@@ -1,8 +1,8 @@
-"""A scene: meshcat's commands, kept instead of sent, and what a page shows around them.
+"""Scenes: recorded meshcat commands, and what a page shows around the 3-D view.
 
-meshcat's own window starts a server that other machines can reach and that outlives its parent.
-A scene needs none: it keeps the commands, and a page plays them to meshcat's viewer, from a file
-or from a server that listens on this machine only (`live`).
+meshcat's own window starts a server that other machines can reach and that outlives its parent
+process. A scene records the commands instead. A page plays them to meshcat's viewer, either from a
+file or from the server of `live`, which only this machine can reach.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from typing import Any, Literal
 import meshcat
 import numpy as np
 import umsgpack
-from meshcat.animation import Animation
+from meshcat.animation import Animation, AnimationClip, AnimationTrack
 from meshcat.geometry import Geometry, Material
+from meshcat.path import Path as NodePath
 from numpy.typing import NDArray
 
 from orthocal.io.files import write_file
@@ -36,64 +37,70 @@ _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data: blob:; connect-src {connect}"
 )
-"""A page may load nothing, whatever a file from a stranger has put into it."""
+"""A page loads nothing from elsewhere, whatever names the user's files contain."""
+
+FRAME_RATE = 30
+"""Frames of the animation per second."""
+
+STILL = 1e-12
+"""Changes below this are not animated, [m or 1]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A text at a point of the scene; pages keep labels from covering each other."""
+    """A text at a point of the scene; the page places labels so that none covers another."""
 
     at: tuple[Point, ...]
-    """One a step of the animation, or one for all, [m]."""
+    """Point in each step of the animation, or one point for all steps, [m]."""
     texts: tuple[str, ...]
-    """The same; empty where there is none."""
+    """Text in each step, or one text for all steps; "" for no label."""
     node: str
-    """Path of the node that it belongs to: it is hidden with that."""
+    """Path of the node with which the label is hidden."""
     rank: float = 0.0
-    """Where there is no room for all, those of the highest rank stay; below 0 a name, not a box."""
+    """Labels of the highest rank stay if there is no room for all; names have rank -1."""
     uncovered: tuple[tuple[Point, ...], ...] = ()
-    """Points a step around all of which no label stands, [m]."""
+    """Points in each step that no label may cover, [m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class LegendEntry:
-    """A line of the legend, with a box that shows and hides nodes."""
+    """A line of the legend, with a box that shows and hides its nodes."""
 
     text: str
     nodes: tuple[str, ...]
     colour: str
-    """CSS."""
+    """Colour in CSS."""
     mark: Mark
     shown: bool = True
-    """At first."""
+    """Whether the nodes are visible at first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A stage of the animation."""
+    """A stop of the animation."""
 
     name: str
     caption: str
     start: float
-    """[s]."""
+    """Time of arrival, [s]."""
     end: float
-    """[s]."""
+    """Time of departure, [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Where the scene is looked at from."""
+    """Initial view of the scene."""
 
     target: Point
-    """[m]."""
+    """Point in the middle of the view, [m]."""
     direction: Point
     """From the target to the camera."""
     points: tuple[Point, ...] = ((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-    """What is in view at first, [m]."""
+    """Points that are in view at first, [m]."""
 
 
 class _Recorder:
-    """Stands in for meshcat's window: keeps commands in their order."""
+    """Replacement of meshcat's window that records the commands in their order."""
 
     def __init__(self, to_html: Callable[[], str]) -> None:
         self.commands: list[dict[str, Any]] = []
@@ -107,15 +114,15 @@ class _Recorder:
             listener()
 
     def get_scene(self) -> str:
-        """For `static_html` of meshcat's interface."""
+        """The page, for `static_html` of meshcat's interface."""
         return self._to_html()
 
     def _plain(self, value: Any) -> Any:  # noqa: ANN401 - a JSON-like tree
-        """The same with plain numbers, and names counted instead of drawn at random."""
+        """A copy with plain numbers, and with counters in place of random identifiers."""
         if isinstance(value, dict):
             return {k: self._plain(v) for k, v in value.items()}
         if isinstance(value, list | tuple):
-            if all(type(v) is float for v in value):  # most of what there is
+            if all(type(v) is float for v in value):  # a fast path for most of the data
                 return list(value)
             return [self._plain(v) for v in value]
         if isinstance(value, np.generic):
@@ -127,78 +134,117 @@ class _Recorder:
 
 @dataclass(eq=False)
 class Scene:
-    """Something to look at in a browser."""
+    """A 3-D scene with legend, labels and animation, to be shown in a browser."""
 
     title: str
     headline: str = ""
-    """What is to be seen, in a sentence."""
+    """The main result, in a sentence."""
     facts: list[str] = field(default_factory=list)
-    """Scales and what else has to be said, a line each."""
+    """Scales and further facts, one per line."""
     camera: Camera = Camera((0.0, 0.0, 0.0), (1.0, 1.0, 0.7))
     labels: list[Label] = field(default_factory=list)
     legend: list[LegendEntry] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
     exaggeration: float = 1.0
-    """How many times its size the machine's deviation is drawn."""
+    """Factor by which the deviation of the machine is enlarged."""
     arrow_scale: float = 1.0
-    """Drawn length of an arrow at a gauge over the reading that it stands for."""
+    """Drawn length of an arrow at a gauge divided by its reading."""
     tool_scale: float = 1.0
-    """The same for errors of the tool."""
+    """Drawn length of an arrow at the tool divided by its error."""
 
     def __post_init__(self) -> None:
         self._recorder = _Recorder(self.to_html)
+        self._clips: dict[NodePath, AnimationClip] = {}
         self.visualizer = meshcat.Visualizer(window=self._recorder)
-        """meshcat's interface to this scene; `scene.visualizer["/Name"]` adds to it."""
+        """meshcat's interface to this scene; `scene.visualizer["/Name"]` adds nodes."""
 
-    def add(self, path: str, geometry: Geometry, material: Material) -> None:
-        """Put a shape at a node.
+    def add(
+        self, path: str, geometry: Geometry, material: Material, pose: Array | None = None
+    ) -> None:
+        """Add a shape.
 
         Args:
-            path: Names with slashes between.
-            geometry: One of meshcat's.
-            material: One of meshcat's.
+            path: Path of its node: names separated by slashes.
+            geometry: Geometry of meshcat.
+            material: Material of meshcat.
+            pose: Pose in the parent node, shape (4, 4), [m].
         """
         self.visualizer[f"/{path}"].set_object(geometry, material)
+        if pose is not None:
+            self.place(path, pose)
 
     def place(self, path: str, pose: Array) -> None:
-        """Move a node: shape (4, 4), [m]."""
+        """Set the pose of a node in its parent, shape (4, 4), [m]."""
         self.visualizer[f"/{path}"].set_transform(np.asarray(pose, dtype=np.float64))
+
+    def move(self, path: str, times: Array, poses: Array) -> None:
+        """Place a node at its first pose and animate it through all of them.
+
+        Args:
+            path: Path of the node.
+            times: Times of the poses, shape (F,), [frames].
+            poses: Poses in the parent node, shape (F, 4, 4), [m].
+        """
+        from scipy.spatial.transform import Rotation
+
+        self.place(path, poses[0])
+        if np.ptp(poses[:, :3, 3], axis=0).max() > STILL:
+            self.track(path, "position", "vector3", times, poses[:, :3, 3])
+        if np.ptp(poses[:, :3, :3], axis=0).max() > STILL:
+            rotations = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+            self.track(path, "quaternion", "quaternion", times, rotations)
+
+    def track(self, path: str, name: str, kind: str, times: Array, values: Array) -> None:
+        """Animate a property of a node.
+
+        Args:
+            path: Path of the node.
+            name: Property, such as `position`.
+            kind: Type of the property in three.js, such as `vector3`.
+            times: Times of the values, shape (F,), [frames].
+            values: Values, shape (F, n) or (F,).
+        """
+        node = NodePath(tuple(path.split("/")))
+        clip = self._clips.setdefault(node, AnimationClip(fps=FRAME_RATE))
+        clip.tracks[name] = AnimationTrack(name, kind, times.tolist(), values.tolist())
+
+    def animate(self) -> None:
+        """Add the animation of all tracks; it waits until somebody plays it."""
+        self.visualizer.set_animation(
+            Animation(self._clips, default_framerate=FRAME_RATE), play=False
+        )
 
     def set_property(self, path: str, name: str, value: object) -> None:
         """Set a property of a node, such as `visible`."""
         self.visualizer[f"/{path}"].set_property(name, value)
 
     def explain(self, entry: LegendEntry) -> None:
-        """Add a line to the legend; what it says is not shown at first is hidden."""
+        """Add a line to the legend, and show or hide its nodes."""
         self.legend.append(entry)
         for node in entry.nodes:
             self.set_property(node, "visible", entry.shown)
 
-    def animate(self, animation: Animation) -> None:
-        """Give the scene its animation; it waits for someone to play it."""
-        self.visualizer.set_animation(animation, play=False)
-
     @property
     def listeners(self) -> list[Callable[[], object]]:
-        """What is called after every command; to be added to and taken from."""
+        """Functions that are called after every command; a list to append to."""
         return self._recorder.listeners
 
     @property
     def commands(self) -> tuple[Mapping[str, Any], ...]:
-        """All commands so far, as meshcat's viewer takes them."""
+        """All commands so far, in the form of meshcat's viewer."""
         return tuple(self._recorder.commands)
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """Paths of all nodes that hold a shape, in the order in which they came."""
-        found = (c["path"] for c in self.commands if c["type"] == "set_object")
-        return tuple(dict.fromkeys(path.strip("/") for path in found))
+        """Paths of all nodes with a shape, in the order of their creation."""
+        paths = (c["path"] for c in self.commands if c["type"] == "set_object")
+        return tuple(dict.fromkeys(path.strip("/") for path in paths))
 
     def pose(self, path: str) -> Array:
-        """Where a node is, in its parent, shape (4, 4), [m].
+        """Pose of a node in its parent, shape (4, 4), [m].
 
         Raises:
-            KeyError: If there is no such node.
+            KeyError: If the node does not exist.
         """
         path, pose = path.strip("/"), np.eye(4)
         paths = [c["path"].strip("/") for c in self.commands]
@@ -210,34 +256,34 @@ class Scene:
         return pose
 
     def pack(self, start: int = 0) -> Iterator[bytes]:
-        """Commands from one on, as meshcat's viewer takes them from a server."""
+        """Commands from number `start` on, packed for meshcat's viewer."""
         for command in self.commands[start:]:
-            # the viewer keeps what moves in single precision anyway
+            # the viewer animates in single precision
             precision = "single" if command["type"] == "set_animation" else "double"
             yield umsgpack.packb(command, force_float_precision=precision)
 
     def to_html(self) -> str:
-        """One page that holds all it needs, meshcat's viewer too."""
+        """A self-contained page that includes meshcat's viewer."""
         packed = [base64.b64encode(data).decode() for data in self.pack()]
         return self._page(packed, viewer=f"<script>{viewer_script()}</script>", connect="'none'")
 
     def to_live_html(self) -> str:
-        """A page that takes the viewer and the commands from the server that it came from."""
-        # not every browser counts a socket of its own server among 'self'
-        own = "'self' ws://127.0.0.1:* ws://localhost:*"
-        return self._page([], viewer='<script src="main.min.js"></script>', connect=own)
+        """A page that loads the viewer and the commands from its server."""
+        # some browsers do not count web sockets of the same server as 'self'
+        server = "'self' ws://127.0.0.1:* ws://localhost:*"
+        return self._page([], viewer='<script src="main.min.js"></script>', connect=server)
 
     def save(self, path: str | Path) -> Path:
-        """Write the page.
+        """Write the self-contained page.
 
         Raises:
-            OrthocalError: If it cannot be written.
+            OrthocalError: If the file cannot be written.
         """
         write_file(Path(path), self.to_html())
         return Path(path)
 
     def _repr_html_(self) -> str:
-        """In a notebook: the page in a frame."""
+        """The page in a frame, for notebooks."""
         return frame_of(self.to_html(), height="560px")
 
     def _page(self, commands: list[str], *, viewer: str, connect: str) -> str:
@@ -255,9 +301,10 @@ class Scene:
             "commands": commands,
             "live": connect != "'none'",
         }
-        # the only places where </script> could end: no "<" is left in the data
-        shown = _printable(content)
-        data = json.dumps(shown, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+        # without "<" the data cannot end the script element
+        data = json.dumps(_printable(content), ensure_ascii=False, allow_nan=False).replace(
+            "<", "\\u003c"
+        )
         parts = {
             "TITLE": html.escape(printable(self.title)),
             "POLICY": policy,
@@ -271,23 +318,23 @@ class Scene:
         return "".join(parts[p] if i % 2 else p for i, p in enumerate(pieces))
 
 
-_NAMES_OF_JAVASCRIPT = frozenset(
+_RESERVED_NAMES = frozenset(
     "constructor hasOwnProperty isPrototypeOf propertyIsEnumerable toLocaleString toString valueOf "
     "__defineGetter__ __defineSetter__ __lookupGetter__ __lookupSetter__ __proto__ "
     "<object>".split()
 )
-"""What the viewer's tables of nodes, which are plain objects, hold before there is any node; and
-its own name for the shape of a node."""
+"""Keys of every plain object of JavaScript, in which the viewer keeps its nodes; and its name for
+the shape of a node."""
 
 
 def node_name(name: str) -> str:
-    """A name from a file as a node's: a slash would be a level, and some names are taken."""
-    shown = printable(name.replace("/", "∕"))
-    return f"{shown} (name)" if shown in _NAMES_OF_JAVASCRIPT else shown
+    """Node name for a name from a file: without slashes and without the viewer's own names."""
+    text = printable(name.replace("/", "∕"))
+    return f"{text} (name)" if text in _RESERVED_NAMES else text
 
 
 def frame_of(page: str, *, height: str) -> str:
-    """A page inside another one."""
+    """A page in a frame of another page."""
     style = f"width:100%;height:{height};border:1px solid #ccc;border-radius:6px"
     source = html.escape(page)
     return f'<iframe title="3-D scene" loading="lazy" srcdoc="{source}" style="{style}"></iframe>'
@@ -301,7 +348,7 @@ def viewer_script() -> str:
 
 
 def round_scale(value: float) -> float:
-    """The next lower of 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8 times a power of ten; at least 1."""
+    """Largest of 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8 times 10ⁿ up to a value; at least 1."""
     if not (math.isfinite(value) and value > 1.0):
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))
@@ -310,7 +357,7 @@ def round_scale(value: float) -> float:
 
 
 def _printable(value: Any) -> Any:  # noqa: ANN401 - a JSON-like tree
-    """The same with every text as it can be shown: none turns the order of others about."""
+    """A copy with printable texts, without characters that change the direction of writing."""
     if isinstance(value, str):
         return printable(value, keep="\n")
     if isinstance(value, dict):

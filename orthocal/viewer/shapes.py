@@ -1,8 +1,9 @@
-"""Shapes to draw with: cylinders along z, arrows, dial gauges, ground and axes, for meshcat."""
+"""Shapes of scenes: cylinders along z, arrows, dial gauges, ground and axes."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import meshcat.geometry as g
@@ -25,10 +26,10 @@ class _AlongZ(g.Cylinder):  # type: ignore[misc] # meshcat has no types
     """A cylinder or cone along z.
 
     Args:
-        height: [m].
-        bottom: Radius at its lower end, [m].
-        top: Radius at its upper end, [m].
-        start: z of its lower end, [m].
+        height: Height, [m].
+        bottom: Radius at the lower end, [m].
+        top: Radius at the upper end, [m].
+        start: z of the lower end, [m].
     """
 
     def __init__(self, height: float, bottom: float, top: float, *, start: float = 0.0) -> None:
@@ -36,7 +37,7 @@ class _AlongZ(g.Cylinder):  # type: ignore[misc] # meshcat has no types
         self.start = start
 
     def intrinsic_transform(self) -> Array:
-        """Turns meshcat's y to z; transposed, as three.js stores columns."""
+        """Rotation from meshcat's y to z; transposed, because three.js stores columns."""
         turn = np.array(
             [
                 [1.0, 0.0, 0.0, 0.0],
@@ -49,20 +50,20 @@ class _AlongZ(g.Cylinder):  # type: ignore[misc] # meshcat has no types
 
 
 def cylinder(height: float, radius: float, *, start: float = 0.0) -> g.Geometry:
-    """A cylinder along z from z = start on, [m]."""
+    """A cylinder along z that begins at z = start, [m]."""
     return _AlongZ(height, radius, radius, start=start)
 
 
 def cone(height: float, radius: float, *, start: float = 0.0) -> g.Geometry:
-    """A cone along z from its foot at z = start to its tip, [m]."""
+    """A cone along z whose base is at z = start, [m]."""
     return _AlongZ(height, radius, 0.0, start=start)
 
 
 def pose_along(origin: Array, direction: Array) -> Array:
-    """Poses whose z is along unit vectors, shape (..., 4, 4).
+    """Poses with z along unit vectors, shape (..., 4, 4), [m].
 
     Args:
-        origin: Shape (..., 3), [m].
+        origin: Origins, shape (..., 3), [m].
         direction: Unit vectors, shape (..., 3).
     """
     helper = np.eye(3)[np.abs(direction).argmin(axis=-1)]
@@ -76,21 +77,21 @@ def pose_along(origin: Array, direction: Array) -> Array:
 
 
 def to_triple(point: Array) -> tuple[float, float, float]:
-    """A point as plain numbers."""
+    """The coordinates of a point as plain numbers."""
     return float(point[0]), float(point[1]), float(point[2])
 
 
 def material(colour: Colour, *, opacity: float = 1.0, shiny: bool = False) -> g.Material:
-    """A material; what is seen through does not hide what is behind it.
+    """A material; a transparent one does not hide shapes behind it.
 
     Args:
         colour: Red, green and blue, 0 to 1.
         opacity: 0 to 1.
-        shiny: Whether it is lit; flat otherwise.
+        shiny: Whether the surface has highlights.
     """
     hexadecimal = sum(round(255 * c) << shift for c, shift in zip(colour, (16, 8, 0), strict=True))
     extra: dict[str, object] = {}
-    if opacity < 1.0:  # where it lies in what is solid, that is what is seen
+    if opacity < 1.0:  # a solid shape in the same place is drawn in front
         extra = {
             "depthWrite": False,
             "polygonOffset": True,
@@ -102,73 +103,78 @@ def material(colour: Colour, *, opacity: float = 1.0, shiny: bool = False) -> g.
 
 
 def head_length(width: float) -> float:
-    """Length of an arrow's head by its shaft's diameter, [m]."""
+    """Length of the head of an arrow whose shaft has a diameter `width`, [m]."""
     return 3.5 * width
 
 
 @dataclass(frozen=True, slots=True)
 class ArrowParts:
-    """What makes an arrow of a unit shaft and a head, both along z."""
+    """Scales and place of the two parts of an arrow, both along z."""
 
     shaft: tuple[float, float, float]
-    """Scale."""
+    """Scale of a shaft of unit length."""
     foot: float
-    """Where the head begins, [m]."""
+    """Start of the head, [m]."""
     head: tuple[float, float, float]
-    """Scale."""
+    """Scale of the head."""
 
 
 def arrow_parts(length: float, width: float) -> ArrowParts:
-    """Shaft and head that are as long as an arrow together.
-
-    An arrow that is shorter than its head is all head, and a smaller one.
+    """Parts of an arrow of a length; an arrow shorter than its head is a smaller head.
 
     Args:
-        length: Against the arrow's direction where negative, [m].
-        width: Of the shaft, [m].
+        length: Length, negative against the arrow's direction, [m].
+        width: Diameter of the shaft, [m].
     """
-    # nothing at all has no inverse: three.js wants one
+    # three.js needs scales that can be inverted
     girth = max(min(1.0, abs(length) / head_length(width)), 1e-6)
     head = math.copysign(girth, length)
     foot = length - head * head_length(width)
-    rest = math.copysign(max(abs(foot), 1e-9), length)
-    return ArrowParts((girth, girth, rest), foot, (girth, girth, head))
+    shaft = math.copysign(max(abs(foot), 1e-9), length)
+    return ArrowParts((girth, girth, shaft), foot, (girth, girth, head))
 
 
 def draw_arrow(
     scene: Scene,
     path: str,
-    origin: Array,
-    direction: Array,
+    pose: Array,
+    lengths: Sequence[float],
     *,
-    length: float,
     width: float,
     colour: Colour,
+    times: Array | None = None,
 ) -> None:
-    """An arrow: a node with its foot at the origin and z along it, and in it shaft and head.
+    """An arrow along z of its node.
 
     Args:
-        scene: Where to draw.
-        path: Of the node.
-        origin: Shape (3,), [m].
-        direction: Unit vector, shape (3,).
-        length: Against the direction where negative, [m].
-        width: Of the shaft, [m].
+        scene: The scene.
+        path: Path of the node.
+        pose: Pose of the node, shape (4, 4), [m].
+        lengths: Length at the start, or at each of the times; negative against z, [m].
+        width: Diameter of the shaft, [m].
         colour: Red, green and blue, 0 to 1.
+        times: Times of the lengths, shape (F,), [frames].
     """
     look = material(colour)
-    scene.add(f"{path}/shaft", cylinder(1.0, width / 2.0), look)
-    scene.add(f"{path}/head", cone(head_length(width), 1.3 * width), look)
-    scene.place(path, pose_along(origin, direction))
-    parts = arrow_parts(length, width)
-    scene.place(f"{path}/shaft", np.diag([*parts.shaft, 1.0]))
-    pose = np.diag([*parts.head, 1.0])
-    pose[2, 3] = parts.foot
-    scene.place(f"{path}/head", pose)
+    scene.place(path, pose)
+    parts = [arrow_parts(length, width) for length in lengths]
+    head = np.diag([*parts[0].head, 1.0])
+    head[2, 3] = parts[0].foot
+    shaft = np.diag([*parts[0].shaft, 1.0])
+    scene.add(f"{path}/shaft", cylinder(1.0, width / 2.0), look, shaft)
+    scene.add(f"{path}/head", cone(head_length(width), 1.3 * width), look, head)
+    if times is None:
+        return
+    for part, name, values in (
+        ("shaft", "scale", [p.shaft for p in parts]),
+        ("head", "position", [(0.0, 0.0, p.foot) for p in parts]),
+        ("head", "scale", [p.head for p in parts]),
+    ):
+        scene.track(f"{path}/{part}", name, "vector3", times, np.array(values))
 
 
 def dial_distance(size: float) -> float:
-    """From the tip of a gauge to the middle of its dial, whose radius is given, [m]."""
+    """Distance from the tip of a gauge to the middle of its dial of radius `size`, [m]."""
     return 2.3 * size
 
 
@@ -183,17 +189,17 @@ def draw_gauge(
     ball: float | None = None,
     edge: Array | None = None,
 ) -> None:
-    """A dial indicator that touches a point, its stem along the measured direction.
+    """A dial indicator with its stem along the measured direction.
 
     Args:
-        scene: Where to draw.
-        path: Of the node.
-        tip: The point, shape (3,), [m].
-        direction: Away from the leg: that of a growing reading, shape (3,).
-        face: Which way the dial faces, across the direction, shape (3,).
+        scene: The scene.
+        path: Path of the node.
+        tip: Point of contact, shape (3,), [m].
+        direction: Direction of a growing reading, shape (3,).
+        face: Direction that the dial faces, across `direction`, shape (3,).
         size: Radius of the dial, [m].
-        ball: Radius of what touches, as it is, [m]: of a ball, or of an edge that is a pin.
-        edge: From one end of an edge that touches to the other, shape (3,), [m].
+        ball: Radius of a ball or pin at the tip, [m].
+        edge: Vector from one end of a blade or pin to the other, shape (3,), [m].
     """
     axes = np.column_stack([np.cross(direction, face), face, direction])
     scene.place(path, np.block([[axes, tip[:, None]], [np.zeros(3), np.ones(1)]]))
@@ -206,83 +212,73 @@ def draw_gauge(
     if edge is not None:
         _draw_edge(scene, f"{path}/tip", axes.T @ edge, radius=ball or 0.0, height=stem)
     else:
-        scene.add(f"{path}/tip", g.Sphere(ball or stem), dark)
-    if ball and edge is None:
-        scene.place(f"{path}/tip", pose_along(np.array([0.0, 0.0, ball]), np.eye(3)[2]))
+        scene.add(f"{path}/tip", g.Sphere(ball or stem), dark, _shift(0.0, 0.0, ball or 0.0))
     probe = 0.55 * stem if not ball else min(0.55 * stem, 0.7 * ball)
     above = ball or (stem if edge is not None else 0.0)
     scene.add(f"{path}/probe", cylinder(reach - size - above, probe, start=above), steel)
     scene.add(f"{path}/stem", cylinder(0.75 * size, stem, start=reach - 1.6 * size), dark)
-    # the dial's axis, z of a cylinder, along the face: y of the gauge
-    turn = np.eye(4)
-    turn[:3, :3] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    turn[:3, 3] = [0.0, 0.0, reach]
+    # from the axis of a cylinder, z, to the axis of the dial, y of the gauge
+    dial = _shift(0.0, 0.0, reach)
+    dial[:3, :3] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     thick = 0.45 * size
-    scene.add(f"{path}/case", cylinder(thick, size, start=-thick / 2.0), dark)
-    scene.add(f"{path}/dial", cylinder(0.04 * size, 0.86 * size, start=thick / 2.0), white)
-    for part in ("case", "dial"):
-        scene.place(f"{path}/{part}", turn)
-    needle = np.eye(4)
-    needle[:3, 3] = [0.0, thick / 2.0 + 0.06 * size, reach + 0.3 * size]
-    scene.add(f"{path}/needle", g.Box([0.09 * size, 0.04 * size, 0.75 * size]), dark)
-    scene.place(f"{path}/needle", needle)
+    scene.add(f"{path}/case", cylinder(thick, size, start=-thick / 2.0), dark, dial)
+    scene.add(f"{path}/dial", cylinder(0.04 * size, 0.86 * size, start=thick / 2.0), white, dial)
+    hand = _shift(0.0, thick / 2.0 + 0.06 * size, reach + 0.3 * size)
+    scene.add(f"{path}/needle", g.Box([0.09 * size, 0.04 * size, 0.75 * size]), dark, hand)
+
+
+def _shift(x: float, y: float, z: float) -> Array:
+    """A pose that is shifted but not turned, shape (4, 4), [m]."""
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
 
 
 def _draw_edge(scene: Scene, path: str, edge: Array, *, radius: float, height: float) -> None:
-    """A blade, or a pin of a radius, above the origin, [m]."""
+    """A blade, or a pin with a radius, above the origin, [m]."""
     steel, length = material((0.75, 0.76, 0.8), shiny=True), float(np.linalg.norm(edge))
-    if radius > 0.0:
-        scene.add(path, cylinder(length, radius, start=-length / 2.0), steel)
-        scene.place(path, pose_along(np.array([0.0, 0.0, radius]), edge / length))
-        return
-    scene.add(path, g.Box([length, 0.1 * height, height]), steel)
     along, up = edge / length, np.array([0.0, 0.0, 1.0])
+    if radius > 0.0:
+        pin = cylinder(length, radius, start=-length / 2.0)
+        scene.add(path, pin, steel, pose_along(radius * up, along))
+        return
     pose = np.eye(4)
     pose[:3] = np.column_stack([along, np.cross(up, along), up, height / 2.0 * up])
-    scene.place(path, pose)
+    scene.add(path, g.Box([length, 0.1 * height, height]), steel, pose)
 
 
 def draw_ground(scene: Scene, path: str, *, side: float, pitch: float) -> None:
-    """Ground: a pale plate with lines at a pitch, around the node's origin.
+    """A pale plate with grid lines around the origin of its node.
 
     Args:
-        scene: Where to draw.
-        path: Of the node.
-        side: [m].
-        pitch: [m].
+        scene: The scene.
+        path: Path of the node.
+        side: Side of the plate, [m].
+        pitch: Distance of the lines, [m].
     """
     count = max(2, math.ceil(side / pitch / 2.0))
     half = count * pitch
     line = np.linspace(-half, half, 2 * count + 1)
-    ends = np.array([[-half, v] for v in line] + [[v, -half] for v in line])
-    others = np.array([[half, v] for v in line] + [[v, half] for v in line])
-    points = np.empty((2 * len(ends), 3), dtype=np.float32)
-    points[0::2, :2], points[1::2, :2], points[:, 2] = ends, others, 0.0
-    scene.add(f"{path}/plate", g.Box([2.0 * half, 2.0 * half, 0.002]), material((0.93, 0.94, 0.95)))
-    lowered = np.eye(4)
-    lowered[2, 3] = -0.002
-    scene.place(f"{path}/plate", lowered)
+    far = np.full_like(line, half)
+    ends = [np.stack([-far, line, far, line], axis=1), np.stack([line, -far, line, far], axis=1)]
+    points = np.zeros((8 * count + 4, 3), dtype=np.float32)
+    points[:, :2] = np.concatenate(ends).reshape(-1, 2)
+    plate = g.Box([2.0 * half, 2.0 * half, 0.002])
+    scene.add(f"{path}/plate", plate, material((0.93, 0.94, 0.95)), _shift(0.0, 0.0, -0.002))
     lines = g.LineSegments(g.PointsGeometry(points.T), g.LineBasicMaterial(color=0xB8BEC6))
     scene.visualizer[f"/{path}/lines"].set_object(lines)
 
 
 def draw_axes(scene: Scene, path: str, *, length: float) -> None:
-    """The world's axes: red x, green y and blue z, from the origin."""
+    """The axes of the world: x red, y green, z blue."""
     for name, direction, colour in zip("xyz", np.eye(3), AXIS_COLOURS, strict=True):
-        draw_arrow(
-            scene,
-            f"{path}/{name}",
-            np.zeros(3),
-            direction,
-            length=length,
-            width=0.05 * length,
-            colour=colour,
-        )
+        pose = pose_along(np.zeros(3), direction)
+        draw_arrow(scene, f"{path}/{name}", pose, [length], width=0.05 * length, colour=colour)
         scene.labels.append(
             Label((to_triple(1.12 * length * direction),), (name,), f"{path}/{name}", rank=-1.0)
         )
 
 
 def css(colour: Colour) -> str:
-    """A colour as a page has it."""
+    """A colour in CSS."""
     return "#" + "".join(f"{round(255 * c):02x}" for c in colour)

@@ -1,4 +1,4 @@
-"""What is to be seen of a robot: the visuals of its URDF, or sticks where it has none."""
+"""Visible shapes of a robot: the visuals of its URDF, or sticks if it has none."""
 
 from __future__ import annotations
 
@@ -25,43 +25,43 @@ Array = NDArray[np.float64]
 MESH_FORMATS = (".stl", ".obj", ".dae", ".ply")
 
 LARGEST_REPETITION = 10 * 2**20
-"""What a mesh file amounts to where it is drawn again and again, [bytes]."""
+"""Largest size of the repetitions of a mesh file, [bytes]."""
 
 LONGEST_LINE = 4_000
-"""Characters of a line of an OBJ: a face of some hundred corners."""
+"""Characters of the longest line in an OBJ file, a face of some hundred corners."""
 
 MOST_TRIANGLES = 300_000
-"""Of a mesh; a page holds each as text."""
+"""Triangles of the largest mesh; a page holds each as text."""
 
 _STICK: Colour = (0.55, 0.58, 0.62)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visual:
-    """One visible part of a link."""
+    """A visible shape of a link."""
 
     link: str
     placement: Array
-    """In the link's frame, shape (4, 4), [m]."""
+    """Pose in the frame of the link, shape (4, 4), [m]."""
     geometry: g.Geometry
     colour: Colour
     opacity: float
     corners: Array
-    """Of its bounding box in the link's frame, shape (8, 3), [m]."""
+    """Corners of the bounding box in the frame of the link, shape (8, 3), [m]."""
 
 
 def load_visuals(robot: Robot) -> tuple[Visual, ...]:
-    """Visible parts of a robot's links, or sticks between its joints where the URDF has none.
+    """Visible shapes of the links of a robot, or sticks between its joints if it has none.
 
     Raises:
-        RobotError: If a mesh file is missing, outside of the robot's folder or not readable.
+        RobotError: If a mesh file is missing, unreadable or outside the robot's directory.
     """
     text = _with_absolute_meshes(robot)
     try:
         with captured_stderr():
             geometry = pin.buildGeomFromUrdfString(robot.model, text, pin.GeometryType.VISUAL)
     except (ValueError, RuntimeError) as e:
-        # without the place in its source, and a hint at a folder that was right
+        # without the place in the source of the library, and its hint
         reason = " ".join(str(e).split("message:")[-1].split("Hint:")[0].split())
         raise RobotError(f"its visuals cannot be loaded: {reason}", where=str(robot.urdf)) from None
     visuals = tuple(_visual(robot, part) for part in geometry.geometryObjects)
@@ -69,7 +69,7 @@ def load_visuals(robot: Robot) -> tuple[Visual, ...]:
 
 
 def _with_absolute_meshes(robot: Robot) -> str:
-    """Text of the URDF with the paths of its meshes resolved within the robot's folder."""
+    """Text of the URDF with absolute paths of its meshes."""
     root = parse_urdf(robot.urdf)
     folder = robot.folder.resolve()
     uses: Counter[Path] = Counter()
@@ -78,7 +78,9 @@ def _with_absolute_meshes(robot: Robot) -> str:
         where = f"{robot.urdf}:{mesh.sourceline}"
         path = (folder / _relative(name)).resolve()
         if not path.is_relative_to(folder):
-            raise RobotError(f"the mesh '{name}' lies outside of the robot's folder", where=where)
+            raise RobotError(
+                f"the mesh '{name}' lies outside of the robot's directory", where=where
+            )
         if path.suffix.lower() not in MESH_FORMATS:
             raise RobotError(f"the mesh '{name}' is none of {', '.join(MESH_FORMATS)}", where=where)
         if not exists(path):
@@ -86,11 +88,11 @@ def _with_absolute_meshes(robot: Robot) -> str:
         require_file(path, error=RobotError)
         if path.suffix.lower() == ".obj":
             _require_short_lines(path, where)
-        again = path.stat().st_size * uses[path]
+        repeated = path.stat().st_size * uses[path]
         uses[path] += 1
-        if again > LARGEST_REPETITION:
+        if repeated > LARGEST_REPETITION:
             raise RobotError(
-                f"the mesh '{name}' is drawn {uses[path]} times, {again / 2**20:.0f} MiB again; "
+                f"the mesh '{name}' is drawn {uses[path]} times, {repeated / 2**20:.0f} MiB again; "
                 f"expected at most {LARGEST_REPETITION / 2**20:g} MiB",
                 where=where,
             )
@@ -99,7 +101,7 @@ def _with_absolute_meshes(robot: Robot) -> str:
 
 
 def _require_short_lines(path: Path, where: str) -> None:
-    """Refuse an OBJ with a face of thousands of corners: cutting it up takes their square."""
+    """Refuse an OBJ file with a face of thousands of corners: triangulation is quadratic."""
     lines = read_file(path, error=RobotError).split(b"\n")
     longest = max(len(line) for line in lines)
     if longest > LONGEST_LINE:
@@ -110,7 +112,7 @@ def _require_short_lines(path: Path, where: str) -> None:
 
 
 def _relative(name: str) -> Path:
-    """Path of a mesh in the robot's folder: a package's name, or file://, is taken off."""
+    """Path of a mesh in the robot's directory, without package name or file://."""
     if name.startswith("package://"):
         return Path(*Path(name.removeprefix("package://")).parts[1:])
     return Path(name.removeprefix("file://"))
@@ -159,7 +161,7 @@ def _geometry(robot: Robot, part: pin.GeometryObject) -> g.Geometry:
 
 
 def _check_mesh(robot: Robot, part: pin.GeometryObject) -> None:
-    """Refuse a mesh that no picture can hold."""
+    """Refuse a mesh that is too large for a scene."""
     vertices = np.asarray(part.geometry.vertices())
     problem = None
     if part.geometry.num_tris > MOST_TRIANGLES:
@@ -171,7 +173,7 @@ def _check_mesh(robot: Robot, part: pin.GeometryObject) -> None:
 
 
 def _sticks(robot: Robot) -> Iterator[Visual]:
-    """A ball at every link, and a stick from it to all that hangs on it."""
+    """A ball at every link, and a stick to each joint and link mounted on it."""
     model = robot.model
     radius = 0.012 * robot.characteristic_length
     for i, frame in enumerate(model.frames):
@@ -184,7 +186,7 @@ def _sticks(robot: Robot) -> Iterator[Visual]:
                 yield _stick(frame.name, np.asarray(end.translation), radius)
         for other in model.frames:
             fixed = other.type == pin.FrameType.BODY and other.name != frame.name
-            if fixed and other.parentJoint == frame.parentJoint and _hangs_on(model, other, i):
+            if fixed and other.parentJoint == frame.parentJoint and _is_mounted_on(model, other, i):
                 end = frame.placement.inverse() * other.placement
                 yield _stick(frame.name, np.asarray(end.translation), radius)
 
@@ -199,7 +201,7 @@ def _body_of(model: pin.Model, joint: int) -> int:
     return next(bodies, -1)
 
 
-def _hangs_on(model: pin.Model, frame: pin.Frame, body: int) -> bool:
+def _is_mounted_on(model: pin.Model, frame: pin.Frame, body: int) -> bool:
     """Whether a link is mounted on another by one fixed joint."""
     mount = model.frames[frame.parentFrame]
     return mount.type == pin.FrameType.FIXED_JOINT and int(mount.parentFrame) == body

@@ -1,4 +1,4 @@
-"""Every robot that loads is shown: with motions left free, rows to spare, no legs and no tool."""
+"""Scenes of robots with free motions, redundant closure rows, no legs or no tool."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def write_loose_loop(folder):
 
 
 def write_open_arm(folder):
-    """No loop at all, and a drive whose limits are as good as none."""
+    """No loop, and a drive with practically no limits."""
     far = '<limit lower="-1e6" upper="1e6" effort="1" velocity="1"/>'
     joints = joint("slide", "base", (0, 0, 0), "x", kind="prismatic", limit=far)
     joints += joint("hand", "slide", (0.2, 0, 0), "")
@@ -58,7 +58,7 @@ def robot(request, tmp_path):
     return load_robot(ROBOTS[request.param](tmp_path / request.param))
 
 
-def test_it_is_drawn_where_pinocchio_has_it(robot):
+def test_links_are_where_pinocchio_places_them(robot):
     scene = draw_scene(robot)
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, robot.configuration(robot.zero))
@@ -70,7 +70,7 @@ def test_it_is_drawn_where_pinocchio_has_it(robot):
     assert any(fact.startswith("Mechanical zero: ") for fact in scene.facts)
 
 
-def test_its_drives_are_moved_and_no_further_than_the_machine_is_large(robot):
+def test_every_drive_moves_within_the_size_of_the_machine(robot):
     stops = drawing._tour(robot)
     assert len(stops) > 1
     drives = np.array([s.drives for s in stops])
@@ -81,16 +81,16 @@ def test_its_drives_are_moved_and_no_further_than_the_machine_is_large(robot):
         assert np.abs(residual).max(initial=0.0) < CLOSED
 
 
-def test_what_is_found_and_what_is_free_is_said(robot):
+def test_computed_zeros_and_free_motions_are_stated(robot):
     facts = " ".join(draw_scene(robot).facts)
     found = [d.name for d in robot.drives if d.zero_found]
-    assert ("Found when the loops were closed, not given" in facts) == bool(found)
+    assert ("Computed by closing the loops" in facts) == bool(found)
     assert all(name in facts for name in found)
     free = count_free_motions(robot)
     assert (f"The loops leave {free} passive motion" in facts) == bool(free)
 
 
-def test_only_the_wide_linkage_has_a_zero_that_was_found(tmp_path):
+def test_only_the_wide_linkage_has_a_computed_zero(tmp_path):
     found = {n: load_robot(w(tmp_path / n)).drives[0].zero_found for n, w in ROBOTS.items()}
     assert [name for name, moved in found.items() if moved] == ["wide"]
 

@@ -1,4 +1,4 @@
-"""The live server: this machine only, and nothing left of it however it ends."""
+"""The live server is for this machine only, and ends with its process in every case."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from orthocal import LiveScene, draw_scene
 from orthocal.errors import OrthocalError
 
 PATIENCE = 60.0
-"""[s] Until something that must happen has happened."""
+"""Longest wait for an expected event, [s]."""
 
 VIEW = [sys.executable, "-m", "orthocal.cli", "view", "orthoglide"]
 
@@ -52,8 +52,8 @@ def processor_time(pid):
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def test_a_server_that_can_open_no_more_turns_visitors_away_quietly():
-    """Else it is told of the same visitor again and again, as fast as it can."""
+def test_server_without_free_descriptors_refuses_connections_quietly():
+    """Otherwise the event loop reports the same connection as fast as it can."""
     with subprocess.Popen(
         [sys.executable, "-c", FEW_FILES],
         stdin=subprocess.PIPE,
@@ -65,13 +65,13 @@ def test_a_server_that_can_open_no_more_turns_visitors_away_quietly():
         assert process.stdout is not None
         assert process.stderr is not None
         port = int(process.stdout.readline())
-        visitors = [socket.create_connection(("127.0.0.1", port), 20) for _ in range(30)]
+        clients = [socket.create_connection(("127.0.0.1", port), 20) for _ in range(30)]
         time.sleep(0.5)
         before = processor_time(process.pid)
         time.sleep(2.0)
         assert processor_time(process.pid) - before < 0.5
-        for visitor in visitors:
-            visitor.close()
+        for client in clients:
+            client.close()
         time.sleep(0.5)
         assert get(port)[0] == 200
         assert len(get(port, "/main.min.js")[1]) > 100_000
@@ -79,9 +79,9 @@ def test_a_server_that_can_open_no_more_turns_visitors_away_quietly():
         assert process.stderr.read() == ""
 
 
-def get(port, path="/", host="127.0.0.1"):
+def get(port, path="/", host="127.0.0.1", headers=None):
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
-    connection.request("GET", path, headers={"Host": f"{host}:{port}"})
+    connection.request("GET", path, headers={"Host": f"{host}:{port}", **(headers or {})})
     answer = connection.getresponse()
     text = answer.read().decode(errors="replace")
     connection.close()
@@ -95,7 +95,7 @@ def is_open(port):
 
 
 def listening(pid):
-    """Addresses and ports on which a process listens, from the kernel's tables."""
+    """Listening addresses and ports of a process, from the kernel's tables."""
     sockets = set()
     for link in Path(f"/proc/{pid}/fd").iterdir():
         try:
@@ -124,7 +124,7 @@ def wait_until(condition, what):
 
 
 def start(*arguments, code=None):
-    """A view in a process of its own, and its port."""
+    """Start a view in another process; return the process and its port."""
     command = [*VIEW, *arguments] if code is None else [sys.executable, "-c", code]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
@@ -179,27 +179,48 @@ def test_page_viewer_and_commands_come_from_the_server(scene):
     assert not is_open(live.port)
 
 
-def test_answers_only_to_its_own_name(scene):
-    """A page from elsewhere that has a name resolve to 127.0.0.1 gets nothing."""
+def test_other_host_names_are_refused(scene):
+    """A page from elsewhere whose host name resolves to 127.0.0.1 gets nothing."""
     with LiveScene(scene) as live:
         assert get(live.port, host="localhost")[0] == 200
         assert get(live.port, host="evil.example")[0] == 404
 
-        async def listen(origin):
-            request = HTTPRequest(
-                f"ws://127.0.0.1:{live.port}/commands", headers={"Origin": origin}
-            )
+
+@pytest.mark.parametrize("name", ["Origin", "Sec-Websocket-Origin"])
+@pytest.mark.parametrize(
+    ("origin", "accepted"),
+    [
+        ("http://127.0.0.1:{port}", True),
+        ("https://127.0.0.1:{port}", False),
+        ("ftp://127.0.0.1:{port}", False),
+        ("http://127.0.0.1:{port}/", False),
+        ("http://localhost:{port}", False),
+        ("http://127.0.0.1", False),
+        ("http://evil.example", False),
+        ("null", False),
+    ],
+)
+def test_page_and_commands_are_for_the_same_origin_alone(scene, name, origin, accepted):
+    with LiveScene(scene) as live:
+        headers = {name: origin.format(port=live.port), "Sec-Fetch-Site": "same-origin"}
+
+        async def first_command():
+            request = HTTPRequest(f"ws://127.0.0.1:{live.port}/commands", headers=headers)
             connection = await websocket_connect(request)
             first = await connection.read_message()
             await hang_up(connection)
             return umsgpack.unpackb(first)
 
-        assert asyncio.run(listen(f"http://127.0.0.1:{live.port}"))["type"] == "delete"
-        with pytest.raises(HTTPClientError, match="403"):
-            asyncio.run(listen("http://evil.example"))
+        for path in ("/", "/main.min.js"):
+            assert get(live.port, path, headers=headers)[0] == (200 if accepted else 403)
+        if accepted:
+            assert asyncio.run(first_command())["type"] == "delete"
+        else:
+            with pytest.raises(HTTPClientError, match="403"):
+                asyncio.run(first_command())
 
 
-def test_what_is_added_later_is_sent_at_once(orthoglide):
+def test_later_commands_are_sent_at_once(orthoglide):
     scene = draw_scene(orthoglide)
     known = len(scene.commands)
 
@@ -215,14 +236,14 @@ def test_what_is_added_later_is_sent_at_once(orthoglide):
 
     with LiveScene(scene) as live:
         with LiveScene(scene):
-            pass  # another view of the same scene that ends takes nothing from this one
+            pass  # another view of the same scene does not disturb this one
         first, later = asyncio.run(follow(live))
     assert [c["path"] for c in first] == [c["path"] for c in scene.commands[:known]]
     assert later["path"] == "/Mine"
-    scene.visualizer["/Mine"].delete()  # nobody listens any more, and nothing breaks
+    scene.visualizer["/Mine"].delete()  # without a listener
 
 
-def test_what_is_no_scene_is_refused_at_once(orthoglide):
+def test_other_types_than_a_scene_are_refused(orthoglide):
     with pytest.raises(TypeError, match=r"found a Robot; expected a Scene: draw_scene"):
         LiveScene(orthoglide)
 
@@ -230,7 +251,7 @@ def test_what_is_no_scene_is_refused_at_once(orthoglide):
 def test_listens_on_loopback_only(scene):
     with LiveScene(scene) as live:
         own = [a for a, p in listening(os.getpid()) if p == live.port]
-        assert own == ["0100007F"]  # 127.0.0.1 as the kernel writes it
+        assert own == ["0100007F"]  # 127.0.0.1 in the kernel's notation
         others = [a for a, _ in listening(os.getpid()) if a not in ("0100007F",)]
         assert others == []
 
@@ -238,7 +259,7 @@ def test_listens_on_loopback_only(scene):
 def test_two_views_find_two_ports(scene):
     with LiveScene(scene) as one, LiveScene(scene) as two:
         assert one.port != two.port
-        with pytest.raises(OrthocalError, match=f"port {one.port} of 127.0.0.1 cannot be had"):
+        with pytest.raises(OrthocalError, match=f"cannot listen on port {one.port} of 127.0.0.1"):
             LiveScene(scene, port=one.port)
     assert not is_open(one.port)
     assert not is_open(two.port)
@@ -246,11 +267,11 @@ def test_two_views_find_two_ports(scene):
         assert again.port == one.port
 
 
-# ---- in a process of its own
+# ---- in another process
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ends_cleanly_when_asked_to(number):
+def test_view_ends_cleanly_on_a_signal(number):
     process, port = start()
     assert [a for a, _ in listening(process.pid)] == ["0100007F"]
     assert children(process.pid) == []
@@ -262,7 +283,7 @@ def test_ends_cleanly_when_asked_to(number):
     assert not is_open(port)
 
 
-def test_nothing_is_left_after_a_kill():
+def test_port_is_free_after_a_kill():
     process, port = start()
     process.kill()
     process.wait(PATIENCE)
@@ -281,12 +302,12 @@ with LiveScene(draw_scene(load_robot('orthoglide'))) as live:
         time.sleep(0.05)
     live.wait()
 """
-"""A view that does not wait yet when its parent ends."""
+"""A view whose parent ends before it waits."""
 
 
 @pytest.mark.parametrize("view", [VIEW, [sys.executable, "-c", BUSY]], ids=["waiting", "busy"])
-def test_nothing_is_left_after_a_kill_of_its_parent(view):
-    """As where a shell or a script that started the view is killed: the view ends, too."""
+def test_view_ends_with_a_killed_parent(view):
+    """A view ends if the shell or script that started it is killed."""
     code = (
         "import subprocess, sys\n"
         f"view = subprocess.Popen({view!r}, stdout=subprocess.PIPE, text=True)\n"
@@ -301,13 +322,13 @@ def test_nothing_is_left_after_a_kill_of_its_parent(view):
     process.stdout.close()
     process.stderr.close()
     try:
-        wait_until(lambda: not alive(child), "the view's end")  # its port may be another's by then
+        wait_until(lambda: not alive(child), "the view's end")  # its port may be in use again
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.kill(child, signal.SIGKILL)
 
 
-def test_nothing_is_left_after_an_exception():
+def test_port_is_free_after_an_exception():
     code = (
         "from orthocal import LiveScene, draw_scene, load_robot\n"
         "live = LiveScene(draw_scene(load_robot('orthoglide')))\n"

@@ -1,7 +1,4 @@
-"""Every page in a real browser without a network: it draws, moves, says what it must, and no more.
-
-How many requests: one, for the file itself. What the console says: nothing.
-"""
+"""Pages in a real browser without a network: one request, no message on the console."""
 
 from __future__ import annotations
 
@@ -15,6 +12,7 @@ from PIL import Image
 
 from orthocal import LiveScene, calibrate, draw_scene, load_robot, load_session, write_report
 from orthocal.measurement.files.session_file import load_plan
+from orthocal.output.report.parameter_plots import plot_correlations
 from orthocal.viewer.browser import take_picture
 
 EXPECTED = ("zx −1.140 → −0.130 mm", "x_max − x_min", "Before: measured − nominal", "leg z")
@@ -46,7 +44,7 @@ def page(calibration, tmp_path_factory):
 
 @pytest.fixture(scope="module", params=SIZES, ids=by_size)
 def drawn(browser, page, request):
-    """The calibration's page, open and drawn: tests only look at it."""
+    """The page of the calibration, open and drawn; tests do not change it."""
     with visit(browser, page.as_uri(), size=request.param) as found:
         found.wait_until_drawn()
         yield found, request.param
@@ -54,7 +52,7 @@ def drawn(browser, page, request):
 
 @pytest.fixture(scope="module")
 def session_drawn(browser, root, tmp_path_factory, request):
-    """A session's page, likewise, and its size."""
+    """The page of a session, open and drawn, and its size."""
     name, size = request.param
     scene = draw_scene(load_session(session_folder(root, name)))
     path = scene.save(tmp_path_factory.mktemp("session") / "page.html")
@@ -69,19 +67,19 @@ def report(calibration, tmp_path_factory):
 
 
 def count_colours(picture):
-    """Different ones, transparency left out."""
+    """Number of colours without transparency."""
     red, green, blue = np.moveaxis(picture[..., :3].astype(np.int64), -1, 0)
     return np.unique(red << 16 | green << 8 | blue).size
 
 
 def is_drawn(picture):
-    """Whether there is more than a background: many colours, and large parts that are no grey."""
+    """Whether a picture has many colours, and large parts that are not grey."""
     spread = picture[..., :3].max(axis=-1) - picture[..., :3].min(axis=-1)
     return count_colours(picture) > 500 and (spread > 60).mean() > 0.005
 
 
 def boxes(page):
-    """Rectangles of the labels that are to be seen, and of the panels."""
+    """Rectangles and texts of visible labels and panels."""
     return page.evaluate(
         """() => [...document.querySelectorAll('.label, #panel, #bar, .dg.main')]
              .filter((e) => e.offsetWidth > 0 && e.offsetHeight > 0)
@@ -91,7 +89,7 @@ def boxes(page):
 
 
 def seek(found, time):
-    """Go to a time of the animation by meshcat's own controls, and wait until that is drawn."""
+    """Go to a time of the animation with meshcat's controls, and wait until it is drawn."""
     found.page.evaluate(
         """(time) => {
              const animator = viewer.animator;
@@ -106,7 +104,7 @@ def seek(found, time):
 
 
 def test_setups_with_any_names_are_drawn(browser, raw_cycles, tmp_path):
-    """The viewer keeps nodes in plain objects, which hold some names from the beginning."""
+    """The viewer keeps nodes in plain JavaScript objects, which have some keys already."""
     odd = dict(zip(raw_cycles.setups, ("constructor", "__proto__", "<object>"), strict=False))
     name_of = {name: odd.get(name, name) for name in raw_cycles.setups}
     assert len(odd) == 3
@@ -124,7 +122,7 @@ def test_setups_with_any_names_are_drawn(browser, raw_cycles, tmp_path):
     assert all(any(name in node for node in nodes) for name in odd.values()), nodes
 
 
-def test_scene_draws_and_asks_for_nothing(drawn, page):
+def test_scene_draws_without_requests(drawn, page):
     found, _ = drawn
     assert found.messages == []
     assert found.requests == [page.as_uri()]
@@ -179,8 +177,8 @@ SWEPT = [("sweep", size) for size in SIZES]
 
 
 @pytest.mark.parametrize("session_drawn", SWEPT, ids=by_name_and_size, indirect=True)
-def test_labels_cover_no_dial_of_all_eighteen(session_drawn):
-    """Six of them have a label, the worst of each leg and direction."""
+def test_labels_cover_no_dial(session_drawn):
+    """Six of 18 dials have a label, the worst of each leg and direction."""
     found, _ = session_drawn
     dials = found.page.evaluate(
         """() => JSON.parse(document.getElementById('scene-data').textContent).labels
@@ -199,7 +197,7 @@ def test_labels_cover_no_dial_of_all_eighteen(session_drawn):
 
 
 @pytest.mark.parametrize("size", SIZES, ids=by_size)
-def test_all_that_the_panel_says_is_in_the_picture(browser, calibration, tmp_path, size):
+def test_text_of_the_panel_fits_into_the_picture(browser, calibration, tmp_path, size):
     page = draw_scene(calibration, show="all").save(tmp_path / "page.html")
     with visit(browser, f"{page.as_uri()}#picture", size=size) as found:
         found.wait_until_drawn()
@@ -211,7 +209,7 @@ def test_all_that_the_panel_says_is_in_the_picture(browser, calibration, tmp_pat
 
 
 def test_measurement_plays(browser, page):
-    """By the scrubber of meshcat's controls, and by the button; labels follow the posture."""
+    """The controls and the button move machine and labels."""
     with visit(browser, page.as_uri(), size=SIZES[1]) as found:
         found.wait_until_drawn()
         steps = found.page.evaluate(
@@ -231,7 +229,7 @@ def test_measurement_plays(browser, page):
             changed = np.abs(pictures[one].astype(int) - pictures[two].astype(int)).max(axis=-1)
             assert (changed > 40).mean() > 0.005
         assert captions[1].startswith("x_max, leg x: ")
-        assert captions[2].startswith("y_min, leg y: taken off what is read at y_max")
+        assert captions[2].startswith("y_min, leg y: subtracted from the readings at y_max")
         found.page.evaluate("viewer.animator.reset()")
         found.page.click("#bar button")
         found.wait_for("viewer.animator.time > 2.5")
@@ -251,7 +249,7 @@ def test_boxes_of_the_legend_show_and_hide(browser, page):
         assert any("zx" in r[4] and "→" in r[4] for r in boxes(found.page)[2:])
         found.page.click("#legend label:has-text('Gauges')")
         found.wait_for("!document.getElementById('labels').innerText.includes('→')")
-        # what meshcat's own tree hides is off in the legend, too
+        # the legend shows what meshcat's controls have hidden
         found.page.evaluate(
             "viewer.set_property(['Leg lines'], 'visible', false); viewer.set_dirty()"
         )
@@ -296,11 +294,11 @@ def test_live_page_draws_what_the_server_sends(browser, calibration):
 # ---- the report
 
 
-def test_report_opens_and_asks_for_nothing(browser, report):
+def test_report_opens_without_requests(browser, report):
     with visit(browser, report.as_uri(), size=(1000, 900)) as found:
         assert found.page.title().startswith("Calibration of orthoglide")
         text = found.page.inner_text("body")
-        for expected in ("x_slide", "-0.527", "What it means", "SHA-256"):
+        for expected in ("x_slide", "-0.527", "Findings", "SHA-256"):
             assert expected in text
         found.page.locator("iframe").scroll_into_view_if_needed()
         frame = found.page.frame_locator("iframe")
@@ -314,7 +312,7 @@ def test_report_opens_and_asks_for_nothing(browser, report):
 
 
 def test_report_is_as_wide_as_its_window(browser, report):
-    """Nothing sticks out at either size."""
+    """No figure is wider than the window at either size."""
     for size in SIZES:
         with visit(browser, report.as_uri(), size=size) as found:
             width = found.page.evaluate("document.documentElement.scrollWidth")
@@ -325,8 +323,29 @@ def test_report_is_as_wide_as_its_window(browser, report):
                 assert box["x"] + box["width"] <= size[0] + 1
 
 
+def test_no_text_of_a_plot_is_cut_off(browser, root, tmp_path):
+    """Browsers may draw text wider than matplotlib does, here the names of 40 parameters."""
+    calibration = calibrate(load_session(root / "examples/workshop"), "full")
+    path = tmp_path / "plot.html"
+    path.write_text(plot_correlations(calibration), encoding="utf-8")
+    with visit(browser, path.as_uri()) as found:
+        texts = found.page.evaluate(
+            """() => {
+                 const svg = document.querySelector('svg').getBoundingClientRect();
+                 return [...document.querySelectorAll('svg text')].map((text) => {
+                   const box = text.getBoundingClientRect();
+                   return [box.left - svg.left, box.top - svg.top,
+                           svg.right - box.right, svg.bottom - box.bottom, text.textContent];
+                 });
+               }"""
+        )
+    assert len(texts) > 80
+    for *gaps, text in texts:
+        assert min(gaps) >= 0.0, text
+
+
 def test_report_prints(browser, report, tmp_path):
-    """On paper: several pages, the list of readings open, and the scene as a picture."""
+    """The printed report has several pages."""
     with visit(browser, report.as_uri()) as found:
         found.page.locator("iframe").scroll_into_view_if_needed()
         handle = found.page.query_selector("iframe").content_frame()
@@ -339,7 +358,7 @@ def test_report_prints(browser, report, tmp_path):
 # ---- pictures
 
 
-def test_picture_is_of_the_size_asked_for(page, tmp_path):
+def test_picture_has_the_requested_size(page, tmp_path):
     require_browser()
     width, height = SIZES[1]
     text = page.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What scenes hold, without a browser: poses against Pinocchio, arrows against residuals."""
+"""Scenes without a browser: poses compared with Pinocchio, arrows with residuals."""
 
 from __future__ import annotations
 
@@ -25,9 +25,8 @@ from orthocal.observation.simulate import simulate_session
 from orthocal.output.scene import drawing, readings, tool_errors
 from orthocal.output.scene.deviations import measure_deviations
 from orthocal.sensors.leg_indicator import DIRECTIONS
-from orthocal.viewer import stage
-from orthocal.viewer.motion import FRAMES_A_SECOND
-from orthocal.viewer.scene import round_scale
+from orthocal.viewer import machine as machine_scene
+from orthocal.viewer.scene import FRAME_RATE, round_scale
 from orthocal.viewer.shapes import arrow_parts, head_length
 
 
@@ -56,7 +55,7 @@ def world(scene, path):
 
 
 def placed(robot, drives, passive):
-    """Every link's pose by Pinocchio alone."""
+    """Poses of all links by Pinocchio alone."""
     data = robot.model.createData()
     q = robot.configuration(robot.joint_coordinates(drives, passive))
     pin.framesForwardKinematics(robot.model, data, q)
@@ -72,7 +71,7 @@ def links(scene, machine):
 
 
 def arrow_length(scene, path):
-    """From the foot of an arrow to the tip of its head, along it."""
+    """Length of an arrow from its foot to the tip of its head."""
     shaft, head = scene.pose(f"{path}/shaft"), scene.pose(f"{path}/head")
     width = readings.arrow_width(dial(scene))
     assert np.isclose(shaft[2, 2], head[2, 3], atol=1e-8)
@@ -80,7 +79,7 @@ def arrow_length(scene, path):
 
 
 def dial(scene):
-    """Radius of the dials, from the shape itself."""
+    """Radius of the dials."""
     shape = next(
         c["object"]["geometries"][0]
         for c in scene.commands
@@ -107,7 +106,7 @@ def animation(scene):
 # ---- the machine
 
 
-def test_nominal_machine_stands_where_pinocchio_puts_it(orthoglide):
+def test_nominal_links_are_where_pinocchio_places_them(orthoglide):
     scene = draw_scene(orthoglide)
     zero = placed(orthoglide, orthoglide.drive_zero, orthoglide.zero[orthoglide.passive_index])
     drawn = links(scene, drawing.MACHINE)
@@ -118,7 +117,7 @@ def test_nominal_machine_stands_where_pinocchio_puts_it(orthoglide):
 
 
 def test_true_scale_is_the_calibrated_machine_of_pinocchio(full):
-    """All 126 errors in placements, loops closed by Pinocchio; in a posture, and the ghost."""
+    """Calibrated links and ghost in a posture, with loops closed by Pinocchio."""
     posture = next(p for p in full.postures if p.name == "y_+60")
     scene = draw_scene(full, posture="y_+60", exaggeration=1.0)
     machine = full.robot.with_errors(full.errors)
@@ -138,7 +137,7 @@ def test_true_scale_is_the_calibrated_machine_of_pinocchio(full):
         assert np.abs(pose - nominal[link]).max() < KINEMATICS
 
 
-def test_deviation_is_drawn_larger_by_the_factor_that_is_stated(full):
+def test_deviation_is_enlarged_by_the_stated_factor(full):
     true = draw_scene(full, posture="x_+60", exaggeration=1.0)
     large = draw_scene(full, posture="x_+60", exaggeration=25.0)
     assert large.exaggeration == 25.0
@@ -170,18 +169,18 @@ def test_default_factor_makes_the_largest_deviation_a_twentieth_of_the_machine(r
 
 
 def test_machine_without_deviation_needs_no_ghost(root):
-    """The true machine is the nominal one, and so is what comes out."""
+    """The true and the estimated machine are the nominal one."""
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     session = simulate_session(plan, {}, exact=True).session
     scene = draw_scene(calibrate(session))
     assert not links(scene, drawing.GHOST)
     assert scene.exaggeration == 1.0
-    assert "where the controller takes it to be" in " ".join(scene.facts)
-    assert "No gauge has seen any deviation" in scene.headline
+    assert "where the controller assumes it" in " ".join(scene.facts)
+    assert "No gauge shows a deviation" in scene.headline
 
 
-def test_offsets_that_are_active_are_in_the_ghost(root):
-    """The controller sends the drives elsewhere because it knows: the ghost is at the target."""
+def test_active_offsets_move_the_ghost(root):
+    """The controller corrects its active offsets, so that the ghost is at the target."""
     session = load_session(root / "examples/raw-cycles")
     offsets = np.array([1e-3, -2e-3, 0.5e-3])
     postures = {n: replace(p, drives=p.drives - offsets) for n, p in session.postures.items()}
@@ -196,9 +195,9 @@ def test_offsets_that_are_active_are_in_the_ghost(root):
 
 
 def test_leg_lines_go_from_root_to_tip(scene, calibration):
-    """Through what is drawn: both ends belong to links that are."""
+    """Both ends of a leg line belong to drawn links."""
     root = world(scene, f"{drawing.SOLID}/x_yoke")[:3, 3]
-    line = scene.pose(f"{stage.LINES}/leg x")
+    line = scene.pose(f"{machine_scene.LINES}/leg x")
     assert line[:3, 3] == pytest.approx(root, abs=KINEMATICS)
     assert np.linalg.norm(line[:3, 2]) == pytest.approx(
         calibration.robot.legs["x"].length, abs=1e-3
@@ -237,7 +236,7 @@ def test_arrow_that_is_shorter_than_its_head_is_a_smaller_head():
 def test_gauges_touch_the_leg_at_their_section(scene, calibration):
     for setup in calibration.setups:
         tip = scene.pose(f"{readings.GAUGES}/{setup.name}")[:3, 3]
-        line = scene.pose(f"{stage.LINES}/leg {setup.sensor.leg}")
+        line = scene.pose(f"{machine_scene.LINES}/leg {setup.sensor.leg}")
         along = line[:3, 2] / np.linalg.norm(line[:3, 2])
         off = tip - line[:3, 3]
         assert np.linalg.norm(off - (off @ along) * along) < KINEMATICS
@@ -256,8 +255,8 @@ def test_labels_say_setup_millimetres_and_postures(scene, calibration):
     assert scene.headline.startswith("Leg x is furthest from parallel: −1.140 mm at gauge zx")
 
 
-def test_scene_says_which_offsets_were_found(scene, calibration):
-    """The leg that leans most, x, is not the one whose drive is most off, z."""
+def test_scene_states_the_offsets_to_enter(scene, calibration):
+    """The leg with the largest deviation, x, is not the one with the largest offset, z."""
     fact = next(f for f in scene.facts if f.startswith("Offsets to enter"))
     for entry in find_entries(calibration):
         assert f"{entry.drive} {entry.enter * 1e3:+.3f}".replace("-", "−") + " mm" in fact
@@ -276,8 +275,10 @@ def test_of_many_gauges_the_overview_names_the_worst(full):
 
 @pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles", "lines", "sweep"])
 def test_deviations_of_a_session_are_those_of_its_calibration(root, name):
-    """Two ways to the same numbers: without any solution, and as the solved problem reports."""
-    session = exact(load_session(session_folder(root, name)))  # else it is found how gauges stood
+    """Two ways to the same numbers: without a fit, and from the residuals of a fit."""
+    session = exact(
+        load_session(session_folder(root, name))
+    )  # without nuisance parameters of the mounting
     rows = calibrate(session).residuals
     mean = {}
     for row in rows:
@@ -288,7 +289,7 @@ def test_deviations_of_a_session_are_those_of_its_calibration(root, name):
         assert found[key] == pytest.approx(np.mean(values), abs=1e-10)
 
 
-def test_session_alone_shows_the_nominal_machine_and_what_was_seen(raw_cycles):
+def test_session_shows_the_nominal_machine_and_the_deviations(raw_cycles):
     scene = draw_scene(raw_cycles)
     assert links(scene, drawing.MACHINE)
     assert not links(scene, drawing.SOLID)
@@ -297,7 +298,7 @@ def test_session_alone_shows_the_nominal_machine_and_what_was_seen(raw_cycles):
     assert f"{abs(worst.before) * 1e3:.3f} mm" in scene.headline
 
 
-def test_plan_shows_where_gauges_will_stand(root):
+def test_plan_shows_the_places_of_the_gauges(root):
     scene = draw_scene(load_plan(root / "tests/sessions/lines/plan.yaml"))
     assert scene.headline == "A plan: 270 readings in 135 postures, none taken yet."
     assert not [p for p in scene.nodes if p.startswith(readings.BEFORE)]
@@ -319,7 +320,7 @@ def test_measurement_goes_from_zero_through_every_leg(raw_cycles):
     assert all(a[1] < b[0] for a, b in pairwise(ends))
 
 
-def test_animation_is_at_every_posture_when_its_step_says_so(full):
+def test_animation_reaches_every_posture_at_the_stated_time(full):
     scene = draw_scene(full, exaggeration=1.0)
     tracks = animation(scene)
     machine = full.robot.with_errors(full.errors)
@@ -373,11 +374,11 @@ def test_many_postures_are_thinned_out_for_the_animation(root, monkeypatch):
 
 
 def test_no_joint_leaps_between_two_frames(scene):
-    """Links move a little at a time: no branch of assembly is left."""
+    """Links move in small steps: the loops stay on one branch."""
     times, values = animation(scene)[f"{drawing.SOLID}/platform"]["position"]
     assert np.abs(np.diff(values, axis=0)).max() < 0.03
     assert np.diff(times).max() < 2.0
-    assert times[-1] * FRAMES_A_SECOND > 100
+    assert times[-1] * FRAME_RATE > 100
 
 
 # ---- errors of the tool
@@ -385,13 +386,13 @@ def test_no_joint_leaps_between_two_frames(scene):
 
 def test_errors_of_the_tool_are_those_of_the_calibration(full):
     scene = draw_scene(full, show="tool")
-    whole = assess_tool(full)  # what is taken out is taken out of the whole region
+    whole = assess_tool(full)  # aligned over the whole workspace
     middles = np.isin(np.round(whole.workspace.points, 9), [-0.06, 0.0, 0.06]).all(axis=1)
     corners = np.flatnonzero(middles)
     targets = whole.targets[corners]
     for node, deviation in (
         (tool_errors.TOOL_NOW, whole.align(whole.deviation)[corners]),
-        (tool_errors.TOOL_LEFT, whole.align(whole.error_after_offsets)[corners]),
+        (tool_errors.TOOL_ENTERED, whole.align(whole.error_after_offsets)[corners]),
     ):
         for i in (0, 13, 26):
             pose = scene.pose(f"{node}/point {i + 1}")
@@ -405,14 +406,14 @@ def test_errors_of_the_tool_are_those_of_the_calibration(full):
     told = [e.text for e in scene.legend if e.nodes[0].startswith("Tool error")]
     assert len(told) == 3
     assert all(text.endswith(f"(× {scene.tool_scale:g})") for text in told)
-    assert scene.steps[0].caption == "Overview at the zero"  # no gauge is there
-    ball = scene.pose(f"{tool_errors.TOOL_UNKNOWN}/point 5")[:3, :3]
+    assert scene.steps[0].caption == "Overview at the mechanical zero"  # no gauge is shown
+    ball = scene.pose(f"{tool_errors.TOOL_UNCERTAINTY}/point 5")[:3, :3]
     assert ball @ ball.T == pytest.approx(
         scene.tool_scale**2 * whole.after.aligned_covariance[corners[4]], rel=1e-6, abs=1e-16
     )
 
 
-def test_what_is_shown_at_first_can_be_chosen(calibration):
+def test_choice_of_what_is_shown_at_first(calibration):
     def hidden(scene):
         return {
             c["path"].strip("/")
@@ -420,7 +421,7 @@ def test_what_is_shown_at_first_can_be_chosen(calibration):
             if c["type"] == "set_property" and c["property"] == "visible" and not c["value"]
         }
 
-    assert hidden(draw_scene(calibration)) == {tool_errors.TOOL_NOW, tool_errors.TOOL_UNKNOWN}
+    assert hidden(draw_scene(calibration)) == {tool_errors.TOOL_NOW, tool_errors.TOOL_UNCERTAINTY}
     assert hidden(draw_scene(calibration, show="tool")) == {
         *(readings.GAUGES, readings.BEFORE, readings.AFTER)
     }
@@ -429,13 +430,13 @@ def test_what_is_shown_at_first_can_be_chosen(calibration):
         draw_scene(calibration, show="everything")
 
 
-def test_pose_of_a_node_that_is_not_there_is_an_error(scene):
+def test_pose_of_a_missing_node_is_an_error(scene):
     assert (scene.pose("/Leg lines/leg x") == scene.pose("Leg lines/leg x")).all()
     with pytest.raises(KeyError, match="Leg lines/leg w"):
         scene.pose("Leg lines/leg w")
 
 
-def test_legend_names_nodes_that_are_there(scene):
+def test_legend_names_existing_nodes(scene):
     for entry in scene.legend:
         for node in entry.nodes:
             assert any(p.startswith(f"{node}/") for p in scene.nodes), node
@@ -460,13 +461,13 @@ def test_robots_without_visuals_are_drawn_as_sticks(root, name):
 def test_posture_must_be_one_of_the_session(calibration, orthoglide):
     with pytest.raises(ParameterError, match=r"'x_mx' is not a posture; postures: x_max, x_min"):
         draw_scene(calibration, posture="x_mx")
-    with pytest.raises(ParameterError, match="a robot alone has no postures"):
+    with pytest.raises(ParameterError, match="a robot has no postures"):
         draw_scene(orthoglide, posture="zero")
 
 
 def test_only_a_calibrated_machine_deviates(experiment_2, orthoglide):
     for subject in (experiment_2, orthoglide):
-        with pytest.raises(ParameterError, match="only a calibration has a machine that deviates"):
+        with pytest.raises(ParameterError, match="applies to a calibration only"):
             draw_scene(subject, exaggeration=2.0)
 
 
@@ -476,7 +477,7 @@ def test_exaggeration_must_be_positive(calibration, factor):
         draw_scene(calibration, exaggeration=factor)
 
 
-def test_arrows_at_one_place_stand_beside_each_other(scene):
+def test_arrows_at_one_contact_are_beside_each_other(scene):
     """Both gauges of a leg touch it at the same point."""
     for one, two in (("yx", "zx"), ("xy", "zy"), ("xz", "yz")):
         for node in (readings.BEFORE, readings.AFTER):
@@ -487,7 +488,7 @@ def test_arrows_at_one_place_stand_beside_each_other(scene):
 @pytest.mark.parametrize("posture", [None, "x_max", "x_min"])
 def test_arrows_do_not_reach_through_the_ground(calibration, posture):
     scene = draw_scene(calibration, posture=posture)
-    ground = scene.pose(stage.GROUND)[2, 3]
+    ground = scene.pose(machine_scene.GROUND)[2, 3]
     for row in calibration.residuals:
         pose = scene.pose(f"{readings.BEFORE}/{row.setup}")
         shown = posture is None or row.posture == posture
@@ -495,19 +496,19 @@ def test_arrows_do_not_reach_through_the_ground(calibration, posture):
         assert (pose[:3, 3] + length * pose[:3, 2])[2] > ground
 
 
-def test_a_scene_of_the_tool_says_how_far_it_is_off(calibration):
+def test_headline_of_the_tool_states_error_and_uncertainty(calibration):
     scene = draw_scene(calibration, show="tool")
     found = assess_tool(calibration)
     largest = np.linalg.norm(found.align(found.deviation), axis=1).max() * 1e6
-    assert scene.headline.startswith(f"The tool is up to {largest:.0f} µm off where it is sent")
-    # with errors as far beyond their tolerances as what remains of the readings says
+    assert scene.headline.startswith(f"Tool error now: up to {largest:.0f} µm over ±60 mm")
+    # with errors enlarged by the tolerance scale
     covariance = error_covariance(calibration, excess=find_excess(calibration))
     known = measure_uncertainty(found.jacobian, covariance, found.workspace, found.targets)
     known = known.sizes.aligned.largest
     assert known > 1.2 * found.after.sizes.aligned.largest
-    assert f"known to {known * 1e6:.0f} µm or better" in scene.headline
-    (told,) = (e.text for e in scene.legend if e.nodes == (tool_errors.TOOL_UNKNOWN,))
-    assert "errors 2.1 × tolerances" in told
+    assert f"With all corrected: {known * 1e6:.0f} µm or less" in scene.headline
+    (told,) = (e.text for e in scene.legend if e.nodes == (tool_errors.TOOL_UNCERTAINTY,))
+    assert "errors at 2.1 × tolerances" in told
 
 
 def test_only_machines_sessions_and_calibrations_are_drawn():
@@ -546,8 +547,8 @@ TAKEN = ("constructor", "__proto__", "toString", "hasOwnProperty", "<object>")
 
 
 @pytest.mark.parametrize("name", TAKEN)
-def test_names_that_the_viewer_takes_for_itself_are_not_those_of_nodes(name, raw_cycles):
-    """Its tables are plain objects of JavaScript, which hold some names from the beginning."""
+def test_reserved_names_of_the_viewer_are_not_used_for_nodes(name, raw_cycles):
+    """The viewer keeps nodes in plain JavaScript objects, which have some keys already."""
     session = rename_setups(raw_cycles, {"yx": name})
     scene = draw_scene(session)
     parts = {part for path in scene.nodes for part in path.split("/")}
@@ -557,7 +558,7 @@ def test_names_that_the_viewer_takes_for_itself_are_not_those_of_nodes(name, raw
 
 
 def test_links_with_any_name_move(root, tmp_path):
-    """A link's name is a node's, drawn and moved under the same one."""
+    """Drawing and animation use the same node name for a link."""
     folder = tmp_path / "biglide"
     shutil.copytree(root / "tests/robots/biglide", folder)
     path = folder / "biglide.urdf"
@@ -570,8 +571,8 @@ def test_links_with_any_name_move(root, tmp_path):
     assert not [path for path in paths if "constructor" in path.split("/")]
 
 
-def test_names_of_strangers_cannot_leave_the_data(raw_cycles):
-    """Titles, setups and postures come from files: none may end a script or begin an element."""
+def test_names_from_files_stay_in_the_data(raw_cycles):
+    """Titles, setups and postures from files can neither end a script nor begin an element."""
     evil = "</script><img src=x onerror=alert(1)>"
     names = {r.setup for r in raw_cycles.readings}
     session = replace(

@@ -1,4 +1,4 @@
-"""What is drawn of a link: primitives where the URDF puts them, meshes whole, sticks else."""
+"""Visuals of links: primitives and meshes as in the URDF, otherwise sticks."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def with_mesh(root, tmp_path):
 
 
 def test_visuals_are_those_that_yourdfpy_reads(orthoglide):
-    """Another reader of the same file: parts, sizes, colours and places of every link."""
+    """Parts, sizes, colours and poses as another reader of the same file has them."""
     other = yourdfpy.URDF.load(str(orthoglide.urdf), build_scene_graph=False, load_meshes=False)
     found = load_visuals(orthoglide)
     for link in other.robot.links:
@@ -66,7 +66,7 @@ def test_visuals_are_those_that_yourdfpy_reads(orthoglide):
 
 
 def test_cylinders_lie_along_z_as_in_a_urdf(orthoglide):
-    """Of meshcat's they lie along y: the rod's ends must be the joints."""
+    """meshcat's cylinders lie along y; the ends of the rod must be the joints."""
     rod = next(v for v in load_visuals(orthoglide) if v.link == "x_rod_a")
     inner = rod.geometry.intrinsic_transform().T  # three.js stores columns
     half = rod.geometry.height / 2.0
@@ -75,7 +75,7 @@ def test_cylinders_lie_along_z_as_in_a_urdf(orthoglide):
     assert ends[1][:3] == pytest.approx([0.31025, 0.0, 0.0], abs=1e-9)
 
 
-def test_meshes_of_the_robots_folder_are_drawn(with_mesh):
+def test_meshes_of_the_robot_are_drawn(with_mesh):
     mesh = next(v for v in load_visuals(with_mesh) if v.link == "base")
     vertices = np.unique(np.round(mesh.geometry.vertices, 6), axis=0)
     expected = np.unique(np.round(2.0 * TETRAHEDRON, 6), axis=0)
@@ -86,7 +86,7 @@ def test_meshes_of_the_robots_folder_are_drawn(with_mesh):
     assert "Machine/base/part 1" in draw_scene(with_mesh).nodes
 
 
-def test_sticks_join_what_hangs_together(fivebar):
+def test_sticks_join_links_and_their_joints(fivebar):
     """Every link has a ball, and a stick to each joint or mount on it."""
     found = load_visuals(fivebar)
     model = fivebar.model

@@ -1,1 +1,1 @@
-"""A calibration as one page."""
+"""The report of a calibration, and the figures of all reports."""

@@ -1,7 +1,7 @@
-"""Figures as inline `<svg>` for an HTML page, all in one style.
+"""Figures of all reports as inline `<svg>`, in one style.
 
-Text stays text and is never parsed: names come from files. Every plot can be read in black and
-white, by its markers, and its ids are its own, so that several stand on one page.
+Text stays text and is never parsed, because names come from files. Markers make every plot readable
+in black and white. Every figure has its own ids, so that a page can hold several.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any, Generic, Literal, ParamSpec
 
 import matplotlib
 import numpy as np
@@ -26,13 +27,16 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 WIDTH = 7.2
-"""Of a figure, [inch], at 100 pixels an inch on the page."""
+"""Width of a figure, [inch]; 100 pixels per inch on the page."""
 
 ROW_HEIGHT = 0.17
-"""Of a line of a plot that lists things, [inch]."""
+"""Height of a row of a list, [inch]."""
 
 HEAD = 0.48
-"""Height of title and legend, [inch]."""
+"""Height of title and legend together, [inch]."""
+
+PADDING = 0.1
+"""Distance of text from the border, [inch]; browsers draw text wider than matplotlib expects."""
 
 BEFORE, AFTER, UNSEEN, BAND = "#E69F00", "#0072B2", "#009E73", "#DDDDDD"
 
@@ -63,7 +67,9 @@ _SVG = "{http://www.w3.org/2000/svg}"
 _HREF = "{http://www.w3.org/1999/xlink}href"
 
 Look = dict[str, Any]
-"""How markers are drawn, as keyword arguments of `plot`."""
+"""Keyword arguments of matplotlib's drawing functions."""
+
+P = ParamSpec("P")
 
 BEFORE_LOOK: Look = {
     "marker": "o",
@@ -79,7 +85,7 @@ BOUND_LOOK: Look = {"marker": "X", "color": "black", "markersize": 7.0, "linesty
 
 @contextmanager
 def house_style() -> Iterator[None]:
-    """Matplotlib's own defaults and ours, whatever its user has configured."""
+    """The style of all figures, whatever the user has configured in matplotlib."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_STYLE)
@@ -90,25 +96,25 @@ def render_figure(name: str, label: str, draw: Callable[[], Figure]) -> str:
     """A figure as an inline `<svg>` that scales with its page.
 
     Args:
-        name: Of the plot, with which its ids begin.
-        label: What it shows, for those who do not see it.
-        draw: Draws the figure.
+        name: Name of the plot, with which its ids begin.
+        label: Description for those who do not see the figure.
+        draw: Function that draws the figure.
     """
     stream = io.BytesIO()
     with house_style(), warnings.catch_warnings():
-        # the reader's fonts draw the text, not those here
+        # the text is drawn with the fonts of the reader
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         figure = draw()
         nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
         layout = figure.get_layout_engine()
-        if layout is not None:  # else savefig would lay out, and draw, twice
+        if layout is not None:  # otherwise savefig would draw twice
             layout.execute(figure)
             figure.set_layout_engine(None)
         figure.savefig(stream, format="svg", metadata=nothing)
     parser = etree.XMLParser(resolve_entities=False, huge_tree=True)
     root = etree.fromstring(stream.getvalue(), parser)
     _name_ids(root, f"{name}-{hashlib.sha256(stream.getvalue()).hexdigest()[:8]}-")
-    for styles in root.findall(f".//{_SVG}style"):  # would hold for the whole page
+    for styles in root.findall(f".//{_SVG}style"):  # they would apply to the whole page
         styles.getparent().remove(styles)
     for key in ("width", "height", "version"):
         root.attrib.pop(key, None)
@@ -122,33 +128,66 @@ def render_figure(name: str, label: str, draw: Callable[[], Figure]) -> str:
     return str(etree.tostring(root, encoding="unicode"))
 
 
-def open_figure(height: float, title: str, *, legend: bool = True) -> Figure:
-    """An empty figure of the page's width with its title.
+@dataclass(frozen=True)
+class Plot(Generic[P]):
+    """A plot: called, it gives an inline `<svg>`, or "" if it has nothing to show."""
+
+    name: str
+    draw: Callable[P, Figure | None]
+
+    def figure(self, *args: P.args, **kwargs: P.kwargs) -> Figure | None:
+        """The figure in the style of all figures; None if it has nothing to show."""
+        with house_style():
+            return self.draw(*args, **kwargs)
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> str:
+        """Draw and render the plot."""
+        figure = self.figure(*args, **kwargs)
+        if figure is None:
+            return ""
+        return render_figure(self.name, str(figure.get_label()), lambda: figure)
+
+
+def plot(name: str) -> Callable[[Callable[P, Figure | None]], Plot[P]]:
+    """Decorator that makes a plot of a function that draws a figure.
 
     Args:
-        height: Of the plot itself, [inch].
-        title: What the plot is for.
-        legend: Whether there is room for one below the title.
+        name: Name with which the ids of the plot begin.
+    """
+    return lambda draw: Plot(name, draw)
+
+
+def open_figure(height: float, title: str, *, legend: bool = True) -> Figure:
+    """An empty figure with its title, which also describes it to those who do not see it.
+
+    Args:
+        height: Height of the plot without title and legend, [inch].
+        title: The title.
+        legend: Whether to leave room for a legend below the title.
     """
     head = HEAD if legend else 0.7 * HEAD
     height += head
     below = (0.0, 0.0, 1.0, 1.0 - head / height)
-    figure = Figure(figsize=(WIDTH, height), layout=ConstrainedLayoutEngine(rect=below))
+    figure = Figure(
+        figsize=(WIDTH, height),
+        layout=ConstrainedLayoutEngine(rect=below, w_pad=PADDING, h_pad=PADDING),
+    )
     bold = {"fontsize": 10.0, "fontweight": "bold", "verticalalignment": "top"}
     figure.text(0.01, 1.0 - 0.06 / height, title, bold)
+    figure.set_label(title)
     return figure
 
 
 def open_list(
     title: str, names: Sequence[str], *, height: float = ROW_HEIGHT, share: bool = False
 ) -> tuple[Figure, Axes]:
-    """A figure with a line for each name, from top to bottom; a narrow panel at its right."""
+    """A figure with a row for each name; `share` adds a narrow panel at the right."""
     figure = open_figure(0.6 + height * max(len(names), 2), title)
     if share:
         axes, _ = figure.subplots(1, 2, sharey=True, width_ratios=[4.0, 1.0])
     else:
         axes = figure.subplots()
-    axes.use_sticky_edges = False  # markers stay whole where a band ends
+    axes.use_sticky_edges = False  # markers at the end of a band are not cut
     axes.set_yticks(np.arange(len(names)), names)
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.tick_params(axis="y", length=0)
@@ -157,20 +196,20 @@ def open_list(
 
 
 def shade(axes: Axes, y: NDArray[np.int64], low: Array, high: Array, label: str) -> None:
-    """A band behind lines of a list."""
+    """Draw a band behind rows of a list."""
     look: Look = {"color": BAND, "edgecolor": BAND, "linewidth": 0.5}
     axes.barh(y, high - low, 1.0, low, zorder=0.5, label=label, **look)
 
 
 def draw_legend(figure: Figure, axes: Axes) -> None:
-    """What the markers mean, in a line below the title."""
+    """Draw the legend in a line below the title."""
     handles, labels = axes.get_legend_handles_labels()
     place = (0.01, 1.0 - 0.27 / figure.get_figheight())
     figure.legend(handles, labels, bbox_to_anchor=place, ncols=len(handles))
 
 
 def scale_log(axes: Axes, side: Literal["x", "y"], values: Array) -> None:
-    """A logarithmic axis around positive values, ticks at 1, 2 and 5 or at decades."""
+    """Make an axis logarithmic, with ticks at 1, 2 and 5 or at decades around positive values."""
     low, high = (math.log10(float(v)) for v in (values.min(), values.max()))
     room = 0.02 + 0.03 * (high - low)
     decades = range(math.floor(low - room) - 1, math.ceil(high + room) + 2)
@@ -187,12 +226,12 @@ def scale_log(axes: Axes, side: Literal["x", "y"], values: Array) -> None:
 
 
 def count_of(shown: int, count: int) -> str:
-    """How many are shown of how many there are, in words."""
+    """Number of shown items, and of all items if some are not shown."""
     return str(count) if shown == count else f"{shown} of {count}"
 
 
 def _name_ids(root: etree._Element, prefix: str) -> None:
-    """Put a prefix before all ids and before what refers to them."""
+    """Put a prefix before all ids and all references to them."""
     for element in root.iter():
         for key, value in element.attrib.items():
             if key == "id":

@@ -1,7 +1,7 @@
-"""A calibration as one page: what to enter, how far to believe it, and why.
+"""The report of a calibration: a page with the values to enter, their accuracy, and the reasons.
 
-The order is that of mrcal's tour: first how well the tool is known, then whether the model fits,
-then the residuals and all the rest. Plots are drawn into the page, which asks nothing of a network.
+The order is that of mrcal's tour: accuracy of the tool, fit of the model, residuals, and then
+everything else. The page is self-contained and needs no network.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from orthocal.assessment.tool_error import ToolAccuracy, assess_tool, find_exces
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.io.files import write_file
-from orthocal.io.html import escape, heading, items, paragraph, table
+from orthocal.io.html import escape, heading, items, page, paragraph, table
 from orthocal.output.report.parameter_plots import (
     plot_correlations,
     plot_linearised,
@@ -27,7 +27,6 @@ from orthocal.output.report.parameter_plots import (
     plot_singular_values,
 )
 from orthocal.output.report.reading_plots import plot_residuals, plot_setups, plot_spread
-from orthocal.output.report.rich_markup import to_markup
 from orthocal.output.report.tool_map import Field, plot_tool_map
 from orthocal.output.scene.drawing import draw_scene
 from orthocal.output.text.accuracy import render_tool
@@ -35,7 +34,7 @@ from orthocal.output.text.answer import render_answer, shows_entries
 from orthocal.output.text.entries import entry_table, render_meaning
 from orthocal.output.text.explanation import explain_fit
 from orthocal.output.text.heading import render_heading
-from orthocal.output.text.layout import bullets, mm, plain, signed
+from orthocal.output.text.layout import bullets, mm, plain, signed, to_markup
 from orthocal.output.text.sensors import render_parts
 from orthocal.output.text.tables import (
     render_fit,
@@ -47,60 +46,59 @@ from orthocal.units import MM
 from orthocal.viewer.scene import frame_of
 
 FEW_ROWS = 40
-"""Readings up to which the list of all is open."""
+"""Largest number of readings for which their list is open."""
 
 ALL_ROWS = 300
-"""Readings up to which all are listed."""
+"""Largest number of readings that are all listed."""
 
 MOST_NAMED = 9
-"""Parameters of which provenance says what was given for them."""
+"""Largest number of parameters that the provenance lists."""
 
 GLOSSARY = (
-    "σ: one standard deviation of a reading, from repeated cycles, else from the residuals, else "
-    "as given for the gauge. ± σ: one standard deviation from all that is not known, errors of the "
-    "machine that were left out at their tolerances; scatter: the part of it that the noise of the "
-    "readings has.",
-    "tolerance: one standard deviation of what the workshop can be trusted with, from the robot's "
-    "YAML or --tolerance. told: the share of what it left open that the readings took away.",
-    "before: measured less what the machine would show as the controller knows it; after: measured "
-    "less what the calibrated machine shows; each with its best gauge zeros.",
-    "predicted: a setup's readings as all other setups foretell them.",
-    "studentised: how far a reading is from what all others say of it, in its own σ. moves by: the "
-    "σ by which a parameter would change without it, at most.",
-    "shift and rotation taken out: less the shift and the rotation of the whole cube that take "
-    "most of the error away. A workpiece that is aligned on the machine never sees them.",
-    "not known before: with every error at its tolerance, offsets too; after: with what the "
-    "readings told. worst point: one standard deviation there.",
-    "combination: a direction in which the errors can change together. The readings tell one if a "
-    "tolerance along it moves them together by more than their noise. Condition number and "
-    "observability O1 to O5 are the field's indices of how well.",
+    "σ: standard deviation of one reading. It comes from repeated cycles, else from the residuals, "
+    "else from the gauge as stated. ± σ: standard deviation of a value from everything that is not "
+    "known, with unmodelled errors at their tolerances. scatter: the part of it from the noise of "
+    "the readings.",
+    "tolerance: prior standard deviation of an error, from the robot's YAML or --tolerance. told: "
+    "share of the prior uncertainty that the readings removed.",
+    "before: measured less nominal with the active offsets. after: measured less calibrated. Both "
+    "use the best gauge zeros.",
+    "predicted: readings of a setup, predicted from all other setups.",
+    "studentised: deviation of a reading from its prediction by all other readings, divided by its "
+    "own standard deviation. moves by: largest change of a parameter without this reading, in its "
+    "standard deviation.",
+    "shift and rotation taken out: the error after the best alignment of the workpiece on the "
+    "machine, which removes one shift and one rotation of the workspace.",
+    "not known before: uncertainty of the tool position with every error at its tolerance. after: "
+    "the uncertainty with the readings. worst point: the largest standard deviation in the "
+    "workspace.",
+    "combination: a direction in parameter space. It is identifiable if a change by its prior "
+    "standard deviation moves the readings by more than their noise. Condition number and "
+    "observability O1 to O5 are the usual indices of identifiability.",
 )
-"""Words that a machine builder need not know."""
-
-_POLICY = (
-    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
-)
+"""Terms of the report that a machine builder may not know."""
 
 
 def build_report(calibration: Calibration) -> str:
-    """The report of a calibration as one HTML page that holds all it needs.
+    """Report of a calibration as a self-contained HTML page.
 
     Raises:
-        OrthocalError: If the robot cannot be found, or is not the one that was calibrated.
+        OrthocalError: If the robot is missing or differs from the calibrated one.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     title = f"Calibration of {calibration.robot_record.name}: {calibration.session.title}"
+    sensors = "".join(to_markup(part) for part in render_parts(calibration))
     sections = [
-        ("verdict", "What to enter, and can it be believed?", _verdict(calibration)),
-        ("tool", "How well is the tool known?", _tool(calibration)),
-        ("fit", "Does the model fit?", _fit(calibration)),
+        ("verdict", "Values to enter", _verdict(calibration)),
+        ("tool", "Tool error", _tool(calibration)),
+        ("fit", "Fit of the model", _fit(calibration)),
         ("residuals", "Readings before and after, the worst first", _residuals(calibration)),
-        ("parameters", "What was identified", _parameters(calibration)),
-        *([("sensors", "Gauges and sensors", own)] if (own := _sensors(calibration)) else []),
-        ("correlations", "What hangs together", _correlations(calibration)),
-        ("identifiability", "What the readings can tell", _identifiability(calibration)),
-        ("words", "What the words mean", items(GLOSSARY)),
-        ("provenance", "Where this is from", _provenance(calibration)),
+        ("parameters", "Parameters", _parameters(calibration)),
+        *([("sensors", "Gauges and sensors", sensors)] if sensors else []),
+        ("correlations", "Correlations", _correlations(calibration)),
+        ("identifiability", "Identifiability", _identifiability(calibration)),
+        ("words", "Glossary", items(GLOSSARY)),
+        ("provenance", "Provenance", _provenance(calibration)),
         ("scene", "The machine", _scene(calibration)),
     ]
     links = "".join(f'<a href="#{name}">{escape(words)}</a>' for name, words, _ in sections)
@@ -110,22 +108,15 @@ def build_report(calibration: Calibration) -> str:
     )
     head = to_markup(render_heading(calibration, effort=False))
     style = (resources.files("orthocal.output.report") / "report.css").read_text(encoding="utf-8")
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
-        f'<title>{escape(title)}</title>\n<link rel="icon" href="data:,">\n'
-        f"<style>\n{style}</style>\n</head>\n<body>\n"
-        f"<header>{heading('Calibration report', level=1)}{head}"
-        f"<nav>{links}</nav></header>\n<main>{body}</main>\n</body>\n</html>\n"
-    )
+    header = f"<header>{heading('Calibration report', level=1)}{head}<nav>{links}</nav></header>"
+    return page(title, style, f"{header}\n<main>{body}</main>", scripts=True)
 
 
 def write_report(calibration: Calibration, path: str | Path) -> Path:
     """Write the report of a calibration.
 
     Raises:
-        OrthocalError: If it cannot be built or written.
+        OrthocalError: If the report cannot be built or written.
     """
     write_file(Path(path), build_report(calibration))
     return Path(path)
@@ -149,10 +140,10 @@ def _verdict(calibration: Calibration) -> str:
         meaning = Group(*listed, *render_meaning(calibration))
     return (
         answer
-        + heading("What these numbers are", level=3)
+        + heading("Meaning of the values", level=3)
         + to_markup(meaning)
         + paragraph(told)
-        + heading("What it means", level=3)
+        + heading("Findings", level=3)
         + to_markup(bullets(explain_fit(calibration)))
     )
 
@@ -161,25 +152,24 @@ def _tool(calibration: Calibration) -> str:
     words = to_markup(render_tool(calibration))
     try:
         return words + _maps(calibration, assess_tool(calibration))
-    except (ClosureError, RobotError):  # the words say why
+    except (ClosureError, RobotError):  # the text states the reason
         return words
 
 
-def _maps(calibration: Calibration, found: ToolAccuracy) -> str:
+def _maps(calibration: Calibration, accuracy: ToolAccuracy) -> str:
     excess = find_excess(calibration)
     times = f"{excess:.1f} times " if excess > 1.0 else ""
     captions: dict[Field, str] = {
-        "now": "Where the tool is, less where it is sent, with the controller as it was while "
-        "measuring; shift and rotation of the whole cube are taken out here and below: a "
-        "workpiece is aligned on the machine.",
-        "left": "The same once the offsets above are entered, in a controller that knows of "
-        "nothing else.",
-        "unknown": "What is not known of the tool's position after this calibration: one standard "
-        f"deviation in space, errors that were not identified at {times}their tolerances.",
+        "now": "Actual less commanded position of the tool, with the offsets that were active "
+        "during the measurement. All maps are for a workpiece that is aligned on the machine: one "
+        "shift and one rotation are removed.",
+        "left": "The same once the offsets above are entered, without any other correction.",
+        "unknown": "Uncertainty of the tool position after this calibration: one standard "
+        f"deviation in space, with unidentified errors at {times}their tolerances.",
     }
     return "".join(
-        _figure(plot_tool_map(calibration, found, which=which), words)
-        for which, words in captions.items()
+        _figure(plot_tool_map(calibration, accuracy, which=which), caption)
+        for which, caption in captions.items()
     )
 
 
@@ -187,23 +177,23 @@ def _fit(calibration: Calibration) -> str:
     parts = [to_markup(render_fit(calibration))]
     if any(r.unseen == r.unseen for r in calibration.residuals):
         text = (
-            "Predicted: every setup from all the others. A model that fits predicts what it has "
-            "not seen nearly as well as what it was fitted to."
+            "Predicted: the readings of each setup, from all other setups. A good model predicts "
+            "them nearly as well as it fits them."
         )
     else:
-        text = "No setup can be predicted from the others: they do not determine the model alone."
+        text = "No setup can be predicted: the other setups do not determine the model."
     parts.append(_figure(plot_setups(calibration), text))
     parts.append(
         _figure(
             plot_spread(calibration),
-            "Residuals that are noise lie on the line. A steeper or bent row is error of the "
-            "model; single readings far off are mistakes of reading.",
+            "Residuals that are pure noise lie on the line. A steeper or bent curve indicates an "
+            "error of the model, single points far from the line indicate wrong readings.",
         )
     )
     parts.append(
         _figure(
             plot_linearised(calibration),
-            "The solution of the linear equations, as in the paper, against the exact one.",
+            "Exact solution less the solution of the linear equations, as in the paper.",
         )
     )
     return "".join(parts)
@@ -225,20 +215,16 @@ def _parameters(calibration: Calibration) -> str:
     )
 
 
-def _sensors(calibration: Calibration) -> str:
-    return "".join(to_markup(part) for part in render_parts(calibration))
-
-
 def _correlations(calibration: Calibration) -> str:
     figure = plot_correlations(calibration)
     if not figure:
-        return paragraph("One parameter alone has nothing to hang together with.")
+        return paragraph("A single parameter has no correlations.")
     pairs = calibration.correlated(above=0.5)
     if not pairs:
         return _figure(figure, "No correlation is above 0.5.")
     rows = [(a, b, signed(r, 2)) for a, b, r in pairs[:20]]
-    more = f" The strongest 20 of {len(pairs)}." if len(pairs) > 20 else ""
-    return _figure(figure, f"Pairs above 0.5 stand below.{more}") + table(
+    more = f", the strongest 20 of {len(pairs)}" if len(pairs) > 20 else ""
+    return _figure(figure, f"The table lists pairs above 0.5{more}.") + table(
         ("parameter", "with", "correlation"), rows, left=2
     )
 
@@ -247,7 +233,7 @@ def _identifiability(calibration: Calibration) -> str:
     few = len(calibration.free) <= 12
     words = to_markup(render_identifiability(calibration, all_rows=True))
     return _figure(plot_singular_values(calibration), "") + (
-        words if few else _details("In words", words)
+        words if few else _details("Tables", words)
     )
 
 
@@ -262,7 +248,7 @@ def _provenance(calibration: Calibration) -> str:
         )
     rows: list[tuple[str, str]] = [
         ("Robot", f"{robot.name} ({robot.reference})"),
-        ("its files, SHA-256", robot.sha256),
+        ("SHA-256 of the robot's files", robot.sha256),
         *(
             row
             for part in session.parts or (session,)
@@ -270,11 +256,11 @@ def _provenance(calibration: Calibration) -> str:
                 ("Session", part.title),
                 ("Source", part.source or "not stated"),
                 ("File", part.path or "none"),
-                ("its files, SHA-256", part.sha256 or "none"),
+                ("SHA-256 of the session's files", part.sha256 or "none"),
             )
         ),
-        ("Gauge", "σ not stated" if sigma is None else f"σ {plain(sigma / MM)} mm a reading"),
-        ("Offsets active while measuring", active),
+        ("Gauge", "σ not stated" if sigma is None else f"σ {plain(sigma / MM)} mm per reading"),
+        ("Offsets active during the measurement", active),
         (
             "Model",
             f"{calibration.model}: {len(calibration.free)} free parameters, "
@@ -292,7 +278,7 @@ def _provenance(calibration: Calibration) -> str:
 
 
 def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
-    """What was given beside the readings, of every parameter that it was given for."""
+    """Tolerances, known values and bounds that the user stated."""
     usual = calibration.robot.parameters.own
     tolerances, known, bounds = [], [], []
     for p in calibration.parameters:
@@ -313,11 +299,11 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
         for name, texts in (("Tolerances", tolerances), ("Known values", known), ("Bounds", bounds))
         if texts
     ]
-    return rows or [("Given beside the readings", "nothing: the robot's own tolerances hold")]
+    return rows or [("Assumptions", "the tolerances of the robot")]
 
 
 def _some(texts: Sequence[str]) -> str:
-    """All of a few, the first of many."""
+    """All texts if they are few, else the first of them."""
     more = len(texts) - MOST_NAMED
     return "; ".join(texts[:MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
 
@@ -325,11 +311,11 @@ def _some(texts: Sequence[str]) -> str:
 def _scene(calibration: Calibration) -> str:
     try:
         scene = draw_scene(calibration)
-    except OrthocalError as e:  # the numbers stand without it
-        return paragraph(f"It cannot be drawn: {e}.")
+    except OrthocalError as e:  # the report is useful without the scene
+        return paragraph(f"The scene cannot be drawn: {e}.")
     hint = (
-        "Drag to turn, scroll to come nearer; play to go through the measurement. Open Controls is "
-        "a tree of all parts, to show and hide."
+        "Drag to turn, scroll to zoom, press Play to go through the measurement. Open Controls "
+        "shows and hides single parts."
     )
     return frame_of(scene.to_html(), height="640px") + paragraph(hint, kind="screen")
 

@@ -1,4 +1,4 @@
-"""What was identified, how well, and what hangs together: plots of the parameters."""
+"""Plots of the parameters: estimates, correlations, singular values, error of linearising."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ from orthocal.output.report.figure import (
     AFTER_LOOK,
     BOUND_LOOK,
     Look,
-    count_of,
     draw_legend,
     open_figure,
     open_list,
-    render_figure,
+    plot,
     scale_log,
     shade,
 )
@@ -34,98 +33,62 @@ from orthocal.units import MM
 Array = NDArray[np.float64]
 
 FEW_PARAMETERS = 12
-"""Parameters up to which they are shown in their own unit, and their correlations as numbers."""
+"""Number of parameters up to which units and correlations are printed as numbers."""
 
-CHEAP = 0.1
-"""Cost of linearising below which it does not matter, [σ]."""
+NEGLIGIBLE = 0.1
+"""Error of the linearised solution that does not matter, [σ]."""
 
 MOST_SHIFTS = 20
-"""Parameters whose cost of linearising is shown."""
+"""Largest number of parameters whose linearised solution is shown."""
 
 CLEAR, DARK = 0.1, 0.6
-"""Correlations above which the sign is marked, and whose colour is a dark one."""
+"""Correlations above which the sign is marked, and above which the colour is dark."""
 
 STEPS = (-1.0, -0.9, -0.7, -0.5, -0.3, -CLEAR, CLEAR, 0.3, 0.5, 0.7, 0.9, 1.0)
-"""Correlations between which the colour is the same."""
+"""Limits of the colours of correlations."""
 
 LONGEST_IN_MATRIX = 24
+"""Characters of a name in the correlation matrix."""
 
 _MIDDLE: Look = {"horizontalalignment": "center", "verticalalignment": "center"}
 
 
-def plot_linearised(calibration: Calibration) -> str:
-    """What linearising costs: exact less linearised estimates in σ; "" where there is no σ."""
+@plot("linearised")
+def plot_linearised(calibration: Calibration) -> Figure | None:
+    """Exact less linearised estimates, in their standard deviations, the largest first."""
     shifts = _linearisation_shifts(calibration)
     if not shifts:
-        return ""
-    label = "Exact less linearised estimates in their standard deviations, the largest first."
-    return render_figure("linearised", label, lambda: _draw_linearised(shifts))
-
-
-def plot_parameters(calibration: Calibration, *, most: int = 30) -> str:
-    """Estimates with their 95 % intervals, and how much the readings told of each.
-
-    Args:
-        calibration: The calibration.
-        most: Parameters that are shown: offsets, then what the readings tell best.
-    """
-    count = len(calibration.free)
-    label = f"Estimates of {count_of(min(most, count), count)} parameters with 95 % intervals."
-    return render_figure("parameters", label, lambda: _draw_parameters(calibration, most))
-
-
-def plot_correlations(calibration: Calibration, *, most: int = 40) -> str:
-    """Correlations of the estimates as a matrix; "" for less than two that have any.
-
-    Args:
-        calibration: The calibration.
-        most: Parameters that are shown: those that take part in the strongest correlations.
-    """
-    matrix = calibration.correlation
-    known = np.flatnonzero(np.isfinite(np.diag(matrix)))
-    if known.size < 2:
-        return ""
-    shown = count_of(min(most, known.size), known.size)
-    label = f"Correlations between {shown} estimated parameters."
-    return render_figure("correlations", label, lambda: _draw_correlations(calibration, most))
-
-
-def plot_singular_values(calibration: Calibration) -> str:
-    """What the readings tell beside their noise; "" where they tell nothing at all."""
-    found = calibration.identifiability
-    if not found.structural_rank:
-        return ""
-    label = (
-        f"Singular values of the readings: {found.rank} of {found.singular_values.size} "
-        "combinations of parameters are above the noise."
-    )
-    return render_figure("singular-values", label, lambda: _draw_singular_values(calibration))
-
-
-def _draw_linearised(shifts: list[tuple[float, ParameterEstimate]]) -> Figure:
-    costs = [typeset((p.value - p.linear) * p.edge_factor, 4) for _, p in shifts]
+        return None
+    errors = [typeset((p.value - p.linear) * p.edge_factor, 4) for _, p in shifts]
     names = [
-        f"{short_name(p.name)} ({cost} {p.edge_unit})"
-        for (_, p), cost in zip(shifts, costs, strict=True)
+        f"{short_name(p.name)} ({error} {p.edge_unit})"
+        for (_, p), error in zip(shifts, errors, strict=True)
     ]
-    figure, axes = open_list("What linearising costs, the most first", names)
+    figure, axes = open_list("Error of the linearised solution, the largest first", names)
     y, sizes = np.arange(len(shifts)), np.array([s for s, _ in shifts])
     axes.hlines(y, 0.0, sizes, color="#888888", linewidth=0.8)
     axes.plot(sizes, y, label="exact − linearised", **AFTER_LOOK)
     axes.axvline(0.0, color="black", linewidth=0.8)
-    for sign, label in ((-1.0, "a tenth of σ: less does not matter"), (1.0, "")):
-        axes.axvline(sign * CHEAP, color="black", linestyle=":", label=label)
+    for sign, label in ((-1.0, "±0.1 σ: smaller errors do not matter"), (1.0, "")):
+        axes.axvline(sign * NEGLIGIBLE, color="black", linestyle=":", label=label)
     axes.set_xlabel("exact − linearised estimate, in σ of the parameter")
     draw_legend(figure, axes)
     return figure
 
 
-def _draw_parameters(calibration: Calibration, most: int) -> Figure:
+@plot("parameters")
+def plot_parameters(calibration: Calibration, *, most: int = 30) -> Figure:
+    """Estimates with 95 % intervals, and the share of the prior that the readings removed.
+
+    Args:
+        calibration: The calibration.
+        most: Largest number of parameters: offsets, then those that the readings determine best.
+    """
     free = calibration.free
     rows = sorted(free, key=_importance)[:most]
     title = "Estimates with 95 % intervals"
     if len(rows) < len(free):
-        title += f": {len(rows)} of {len(free)}, offsets, then the best told"
+        title += f": {len(rows)} of {len(free)}, offsets, then the best determined"
     names = [f"{short_name(p.name)}{f' at {p.at_bound} bound' if p.at_bound else ''}" for p in rows]
     own_unit = len(rows) <= FEW_PARAMETERS and len({p.unit for p in rows}) == 1
     figure, axes = open_list(title, names, share=calibration.prior)
@@ -134,7 +97,7 @@ def _draw_parameters(calibration: Calibration, most: int) -> Figure:
     prior = np.array([i for i, p in enumerate(rows) if p.prior], dtype=int)
     if prior.size and not own_unit:
         means = np.array([rows[i].mean for i in prior]) * scale[prior]
-        shade(axes, prior, means - 1.0, means + 1.0, "±1 tolerance: known before")
+        shade(axes, prior, means - 1.0, means + 1.0, "prior: ±1 standard deviation")
     axes.axvline(0.0, color="black", linewidth=0.8)
     bound = np.array([p.at_bound is not None for p in rows])
     intervals = {p.name: i for p, i in zip(free, calibration.intervals, strict=True)}
@@ -146,10 +109,12 @@ def _draw_parameters(calibration: Calibration, most: int) -> Figure:
     if not bound.all():
         axes.plot(values[~bound], y[~bound], label="estimate", **AFTER_LOOK)
     if bound.any():
-        axes.plot(values[bound], y[bound], label="held by its bound", **BOUND_LOOK)
+        axes.plot(values[bound], y[bound], label="at its bound", **BOUND_LOOK)
     if not known.any() and not bound.all():
-        axes.plot([], [], linestyle="none", label="no intervals: nothing tells the noise")
-    axes.set_xlabel(f"estimate [{rows[0].edge_unit}]" if own_unit else "estimate [tolerances]")
+        axes.plot([], [], linestyle="none", label="no intervals: the noise is unknown")
+    axes.set_xlabel(
+        f"estimate [{rows[0].edge_unit}]" if own_unit else "estimate [prior standard deviations]"
+    )
     draw_legend(figure, axes)
     if calibration.prior:
         _draw_shares(figure.axes[1], rows)
@@ -157,19 +122,28 @@ def _draw_parameters(calibration: Calibration, most: int) -> Figure:
 
 
 def _draw_shares(axes: Axes, rows: Sequence[ParameterEstimate]) -> None:
-    """How much of what was open the readings told, beside the parameters."""
+    """Draw the share of the prior that the readings removed, beside the parameters."""
     shares = np.nan_to_num([p.data_share for p in rows]).clip(0.0, 1.0)
     axes.barh(np.arange(len(rows)), 100.0 * shares, 0.6, color=AFTER)
     axes.set_xlim(0.0, 100.0)
     axes.set_xticks([0, 50, 100])
     axes.grid(True, axis="x")
     axes.tick_params(axis="y", length=0, labelleft=False)
-    axes.set_xlabel("told [%]")
+    axes.set_xlabel("from readings [%]")
 
 
-def _draw_correlations(calibration: Calibration, most: int) -> Figure:
+@plot("correlations")
+def plot_correlations(calibration: Calibration, *, most: int = 40) -> Figure | None:
+    """Correlation matrix of the estimates; nothing for fewer than two parameters.
+
+    Args:
+        calibration: The calibration.
+        most: Largest number of parameters: those with the strongest correlations.
+    """
     matrix = calibration.correlation
     known = np.flatnonzero(np.isfinite(np.diag(matrix)))
+    if known.size < 2:
+        return None
     size = np.abs(matrix[np.ix_(known, known)] - np.eye(known.size))
     chosen = np.sort(known[np.argsort(-size.max(axis=1), kind="stable")[:most]])
     names = [short_name(calibration.free[i].name, LONGEST_IN_MATRIX) for i in chosen]
@@ -206,7 +180,7 @@ def _draw_correlations(calibration: Calibration, most: int) -> Figure:
 def _mark_signs(
     axes: Axes, columns: NDArray[np.int64], rows: NDArray[np.int64], r: Array, *, numbers: bool
 ) -> None:
-    """Numbers in the cells of a matrix, or a minus where they are negative."""
+    """Print the numbers of a matrix in its cells, or a minus in negative cells."""
     x, y, inks = columns + 0.5, rows + 0.5, np.where(np.abs(r) > DARK, "white", "black")
     if numbers:
         for i, value in enumerate(r):
@@ -218,18 +192,22 @@ def _mark_signs(
         axes.plot(x[marked], y[marked], "_", color=ink, markersize=4.0)
 
 
-def _draw_singular_values(calibration: Calibration) -> Figure:
+@plot("singular-values")
+def plot_singular_values(calibration: Calibration) -> Figure | None:
+    """Singular values of the readings beside their noise; nothing if all are zero."""
     found = calibration.identifiability
+    if not found.structural_rank:
+        return None
     count = found.singular_values.size
     values = found.singular_values[: found.structural_rank] / MM
-    title = f"What the readings tell: {found.rank} of {count} combinations rise above the noise"
+    title = f"Singular values: {found.rank} of {count} parameter combinations are above the noise"
     figure = open_figure(2.9, title)
     axes = figure.subplots()
     index = np.arange(1, values.size + 1)
     above = values > found.threshold / MM
     for chosen, face, label in (
-        (above, AFTER, "told better than its tolerance"),
-        (~above, "white", "lost in the noise"),
+        (above, AFTER, "above the noise"),
+        (~above, "white", "below the noise"),
     ):
         if chosen.any():
             look = {**AFTER_LOOK, "markerfacecolor": face}
@@ -243,14 +221,14 @@ def _draw_singular_values(calibration: Calibration) -> Figure:
     axes.set_xlim(0.5, values.size + 0.5)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     zeros = f" ({count - values.size} more are zero)" if values.size < count else ""
-    axes.set_xlabel(f"combination of parameters, the best told first{zeros}")
-    axes.set_ylabel("change of all readings [mm a tolerance]")
+    axes.set_xlabel(f"parameter combination, the best determined first{zeros}")
+    axes.set_ylabel("change of all readings\n[mm per prior standard deviation]")
     draw_legend(figure, axes)
     return figure
 
 
 def _linearisation_shifts(calibration: Calibration) -> list[tuple[float, ParameterEstimate]]:
-    """Exact less linearised estimate in σ, the largest first."""
+    """Exact less linearised estimates in σ, the largest first."""
     if not calibration.solver.tells_linearisation:
         return []
     known = [p for p in calibration.free if math.isfinite(p.std) and p.std > 0.0]
@@ -259,6 +237,6 @@ def _linearisation_shifts(calibration: Calibration) -> list[tuple[float, Paramet
 
 
 def _importance(parameter: ParameterEstimate) -> tuple[bool, float]:
-    """Sorts offsets to the front, then what the readings told best."""
+    """Sort key: offsets first, then the parameters that the readings determine best."""
     share = parameter.data_share
     return not parameter.name.endswith(".offset"), math.inf if math.isnan(share) else -share

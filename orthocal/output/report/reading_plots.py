@@ -1,4 +1,4 @@
-"""Readings before and after, setups predicted from others, and scatter: plots of the readings."""
+"""Plots of the readings: deviations before and after, per setup, and their distribution."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from orthocal.output.report.figure import (
     draw_legend,
     open_figure,
     open_list,
-    render_figure,
+    plot,
     scale_log,
     shade,
 )
@@ -38,48 +38,25 @@ Array = NDArray[np.float64]
 _deviation, _residual, _unseen = map(attrgetter, ("deviation", "residual", "unseen"))
 
 SMALLEST_LENGTH = 1e-9
-"""What a logarithmic axis shows for smaller lengths, [m]."""
+"""Smallest length on a logarithmic axis, [m]."""
 
 MOST_POINTS = 500
-"""Points of a quantile plot: of more, the outermost and a selection of the others are shown."""
+"""Largest number of points in a quantile plot; the outermost points are always shown."""
 
 
-def plot_residuals(calibration: Calibration, *, most: int = 40) -> str:
-    """Every reading before and after, the worst first: before or after, whichever is larger.
-
-    Args:
-        calibration: The calibration.
-        most: Readings that are shown.
-    """
-    count = len(calibration.residuals)
-    shown = count_of(min(most, count), count)
-    label = f"Residuals of {shown} readings before and after calibration."
-    return render_figure("residuals", label, lambda: _draw_residuals(calibration, most))
-
-
-def plot_setups(calibration: Calibration, *, most: int = 40) -> str:
-    """Root mean square of every setup before, after and as all others predict it.
+@plot("residuals")
+def plot_residuals(calibration: Calibration, *, most: int = 40) -> Figure:
+    """Deviations of the readings before and after calibration, the worst first.
 
     Args:
         calibration: The calibration.
-        most: Setups that are shown, those with the largest remainder first.
+        most: Largest number of readings that are shown.
     """
-    label = "Root mean square of the residuals of each setup before and after calibration."
-    return render_figure("setups", label, lambda: _draw_setups(calibration, most))
-
-
-def plot_spread(calibration: Calibration) -> str:
-    """Whether the residuals have the spread that the noise explains: a normal quantile plot."""
-    label = "Residuals after calibration in order, against those that normal noise would leave."
-    return render_figure("spread", label, lambda: _draw_spread(calibration))
-
-
-def _draw_residuals(calibration: Calibration, most: int) -> Figure:
-    found = calibration.residuals
-    rows = sorted(found, key=lambda r: -max(abs(r.deviation), abs(r.residual)))[:most]
+    residuals = calibration.residuals
+    rows = sorted(residuals, key=lambda r: -max(abs(r.deviation), abs(r.residual)))[:most]
     title = "Readings before and after calibration, the worst first"
-    if len(rows) < len(found):
-        title = f"Readings before and after calibration: the {len(rows)} worst of {len(found)}"
+    if len(rows) < len(residuals):
+        title = f"Readings before and after calibration: the {len(rows)} worst of {len(residuals)}"
     figure, axes = open_list(title, _row_names(calibration, rows))
     y = np.arange(len(rows))
     before, after = (np.array([f(r) for r in rows]) / MM for f in (_deviation, _residual))
@@ -96,12 +73,19 @@ def _draw_residuals(calibration: Calibration, most: int) -> Figure:
     return figure
 
 
-def _draw_setups(calibration: Calibration, most: int) -> Figure:
+@plot("setups")
+def plot_setups(calibration: Calibration, *, most: int = 40) -> Figure:
+    """Root mean square of every setup before, after, and predicted from all other setups.
+
+    Args:
+        calibration: The calibration.
+        most: Largest number of setups that are shown.
+    """
     groups = rows_by_setup(calibration.residuals)
     names = sorted(groups, key=lambda n: -root_mean_square(map(_residual, groups[n])))[:most]
-    title = "Which setup the model fits, the worst first"
+    title = "Residuals per setup, the worst first"
     if len(names) < len(groups):
-        title = f"Which setup the model fits: the {len(names)} worst of {len(groups)}"
+        title = f"Residuals per setup: the {len(names)} worst of {len(groups)}"
     figure, axes = open_list(title, [short_name(n) for n in names], height=2.0 * ROW_HEIGHT)
     y = np.arange(len(names))
     shown = []
@@ -126,34 +110,35 @@ def _draw_setups(calibration: Calibration, most: int) -> Figure:
     return figure
 
 
-def _draw_spread(calibration: Calibration) -> Figure:
-    found = calibration.residuals
+@plot("spread")
+def plot_spread(calibration: Calibration) -> Figure:
+    """Normal quantile plot of the residuals, with the noise as a line."""
     word = _row_word(calibration)
-    single = np.array([_residual(r) / _noise_factor(r) for r in found])
+    single = np.array([_residual(r) / _noise_factor(r) for r in calibration.residuals])
     values = np.sort(single) * calibration.row_factor / MM
     quantiles = special.ndtri((np.arange(values.size) + 0.5) / values.size)
     chosen = _thin(values.size)
-    figure = open_figure(3.8, "Do the residuals scatter as the noise explains?")
+    figure = open_figure(3.8, "Normal quantile plot of the residuals")
     axes = figure.subplots()
     label = f"residuals after: {count_of(chosen.size, values.size)}"
     look = {**AFTER_LOOK, "markersize": 3.5}
     axes.plot(quantiles[chosen], values[chosen], label=label, **look)
-    # what parameters and gauge zeros have taken up is missing in the residuals
+    # the residuals lack the degrees of freedom of parameters and gauge zeros
     part = math.sqrt(min(calibration.noise.residual_dof / values.size, 1.0))
     gauge = calibration.session.gauge_sigma
-    given = math.nan if gauge is None else gauge * calibration.row_factor
+    stated = math.nan if gauge is None else gauge * calibration.row_factor
     reach = np.array([-1.0, 1.0]) * max(abs(float(quantiles[0])), 1.0)
     for sigma, name, line in (
         (calibration.sigma, f"σ of a {word}", "-"),
-        (given, "σ given for the gauge", "--"),
+        (stated, "σ stated for the gauge", "--"),
     ):
         if math.isfinite(sigma):
             label = f"{name}: {sigma / MM:.2g} mm"
             axes.plot(reach, reach * part * sigma / MM, color="black", linestyle=line, label=label)
     axes.grid(True)
     axes.set_xlabel(
-        "normal quantile: what pure noise would give at the same place in the order [σ]\n"
-        "lines: what is left of σ when parameters and gauge zeros have taken up their part"
+        "normal quantile, expected from noise alone [σ]\n"
+        "lines: σ reduced by the degrees of freedom of parameters and gauge zeros"
     )
     axes.set_ylabel("residual after [mm]")
     draw_legend(figure, axes)
@@ -161,7 +146,7 @@ def _draw_spread(calibration: Calibration) -> Figure:
 
 
 def _noise_factor(row: ResidualRow) -> float:
-    """Standard deviation of a row over that of one reading."""
+    """Ratio of the standard deviations of a row and of one reading."""
     return math.sqrt(2.0) if row.minus else 1.0
 
 
@@ -174,13 +159,13 @@ def _row_word(calibration: Calibration) -> str:
 
 
 def _row_names(calibration: Calibration, rows: Sequence[ResidualRow]) -> list[str]:
-    """Setup and postures of rows, and the cycle where there are several."""
+    """Names of rows: setup, postures, and the cycle if there are several."""
     repeated = any(r.cycle != 1 for r in calibration.residuals)
     return [short_name(f"{r.label}, cycle {r.cycle}" if repeated else r.label) for r in rows]
 
 
 def _thin(count: int) -> NDArray[np.int64]:
-    """Positions in an order that are drawn: of many, the outermost and a selection between."""
+    """Indices of sorted points that are drawn: of many the outermost, and a selection between."""
     if count <= MOST_POINTS:
         return np.arange(count)
     edge = MOST_POINTS // 4

@@ -1,4 +1,4 @@
-"""A calibration at the tool: maps of the planes through the middle of a region."""
+"""Maps of the tool error in the planes through the middle of the workspace."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from scipy.interpolate import RectBivariateSpline
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.tool_error import ToolAccuracy, assess_remaining, find_excess
 from orthocal.calibration.calibration import Calibration
-from orthocal.output.report.figure import open_figure, render_figure
+from orthocal.output.report.figure import Plot, open_figure
 from orthocal.units import MM, UM
 
 Array = NDArray[np.float64]
@@ -26,66 +26,40 @@ Array = NDArray[np.float64]
 Field = Literal["now", "left", "unknown"]
 
 TITLES: dict[Field, str] = {
-    "now": "How far the tool is off its target now, shift and rotation taken out",
-    "left": "How far the tool is off with the offsets entered, shift and rotation out",
-    "unknown": "What is not known of the tool after calibration, 1 σ, shift and rotation out",
+    "now": "Tool error now, workpiece aligned on the machine",
+    "left": "Tool error with the offsets entered, workpiece aligned on the machine",
+    "unknown": "Uncertainty of the tool error, one standard deviation, workpiece aligned",
 }
 
 FINEST = 1e-3
-"""Errors, and differences of errors, below which they are none, [µm]."""
+"""Errors and differences of errors below this are zero, [µm]."""
 
 EVEN = 1e-4
-"""Part of an error by which it must differ over a plane not to be the same everywhere."""
+"""Relative variation over a plane below which an error counts as constant."""
 
 LEVELS = 8
+"""Largest number of contour levels."""
 
 FINE = 43
-"""Points a side that the map is drawn from."""
+"""Points per side of the drawn grid."""
 
 ARROWS = np.array([-2.0, 0.0, 2.0]) / 3.0
-"""Where arrows are drawn along a side, from -1 to 1."""
+"""Places of the arrows along a side, from -1 to 1."""
 
 HIGHEST_DEGREE = 4
-"""Of the splines between points: with five a side they are the polynomials through all of them."""
+"""Degree of the splines; with five points per side they are polynomials through all points."""
 
 COLOURS = "cividis"
 
 MARGIN = 0.09
-"""Part of a side within which a border would cut a label off."""
+"""Distance from the border within which a label would be cut off, in sides."""
 
 ARROW = 0.85
 """Length of the longest arrow, in distances between arrows."""
 
 
-def plot_tool_map(calibration: Calibration, accuracy: ToolAccuracy, *, which: Field) -> str:
-    """The tool's error in the planes through the middle of a region, shift and rotation taken out.
-
-    Args:
-        calibration: The calibration.
-        accuracy: Its errors at the tool, over a grid with an odd number of points a side.
-        which: The error as the machine is now, what is left of it with the identified offsets in
-            the controller, or what is not known after the calibration.
-
-    Returns:
-        "" where the points are no such grid, where nothing tells what is not known, and for what
-        is left where nothing but offsets was identified: it would be nothing by definition.
-    """
-    lines = _find_grid(accuracy.workspace.points)
-    told = {
-        "now": True,
-        "left": not calibration.only_offsets and bool(find_entries(calibration)),
-        "unknown": accuracy.after is not None,
-    }
-    if lines is None or not told[which]:
-        return ""
-    label = f"{TITLES[which]}: maps of the planes through the middle of the region, in µm."
-    return render_figure(
-        f"tool-{which}", label, lambda: _draw_tool_map(calibration, accuracy, which, lines)
-    )
-
-
 def _find_grid(points: Array) -> list[Array] | None:
-    """Coordinates along each side, where points are a grid of two or three with a middle."""
+    """Coordinates along the sides of a grid with a middle point; None for other points."""
     lines = [np.unique(column) for column in points.T]
     if len(lines) < 2 or any(line.size < 3 or line.size % 2 == 0 for line in lines):
         return None
@@ -94,10 +68,7 @@ def _find_grid(points: Array) -> list[Array] | None:
 
 
 def _error_parts(calibration: Calibration, accuracy: ToolAccuracy, which: Field) -> Array:
-    """What the size of the error is the length of, (K, 3) or without direction (K, 1), [µm].
-
-    Shift and rotation of the whole region are no errors of a workpiece that is aligned there.
-    """
+    """Tool errors after alignment, shape (K, 3), or their uncertainty, shape (K, 1), [µm]."""
     if which == "now":
         return accuracy.align(accuracy.deviation) / UM
     remaining, _ = assess_remaining(calibration, accuracy)
@@ -107,9 +78,30 @@ def _error_parts(calibration: Calibration, accuracy: ToolAccuracy, which: Field)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0))[:, None] / UM)
 
 
-def _draw_tool_map(
-    calibration: Calibration, accuracy: ToolAccuracy, which: Field, lines: list[Array]
-) -> Figure:
+def plot_tool_map(calibration: Calibration, accuracy: ToolAccuracy, *, which: Field) -> str:
+    """Tool error in the planes through the middle of the workspace, after alignment.
+
+    Args:
+        calibration: The calibration.
+        accuracy: Tool errors over a grid with an odd number of points per side.
+        which: The present error, the error with the offsets entered, or the uncertainty.
+
+    Returns:
+        "" if the points are not such a grid, if the uncertainty is unknown, and for the error with
+        the offsets entered if nothing but offsets was identified, because it is zero by definition.
+    """
+    return Plot(f"tool-{which}", _draw_tool_map)(calibration, accuracy, which)
+
+
+def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Field) -> Figure | None:
+    lines = _find_grid(accuracy.workspace.points)
+    shown = {
+        "now": True,
+        "left": not calibration.only_offsets and bool(find_entries(calibration)),
+        "unknown": accuracy.after is not None,
+    }
+    if lines is None or not shown[which]:
+        return None
     planes = list(combinations(range(len(lines)), 2))
     tcp = calibration.robot.tcp
     world = tuple(range(len(lines))) if tcp is None else tcp.coordinates
@@ -134,7 +126,7 @@ def _draw_tool_map(
             sides = [lines[k] for k in plane]
             taken = _draw_arrows(axes, sides, at, [world[k] for k in plane], levels)
         _draw_size(axes, x, y, size, levels, taken)
-    label = "size of the error [µm]; arrows: its part in the plane"
+    label = "size of the tool error [µm]; arrows: its part in the plane"
     if which == "unknown":
         label = "standard deviation in space [µm]"
         excess = find_excess(calibration)
@@ -153,7 +145,7 @@ def _draw_tool_map(
 
 
 def _cut(grid: Array, plane: tuple[int, ...]) -> Array:
-    """Values over a plane through the middle of a grid, shape (n_x, n_y, parts)."""
+    """Values in a plane through the middle of a grid, shape (n_x, n_y, parts)."""
     middle = tuple(
         slice(None) if k in plane else size // 2 for k, size in enumerate(grid.shape[:-1])
     )
@@ -161,7 +153,7 @@ def _cut(grid: Array, plane: tuple[int, ...]) -> Array:
 
 
 def _interpolate(lines: list[Array], parts: Array) -> Callable[[Array, Array], Array]:
-    """An error between points of its grid: (x, y) in m to (parts, n_x, n_y), by splines."""
+    """Spline interpolation of an error: (x, y) in m to values, shape (parts, n_x, n_y)."""
     degree = {
         k: min(HIGHEST_DEGREE, line.size - 1) for k, line in zip(("kx", "ky"), lines, strict=True)
     }
@@ -172,17 +164,13 @@ def _interpolate(lines: list[Array], parts: Array) -> Callable[[Array, Array], A
 def _refine(
     lines: list[Array], between: Callable[[Array, Array], Array]
 ) -> tuple[Array, Array, Array]:
-    """Size of an error all over a plane.
-
-    Returns:
-        x and y, [mm], and the size, shape (n_y, n_x).
-    """
+    """Coordinates x and y of a fine grid, [mm], and the size of the error, shape (n_y, n_x)."""
     x, y = (np.linspace(line[0], line[-1], FINE) for line in lines)
     return x / MM, y / MM, np.linalg.norm(between(x, y), axis=0).T
 
 
 def _describe_cut(lines: list[Array], plane: tuple[int, ...], world: tuple[int, ...]) -> str:
-    """Where the plane lies: z = 0 mm."""
+    """Position of a plane, such as z = 0 mm."""
     return ", ".join(
         f"{'xyz'[world[k]]} = {line[line.size // 2] / MM + 0.0:g} mm"
         for k, line in enumerate(lines)
@@ -191,24 +179,24 @@ def _describe_cut(lines: list[Array], plane: tuple[int, ...], world: tuple[int, 
 
 
 def _choose_levels(size: Array) -> Array:
-    """Round levels around all sizes, two at least, [µm]."""
+    """Round contour levels, at least two, around all sizes, [µm]."""
     low, high = float(size.min()), float(size.max())
-    if _is_even(size):
+    if _is_constant(size):
         around = max(0.01 * high, 0.5)
         low, high = max(low - around, 0.0), high + around
     return np.asarray(MaxNLocator(LEVELS, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
 
 
-def _is_even(size: Array) -> bool:
-    """Whether an error is the same everywhere."""
+def _is_constant(size: Array) -> bool:
+    """Whether an error is constant."""
     return float(np.ptp(size)) < max(EVEN * float(size.max()), FINEST)
 
 
 def _draw_size(axes: Axes, x: Array, y: Array, size: Array, levels: Array, taken: Array) -> None:
-    """Colours and labelled contour lines of the size over a plane, shape (n_y, n_x), [µm]."""
+    """Draw colours and labelled contour lines of a size, shape (n_y, n_x), [µm]."""
     axes.contourf(x, y, size, levels=levels, norm=BoundaryNorm(levels, 256), cmap=COLOURS)
     inside = levels[(levels > size.min()) & (levels < size.max())]
-    if _is_even(size):
+    if _is_constant(size):
         ink = _ink(levels, float(size.mean()))
         text = f"{size.mean():.3g} µm everywhere"
         axes.text(x.mean(), y.mean(), text, color=ink, horizontalalignment="center")
@@ -222,7 +210,7 @@ def _draw_size(axes: Axes, x: Array, y: Array, size: Array, levels: Array, taken
 def _place_labels(
     contours: Sequence[ArrayLike], x: Array, y: Array, taken: Array
 ) -> list[tuple[float, float]]:
-    """A point on each contour away from border, arrows and other labels; none on the shortest."""
+    """A point for a label on each contour that is away from border, arrows and other labels."""
     side = float(x[-1] - x[0])
     places: list[tuple[float, float]] = []
     for vertices in map(np.asarray, contours):
@@ -248,7 +236,7 @@ def _draw_arrows(
     within: list[int],
     levels: Array,
 ) -> Array:
-    """The part of an error in the plane.
+    """Draw the part of an error in the plane as arrows.
 
     Returns:
         Points that the arrows cover, shape (n, 2), [mm].
@@ -277,5 +265,5 @@ def _draw_arrows(
 
 
 def _ink(levels: Array, size: float) -> str:
-    """What can be read on the colour of a size."""
+    """Colour of text that is readable on the colour of a size."""
     return "white" if size < 0.5 * (levels[0] + levels[-1]) else "black"

@@ -1,1 +1,1 @@
-"""A session, a calibration or a robot as a scene."""
+"""Scenes of robots, sessions and calibrations."""

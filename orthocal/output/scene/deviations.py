@@ -1,4 +1,4 @@
-"""What a scene has to show of a session: what every gauge saw where, and where the machine went."""
+"""Deviations of the readings of a session or calibration, and the stops that show them."""
 
 from __future__ import annotations
 
@@ -20,119 +20,114 @@ from orthocal.statistics.zeros import project_out_zeros
 Array = NDArray[np.float64]
 
 Place = tuple[str, str]
-"""What of the machine a sensor stands at, as kind and name."""
+"""Kind and name of the part of the machine that a sensor measures, such as ("leg", "x")."""
 
 FEW_NAMES = 12
-"""Postures up to which a message names all."""
+"""Largest number of postures that a message lists."""
 
 MOST_STOPS = 150
-"""Postures that an animation goes through; more are thinned out."""
+"""Largest number of stops of an animation; of more postures a selection is shown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Deviation:
-    """What a gauge saw in a posture, or in one less in another; the mean of its cycles."""
+    """Deviation of a reading or a difference of readings, mean of its cycles."""
 
     setup: str
     posture: str
     minus: str | None
+    """Posture whose reading was subtracted."""
     before: float
-    """Measured less nominal, [m]."""
+    """Measured − nominal, [m]."""
     after: float | None
-    """Measured less calibrated, [m]; None without a calibration."""
+    """Measured − calibrated, [m]; None without a calibration."""
     cycles: int = 1
-    """Readings of which it is the mean."""
+    """Number of cycles."""
 
     @property
     def where(self) -> str:
-        """Posture, or postures, in words."""
+        """The posture, or the difference of postures."""
         return f"{self.posture} − {self.minus}" if self.minus else self.posture
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
-    """Postures, setups and deviations of a session."""
+    """Postures, setups and deviations of a session or calibration."""
 
     robot: Robot
     setups: Mapping[str, Setup]
     drives: Mapping[str, Array]
-    """Posture to commanded drive coordinates, [m, rad]."""
+    """Posture to commanded drive coordinates, shape (n_drives,), [m, rad]."""
     offsets: Array
-    """Active in the controller, shape (n_drives,), [m, rad]."""
+    """Offsets active in the controller, shape (n_drives,), [m, rad]."""
     rows: tuple[Deviation, ...]
     count: int
-    """Readings, every cycle counted."""
+    """Number of readings with all cycles."""
     largest_after: float | None
-    """Largest residual of any single reading, [m]; None without a calibration."""
+    """Largest residual of a single reading, [m]; None without a calibration."""
     planned: bool
-    """Whether it has not been made yet: all readings are 0."""
+    """Whether no reading has been taken: all values are 0."""
 
     def place(self, row: Deviation) -> Place:
-        """What of the machine a row is of."""
+        """The part of the machine that a row measures."""
         return self.setups[row.setup].sensor.place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stop:
-    """A posture that the animation stops at."""
+    """A posture at which the animation stops."""
 
     name: str
     drives: Array
-    rows: tuple[Deviation, ...]
-    """What the gauges show there: at most one a setup."""
+    """Commanded drive coordinates, shape (n_drives,), [m, rad]."""
+    rows: tuple[Deviation, ...] = ()
+    """Deviations that the gauges show here, at most one per setup."""
     place: Place | None = None
-    """What is being measured, such as leg x; None where it is all of them."""
-    taken_off: tuple[str, ...] = ()
-    """Postures from whose readings those of this one are taken off."""
+    """The measured part of the machine; None for all."""
+    subtracted_from: tuple[str, ...] = ()
+    """Postures from whose readings those of this stop are subtracted."""
 
 
 def measure_deviations(session: Session) -> tuple[Deviation, ...]:
-    """Readings less what the machine would show as the controller knows it, best gauge zeros taken.
+    """Readings less predictions of the machine with the active offsets, with the best gauge zeros.
 
-    A plan, all of whose readings are 0, has none.
+    All deviations of a plan without readings are zero.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
     """
-    if not session.values.any():
-        rows = [Deviation(r.setup, r.posture, r.minus, 0.0, None) for r in session.readings]
-        return _average(rows)
-    observations = build_observations(session)
-    known = {
-        f"{drive.name}.offset": float(value)
-        for drive, value in zip(session.robot.drives, session.active_offsets, strict=True)
-        if value != 0.0
-    }
-    predicted = predict_entries(session, observations, known)
-    left = project_out_zeros(observations.values(session.values) - predicted, observations)
+    deviations = np.zeros(len(session.readings))
+    if session.values.any():
+        observations = build_observations(session)
+        active = {
+            f"{drive.name}.offset": float(value)
+            for drive, value in zip(session.robot.drives, session.active_offsets, strict=True)
+            if value != 0.0
+        }
+        predicted = predict_entries(session, observations, active)
+        entries = observations.values(session.values) - predicted
+        deviations = observations.rows(project_out_zeros(entries, observations))
     return _average(
-        [
-            Deviation(r.setup, r.posture, r.minus, float(v), None)
-            for r, v in zip(session.readings, observations.rows(left), strict=True)
-        ]
+        Deviation(r.setup, r.posture, r.minus, float(v), None)
+        for r, v in zip(session.readings, deviations, strict=True)
     )
 
 
-def _average(rows: Sequence[Deviation]) -> tuple[Deviation, ...]:
-    """One deviation for all cycles."""
+def _average(rows: Iterable[Deviation]) -> tuple[Deviation, ...]:
+    """One deviation for all cycles of a setup and posture."""
     groups: dict[tuple[str, str, str | None], list[Deviation]] = {}
     for row in rows:
         groups.setdefault((row.setup, row.posture, row.minus), []).append(row)
-    return tuple(
-        Deviation(
-            *key,
-            float(np.mean([r.before for r in group])),
-            None
-            if group[0].after is None
-            else float(np.mean([r.after for r in group if r.after is not None])),
-            len(group),
-        )
-        for key, group in groups.items()
-    )
+    means = []
+    for key, group in groups.items():
+        after = [r.after for r in group if r.after is not None]
+        before = float(np.mean([r.before for r in group]))
+        means.append(Deviation(*key, before, float(np.mean(after)) if after else None, len(group)))
+    return tuple(means)
 
 
 def measurement_of_session(session: Session) -> Measurement:
-    """What the gauges saw of the machine, before any calibration."""
+    """Measurement of a session without a calibration."""
     return Measurement(
         robot=session.robot,
         setups=session.setups,
@@ -146,7 +141,7 @@ def measurement_of_session(session: Session) -> Measurement:
 
 
 def measurement_of_calibration(calibration: Calibration) -> Measurement:
-    """What the gauges saw, before and after."""
+    """Measurement of a calibration, with deviations before and after."""
     robot, offsets = calibration.robot, calibration.session.controller_offsets
     return Measurement(
         robot=robot,
@@ -154,10 +149,8 @@ def measurement_of_calibration(calibration: Calibration) -> Measurement:
         drives={p.name: np.array(p.drives) for p in calibration.postures},
         offsets=np.zeros(len(robot.drives)) if offsets is None else np.array(offsets),
         rows=_average(
-            [
-                Deviation(r.setup, r.posture, r.minus, r.deviation, r.residual)
-                for r in calibration.residuals
-            ]
+            Deviation(r.setup, r.posture, r.minus, r.deviation, r.residual)
+            for r in calibration.residuals
         ),
         count=len(calibration.residuals),
         largest_after=calibration.largest_after,
@@ -165,7 +158,7 @@ def measurement_of_calibration(calibration: Calibration) -> Measurement:
     )
 
 
-def worst_of_setups(rows: Sequence[Deviation]) -> tuple[Deviation, ...]:
+def worst_of_setups(rows: Iterable[Deviation]) -> tuple[Deviation, ...]:
     """The row of every setup with the largest deviation."""
     worst: dict[str, Deviation] = {}
     for row in rows:
@@ -175,24 +168,24 @@ def worst_of_setups(rows: Sequence[Deviation]) -> tuple[Deviation, ...]:
 
 
 def plan_stops(measured: Measurement, posture: str | None) -> tuple[list[Stop], int]:
-    """Where the machine goes: an overview at the zero, then all that is measured on each leg.
+    """Stops of the animation: an overview at the mechanical zero, then leg after leg.
 
     Args:
         measured: The measurement.
         posture: The only stop, instead.
 
     Returns:
-        The stops, and how many of too many were left out.
+        The stops, and the number of postures that were left out.
 
     Raises:
-        ParameterError: If there is no such posture.
+        ParameterError: If the posture does not exist.
     """
     robot = measured.robot
     zero = robot.drive_zero - measured.offsets
     if posture is not None:
         if posture not in measured.drives:
             raise ParameterError(
-                f"'{posture}' is not a posture; {_name_some(posture, measured.drives)}",
+                f"'{posture}' is not a posture; {_suggest(posture, list(measured.drives))}",
                 where="posture",
             )
         return [_stop_at(measured, posture, measured.rows, None)], 0
@@ -203,7 +196,7 @@ def plan_stops(measured: Measurement, posture: str | None) -> tuple[list[Stop], 
         names = dict.fromkeys(n for r in rows for n in (r.posture, r.minus) if n is not None)
         stops = [_stop_at(measured, name, rows, place) for name in names]
         if not np.allclose(stops[0].drives, zero, rtol=0.0, atol=1e-9):
-            path.append(Stop("zero", zero, (), place))
+            path.append(Stop("zero", zero, place=place))
         path += stops
     chosen = np.unique(np.linspace(0, len(path) - 1, min(MOST_STOPS, len(path))).round())
     return [overview, *(path[int(i)] for i in chosen), overview], len(path) - len(chosen)
@@ -212,16 +205,15 @@ def plan_stops(measured: Measurement, posture: str | None) -> tuple[list[Stop], 
 def _stop_at(
     measured: Measurement, name: str, rows: Sequence[Deviation], place: Place | None
 ) -> Stop:
-    here = worst_of_setups([r for r in rows if r.posture == name])
-    taken_off = dict.fromkeys(r.posture for r in rows if r.minus == name)
-    return Stop(name, measured.drives[name], here, place, tuple(taken_off))
+    here = worst_of_setups(r for r in rows if r.posture == name)
+    minuends = dict.fromkeys(r.posture for r in rows if r.minus == name)
+    return Stop(name, measured.drives[name], here, place, tuple(minuends))
 
 
-def _name_some(name: str, known: Iterable[str]) -> str:
-    """Names that may have been meant: the nearest of many, or all of a few."""
-    names = list(known)
-    if len(names) <= FEW_NAMES:
-        return f"postures: {', '.join(names)}"
-    near = get_close_matches(name, names, n=3, cutoff=0.4)
+def _suggest(name: str, postures: Sequence[str]) -> str:
+    """All postures if they are few, else those with similar names."""
+    if len(postures) <= FEW_NAMES:
+        return f"postures: {', '.join(postures)}"
+    near = get_close_matches(name, postures, n=3, cutoff=0.4)
     meant = f"; did you mean {', '.join(near)}?" if near else ""
-    return f"there are {len(names)} in the session{meant}"
+    return f"there are {len(postures)} in the session{meant}"

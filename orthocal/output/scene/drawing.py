@@ -1,9 +1,9 @@
-"""Scenes of a robot, of a session and of a calibration.
+"""Scenes of a robot, a session and a calibration.
 
-A calibration shows the machine that the controller takes for granted as a pale ghost, and the
-calibrated one solid: where it really is when it is sent there. Their deviation is drawn larger, by
-a factor that the scene states. Gauges stand where they stood; arrows along what they measure are
-as long as the deviations before and the residuals after, by a factor of their own.
+The scene of a calibration shows two machines: the calibrated one solid, where it really is, and the
+nominal one as a pale ghost, where the controller assumes it. The deviation between them is enlarged
+by a factor that the scene states. Arrows at the gauges show the deviations of the readings before
+and after the calibration, enlarged by a factor of their own.
 """
 
 from __future__ import annotations
@@ -33,60 +33,56 @@ from orthocal.robot.model import Robot, coordinate_units
 from orthocal.robot.reference_posture import count_free_motions
 from orthocal.session.session import Session
 from orthocal.units import MM
+from orthocal.viewer.machine import MachineScene
 from orthocal.viewer.motion import (
-    Film,
     Timeline,
     exaggerate,
     find_largest_shift,
     place_frames,
     plan_motion,
 )
-from orthocal.viewer.scene import LegendEntry, Scene, round_scale
-from orthocal.viewer.shapes import Colour, css
-from orthocal.viewer.stage import GHOST_COLOUR, LINE_COLOUR, LINES, Stage
+from orthocal.viewer.scene import Scene, round_scale
 
 Array = NDArray[np.float64]
+Poses = Mapping[str, Array]
+"""Frame to poses, shape (F, 4, 4), [m]."""
 
 SHOWN = ("readings", "tool", "all")
+"""Choices of what the scene of a calibration shows at first."""
 
 LARGEST_DEVIATION = 0.05
-"""Part of the machine's size that its largest deviation is drawn as."""
+"""Drawn size of the largest deviation, in sizes of the machine."""
 
-FURTHEST = 1.0
-"""The same, at most."""
+LARGEST_EXAGGERATION = 1.0
+"""Largest drawn size of the largest deviation that may be asked for, in sizes of the machine."""
 
 NOTHING = 1e-9
-"""Deviations below this are none, [m]."""
+"""Deviations below this are zero, [m]."""
 
 FREE_REACH = 0.3
-"""How far a drive without limits could go, for a robot that is shown, [rad] or characteristic
-lengths."""
+"""Travel of a drive without limits, [rad] or characteristic lengths."""
 
 LARGEST_REACH = 1.0
-"""How far any drive could, at most."""
+"""Largest travel of a drive, [rad] or characteristic lengths."""
 
 MACHINE = "Machine"
 GHOST = "Machine, nominal (ghost)"
 SOLID = "Machine, calibrated"
 
-SOLID_COLOUR: Colour = (0.5, 0.52, 0.55)
-"""In the legend: a machine has many."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Machines:
-    """The nominal and the real machine in all frames of a motion."""
+    """The nominal and the calibrated machine in all frames of a motion."""
 
     timeline: Timeline
-    nominal: Mapping[str, Array]
-    """Frame to poses, shape (F, 4, 4), [m]."""
-    real: Mapping[str, Array]
-    """The same; as drawn, with the deviation made larger."""
+    nominal: Poses
+    drawn: Poses
+    """Poses of the calibrated machine with enlarged deviation."""
     exaggeration: float
     largest: float
-    """Largest deviation of any frame, [m]."""
-    where: str
-    """Which frame that is."""
+    """Largest deviation of a frame, [m]."""
+    frame: str
+    """Name of that frame."""
 
 
 def draw_scene(
@@ -96,22 +92,22 @@ def draw_scene(
     exaggeration: float | None = None,
     show: str | None = None,
 ) -> Scene:
-    """A scene of a calibration, a session or a robot.
+    """Scene of a calibration, a session or a robot.
 
     Args:
-        subject: What to draw.
-        posture: Where the machine stands; by default at the mechanical zero, from where it can be
-            played through the measurement.
-        exaggeration: How many times its size the deviation of the calibrated machine is drawn; 1
-            for true scale. By default as large as can be seen well.
-        show: What of a calibration is shown at first: "readings", which is what else there is,
-            "tool" (its errors), or "all".
+        subject: The calibration, session or robot.
+        posture: The posture to show; by default the mechanical zero and an animation of the
+            measurement.
+        exaggeration: Factor that enlarges the deviation of the calibrated machine; 1 for true
+            scale. By default a factor that makes the deviation visible.
+        show: What the scene of a calibration shows at first: "readings", "tool" (its errors) or
+            "all".
 
     Raises:
-        ParameterError: If there is no such posture, nothing deviates or by no positive factor, or
-            there is no such thing to show.
-        TypeError: If the subject is none of these.
-        RobotError: If the robot's visuals cannot be loaded.
+        ParameterError: If the posture does not exist, or an argument is out of range or does not
+            apply to the subject.
+        TypeError: If the subject is of another type.
+        RobotError: If the visuals of the robot cannot be loaded.
         ClosureError: If the machine cannot reach a posture.
     """
     if exaggeration is not None and not (math.isfinite(exaggeration) and exaggeration > 0.0):
@@ -120,75 +116,62 @@ def draw_scene(
         )
     if show is not None and show not in SHOWN:
         raise ParameterError(f"'{show}' is none of {', '.join(SHOWN)}", where="show")
-    if show is not None and not isinstance(subject, Calibration):
-        raise ParameterError("only a calibration has a choice of what is shown", where="show")
-    if exaggeration is not None and not isinstance(subject, Calibration):
-        raise ParameterError(
-            "only a calibration has a machine that deviates from another", where="exaggeration"
-        )
-    if isinstance(subject, Robot):
-        return _draw_robot(subject, posture)
+    if isinstance(subject, Calibration):
+        return _draw_calibration(subject, posture, exaggeration, show or SHOWN[0])
+    if show is not None:
+        raise ParameterError("applies to a calibration only", where="show")
+    if exaggeration is not None:
+        raise ParameterError("applies to a calibration only", where="exaggeration")
     if isinstance(subject, Session):
         return _draw_session(subject, posture)
-    if not isinstance(subject, Calibration):
-        raise TypeError(
-            f"found a {type(subject).__name__}; expected a Calibration, a Session or a Robot, such "
-            "as load_calibration(...)"
-        )
-    return _draw_calibration(subject, posture, exaggeration, show or SHOWN[0])
-
-
-# ---- a robot alone
+    if isinstance(subject, Robot):
+        return _draw_robot(subject, posture)
+    raise TypeError(
+        f"found a {type(subject).__name__}; expected a Calibration, a Session or a Robot, such "
+        "as load_calibration(...)"
+    )
 
 
 def _draw_robot(robot: Robot, posture: str | None) -> Scene:
     if posture is not None:
-        raise ParameterError("a robot alone has no postures; it takes a session", where="posture")
-    stage = Stage(robot, f"{robot.name}: the nominal machine")
+        raise ParameterError("a robot has no postures; name a session", where="posture")
+    drawing = MachineScene(robot, f"{robot.name}: the nominal machine")
     stops = _tour(robot)
     timeline = plan_motion([s.drives for s in stops], count=_longest_tour(robot))
-    poses = _follow(robot, nominal_assembly(robot), timeline, stage.frames, allow_free=True)
-    stage.draw_links(MACHINE, poses)
-    stage.look_at(poses)
-    stage.scene.explain(LegendEntry("Machine", (MACHINE,), css(SOLID_COLOUR), "solid"))
-    if robot.legs:
-        stage.draw_leg_lines(poses, timeline.stops)
-        _explain_lines(stage.scene)
-    film = Film()
-    stage.move_links(film, MACHINE, timeline.times, poses)
-    stage.move_leg_lines(film, timeline.times, poses)
-    write_steps(stage.scene, stops, timeline, [f"{s.name}" for s in stops])
-    stage.scene.animate(film.animation)
-    stage.scene.facts[:0] = _state_zero(robot)
+    poses = _follow(nominal_assembly(robot), robot, timeline, drawing.frames, allow_free=True)
+    drawing.draw_machine(MACHINE, "Machine", timeline, poses)
+    drawing.draw_leg_lines(timeline, poses)
+    drawing.look_at(poses)
+    scene = drawing.scene
+    write_steps(scene, stops, timeline, [s.name for s in stops])
+    scene.animate()
+    scene.facts[:0] = _state_zero(robot)
     loops = counted(len(robot.closures), "closed loop")
-    stage.scene.headline = f"{counted(len(robot.drives), 'drive')}, {loops}"
-    return stage.scene
+    scene.headline = f"{counted(len(robot.drives), 'drive')}, {loops}"
+    return scene
 
 
 def _state_zero(robot: Robot) -> list[str]:
-    """Where the machine stands, who says so, and what its loops leave free there."""
+    """Facts about the mechanical zero and about free motions there."""
     drives = ", ".join(
         f"{d.name} {d.zero * (1e3 if d.unit == 'm' else 1.0):g} {'mm' if d.unit == 'm' else 'rad'}"
         for d in robot.drives
     )
     facts = [f"Mechanical zero: {drives}."]
-    found = [d.name for d in robot.drives if d.zero_found]
-    if found:
-        facts.append(
-            f"Found when the loops were closed, not given: the zero of {', '.join(found)}."
-        )
+    computed = [d.name for d in robot.drives if d.zero_found]
+    if computed:
+        facts.append(f"Computed by closing the loops: the zero of {', '.join(computed)}.")
     free = count_free_motions(robot)
     if free:
-        loose = counted(free, "passive motion")
-        facts.append(f"The loops leave {loose} free; where they stand is a choice.")
+        motions = counted(free, "passive motion")
+        facts.append(f"The loops leave {motions} free. Their drawn position is arbitrary.")
     return facts
 
 
 def _tour(robot: Robot) -> list[Stop]:
-    """The zero, and every drive moved some way to either end of its travel, if it can."""
-    zero = robot.drive_zero
+    """Stops at the mechanical zero and, for every drive, towards both ends of its travel."""
     reaches = np.where(coordinate_units(robot) == 1.0, robot.characteristic_length, 1.0)
-    stops = [Stop("mechanical zero", zero, ())]
+    stops = [Stop("mechanical zero", robot.drive_zero)]
     for i, drive in enumerate(robot.drives):
         unit = float(reaches[robot.drive_index[i]])
         for end, word in ((drive.lower, "down"), (drive.upper, "up")):
@@ -196,56 +179,44 @@ def _tour(robot: Robot) -> list[Stop]:
             if not math.isfinite(reach):
                 reach = math.copysign(FREE_REACH * unit, end)
             reach = math.copysign(min(abs(reach), LARGEST_REACH * unit), reach)
-            target = _furthest(robot, i, 0.4 * reach)
+            target = _find_reachable(robot, i, 0.4 * reach)
             if target is not None:
-                stops += [Stop(f"{drive.name} {word}", target, ()), stops[0]]
+                stops += [Stop(f"{drive.name} {word}", target), stops[0]]
     return stops
 
 
 def _longest_tour(robot: Robot) -> int:
-    """Stops of a robot all of whose drives move."""
+    """Number of stops of a robot whose drives can all move."""
     return 1 + 4 * len(robot.drives)
 
 
-def _furthest(robot: Robot, drive: int, move: float) -> Array | None:
-    """Where a drive gets to by a move or a part of it, with loops that close in every frame."""
+def _find_reachable(robot: Robot, drive: int, move: float) -> Array | None:
+    """Drive coordinates after a move, or a part of it, with loops that close on the way."""
     zero = robot.drive_zero
     for part in (1.0, 0.5, 0.25):
         target = zero + part * move * np.eye(len(zero))[drive]
-        way = plan_motion([zero, target, zero], count=_longest_tour(robot)).drives
+        timeline = plan_motion([zero, target, zero], count=_longest_tour(robot))
         try:
-            nominal_assembly(robot).close(way, allow_free=True)
+            nominal_assembly(robot).close(timeline.drives, allow_free=True)
         except ClosureError:
-            continue  # that far it does not go
+            continue
         return np.asarray(target)
     return None
 
 
-# ---- a session
-
-
 def _draw_session(session: Session, posture: str | None) -> Scene:
     robot, measured = session.robot, measurement_of_session(session)
-    stage = Stage(robot, session.title, looked_at=_looked_at(measured))
+    drawing = MachineScene(robot, session.title, sensor_frames=_sensor_frames(measured))
     stops, left_out = plan_stops(measured, posture)
     timeline = plan_motion([s.drives + measured.offsets for s in stops])
-    poses = _follow(robot, nominal_assembly(robot), timeline, stage.followed)
-    stage.draw_links(MACHINE, poses)
-    stage.draw_leg_lines(poses, timeline.stops)
-    stage.look_at(poses)
-    scene = stage.scene
-    scene.explain(LegendEntry("Machine, nominal", (MACHINE,), css(SOLID_COLOUR), "solid"))
-    _explain_lines(scene)
-    film = Film()
-    stage.move_links(film, MACHINE, timeline.times, poses)
-    stage.move_leg_lines(film, timeline.times, poses)
-    draw_readings(stage, measured, stops, timeline, poses, film)
-    scene.headline = write_headline(measured)
-    _finish(scene, film, session.source, stops, left_out)
-    return scene
-
-
-# ---- a calibration
+    poses = _follow(nominal_assembly(robot), robot, timeline, drawing.all_frames)
+    drawing.draw_machine(MACHINE, "Machine, nominal", timeline, poses)
+    drawing.draw_leg_lines(timeline, poses)
+    drawing.look_at(poses)
+    draw_readings(drawing, measured, stops, timeline, poses)
+    drawing.scene.headline = write_headline(measured)
+    _finish(drawing.scene, session.source, stops, left_out)
+    return drawing.scene
 
 
 def _draw_calibration(
@@ -253,27 +224,32 @@ def _draw_calibration(
 ) -> Scene:
     measured = measurement_of_calibration(calibration)
     title = f"{calibration.session.title} · model '{calibration.model}'"
-    stage = Stage(measured.robot, title, looked_at=_looked_at(measured))
-    scene = stage.scene
+    drawing = MachineScene(measured.robot, title, sensor_frames=_sensor_frames(measured))
+    scene = drawing.scene
     stops, left_out = plan_stops(measured, posture)
-    machines = _place_machines(calibration, measured, stops, stage, exaggeration)
+    machines = _place_machines(calibration, measured, stops, drawing, exaggeration)
+    timeline, real = machines.timeline, machines.drawn
+    drawing.draw_machine(SOLID, "Machine where it really is", timeline, real)
+    if machines.largest > NOTHING:
+        text = "Machine where the controller assumes it"
+        drawing.draw_machine(GHOST, text, timeline, machines.nominal, ghost_of=real)
+    drawing.draw_leg_lines(timeline, real)
+    drawing.look_at(real, machines.nominal)
     scene.exaggeration = machines.exaggeration
-    stage.draw_links(SOLID, machines.real)
-    stage.draw_links(GHOST, machines.nominal, ghost_of=machines.real)
-    stage.draw_leg_lines(machines.real, machines.timeline.stops)
-    stage.look_at(machines.real, machines.nominal)
-    _explain_machines(scene, machines)
-    film = Film()
-    times = machines.timeline.times
-    stage.move_links(film, SOLID, times, machines.real)
-    stage.move_links(film, GHOST, times, machines.nominal)
-    stage.move_leg_lines(film, times, machines.real)
+    scene.facts.insert(0, _state_deviation(machines))
     readings, tool = show in ("readings", "all"), show in ("tool", "all")
-    draw_readings(stage, measured, stops, machines.timeline, machines.real, film, shown=readings)
-    of_tool = draw_tool_errors(stage, calibration, shown=tool)
-    scene.headline = of_tool if of_tool and not readings else write_headline(measured)
-    _state_offsets(scene, calibration)
-    _finish(scene, film, calibration.session.source, stops, left_out)
+    draw_readings(drawing, measured, stops, timeline, real, shown=readings)
+    tool_headline = draw_tool_errors(drawing, calibration, shown=tool)
+    scene.headline = write_headline(measured) if readings or not tool_headline else tool_headline
+    entries = ", ".join(
+        f"{e.drive} {typeset(e.enter * e.edge_factor)} {e.edge_unit}"
+        for e in find_entries(calibration)
+    )
+    if entries:
+        scene.facts.insert(
+            0, f"Offsets to enter: {entries}. Each leg leans by the offsets of all drives."
+        )
+    _finish(scene, calibration.session.source, stops, left_out)
     return scene
 
 
@@ -281,104 +257,69 @@ def _place_machines(
     calibration: Calibration,
     measured: Measurement,
     stops: Sequence[Stop],
-    stage: Stage,
+    drawing: MachineScene,
     exaggeration: float | None,
 ) -> _Machines:
-    """Where the controller takes the links to be, and where they are, in every frame."""
-    robot = measured.robot
+    """Poses of the nominal and of the calibrated machine in every frame."""
+    robot, frames, size = measured.robot, drawing.all_frames, drawing.size
+    machine = robot.with_errors(calibration.errors)
+    nominal_loops, real_loops = nominal_assembly(robot), Assembly(robot, fixed=calibration.errors)
     timeline = plan_motion([s.drives for s in stops])
-    believed = Timeline(timeline.drives + measured.offsets, timeline.times, timeline.stops)
-    nominal = _follow(robot, nominal_assembly(robot), believed, stage.followed)
-    assembly = Assembly(robot, fixed=calibration.errors)
-    real = _follow(robot.with_errors(calibration.errors), assembly, timeline, stage.followed)
-    largest, where = _find_largest(measured, assembly, calibration, stage)
+    assumed = Timeline(timeline.drives + measured.offsets, timeline.times, timeline.stops)
+    nominal = _follow(nominal_loops, robot, assumed, frames)
+    real = _follow(real_loops, machine, timeline, frames)
+    # the largest deviation in all postures, whichever are shown
+    drives = np.array([robot.drive_zero - measured.offsets, *measured.drives.values()])
+    expected = drives + measured.offsets
+    largest, frame = find_largest_shift(
+        place_frames(robot, expected, nominal_loops.close(expected), drawing.frames),
+        place_frames(machine, drives, real_loops.close(drives), drawing.frames),
+    )
     if exaggeration is None:
-        wanted = LARGEST_DEVIATION * stage.size / largest if largest > NOTHING else 1.0
-        exaggeration = round_scale(wanted)
-    if exaggeration * largest > FURTHEST * stage.size:
+        exaggeration = round_scale(LARGEST_DEVIATION * size / largest if largest > NOTHING else 1.0)
+    if exaggeration * largest > LARGEST_EXAGGERATION * size:
         raise ParameterError(
             f"is {exaggeration:g}; the largest deviation of {largest / MM:.3g} mm would be drawn "
-            f"larger than the machine: expected at most {stage.size / largest:.0f}",
+            f"larger than the machine: expected at most {size / largest:.0f}",
             where="exaggeration",
         )
     drawn = {name: exaggerate(nominal[name], real[name], exaggeration) for name in real}
-    return _Machines(timeline, nominal, drawn, exaggeration, largest, where)
+    return _Machines(timeline, nominal, drawn, exaggeration, largest, frame)
 
 
-def _find_largest(
-    measured: Measurement, assembly: Assembly, calibration: Calibration, stage: Stage
-) -> tuple[float, str]:
-    """Largest deviation of any frame in any posture of the session, whichever is shown, [m]."""
-    robot = measured.robot
-    drives = np.array([robot.drive_zero - measured.offsets, *measured.drives.values()])
-    believed = drives + measured.offsets
-    closed = nominal_assembly(robot).close(believed), assembly.close(drives)
-    nominal = place_frames(robot, believed, closed[0], stage.frames)
-    machine = robot.with_errors(calibration.errors)
-    return find_largest_shift(nominal, place_frames(machine, drives, closed[1], stage.frames))
-
-
-def _explain_machines(scene: Scene, machines: _Machines) -> None:
-    scene.explain(LegendEntry("Machine where it really is", (SOLID,), css(SOLID_COLOUR), "solid"))
-    if machines.largest > NOTHING:
-        scene.explain(
-            LegendEntry(
-                "Machine where the controller takes it to be", (GHOST,), css(GHOST_COLOUR), "ghost"
-            )
-        )
-    _explain_lines(scene)
+def _state_deviation(machines: _Machines) -> str:
+    """Size and scale of the deviation of the machine."""
     if machines.largest <= NOTHING:
-        scene.facts.insert(0, "The machine is where the controller takes it to be.")
-        return
-    size = f"largest {machines.largest / MM:.3f} mm, at {machines.where}"
-    if machines.exaggeration == 1.0:
-        scene.facts.insert(0, f"Machine: true scale ({size}).")
-    else:
-        scene.facts.insert(0, f"Machine: deviation × {machines.exaggeration:g} ({size}).")
+        return "The machine is where the controller assumes it."
+    scale = "true scale"
+    if machines.exaggeration != 1.0:
+        scale = f"deviation × {machines.exaggeration:g}"
+    return f"Machine: {scale} (largest {machines.largest / MM:.3f} mm, at {machines.frame})."
 
 
-def _state_offsets(scene: Scene, calibration: Calibration) -> None:
-    """Say what is to be entered: the leg that leans is often not the one whose drive is off."""
-    entries = find_entries(calibration)
-    if not entries:
-        return
-    words = []
-    for entry in entries:
-        words.append(f"{entry.drive} {typeset(entry.enter * entry.edge_factor)} {entry.edge_unit}")
-    found = f"Offsets to enter: {', '.join(words)}. A leg leans by its own drive's and by others'."
-    scene.facts.insert(0, found)
-
-
-def _explain_lines(scene: Scene) -> None:
-    scene.explain(LegendEntry("Leg, from its root to its tip", (LINES,), css(LINE_COLOUR), "line"))
-
-
-# ---- small things
-
-
-def _looked_at(measured: Measurement) -> list[str]:
-    """Frames that sensors look at."""
+def _sensor_frames(measured: Measurement) -> list[str]:
+    """Frames that the sensors of all setups measure."""
     sensors = (s.sensor for s in measured.setups.values())
     return [f for s in sensors for f in s.frames(measured.robot).in_posture]
 
 
 def _follow(
-    robot: Robot,
     assembly: Assembly,
+    robot: Robot,
     timeline: Timeline,
     frames: Sequence[str],
     *,
     allow_free: bool = False,
 ) -> dict[str, Array]:
-    """Poses of frames in all frames of a motion, loops closed."""
+    """Poses of frames in all frames of a motion, with closed loops."""
     passive = assembly.close(timeline.drives, allow_free=allow_free)
     return place_frames(robot, timeline.drives, passive, frames)
 
 
-def _finish(scene: Scene, film: Film, source: str, stops: Sequence[Stop], left_out: int) -> None:
-    """Animate, and say what has to be said of it, and where the readings are from."""
+def _finish(scene: Scene, source: str, stops: Sequence[Stop], left_out: int) -> None:
+    """Add the animation, and facts about it and the source of the readings."""
     if len(stops) > 1:
-        scene.animate(film.animation)
+        scene.animate()
     if left_out:
         shown = len(stops) - 2
         scene.facts.append(f"The animation stops at {shown} of {shown + left_out} postures.")

@@ -1,1 +1,1 @@
-"""Measuring sheets: paper to measure by."""
+"""Measuring sheets to print."""

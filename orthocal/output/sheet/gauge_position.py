@@ -1,4 +1,4 @@
-"""How a gauge is to stand, from its contacts: numbers that pictures and words share."""
+"""Position of a gauge on the machine, as the sheet's pictures and steps show it."""
 
 from __future__ import annotations
 
@@ -18,148 +18,172 @@ from orthocal.viewer.motion import place_frames
 Array = NDArray[np.float64]
 
 ALONG_AXIS = 0.9999
-"""Cosine above which a direction is called by an axis of the world."""
+"""Cosine above which a direction is named after an axis of the world."""
+
+ABOUT_ALONG = 0.97
+"""The same for the direction of a small offset."""
 
 NEAR_HINGE = 0.012
-"""From a rod's end to where a tip comes into the way of the hinge, at least, [m]."""
+"""Smallest distance of a tip from the end of a rod that needs no warning, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Standing:
-    """How a gauge stands, in the postures that it is read in."""
+class GaugePosition:
+    """Position of a gauge in the alignment posture and in those that it reads."""
 
     setup: Setup
     leg: Leg | None
-    """The leg that it touches, where it touches one."""
+    """The measured leg, if the sensor is at a leg."""
     rod: Rod | None
-    """The rod; None for the line between the rods, or something else."""
-    postures: tuple[str, ...]
+    """The touched rod; None for the line between the rods and for other sensors."""
     contact: Contact
-    """In these postures."""
+    """Contact in the K postures of the setup, the alignment posture included."""
     poses: Mapping[str, Array]
-    """Poses of all links and of what is touched in the first posture, shape (4, 4), [m]."""
-    first: int
-    """Which of the postures is the first."""
-    tool_points: Array
-    """Where the tool is in the stops, in order, shape (n, 3); (0, 3) without a tool, [m]."""
-    from_root: Array
-    """From the hinge at the drive's end to where the rod is touched, shape (K,), [m]."""
-    aside: Array
-    """From the middle of the rod, across it and the plunger, to the tip in the first posture,
-    shape (3,), [m]."""
+    """Poses of the links and of the leg's frames in the alignment posture, shape (4, 4), [m]."""
+    alignment: str
+    """Posture in which the operator aligns the gauge."""
+    drives: Array
+    """Nominal drive coordinates of the alignment posture, shape (n_drives,), [m, rad]."""
+    aligned: int
+    """Index of the alignment posture in `contact`."""
+    tool_path: Array
+    """Tool points of all stops, in order, shape (n, 3); (0, 3) without a tool, [m]."""
+    hinge_distances: Array
+    """Distance of the contact from the rod's hinge at the drive, shape (K,), [m]."""
+    lateral_offset: Array
+    """From the rod's axis to the tip, across rod and plunger, in the alignment posture, shape
+    (3,), [m]."""
 
     @property
     def tip(self) -> TouchingTip | None:
-        """What touches."""
+        """The tip of the gauge."""
         return self.contact.tip
 
     @property
     def point(self) -> Array:
-        """Where it touches in the first posture, shape (3,), [m]."""
-        return np.asarray(self.contact.points[self.first])
+        """Point of contact in the alignment posture, shape (3,), [m]."""
+        return np.asarray(self.contact.points[self.aligned])
+
+    def origin(self, frame: str) -> Array:
+        """Origin of a frame in the alignment posture, shape (3,), [m]."""
+        return np.asarray(self.poses[frame][:3, 3])
 
     @property
     def near_hinge(self) -> float | None:
-        """How near it comes to a hinge, where that is too near, [m]."""
+        """Distance of the tip from a hinge, if it is too small, [m]."""
         if self.rod is None:
             return None
-        ends = np.minimum(self.from_root, self.rod.length - self.from_root)
-        least = float(ends.min())
-        return least if least < max(NEAR_HINGE, 2.0 * self.rod.radius) else None
+        distances = np.minimum(self.hinge_distances, self.rod.length - self.hinge_distances)
+        smallest = float(distances.min())
+        return smallest if smallest < max(NEAR_HINGE, 2.0 * self.rod.radius) else None
 
 
-def find_touched(robot: Robot, setup: Setup) -> tuple[Leg | None, Rod | None]:
-    """The leg and rod whose ends a sensor looks at."""
-    looked = setup.sensor.frames(robot).in_posture
-    for leg in robot.legs.values():
-        for rod in leg.rods.values():
-            if looked[:2] == (rod.root, rod.tip):
-                return leg, rod
-    for leg in robot.legs.values():
-        if looked[:2] == (leg.root, leg.tip):
-            return leg, None
-    kind, name = setup.sensor.place
-    return (robot.legs.get(name) if kind == "leg" else None), None
-
-
-def find_standing(
+def find_gauge_position(
     session: Session,
     motion: SetupMotion,
     contacts: Mapping[str, tuple[list[str], Contact]],
     passive: Mapping[str, Array],
     links: tuple[str, ...],
-) -> Standing:
-    """How the gauge of a setup stands.
+) -> GaugePosition:
+    """Position of the gauge of one setup.
 
     Args:
         session: The plan.
-        motion: The way through the setup.
-        contacts: Setup to postures, and where it touches in them (`locate_contacts`).
-        passive: Posture to passive coordinates of the nominal machine.
-        links: Frames whose poses are wanted.
+        motion: The motion through the setup.
+        contacts: Setup to its postures and its contact in them (`locate_contacts`).
+        passive: Posture to passive coordinates of the nominal machine, [m, rad].
+        links: Frames whose poses are needed.
     """
     robot, setup = session.robot, session.setups[motion.setup]
-    leg, rod = find_touched(robot, setup)
+    leg, rod = _find_touched(robot, setup)
     names, contact = contacts[motion.setup]
-    ends = [f for r in ([] if leg is None else leg.rods.values()) for f in (r.root, r.tip)]
+    alignment = session.alignment_postures[motion.setup]
+    aligned = names.index(alignment)
+    drives = np.array([session.postures[n].drives + session.active_offsets for n in names])
+    q = np.array([passive[n] for n in names])
+    rods = [] if leg is None else list(leg.rods.values())
+    ends = [frame for r in rods for frame in (r.root, r.tip)]
     ends += [] if leg is None else [leg.root, leg.tip]
     wanted = tuple(dict.fromkeys([*links, *ends]))
-    first = motion.stops[0]
-    found = place_frames(robot, first.drives[None], passive[first.posture][None], wanted)
-    from_root = np.full(len(names), np.nan)
-    aside = np.zeros(3)
+    poses = place_frames(robot, drives[aligned][None], q[aligned][None], wanted)
+    hinge_distances, lateral_offset = np.full(len(names), np.nan), np.zeros(3)
     if rod is not None:
-        drives = np.array([session.postures[n].drives + session.active_offsets for n in names])
-        q = np.array([passive[n] for n in names])
-        of_rod = place_frames(robot, drives, q, (rod.root, rod.tip))
-        roots, tips = (of_rod[f][:, :3, 3] for f in (rod.root, rod.tip))
-        units = (tips - roots) / np.linalg.norm(tips - roots, axis=1)[:, None]
-        from_root = np.einsum("ki,ki->k", contact.points - roots, units)
-        k = names.index(first.posture)
-        normal = contact.points[k] - roots[k] - from_root[k] * units[k]
-        across = np.cross(units[k], contact.direction)
-        across /= np.linalg.norm(across)
-        touching = 0.0 if contact.tip is None or contact.tip.edge is not None else 1.0
-        radius = 0.0 if contact.tip is None else contact.tip.radius
-        # a ball's centre is as far from the rod's axis as both radii
-        aside = touching * (1.0 + radius / rod.radius) * float(normal @ across) * across
-    points = np.zeros((0, 3))
+        frames = place_frames(robot, drives, q, (rod.root, rod.tip))
+        roots, tips = (frames[f][:, :3, 3] for f in (rod.root, rod.tip))
+        axes = (tips - roots) / np.linalg.norm(tips - roots, axis=1)[:, None]
+        hinge_distances = np.einsum("ki,ki->k", contact.points - roots, axes)
+        normals = contact.points - roots - hinge_distances[:, None] * axes
+        lateral_offset = _find_lateral_offset(rod, contact, normals[aligned], axes[aligned])
+    tool_path = np.zeros((0, 3))
     if robot.tcp is not None:
-        drives = np.array([s.drives for s in motion.stops])
-        q = np.array([passive[s.posture] for s in motion.stops])
-        points = place_frames(robot, drives, q, (robot.tcp.frame,))[robot.tcp.frame][:, :3, 3]
-    return Standing(
+        way = np.array([s.drives for s in motion.stops])
+        on_way = np.array([passive[s.posture] for s in motion.stops])
+        tool = robot.tcp.frame
+        tool_path = place_frames(robot, way, on_way, (tool,))[tool][:, :3, 3]
+    return GaugePosition(
         setup=setup,
         leg=leg,
         rod=rod,
-        postures=tuple(names),
         contact=contact,
-        poses={name: pose[0] for name, pose in found.items()},
-        first=names.index(first.posture),
-        tool_points=points,
-        from_root=from_root,
-        aside=aside,
+        poses={name: pose[0] for name, pose in poses.items()},
+        alignment=alignment,
+        drives=drives[aligned],
+        aligned=aligned,
+        tool_path=tool_path,
+        hinge_distances=hinge_distances,
+        lateral_offset=lateral_offset,
     )
 
 
-def direction_words(direction: Array) -> str:
-    """A direction by an axis of the world, or as a vector."""
-    name = axis_name(direction)
-    if name:
-        return name
-    return "(" + ", ".join(f"{round(v, 2) + 0.0:.2f}".replace("-", "−") for v in direction) + ")"
+def _find_lateral_offset(rod: Rod, contact: Contact, normal: Array, axis: Array) -> Array:
+    """Vector from the plane of rod and plunger to the centre of the tip, shape (3,), [m].
+
+    Args:
+        rod: The touched rod.
+        contact: The contact.
+        normal: Vector from the rod's axis to the point of contact, shape (3,), [m].
+        axis: Unit vector along the rod, shape (3,).
+    """
+    if contact.tip is not None and contact.tip.edge is not None:
+        return np.zeros(3)
+    across = np.cross(axis, contact.direction)
+    across /= np.linalg.norm(across)
+    # the centre of a ball is both radii away from the rod's axis
+    radius = 0.0 if contact.tip is None else contact.tip.radius
+    return np.asarray((1.0 + radius / rod.radius) * float(normal @ across) * across)
 
 
-def axis_name(direction: Array) -> str:
-    """The axis of the world that a direction is along, such as −y; empty where it is along none."""
+def _find_touched(robot: Robot, setup: Setup) -> tuple[Leg | None, Rod | None]:
+    """The leg and the rod whose ends the sensor measures."""
+    frames = setup.sensor.frames(robot).in_posture[:2]
+    for leg in robot.legs.values():
+        for rod in leg.rods.values():
+            if frames == (rod.root, rod.tip):
+                return leg, rod
+    for leg in robot.legs.values():
+        if frames == (leg.root, leg.tip):
+            return leg, None
+    kind, name = setup.sensor.place
+    return (robot.legs.get(name) if kind == "leg" else None), None
+
+
+def axis_name(direction: Array, *, cosine: float = ALONG_AXIS) -> str:
+    """Name of the world axis along a direction, such as −y; "" for other directions."""
     k = int(np.abs(direction).argmax())
-    if abs(direction[k]) <= ALONG_AXIS * np.linalg.norm(direction):
+    if abs(direction[k]) <= cosine * np.linalg.norm(direction):
         return ""
     return f"{'+' if direction[k] > 0.0 else '−'}{'xyz'[k]}"
 
 
-def tip_words(tip: TouchingTip | None) -> str:
-    """What touches."""
+def name_direction(direction: Array, *, cosine: float = ALONG_AXIS) -> str:
+    """Name of the world axis along a direction, else the components of its unit vector."""
+    unit = direction / np.linalg.norm(direction)
+    components = ", ".join(f"{round(v, 2) + 0.0:.2f}".replace("-", "−") for v in unit)
+    return axis_name(direction, cosine=cosine) or f"({components})"
+
+
+def name_tip(tip: TouchingTip | None) -> str:
+    """Kind and dimensions of a tip."""
     if tip is None:
         return "tip"
     if tip.edge is None:

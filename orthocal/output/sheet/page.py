@@ -2,54 +2,51 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib import resources
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.io.html import escape, heading, paragraph, table
+from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.kinematics.loop_closure import nominal_assembly
-from orthocal.measurement.motion.motion import SetupMotion, Stop, plan_motion
+from orthocal.measurement.motion.motion import SetupMotion, Stop, plan_motion, shown_joints
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
 from orthocal.observation.sensor_frames import locate_contacts
-from orthocal.output.sheet.drawing import draw_cut, draw_machine
-from orthocal.output.sheet.gauge_position import Standing, direction_words, find_standing, tip_words
-from orthocal.output.sheet.words import (
-    active_words,
-    approach_words,
-    counting_words,
-    gauge_words,
-    joint_list,
-    joint_numbers,
-    limit_words,
-    number,
+from orthocal.output.sheet.gauge_position import (
+    ABOUT_ALONG,
+    GaugePosition,
+    find_gauge_position,
+    name_direction,
+    name_tip,
 )
+from orthocal.output.sheet.pictures import draw_machine, draw_section
 from orthocal.output.text.layout import counted
-from orthocal.session.session import Gauge, Session
+from orthocal.robot.model import Robot
+from orthocal.session.session import Gauge, Reading, Session
 from orthocal.units import DRIVE_UNITS, MM
 from orthocal.viewer.visuals import load_visuals
 
 Array = NDArray[np.float64]
 
 SHEET = "sheet.html"
+"""Name of the sheet's file."""
 
-NOTICED = 5e-5
-"""What a perfect machine shows is told from there on, [m]: a dial's hand moves."""
-
-_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+VISIBLE = 5e-5
+"""Smallest distance that the sheet mentions and smallest deflection that a dial shows, [m]."""
 
 
 def sheet_files(session: Session, *, options: ProgramOptions | None = None) -> dict[str, str]:
-    """The sheet of a plan and a program for each of its setups: name of a file to text.
+    """The sheet of a plan and one program per setup, as a mapping of file name to text.
 
     Args:
         session: The plan, or a session.
-        options: How programs are written.
+        options: Feeds and shift of the programs.
 
     Raises:
         SessionError: If the machine cannot go through the plan.
-        ParameterError: If a feed or a shift is nothing that can be meant.
-        RobotError: If the robot cannot be drawn.
+        ParameterError: If a feed or a shift is out of range.
+        RobotError: If the visuals of the robot cannot be loaded.
     """
     motions = plan_motion(session)
     programs: dict[str, str] = {}
@@ -57,28 +54,27 @@ def sheet_files(session: Session, *, options: ProgramOptions | None = None) -> d
         programs = {program_name(m): write_program(session, m, options) for m in motions}
     visuals = load_visuals(session.robot)
     links = tuple(dict.fromkeys(v.link for v in visuals))
-    contacts, passive = locate_contacts(session), _close(session)
+    contacts, passive = locate_contacts(_with_alignment(session)), _close_loops(session)
     setups = []
     for motion in motions:
-        standing = find_standing(session, motion, contacts, passive, links)
-        pictures = draw_machine(session.robot, visuals, standing) + draw_cut(standing)
-        setups.append(_setup(session, motion, standing, pictures, with_program=bool(programs)))
-    front = _front(session, motions, with_programs=bool(programs), options=options)
+        gauge = find_gauge_position(session, motion, contacts, passive, links)
+        pictures = draw_machine(session.robot, visuals, gauge) + draw_section(gauge)
+        setups.append(_setup(session, motion, gauge, pictures, with_program=bool(programs)))
     title = f"Measuring sheet: {session.robot.name}, {session.title}"
     style = (resources.files("orthocal.output.sheet") / "sheet.css").read_text(encoding="utf-8")
-    page = (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
-        f'<title>{escape(title)}</title>\n<link rel="icon" href="data:,">\n'
-        f"<style>\n{style}</style>\n</head>\n<body>\n{front}\n"
-        f"{''.join(setups)}\n{_afterwards()}\n</body>\n</html>\n"
-    )
-    return {SHEET: page, **programs}
+    front = _front(session, motions, options, with_programs=bool(programs))
+    body = "\n".join([front, "".join(setups), _afterwards()])
+    return {SHEET: page(title, style, body), **programs}
 
 
-def _close(session: Session) -> dict[str, Array]:
-    """Posture to passive coordinates of the nominal machine."""
+def _with_alignment(session: Session) -> Session:
+    """A session whose setups also read the postures in which their gauges are aligned."""
+    extra = [Reading(s, p, None, 1, 0.0, None) for s, p in session.alignment_postures.items()]
+    return replace(session, readings=(*session.readings, *extra))
+
+
+def _close_loops(session: Session) -> dict[str, Array]:
+    """Posture to passive coordinates of the nominal machine, [m, rad]."""
     names = list(session.postures)
     drives = np.array([session.postures[n].drives + session.active_offsets for n in names])
     passive = nominal_assembly(session.robot).close(drives, names=names)
@@ -88,194 +84,199 @@ def _close(session: Session) -> dict[str, Array]:
 def _front(
     session: Session,
     motions: tuple[SetupMotion, ...],
+    options: ProgramOptions | None,
     *,
     with_programs: bool,
-    options: ProgramOptions | None,
 ) -> str:
-    """The first page: what there is to do, and what to look at before."""
+    """The first page: checks of the machine, rules, and the list of setups."""
     robot = session.robot
     stops = [s for m in motions for s in m.stops if s.role == "reading"]
     lead = (
         f"{counted(len(stops), 'reading')} in {counted(len(motions), 'setup')}. "
-        f"Gauge: {gauge_words(session)}."
+        f"Gauge: {_gauges(session)}."
     )
-    headers = ("", "setup", "what is read", "readings", *(("program",) if with_programs else ()))
+    headers = ("", "setup", "measures", "readings", *(("program",) if with_programs else ()))
     rows = []
     for m in motions:
-        read = str(sum(s.role == "reading" for s in m.stops))
-        what = session.setups[m.setup].sensor.describe()
-        rows.append(
-            (str(m.number), m.setup, what, read, *((program_name(m),) if with_programs else ()))
-        )
-    zero = joint_list(robot, robot.drive_zero)
-    limits = "; ".join(limit_words(robot))
+        count = str(sum(s.role == "reading" for s in m.stops))
+        measured = session.setups[m.setup].sensor.describe()
+        program = (program_name(m),) if with_programs else ()
+        rows.append((str(m.number), m.setup, measured, count, *program))
     active = session.controller_offsets
-    shifted = "" if active is None or not any(active) else ", shifted by what was entered"
-    before = [
-        "Let the machine run until it is warm. Then home it once, and not again until all is read.",
-        "In the mechanical zero (legs parallel to their axes, by eye) the controller must show "
-        f"about {zero}: zeros may be off by a few mm, which the calibration finds. Its joints may "
-        f"go: {limits}{shifted}. If a number is another altogether, mend the robot's files first.",
-        "Move each slider by hand a little outwards, away from the middle: its number must "
-        f"{counting_words(robot)}.",
-        active_words(session),
-        "Lay a hand on each rod and turn each hinge: play that you feel is not calibrated away.",
+    shifted = "" if active is None or not any(active) else ", shifted by the active offsets"
+    checks = [
+        "Warm the machine up. Home it once. Do not home it again until all readings are taken.",
+        "Move the machine to its mechanical zero: each leg parallel to its axis, by eye. The "
+        f"controller must show about {_joint_list(robot, robot.drive_zero)}. An error of a few mm "
+        "is normal: the calibration finds it. If a number is quite different, correct the robot's "
+        f"files first. Travel of the joints: {'; '.join(_travel(robot))}{shifted}.",
+        "Move each slider by hand a little outwards, away from the middle. Its number must "
+        f"{_count_outwards(robot)}.",
+        _active_offsets(session),
+        "Check each rod and each hinge for play by hand. The calibration does not remove play.",
     ]
     rules = [
-        "Every posture is approached from the same side: the last millimetres are towards "
-        f"{approach_words(robot, motions[0].side)}. The programs do it; by hand do it, too.",
-        "The dial stays on its rod from the first reading of a setup to the last, except where "
-        "the sheet says to hold the plunger up.",
-        "Once the first reading is set, touch nothing of the gauge: not its bezel, not its stand, "
-        "not its arm. If it was bumped, begin that setup again.",
-        "Write what the dial shows, with its sign; guess the last digit. Write nothing where "
-        "nothing was read.",
+        "Approach every posture from the same side: the last millimetres go towards "
+        f"{_approach(robot, motions[0].side)}. The programs do this. Do the same if you jog.",
+        "Keep the tip on its rod from the first reading of a setup to the last. Lift the plunger "
+        "only where the sheet says so.",
+        "Do not touch bezel, stand or arm of the gauge after you have set the gauge zero. If the "
+        "gauge was bumped, start that setup again.",
+        "Write down what the dial shows, with its sign. Estimate the last digit. If you took no "
+        "reading, leave the box empty.",
     ]
-    how = ""
-    if with_programs:
-        shift = (options or ProgramOptions()).shift_mm
-        origin = (
-            f", world origin at ({', '.join(f'{v:g}' for v in shift)}) mm" if any(shift) else ""
-        )
-        how = paragraph(
-            f"Programs: G-code in mm in machine coordinates (G53){origin}: work offsets, G92 and "
-            "rotation have no effect. They cancel the tool length (G49), pause (M0) at each "
-            "reading and continue by cycle start. Run the first one without a gauge, at a slow "
-            "override. Keep the machine clear: they start from the mechanical zero."
-        )
     blanks = "".join(
-        f"<p>{escape(words)}: <span class='fill'>&nbsp;</span></p>"
-        for words in ("Date, name", "Temperature at the beginning, at the end")
+        f"<p>{escape(text)}: <span class='fill'>&nbsp;</span></p>"
+        for text in ("Date, name", "Temperature at the start, at the end")
     )
     return (
         f"<header>{heading('Measuring sheet', level=1)}"
         f"{paragraph(f'{robot.name}: {session.title}' if session.title else robot.name)}"
         f"{paragraph(lead, kind='lead')}{blanks}</header>"
         + heading("Before the first reading", level=3)
-        + _numbered(before)
-        + heading("What holds all the time", level=3)
+        + _numbered(checks)
+        + heading("Rules for all readings", level=3)
         + _numbered(rules)
         + heading("Setups, in this order", level=3)
         + table(headers, rows, left=3)
-        + how
+        + (_programs(options) if with_programs else "")
+    )
+
+
+def _programs(options: ProgramOptions | None) -> str:
+    """Advice for running the programs."""
+    shift = (options or ProgramOptions()).shift_mm
+    origin = f", world origin at ({', '.join(f'{v:g}' for v in shift)}) mm" if any(shift) else ""
+    return paragraph(
+        f"Programs: G-code in mm, in machine coordinates (G53){origin}. Work offsets, G92 and "
+        "rotation have no effect on them. They cancel the tool length (G49) and stop (M0) at each "
+        "reading: press cycle start to continue. Run the first program without a gauge and with a "
+        "slow override. Keep the machine clear: every program starts from the mechanical zero."
     )
 
 
 def _setup(
     session: Session,
     motion: SetupMotion,
-    standing: Standing,
+    gauge: GaugePosition,
     pictures: str,
     *,
     with_program: bool,
 ) -> str:
     title = f"Setup {motion.number} of {motion.count}: {motion.setup}"
-    words = session.setups[motion.setup].sensor.describe()
     program = f" Program: {program_name(motion)}." if with_program else ""
+    measured = session.setups[motion.setup].sensor.describe()
     return (
         f'<section id="setup-{motion.number}">{heading(title)}'
-        f"{paragraph(f'{words}.{program}', kind='lead')}"
+        f"{paragraph(f'{measured}.{program}', kind='lead')}"
         f'<div class="pictures">{pictures}</div>'
-        f"{_numbered(_steps(session, motion, standing))}"
-        f"{_warnings(session, motion, standing)}{_boxes(session, motion)}</section>"
+        f"{_numbered(_steps(session, motion, gauge))}"
+        f"{_warnings(session, motion, gauge)}{_boxes(session, motion)}</section>"
     )
 
 
-def _steps(session: Session, motion: SetupMotion, standing: Standing) -> list[str]:
-    robot, first = session.robot, motion.stops[0]
-    grows = direction_words(standing.contact.direction)
-    gauge = session.gauges[session.setups[motion.setup].gauge]
-    place = ", ".join(number(v / MM, 1) for v in standing.point)
-    where = f"in the world at ({place}) mm"
-    if standing.rod is not None and standing.leg is not None:
-        what = f"rod {standing.rod.name} of leg {standing.leg.name}"
-        reach = standing.from_root / MM
-        where = (
-            f"its {tip_words(standing.tip)} touches {_beside(standing)}, "
-            f"{reach[standing.first]:.1f} mm from its hinge at the drive ({reach.min():.0f} to "
-            f"{reach.max():.0f} mm as the leg moves); {where}"
+def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[str]:
+    """What to do before the readings of a setup."""
+    first = motion.stops[0]
+    side = name_direction(gauge.contact.direction)
+    opposite = name_direction(-gauge.contact.direction)
+    place = ", ".join(_number(v / MM, 1) for v in gauge.point)
+    contact = ""
+    if gauge.rod is not None and gauge.leg is not None:
+        target = f"rod {gauge.rod.name} of leg {gauge.leg.name}"
+        reach = gauge.hinge_distances / MM
+        contact = (
+            f"Its {name_tip(gauge.tip)} touches {_across(gauge)}, {reach[gauge.aligned]:.1f} mm "
+            f"from the hinge at the drive ({reach.min():.0f} to {reach.max():.0f} mm as the leg "
+            "moves). "
         )
-    elif standing.leg is not None:
-        what = f"leg {standing.leg.name}"
-        where = f"it touches the line between the rods; {where}"
+        if gauge.tip is not None and gauge.tip.edge is None:
+            contact += "Align the ball by eye: half a millimetre is good enough. "
+    elif gauge.leg is not None:
+        target = f"leg {gauge.leg.name}"
+        contact = "Its tip touches the line between the rods. "
     else:
-        what = " ".join(standing.setup.sensor.place).strip()
-        where = f"it touches {where}"
-    opposite = direction_words(-standing.contact.direction)
+        target = " ".join(gauge.setup.sensor.place).strip()
+    start = f"{first.posture}: {_joint_list(session.robot, first.drives)}"
+    go = [f"Move to the first posture, {start}."]
+    align = "Move to the alignment posture"
+    if gauge.alignment == first.posture:
+        align, go = f"{align}, which is also the first posture", []
     return [
-        f"Go to the first posture, {first.posture}: joints {joint_list(robot, first.drives)}.",
-        f"Stand the gauge on the base, on the {grows} side of {what}, its plunger pointing to "
-        f"{opposite}: {where}.",
-        f"Push the plunger in by hand, towards {grows}: does the dial grow? If it falls, write "
-        "every reading of this setup with the opposite sign.",
-        _set_zero(gauge, first),
-        "Then read in the order below. Lines are those of readings.csv.",
+        f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}.",
+        f"Mount the gauge on the base, on the {side} side of {target}. Point its plunger to "
+        f"{opposite}. {contact}Contact in world coordinates: ({place}) mm.",
+        f"Push the plunger in by hand, towards {side}. The dial must grow. If it falls, write "
+        "every reading of this setup with reversed sign.",
+        *go,
+        _gauge_zero(session.gauges[gauge.setup.gauge], first),
+        "Take the readings in the order below. The line numbers are those of readings.csv.",
     ]
 
 
-def _beside(standing: Standing) -> str:
-    """Where across the rod the tip touches in the first posture."""
-    if np.linalg.norm(standing.aside) <= NOTICED:
-        return "over the middle of the rod"
+def _across(gauge: GaugePosition) -> str:
+    """Lateral position of the tip on the rod in the alignment posture."""
+    offset = float(np.linalg.norm(gauge.lateral_offset))
+    if offset <= VISIBLE:
+        return "the middle of the rod"
     return (
-        f"{np.linalg.norm(standing.aside) / MM:.1f} mm beside the middle of the rod, towards "
-        f"{direction_words(standing.aside)}"
+        f"the rod {offset / MM:.1f} mm off its middle, towards "
+        f"{name_direction(gauge.lateral_offset, cosine=ABOUT_ALONG)}"
     )
 
 
-def _set_zero(gauge: Gauge, first: Stop) -> str:
-    if gauge.range is None:
-        how = "Set the dial to the middle of its range"
-    else:
-        low, high = (v / MM for v in gauge.range)
-        middle = 0.5 * (low + high)
-        how = (
-            f"Move the gauge in until half of its travel ({0.5 * (high - low):g} mm) is taken, "
-            f"and turn the bezel until it shows {middle:g}"
-        )
-    again = " Set it to the same again where the table says so." * (first.role == "subtracted")
-    return f"{how}, here only. Tap the stand: the hand must come back.{again}"
-
-
-def _warnings(session: Session, motion: SetupMotion, standing: Standing) -> str:
-    found = []
-    near = standing.near_hinge
-    if near is not None:
-        found.append(
-            f"The tip comes within {near / MM:.1f} mm of the middle of a hinge: look whether it "
-            "stays clear of the bearing before you set it."
-        )
-    gauge = session.gauges[session.setups[motion.setup].gauge]
+def _gauge_zero(gauge: Gauge, first: Stop) -> str:
+    """How to set the gauge zero."""
+    how = "Set the dial to the middle of its range."
     if gauge.range is not None:
-        half = 0.5 * (gauge.range[1] - gauge.range[0])
+        low, high = (v / MM for v in gauge.range)
+        how = (
+            f"Push the gauge in by half its travel ({0.5 * (high - low):g} mm). Turn the bezel "
+            f"until the dial shows {0.5 * (low + high):g}."
+        )
+    again = " Set it again where the table says so." * (first.role == "subtracted")
+    return (
+        f"{how} This is the gauge zero: set it here only.{again} Tap the stand. The hand must come "
+        "back."
+    )
+
+
+def _warnings(session: Session, motion: SetupMotion, gauge: GaugePosition) -> str:
+    texts = []
+    if gauge.near_hinge is not None:
+        texts.append(
+            f"The tip comes within {gauge.near_hinge / MM:.1f} mm of the middle of a hinge. Check "
+            "that it clears the bearing before you set the gauge zero."
+        )
+    limits = session.gauges[gauge.setup.gauge].range
+    if limits is not None:
+        half = 0.5 * (limits[1] - limits[0])
         beyond = [s for s in motion.stops if s.role == "reading" and abs(s.expected) > half]
         if beyond:
-            found.append(
-                f"Even a perfect machine would show {number(beyond[0].expected / MM, 1, sign=True)}"
-                f" mm in {_name(beyond[0])}, more than the dial has to either side: take another "
-                "posture, or another dial."
+            texts.append(
+                "Even a perfect machine shows "
+                f"{_number(beyond[0].expected / MM, 1, sign=True)} mm in {_name(beyond[0])}, "
+                "beyond the range of the dial. Choose another posture or another dial."
             )
     lifted = [s for s in motion.stops if s.lift]
     if lifted:
-        found.append(
-            f"Hold the plunger up on the way to "
-            f"{', '.join(dict.fromkeys(_name(s) for s in lifted))}: {lifted[0].lift} there."
-        )
-    return "".join(paragraph(text, kind="warn") for text in found)
+        places = ", ".join(dict.fromkeys(_name(s) for s in lifted))
+        texts.append(f"Lift the plunger on the way to {places}: {lifted[0].lift} there.")
+    return "".join(paragraph(text, kind="warn") for text in texts)
 
 
 def _boxes(session: Session, motion: SetupMotion) -> str:
-    """Rows to write into: line, posture, joints to command, tool, and a box."""
+    """Table of the readings: line, posture, tool, joints, and a box to write into."""
     robot = session.robot
     tool = motion.stops[0].point is not None
     letters = [] if robot.tcp is None or not tool else ["xyz"[c] for c in robot.tcp.coordinates]
-    told = any(abs(s.expected) > NOTICED for s in motion.stops)
+    expected = any(abs(s.expected) > VISIBLE for s in motion.stops)
     headers = [
         ("line", "number"),
         ("posture", ""),
         *([(f"tool {', '.join(letters)} [mm]", "")] if letters else []),
         *((f"{d.name} [{DRIVE_UNITS[d.unit][0]}]", "number") for d in robot.drives),
-        *([("perfect machine shows [mm]", "number")] if told else []),
+        *([("perfect machine shows [mm]", "number")] if expected else []),
         ("reading [mm]", ""),
         ("remarks", ""),
     ]
@@ -285,14 +286,13 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
         cells = [("" if stop.line is None else str(stop.line), "number"), (_posture(stop), "")]
         if tool and stop.point is not None:
             cells.append((", ".join(_short(v) for v in stop.point), ""))
-        cells += [(text, "number") for text in joint_numbers(robot, stop.drives)]
-        if told:
-            cells.append((number(stop.expected / MM, 2, sign=True), "number"))
+        cells += [(text, "number") for text in _joint_values(robot, stop.drives)]
+        if expected:
+            cells.append((_number(stop.expected / MM, 2, sign=True), "number"))
         body = "".join(f'<td class="{kind}">{escape(text)}</td>' for text, kind in cells)
-        read = stop.role != "subtracted"
-        box = '<td class="box"></td>' if read else "<td>set to 0</td>"
-        asked = "as at first?" if stop.role == "return" else ""
-        rows.append(f'<tr>{body}{box}<td class="note">{asked}</td></tr>')
+        box = "<td>set to 0</td>" if stop.role == "subtracted" else '<td class="box"></td>'
+        remark = "same as first?" if stop.role == "return" else ""
+        rows.append(f'<tr>{body}{box}<td class="note">{remark}</td></tr>')
     return (
         f'<table class="boxes"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
     )
@@ -306,23 +306,18 @@ def _posture(stop: Stop) -> str:
     return f"{stop.posture}, cycle {stop.cycle}"
 
 
-def _short(value: float) -> str:
-    """A coordinate in mm, without zeros at its end."""
-    return number(value / MM, 3).rstrip("0").rstrip(".")
-
-
 def _name(stop: Stop) -> str:
     return stop.posture if stop.line is None else f"line {stop.line}"
 
 
 def _afterwards() -> str:
     steps = [
-        "`orthocal record` takes the readings one after the other and says at once what is odd. Or "
-        "type them into readings.csv, column reading_mm, in its order; leave out lines that were "
-        "not read. `orthocal import` takes them from a spreadsheet.",
-        "The last reading of a setup in its first posture should be the first one again, to the "
-        "dial's scatter. If it is not, the stand or the machine has moved: read that setup again.",
-        "Then run:",
+        "Compare the last reading of each setup with its first. They must agree within the "
+        "scatter of the dial. If not, the gauge or the machine was displaced: repeat that setup.",
+        "Enter the readings with `orthocal record`, which checks each one at once. Or type them "
+        "into readings.csv, column reading_mm, in the order of its lines, and delete the lines "
+        "without a reading. `orthocal import` reads a spreadsheet.",
+        "Run:",
     ]
     return (
         f"<section class='last'>{heading('Afterwards')}{_numbered(steps)}"
@@ -331,4 +326,93 @@ def _afterwards() -> str:
 
 
 def _numbered(texts: list[str]) -> str:
-    return "<ol>" + "".join(f"<li>{escape(t)}</li>" for t in texts) + "</ol>"
+    return "<ol>" + "".join(f"<li>{prose(t)}</li>" for t in texts) + "</ol>"
+
+
+def _gauges(session: Session) -> str:
+    """Name, range and resolution of the gauges."""
+    texts = []
+    for name, gauge in session.gauges.items():
+        parts = [name] if name else []
+        if gauge.range is not None:
+            low, high = (_short(v) for v in gauge.range)
+            parts.append(f"{low} … {high} mm")
+        if gauge.resolution is not None:
+            parts.append(f"read to {gauge.resolution / MM:g} mm")
+        texts.append(", ".join(parts) or "any dial")
+    return "; ".join(texts)
+
+
+def _active_offsets(session: Session) -> str:
+    """The offsets that must be active in the controller."""
+    drives = session.robot.drives
+    if session.controller_offsets is None:
+        key = "offsets_mm" if all(d.unit == "m" for d in drives) else "offsets_deg"
+        return (
+            "session.yaml does not state the offsets of the controller. Write the present ones "
+            f"into it: controller: {{{key}: [{', '.join('0' for _ in drives)}]}}."
+        )
+    active = ", ".join(
+        f"{d.name} {v / DRIVE_UNITS[d.unit][1]:g} {DRIVE_UNITS[d.unit][0]}"
+        for d, v in zip(drives, session.active_offsets, strict=True)
+    )
+    return (
+        f"Check that these offsets are active in the controller, as session.yaml states: {active}. "
+        "Do not change them until all readings are taken."
+    )
+
+
+def _count_outwards(robot: Robot) -> str:
+    """Direction in which the joint numbers change if the sliders move outwards."""
+    verbs = {1: "grow", -1: "fall"}
+    if len({d.direction for d in robot.drives}) == 1:
+        return verbs[robot.drives[0].direction]
+    return ", ".join(f"{verbs[d.direction]} for {d.name}" for d in robot.drives)
+
+
+def _approach(robot: Robot, side: int) -> str:
+    """Direction of the last move to a posture, in joint numbers."""
+    ways = ["larger" if -side * d.direction > 0 else "smaller" for d in robot.drives]
+    if len(set(ways)) == 1:
+        return f"{ways[0]} numbers of all joints"
+    return ", ".join(
+        f"{way} numbers of {d.name}" for way, d in zip(ways, robot.drives, strict=True)
+    )
+
+
+def _travel(robot: Robot) -> list[str]:
+    """Limits of the joints."""
+    texts = []
+    for drive in robot.drives:
+        unit, size = DRIVE_UNITS[drive.unit]
+        low, high = (v / size for v in drive.joint_limits)
+        if np.isfinite([low, high]).all():
+            texts.append(f"{drive.name} {_number(low, 1)} to {_number(high, 1)} {unit}")
+    return texts or ["no limits"]
+
+
+def _joint_list(robot: Robot, drives: Array) -> str:
+    """Every joint with its number in the controller."""
+    return ", ".join(
+        f"{d.name} {text} {DRIVE_UNITS[d.unit][0]}"
+        for d, text in zip(robot.drives, _joint_values(robot, drives), strict=True)
+    )
+
+
+def _joint_values(robot: Robot, drives: Array) -> list[str]:
+    """Numbers that the controller shows for its joints."""
+    return [
+        _number(float(v) / DRIVE_UNITS[d.unit][1], 3)
+        for d, v in zip(robot.drives, shown_joints(robot, drives), strict=True)
+    ]
+
+
+def _number(value: float, decimals: int, *, sign: bool = False) -> str:
+    """A number with a true minus and no negative zero."""
+    text = f"{round(value, decimals) + 0.0:{'+' if sign else ''}.{decimals}f}"
+    return text.replace("-", "−")
+
+
+def _short(value: float) -> str:
+    """A length in mm without trailing zeros."""
+    return _number(value / MM, 3).rstrip("0").rstrip(".")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import sys
 from collections.abc import Callable, Iterable
+from itertools import groupby
 
 from rich import box
 from rich.cells import cell_len
@@ -22,6 +23,7 @@ from orthocal.assessment.wording import plain as plain
 from orthocal.assessment.wording import signed as signed
 from orthocal.assessment.wording import um as um
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
+from orthocal.io.html import items, paragraph, table
 from orthocal.text import printable
 
 MANY_ROWS = 60
@@ -35,6 +37,9 @@ LONGEST_NAME = 44
 
 WIDTH = 100
 """Columns of plain text."""
+
+BULLET = "• "
+"""Start of an item of a list."""
 
 
 SHORTEST_WORD = 12
@@ -114,6 +119,45 @@ def print_rich(content: RenderableType) -> None:
     sys.stdout.flush()
 
 
+def to_markup(content: RenderableType) -> str:
+    """Rich tables, texts and groups of them as HTML.
+
+    Raises:
+        TypeError: For another kind of renderable.
+    """
+    pieces = []
+    for is_item, run in groupby(_flatten(content), key=_is_item):
+        if is_item:
+            pieces.append(items(str(part).removeprefix(BULLET) for part in run))
+        else:
+            pieces += [paragraph(p) if isinstance(p, str) else _from_rich(p) for p in run if p]
+    return "\n".join(pieces)
+
+
+def _flatten(content: RenderableType) -> list[str | Table]:
+    if isinstance(content, Group):
+        return [part for inner in content.renderables for part in _flatten(inner)]
+    if isinstance(content, Padding):
+        return _flatten(content.renderable)
+    if isinstance(content, Text):
+        return [content.plain]
+    if isinstance(content, Table):
+        return [content]
+    raise TypeError(f"no HTML for a {type(content).__name__}")
+
+
+def _is_item(part: str | Table) -> bool:
+    return isinstance(part, str) and part.startswith(BULLET)
+
+
+def _from_rich(content: Table) -> str:
+    headers = [_plain(column.header) for column in content.columns]
+    columns = [[_plain(cell) for cell in column.cells] for column in content.columns]
+    justified = [column.justify == "left" for column in content.columns]
+    left = justified.index(False) if False in justified else len(justified)
+    return table(headers, zip(*columns, strict=True), left=left)
+
+
 def section(title: str, body: RenderableType) -> RenderableType:
     """A titled, indented part."""
     return Group(Text(), Text(title, style="bold cyan"), Padding(body, (0, 0, 0, 2)))
@@ -121,7 +165,7 @@ def section(title: str, body: RenderableType) -> RenderableType:
 
 def bullets(sentences: list[str]) -> RenderableType:
     """Sentences, each with a bullet."""
-    return Group(*(Text(f"• {s}") for s in sentences))
+    return Group(*(Text(f"{BULLET}{s}") for s in sentences))
 
 
 def table_of(*columns: str, left: int = 1) -> Table:

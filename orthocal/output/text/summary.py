@@ -35,7 +35,7 @@ def summarize(
     content = _render(result, details, all_rows)
     if not html:
         return to_text(content)
-    from orthocal.output.report.rich_markup import to_markup
+    from orthocal.output.text.layout import to_markup
 
     return to_markup(content)
 

@@ -1,12 +1,12 @@
 "use strict";
-// Plays a scene's commands to meshcat's viewer and puts legend, labels and captions around it.
+// Plays the commands of a scene to meshcat's viewer; adds legend, labels and captions.
 (() => {
   const data = JSON.parse(document.getElementById("scene-data").textContent);
   const THREE = MeshCat.THREE;
   const viewer = new MeshCat.Viewer(document.getElementById("meshcat-pane"));
   window.viewer = viewer;
 
-  // World coordinates here have z up, three.js has y up.
+  // The world has z up, three.js has y up.
   const toView = (v) => new THREE.Vector3(v[0], v[2], -v[1]);
   const make = (tag, parent, text) => {
     const element = document.createElement(tag);
@@ -51,7 +51,7 @@
     box.type = "checkbox";
     box.checked = entry.shown;
     marks[entry.mark](makeSvg("svg", label, { width: 26, height: 12 }), entry.colour);
-    make("span", label, entry.text);
+    make("span", label, entry.text.replaceAll("× ", "×\u00a0"));
     box.addEventListener("change", () => entry.nodes.forEach((n) => show(n, box.checked)));
     return { box, nodes: entry.nodes.map(split) };
   });
@@ -72,7 +72,7 @@
     return true;
   };
 
-  // ---- camera: whatever the window, the whole machine, beside the panel
+  // ---- camera: the whole machine in view, beside the panel, in a window of any size
   const camera = () => viewer.camera;
   let shift = [0, 0];
   const fit = (again) => {
@@ -91,7 +91,7 @@
       const right = new THREE.Vector3(0, 1, 0).cross(back).normalize(), up = back.clone().cross(right);
       const slope = Math.tan((view.fov * Math.PI) / 360);
       const tall = 0.86 * slope, wide = (0.94 * slope * (width - leftSide - rightSide)) / height;
-      // as near as all points fit, which shifts the middle, which makes room to come nearer
+      // iterate: a smaller distance shifts the middle, and centring leaves room for a smaller distance
       const span = (i) => Math.max(...seen.map((p) => p[i])) - Math.min(...seen.map((p) => p[i]));
       let distance = 4 * size, seen;
       for (let round = 0; round < 30; round++) {
@@ -109,11 +109,11 @@
     viewer.controls.update();
     viewer.set_dirty();
   };
-  let turned = false; // by hand: then the view is left alone
+  let turned = false; // once the user has turned the view, resizing does not change it
   viewer.controls.addEventListener("start", () => (turned = true));
   window.addEventListener("resize", () => fit(!turned));
 
-  // ---- labels: beside their points, never over each other or over the panels
+  // ---- labels: beside their points; none covers another or a panel
   const layer = document.getElementById("labels");
   const leaders = document.getElementById("leaders");
   const labels = data.labels.map((label) => {
@@ -121,7 +121,7 @@
     element.className = label.rank < 0 ? "label plain" : "label";
     return { ...label, element, line: makeSvg("line", leaders, {}), points: label.at.map(toView), path: split(label.node), last: null };
   });
-  // names first, which are short and where they belong; then the largest readings
+  // names first, because they must be at their points; then the largest readings
   labels.sort((a, b) => (a.rank < 0 ? 1 : 0) === (b.rank < 0 ? 1 : 0) ? b.rank - a.rank : a.rank - b.rank);
   const places = [];
   for (const reach of [30, 48, 70, 96, 128, 166, 210]) {
@@ -137,7 +137,7 @@
     const time = viewer.animator.time;
     return data.steps.findIndex((s) => time >= s.start - 1e-6 && time <= s.end + 1e-6);
   };
-  const ofStep = (values, now) => values[Math.min(Math.max(now, 0), values.length - 1)];
+  const atStep = (values, now) => values[Math.min(Math.max(now, 0), values.length - 1)];
   const arrange = () => {
     const width = window.innerWidth, height = window.innerHeight, now = step();
     const taken = ["#panel", "#bar", ".dg.main"]
@@ -148,16 +148,16 @@
     const shown = [], spared = [];
     for (const label of labels) {
       const text = label.texts.length === 1 ? label.texts[0] : now < 0 ? "" : label.texts[now];
-      const at = ofStep(label.points, now).clone().project(camera());
+      const at = atStep(label.points, now).clone().project(camera());
       const inside = Math.abs(at.x) < 1 && Math.abs(at.y) < 1 && at.z < 1;
       label.element.style.display = label.line.style.display = "none";
       if (!inside || !isShown(label.path)) continue;
       const x = ((at.x + 1) / 2) * width, y = ((1 - at.y) / 2) * height;
-      // no label stands on a point that another one explains, nor, where there is room, on others
+      // no label covers the point of another label; other points only if there is no room
       const kept = text ? taken : spared;
       if (label.rank >= 0) kept.push({ left: x - 12, right: x + 12, top: y - 12, bottom: y + 12 });
       if (label.uncovered.length > 0) {
-        const around = ofStep(label.uncovered, now).map((point) => toView(point).project(camera()));
+        const around = atStep(label.uncovered, now).map((point) => toView(point).project(camera()));
         const xs = around.map((p) => ((p.x + 1) / 2) * width), ys = around.map((p) => ((1 - p.y) / 2) * height);
         kept.push({ left: Math.min(...xs) - 8, right: Math.max(...xs) + 8, top: Math.min(...ys) - 8, bottom: Math.max(...ys) + 8 });
       }
@@ -198,7 +198,7 @@
     }
   };
 
-  // ---- the bar: which posture, and a handle on meshcat's animator
+  // ---- bar: caption of the posture, and a button for meshcat's animator
   const bar = document.getElementById("bar");
   const button = bar.querySelector("button"), caption = bar.querySelector("span");
   if (data.steps.length > 0) bar.style.display = "flex";
@@ -235,13 +235,13 @@
     document.documentElement.dataset.rendered = String(Number(document.documentElement.dataset.rendered || 0) + 1);
   };
 
-  // ---- print: what the canvas shows, as an image
+  // ---- print: an image of the canvas
   window.addEventListener("beforeprint", () => {
     const stage = document.getElementById("stage");
     const image = document.getElementById("print-image") || make("img", stage);
     image.id = "print-image";
     image.src = viewer.capture_image();
-    // paper has another width: all stays where it is
+    // keep the size of the window on paper
     for (const element of [stage, image]) {
       element.style.width = `${window.innerWidth}px`;
       element.style.height = `${window.innerHeight}px`;

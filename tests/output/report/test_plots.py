@@ -1,4 +1,4 @@
-"""What the plots draw is what the calibration says, and each can stand in a page with others."""
+"""Plots show the numbers of the calibration, and a page can hold several of them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ LARGEST = 250_000
 """[byte] Of a plot, however many readings there are."""
 
 NAMES = ("$x_{$", "<b>&\"'", "机器", "bell\x07", "n" * 200)
-"""What strangers may call things."""
+"""Names that a file may contain."""
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def bound(experiment_2):
 
 @pytest.fixture(scope="module")
 def unknown(root, tmp_path_factory):
-    """A single reading, and nothing that tells its noise."""
+    """A single reading with unknown noise."""
     folder = tmp_path_factory.mktemp("unknown")
     source = root / "examples/table1/experiment-2"
     text = (source / "session.yaml").read_text()
@@ -104,11 +104,6 @@ def worst(row):
     return -max(abs(row.deviation), abs(row.residual))
 
 
-def draw(function, *args):
-    with style.house_style():
-        return function(*args)
-
-
 def line(axes, label):
     """x and y of the markers with a label."""
     found = next(a for a in axes.lines if str(a.get_label()).startswith(label))
@@ -133,7 +128,7 @@ def texts(svg):
     return ["".join(e.itertext()) for e in ElementTree.fromstring(svg).iter(f"{SVG}text")]
 
 
-def test_each_is_one_inline_element_that_scales_and_says_what_it_is(drawn):
+def test_plots_are_inline_elements_that_scale_and_have_a_title(drawn):
     for svg in drawn:
         assert svg.startswith("<svg ")
         assert svg.endswith("</svg>")
@@ -148,7 +143,7 @@ def test_each_is_one_inline_element_that_scales_and_says_what_it_is(drawn):
         assert root.get("style").startswith("width:720px;max-width:100%;height:auto")
 
 
-def test_none_refers_to_anything_outside_or_styles_the_page(drawn):
+def test_plots_refer_to_nothing_outside_and_do_not_style_the_page(drawn):
     for svg in drawn:
         inside = re.sub(r'xmlns(:\w+)?="[^"]*"', "", svg)
         assert "http" not in inside
@@ -176,7 +171,7 @@ def test_the_same_calibration_makes_the_same_plots(table1, drawn):
     assert [plot(table1) for plot in PLOTS] == drawn[: len(PLOTS)]
 
 
-def test_what_the_user_set_in_matplotlib_is_neither_used_nor_changed(table1):
+def test_settings_of_matplotlib_are_neither_used_nor_changed(table1):
     usual = reading_plots.plot_residuals(table1)
     with matplotlib.rc_context({"font.size": 20.0, "svg.fonttype": "path", "axes.grid": True}):
         before = dict(matplotlib.rcParams)
@@ -193,7 +188,7 @@ def test_pyplot_is_not_needed():
     assert done.stdout.strip() == "False"
 
 
-def test_names_of_strangers_come_out_as_they_are(table1):
+def test_names_from_files_are_shown_unchanged(table1):
     rows = [
         replace(r, setup=NAMES[i % 5], posture=NAMES[(i + 1) % 5], minus=None)
         for i, r in enumerate(table1.residuals)
@@ -222,7 +217,7 @@ def test_dollars_in_pairs_are_not_mathematics(table1):
 
 
 def test_residuals_are_listed_before_and_after_the_worst_first(table1):
-    figure = draw(reading_plots._draw_residuals, table1, 40)
+    figure = reading_plots.plot_residuals.figure(table1, most=40)
     axes = figure.axes[0]
     rows = sorted(table1.residuals, key=lambda r: -abs(r.measured - r.nominal))
     assert row_names(axes) == [r.label for r in rows]
@@ -258,7 +253,7 @@ def test_the_band_is_two_sigma_of_each_row(table1):
     mixed = [replace(r, minus=r.minus if i < 3 else None) for i, r in enumerate(table1.residuals)]
     mixed_up = replace(table1, residuals=tuple(mixed), rows_are_differences=False)
     for calibration, word in ((table1, "difference"), (mixed_up, "row")):
-        axes = draw(reading_plots._draw_residuals, calibration, 40).axes[0]
+        axes = reading_plots.plot_residuals.figure(calibration, most=40).axes[0]
         (band,) = axes.containers
         assert band.get_label() == f"±2 σ of a {word}"
         rows = sorted(calibration.residuals, key=worst)
@@ -273,7 +268,7 @@ def test_of_many_readings_the_largest_are_shown_and_that_is_said(sweep):
     assert "Readings before and after calibration: the 40 worst of 162" in texts(
         reading_plots.plot_residuals(sweep)
     )
-    figure = draw(reading_plots._draw_residuals, sweep, 7)
+    figure = reading_plots.plot_residuals.figure(sweep, most=7)
     assert title(figure).endswith("the 7 worst of 162")
     x, _ = line(figure.axes[0], "before")
     rows = sorted(sweep.residuals, key=worst)[:7]
@@ -284,7 +279,7 @@ def test_a_reading_that_the_calibration_spoils_is_among_the_worst(table1):
     best = min(table1.residuals, key=lambda r: abs(r.deviation))
     spoilt = replace(best, predicted=best.measured - 3e-3)
     rows = tuple(spoilt if r is best else r for r in table1.residuals)
-    figure = draw(reading_plots._draw_residuals, replace(table1, residuals=rows), 1)
+    figure = reading_plots.plot_residuals.figure(replace(table1, residuals=rows), most=1)
     x, _ = line(figure.axes[0], "after")
     np.testing.assert_allclose(x, [3.0], atol=UNIT)
 
@@ -296,16 +291,16 @@ def test_plots_of_many_readings_stay_small(many):
 
 
 def test_cycles_are_named_where_there_are_some(raw, table1):
-    names = row_names(draw(reading_plots._draw_residuals, raw, 40).axes[0])
+    names = row_names(reading_plots.plot_residuals.figure(raw, most=40).axes[0])
     assert names[0] == "xz z_min, cycle 2"
     assert all(", cycle " in n for n in names)
     assert not any(
-        "cycle" in n for n in row_names(draw(reading_plots._draw_residuals, table1, 9).axes[0])
+        "cycle" in n for n in row_names(reading_plots.plot_residuals.figure(table1, most=9).axes[0])
     )
 
 
-def test_setups_are_sorted_by_what_the_model_leaves_of_them(raw):
-    figure = draw(reading_plots._draw_setups, raw, 40)
+def test_setups_are_sorted_by_their_residuals(raw):
+    figure = reading_plots.plot_setups.figure(raw, most=40)
     axes = figure.axes[0]
     names = row_names(axes)
     assert sorted(names) == sorted({r.setup for r in raw.residuals})
@@ -335,23 +330,25 @@ def test_setups_that_no_other_predicts_have_no_such_marker(table1, unknown):
         return replace(row, unseen=np.nan) if row.setup in ("xy", "zy") else row
 
     calibration = replace(table1, residuals=tuple(map(forget, table1.residuals)))
-    axes = draw(reading_plots._draw_setups, calibration, 40).axes[0]
+    axes = reading_plots.plot_setups.figure(calibration, most=40).axes[0]
     _, y = line(axes, "predicted")
     names = row_names(axes)
     assert {names[round(v - 0.2)] for v in y} == {"yx", "zx", "xz", "yz"}
-    labels = [a.get_label() for a in draw(reading_plots._draw_setups, unknown, 40).axes[0].lines]
+    labels = [
+        a.get_label() for a in reading_plots.plot_setups.figure(unknown, most=40).axes[0].lines
+    ]
     assert labels == ["before", "after"]
 
 
 def test_the_worst_of_many_setups_are_shown(sweep):
-    figure = draw(reading_plots._draw_setups, sweep, 5)
+    figure = reading_plots.plot_setups.figure(sweep, most=5)
     assert title(figure).endswith("the 5 worst of 18")
     assert len(row_names(figure.axes[0])) == 5
 
 
 def test_setups_without_any_error_stay_on_a_logarithmic_axis(table1):
     rows = tuple(replace(r, predicted=r.measured, nominal=r.measured) for r in table1.residuals)
-    axes = draw(reading_plots._draw_setups, replace(table1, residuals=rows), 40).axes[0]
+    axes = reading_plots.plot_setups.figure(replace(table1, residuals=rows), most=40).axes[0]
     assert (line(axes, "after")[0] == reading_plots.SMALLEST_LENGTH / MM).all()
     low, high = axes.get_xlim()
     assert 0.0 < low < reading_plots.SMALLEST_LENGTH * 1e3 < table1.sigma * 1e3 < high
@@ -383,8 +380,8 @@ def test_ticks_of_many_decades_do_not_crowd():
         assert axes.get_ylim()[1] > 20.0
 
 
-def test_residuals_stand_in_order_against_normal_quantiles(raw):
-    axes = draw(reading_plots._draw_spread, raw).axes[0]
+def test_residuals_are_plotted_against_normal_quantiles(raw):
+    axes = reading_plots.plot_spread.figure(raw).axes[0]
     x, y = line(axes, "residuals after: 54")
     np.testing.assert_allclose(y, np.sort([r.residual * 1e3 for r in raw.residuals]), atol=UNIT)
     np.testing.assert_allclose(x, stats.norm.ppf((np.arange(54) + 0.5) / 54), atol=QUANTILE)
@@ -393,32 +390,32 @@ def test_residuals_stand_in_order_against_normal_quantiles(raw):
 
 def test_lines_of_the_spread_are_sigma_less_what_was_fitted(table1, raw):
     for calibration in (table1, raw):
-        axes = draw(reading_plots._draw_spread, calibration).axes[0]
+        axes = reading_plots.plot_spread.figure(calibration).axes[0]
         word = "difference" if calibration is table1 else "reading"
         x, y = line(axes, f"σ of a {word}: {calibration.sigma * 1e3:.2g} mm")
         slope = y[1] / x[1]
         part = np.sqrt(calibration.noise.residual_dof / len(calibration.residuals))
         np.testing.assert_allclose(slope, calibration.sigma * 1e3 * part, rtol=UNIT)
-        given_x, given_y = line(axes, "σ given for the gauge")
+        given_x, given_y = line(axes, "σ stated for the gauge")
         given = calibration.session.gauge_sigma * calibration.row_factor
         np.testing.assert_allclose(
             given_y[1] / given_x[1] / slope, given / calibration.sigma, rtol=UNIT
         )
     # where σ is from the residuals, that is their root mean square
-    x, y = line(draw(reading_plots._draw_spread, table1).axes[0], "σ of a difference")
+    x, y = line(reading_plots.plot_spread.figure(table1).axes[0], "σ of a difference")
     np.testing.assert_allclose(y[1] / x[1], table1.rms_after * 1e3, rtol=QUANTILE)
 
 
 def test_differences_count_as_readings_where_both_are(table1):
     rows = [replace(r, minus=None if i else r.minus) for i, r in enumerate(table1.residuals)]
     calibration = replace(table1, residuals=tuple(rows), rows_are_differences=False)
-    _, y = line(draw(reading_plots._draw_spread, calibration).axes[0], "residuals")
+    _, y = line(reading_plots.plot_spread.figure(calibration).axes[0], "residuals")
     own = [r.residual * 1e3 / (np.sqrt(2) if i == 0 else 1.0) for i, r in enumerate(rows)]
     np.testing.assert_allclose(y, np.sort(own), atol=UNIT)
 
 
 def test_of_many_residuals_the_outermost_all_stay(many):
-    x, y = line(draw(reading_plots._draw_spread, many).axes[0], "residuals after: 500 of 12150")
+    x, y = line(reading_plots.plot_spread.figure(many).axes[0], "residuals after: 500 of 12150")
     assert x.size == reading_plots.MOST_POINTS
     values = np.sort([r.residual * 1e3 for r in many.residuals])
     np.testing.assert_allclose(y[:100], values[:100], atol=UNIT)
@@ -427,13 +424,12 @@ def test_of_many_residuals_the_outermost_all_stay(many):
 
 
 def test_unknown_noise_has_neither_band_nor_line(unknown):
-    assert not draw(reading_plots._draw_residuals, unknown, 40).axes[0].containers
-    assert len(draw(reading_plots._draw_spread, unknown).axes[0].lines) == 1
+    assert not reading_plots.plot_residuals.figure(unknown, most=40).axes[0].containers
+    assert len(reading_plots.plot_spread.figure(unknown).axes[0].lines) == 1
 
 
-def test_linearising_is_shown_in_sigma_the_most_first(sweep):
-    shifts = parameter_plots._linearisation_shifts(sweep)
-    figure = draw(parameter_plots._draw_linearised, shifts)
+def test_error_of_linearising_is_in_sigma_the_largest_first(sweep):
+    figure = parameter_plots.plot_linearised.figure(sweep)
     axes = figure.axes[0]
     x, _ = line(axes, "exact − linearised")
     free = sweep.free
@@ -448,7 +444,7 @@ def test_linearising_is_shown_in_sigma_the_most_first(sweep):
     assert axes.get_xlim()[1] > 0.1
 
 
-def test_linearising_is_left_out_where_it_cannot_be_told(table1, bound, unknown):
+def test_linearised_solution_is_left_out_if_it_is_not_comparable(table1, bound, unknown):
     assert parameter_plots.plot_linearised(table1)
     assert parameter_plots.plot_linearised(unknown) == ""
     robust = replace(table1, solver=replace(table1.solver, loss="huber"))
@@ -463,8 +459,8 @@ def test_linearising_is_left_out_where_it_cannot_be_told(table1, bound, unknown)
     ]
 
 
-def test_few_parameters_of_one_unit_are_in_that(table1):
-    figure = draw(parameter_plots._draw_parameters, table1, 30)
+def test_few_parameters_are_in_their_own_unit(table1):
+    figure = parameter_plots.plot_parameters.figure(table1, most=30)
     (axes,) = figure.axes  # without a prior the readings told all
     assert axes.get_xlabel() == "estimate [mm]"
     assert row_names(axes) == ["x_slide.offset", "y_slide.offset", "z_slide.offset"]
@@ -477,11 +473,14 @@ def test_few_parameters_of_one_unit_are_in_that(table1):
     assert not axes.containers
 
 
-def test_many_parameters_are_in_tolerances_what_is_told_best_first(sweep):
-    figure = draw(parameter_plots._draw_parameters, sweep, 30)
+def test_many_parameters_are_in_prior_standard_deviations_the_best_determined_first(sweep):
+    figure = parameter_plots.plot_parameters.figure(sweep, most=30)
     axes, beside = figure.axes
-    assert title(figure) == "Estimates with 95 % intervals: 30 of 129, offsets, then the best told"
-    assert axes.get_xlabel() == "estimate [tolerances]"
+    assert (
+        title(figure)
+        == "Estimates with 95 % intervals: 30 of 129, offsets, then the best determined"
+    )
+    assert axes.get_xlabel() == "estimate [prior standard deviations]"
     names = row_names(axes)
     assert len(names) == 30
     assert all(n.endswith(".offset") for n in names[:3])
@@ -507,7 +506,9 @@ def test_the_band_of_a_parameter_is_where_its_prior_was(sweep):
     known = replace(sweep.parameters[0], mean=0.01, tolerance=0.005, std=0.004)
     without = replace(sweep.parameters[1], prior=False)
     parameters = (known, without, *sweep.parameters[2:])
-    axes = draw(parameter_plots._draw_parameters, replace(sweep, parameters=parameters), 30).axes[0]
+    axes = parameter_plots.plot_parameters.figure(
+        replace(sweep, parameters=parameters), most=30
+    ).axes[0]
     (band,) = axes.containers
     bars = {round(b.get_y() + 0.5): (b.get_x(), b.get_width()) for b in band}
     names = row_names(axes)
@@ -517,8 +518,8 @@ def test_the_band_of_a_parameter_is_where_its_prior_was(sweep):
 
 
 def test_a_parameter_at_its_bound_is_marked_as_such(bound):
-    axes = draw(parameter_plots._draw_parameters, bound, 30).axes[0]
-    x, y = line(axes, "held by its bound")
+    axes = parameter_plots.plot_parameters.figure(bound, most=30).axes[0]
+    x, y = line(axes, "at its bound")
     assert row_names(axes)[int(y[0])] == "x_slide.offset at lower bound"
     np.testing.assert_allclose(x, [bound["x_slide.offset"].value * 1e3], atol=UNIT)
     assert line(axes, "estimate")[0].size == 2
@@ -527,14 +528,14 @@ def test_a_parameter_at_its_bound_is_marked_as_such(bound):
 
 def test_without_noise_there_are_estimates_but_no_intervals(unknown):
     svg = parameter_plots.plot_parameters(unknown)
-    assert "no intervals: nothing tells the noise" in texts(svg)
-    axes = draw(parameter_plots._draw_parameters, unknown, 30).axes[0]
+    assert "no intervals: the noise is unknown" in texts(svg)
+    axes = parameter_plots.plot_parameters.figure(unknown, most=30).axes[0]
     assert not axes.collections
     assert line(axes, "estimate")[0].size == 30
 
 
 def test_few_correlations_are_printed_as_numbers(table1):
-    figure = draw(parameter_plots._draw_correlations, table1, 40)
+    figure = parameter_plots.plot_correlations.figure(table1, most=40)
     axes = figure.axes[0]
     r = table1.correlation
     shown = {
@@ -561,7 +562,7 @@ def test_numbers_have_the_signs_that_axes_have():
 
 
 def test_of_many_parameters_those_with_the_strongest_correlations_are_shown(sweep):
-    figure = draw(parameter_plots._draw_correlations, sweep, 10)
+    figure = parameter_plots.plot_correlations.figure(sweep, most=10)
     assert title(figure).endswith("the 10 of 129 parameters with the strongest")
     axes = figure.axes[0]
     names = [axes.get_xticklabels()[0].get_text(), *row_names(axes)]
@@ -576,8 +577,8 @@ def test_of_many_parameters_those_with_the_strongest_correlations_are_shown(swee
     assert {a, b} <= set(names)
 
 
-def test_negative_correlations_can_be_told_without_colour(sweep):
-    axes = draw(parameter_plots._draw_correlations, sweep, 40).axes[0]
+def test_negative_correlations_are_marked_without_colour(sweep):
+    axes = parameter_plots.plot_correlations.figure(sweep, most=40).axes[0]
     (cells,) = axes.collections
     assert len(cells.get_paths()) == 40 * 39 / 2
     centres = np.array([p.vertices[:4].mean(axis=0) for p in cells.get_paths()])
@@ -588,7 +589,7 @@ def test_negative_correlations_can_be_told_without_colour(sweep):
     assert {a.get_marker() for a in axes.lines} == {"_"}
 
 
-def test_correlations_need_two_parameters_that_have_any(table1, bound, unknown):
+def test_correlations_need_two_parameters(table1, bound, unknown):
     single = replace(table1, parameters=table1.parameters[:1], covariance=table1.covariance[:1, :1])
     assert parameter_plots.plot_correlations(single) == ""
     assert parameter_plots.plot_correlations(unknown) == ""
@@ -599,14 +600,14 @@ def test_correlations_need_two_parameters_that_have_any(table1, bound, unknown):
 
 def test_singular_values_above_the_noise_are_filled(sweep):
     found = sweep.identifiability
-    figure = draw(parameter_plots._draw_singular_values, sweep)
-    assert title(figure).endswith(f"{found.rank} of 129 combinations rise above the noise")
+    figure = parameter_plots.plot_singular_values.figure(sweep)
+    assert title(figure).endswith(f"{found.rank} of 129 parameter combinations are above the noise")
     axes = figure.axes[0]
     values = found.singular_values * 1e3
-    x, y = line(axes, "told better")
+    x, y = line(axes, "above the noise")
     np.testing.assert_array_equal(x, np.arange(1, found.rank + 1))
     np.testing.assert_allclose(y, values[: found.rank], rtol=UNIT)
-    x, y = line(axes, "lost in the noise")
+    x, y = line(axes, "below the noise")
     np.testing.assert_array_equal(x, np.arange(found.rank + 1, found.structural_rank + 1))
     np.testing.assert_allclose(y, values[found.rank : found.structural_rank], rtol=UNIT)
     faces = [a.get_markerfacecolor() for a in axes.lines[:2]]
@@ -617,19 +618,19 @@ def test_singular_values_above_the_noise_are_filled(sweep):
 
 
 def test_all_singular_values_are_named_where_none_is_zero(table1):
-    axes = draw(parameter_plots._draw_singular_values, table1).axes[0]
-    assert axes.get_xlabel() == "combination of parameters, the best told first"
+    axes = parameter_plots.plot_singular_values.figure(table1).axes[0]
+    assert axes.get_xlabel() == "parameter combination, the best determined first"
     assert len(axes.lines) == 2
 
 
 def test_unknown_noise_is_not_called_noise(unknown):
-    axes = draw(parameter_plots._draw_singular_values, unknown).axes[0]
+    axes = parameter_plots.plot_singular_values.figure(unknown).axes[0]
     labels = [str(a.get_label()) for a in axes.lines]
     assert any(text.startswith("rounding: the noise is unknown") for text in labels)
     assert not any(text.startswith("σ") for text in labels)
 
 
-def test_readings_that_tell_nothing_have_no_singular_values_to_show(table1):
+def test_singular_values_that_are_all_zero_are_not_shown(table1):
     nothing = replace(
         table1.identifiability,
         singular_values=np.zeros(3),
@@ -642,13 +643,13 @@ def test_readings_that_tell_nothing_have_no_singular_values_to_show(table1):
 
 def test_nothing_is_cut_off_and_no_labels_overlap(sweep, many, table1):
     figures = [
-        draw(reading_plots._draw_residuals, many, 40),
-        draw(reading_plots._draw_setups, sweep, 40),
-        draw(reading_plots._draw_spread, table1),
-        draw(parameter_plots._draw_linearised, parameter_plots._linearisation_shifts(sweep)),
-        draw(parameter_plots._draw_parameters, sweep, 30),
-        draw(parameter_plots._draw_correlations, sweep, 40),
-        draw(parameter_plots._draw_singular_values, sweep),
+        reading_plots.plot_residuals.figure(many, most=40),
+        reading_plots.plot_setups.figure(sweep, most=40),
+        reading_plots.plot_spread.figure(table1),
+        parameter_plots.plot_linearised.figure(sweep),
+        parameter_plots.plot_parameters.figure(sweep, most=30),
+        parameter_plots.plot_correlations.figure(sweep, most=40),
+        parameter_plots.plot_singular_values.figure(sweep),
     ]
     for figure in figures:
         with style.house_style():

@@ -17,8 +17,7 @@ from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.file import write_calibration
 from orthocal.io.html import items, paragraph, table
 from orthocal.output.report.page import _provenance, build_report
-from orthocal.output.report.rich_markup import to_markup
-from orthocal.output.text.layout import add_row, bullets, section, table_of
+from orthocal.output.text.layout import add_row, bullets, section, table_of, to_markup
 
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & $x_{$'
 
@@ -80,7 +79,7 @@ def read(page):
     return Reader(page)
 
 
-def test_reading_order_is_verdict_tool_fit_residuals_and_the_rest(page, read):
+def test_order_of_the_sections(page, read):
     names = re.findall(r'<section id="(\w+)">', page)
     assert names == [
         *("verdict", "tool", "fit", "residuals", "parameters", "sensors"),
@@ -90,7 +89,7 @@ def test_reading_order_is_verdict_tool_fit_residuals_and_the_rest(page, read):
     assert all(f'href="#{name}"' in page for name in names)
 
 
-def test_what_to_enter_stands_first_and_is_what_was_identified(calibration, read):
+def test_values_to_enter_come_first(calibration, read):
     first = read.rows[1:4]
     for row, entry in zip(first, find_entries(calibration), strict=True):
         assert row[0] == entry.drive
@@ -109,16 +108,16 @@ def test_every_reading_is_listed(calibration, read):
         assert f"{row.deviation * 1e3:+.3f}" in listed[0]
 
 
-def test_provenance_names_files_by_their_sums(calibration, page):
+def test_provenance_has_check_sums_of_files(calibration, page):
     assert calibration.session.sha256 in page
     assert calibration.robot_record.sha256 in page
     assert calibration.version in page
     assert "Pashkevich, Chablat, Wenger (2006)" in page
 
 
-def test_provenance_says_what_was_given_beside_the_readings(root, read, calibration, page):
+def test_provenance_lists_stated_assumptions(root, read, calibration, page):
     assert _provenance(calibration) in page
-    assert ["Given beside the readings", "nothing: the robot's own tolerances hold"] in read.rows
+    assert ["Assumptions", "the tolerances of the robot"] in read.rows
     found = calibrate(
         root / "examples/raw-cycles",
         Choice(
@@ -151,7 +150,7 @@ def test_scene_is_embedded_whole(read):
     assert "Leg x is furthest from parallel" in frame
 
 
-def test_full_model_says_what_the_offsets_leave(root):
+def test_full_model_shows_the_error_with_offsets_entered(root):
     found = calibrate(load_session(root / "examples/sweep"), "full")
     page = build_report(found)
     assert "once the offsets above are entered" in page
@@ -171,7 +170,7 @@ def test_same_calibration_makes_the_same_report(calibration, page, tmp_path):
     assert loaded == page
 
 
-def test_texts_of_strangers_are_text(raw_cycles):
+def test_texts_from_files_are_escaped(raw_cycles):
     session = replace(
         raw_cycles,
         title=EVIL,
@@ -210,8 +209,8 @@ def test_texts_of_strangers_are_text(raw_cycles):
         assert any(EVIL in t for t in seen.text["p"])
 
 
-def test_report_of_what_nothing_tells(raw_cycles):
-    """One setup with a prior: no cross-validation, and no gauge that tells the noise."""
+def test_report_without_prediction_and_noise(raw_cycles):
+    """One setup with a prior has neither cross-validation nor known noise."""
     rows = tuple(r for r in raw_cycles.readings if r.setup == "yx" and r.cycle == 1)
     session = replace(raw_cycles, readings=rows).with_gauge(
         replace(raw_cycles.gauge, sigma=None, resolution=None)
@@ -219,7 +218,7 @@ def test_report_of_what_nothing_tells(raw_cycles):
     found = calibrate(session, "full")
     assert not np.isfinite([r.unseen for r in found.residuals]).any()
     page = build_report(found)
-    assert "No setup can be predicted from the others" in page
+    assert "No setup can be predicted" in page
     assert not Reader(page).open
 
 
@@ -281,7 +280,7 @@ def test_pieces_of_html_are_escaped():
         table(("a",), [("1", "2")])
 
 
-def test_what_is_printed_becomes_html():
+def test_rich_renderables_become_html():
     printed = table_of("name", "value", "unit")
     add_row(printed, "[b]x[/b]", "1", "mm")
     content = Group(

@@ -1,4 +1,4 @@
-"""Maps of the tool show the error that was computed, where it was computed."""
+"""Maps of the tool error show the computed errors at their points."""
 
 from __future__ import annotations
 
@@ -66,9 +66,8 @@ def maps(table1, accuracy):
 
 
 def draw(calibration, accuracy, which):
-    lines = tool_map._find_grid(accuracy.workspace.points)
     with style.house_style():
-        return tool_map._draw_tool_map(calibration, accuracy, which, lines)
+        return tool_map._draw_tool_map(calibration, accuracy, which)
 
 
 def with_error(accuracy, function):
@@ -129,7 +128,7 @@ def test_sizes_are_those_of_the_error_in_question(table1, accuracy):
     np.testing.assert_allclose(sizes("left"), left * 1e6, rtol=GRID)
 
 
-def test_without_an_excess_what_is_not_known_is_that_at_tolerances(planar):
+def test_uncertainty_within_tolerances_is_that_of_the_assessment(planar):
     accuracy = assess_tool(planar)
     assert find_excess(planar) == 1.0
     variance = np.trace(accuracy.after.aligned_covariance, axis1=1, axis2=2)
@@ -137,7 +136,7 @@ def test_without_an_excess_what_is_not_known_is_that_at_tolerances(planar):
     np.testing.assert_allclose(sizes, np.sqrt(variance) * 1e6, rtol=GRID)
 
 
-def test_a_machine_worse_than_its_tolerances_is_known_less_well(experiment_2):
+def test_uncertainty_grows_with_the_tolerance_scale(experiment_2):
     """What remains of the paper's readings is 2.1 times what errors at tolerances would leave."""
     calibration = calibrate(experiment_2)
     accuracy, excess = assess_tool(calibration), find_excess(calibration)
@@ -209,13 +208,13 @@ def test_arrows_point_where_the_tool_is_off_to(table1, accuracy):
     np.testing.assert_allclose(vector[:, 1] * 40.0, place[:, 0] * vector.max(), atol=GRID)
 
 
-def test_what_is_not_known_has_no_direction(table1, accuracy):
+def test_uncertainty_has_no_arrows(table1, accuracy):
     for axes in draw(table1, accuracy, "unknown").axes[:3]:
         assert not [c for c in axes.collections if hasattr(c, "U")]
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 250.0, 1e6])
-def test_an_error_that_is_the_same_everywhere_is_told_as_such(table1, accuracy, size):
+def test_a_constant_error_is_printed_as_a_number(table1, accuracy, size):
     same = with_error(accuracy, lambda x, y, z: (0.0 * x, 0.0, size))
     shown = texts(tool_map.plot_tool_map(table1, same, which="now"))
     assert shown.count(f"{size:.3g} µm everywhere") == 3
@@ -278,7 +277,7 @@ def test_axes_are_the_coordinates_that_the_drives_control(planar):
     np.testing.assert_allclose(vector[:, 1], 0.0, atol=GRID)
 
 
-def test_there_is_no_map_of_what_is_not_there(table1, accuracy):
+def test_no_map_without_uncertainty_or_further_errors(table1, accuracy):
     assert tool_map.plot_tool_map(table1, replace(accuracy, after=None), which="unknown") == ""
     offsets = replace(table1, parameters=table1.parameters[:3])
     assert tool_map.plot_tool_map(offsets, accuracy, which="left") == ""

@@ -1,6 +1,6 @@
-"""The measuring sheet: all setups and rows, what to command, where to stand.
+"""The measuring sheet: its setups and rows, the joints to command, the place of the gauge.
 
-Numbers on it are held against Pinocchio's loops and placements.
+Numbers are compared with Pinocchio's loop closures and placements.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from orthocal.units import MM
 ROUNDED = 1e-3
 """Joints are shown with three decimals, [mm]."""
 
-SHOWN = 0.06
+ROUNDED_PLACE = 0.06
 """Places are shown with one decimal, [mm]."""
 
 SMALL = Sizes(leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004)
@@ -80,7 +80,7 @@ def rows(section):
     return [[words(cell) for cell in line] for line in lines]
 
 
-def test_every_setup_and_row_is_on_it(small, page):
+def test_sheet_has_every_setup_and_row(small, page):
     found = sections(page)
     names = list(small.setups)
     assert [words(s.find("h2")) for s in found] == [
@@ -89,14 +89,14 @@ def test_every_setup_and_row_is_on_it(small, page):
     readings = list(small.readings)
     for section, name in zip(found, names, strict=True):
         expected = [(str(i + 2), r.posture) for i, r in enumerate(readings) if r.setup == name]
-        own = rows(section)
-        assert [(r[0], r[1]) for r in own[:-1]] == expected
-        # back to the first posture, with a box of its own
-        assert own[-1][:2] == ["", f"{expected[0][1]}, again"]
-        assert len(section.xpath(".//td[@class='box']")) == len(own)
+        cells = rows(section)
+        assert [(r[0], r[1]) for r in cells[:-1]] == expected
+        # a box for the return to the first posture
+        assert cells[-1][:2] == ["", f"{expected[0][1]}, again"]
+        assert len(section.xpath(".//td[@class='box']")) == len(cells)
 
 
-def test_joints_on_it_bring_pinocchios_tool_to_where_it_says(small, page):
+def test_joints_move_the_tool_to_the_stated_point(small, page):
     robot = small.robot
     for section in sections(page):
         for row in rows(section):
@@ -107,20 +107,22 @@ def test_joints_on_it_bring_pinocchios_tool_to_where_it_says(small, page):
             assert at == pytest.approx(tool, abs=2.0 * ROUNDED)
 
 
-def test_where_a_tip_touches_is_where_the_rod_is(small, page):
+def test_stated_contact_is_on_the_rod(small, page):
     """Surface of rod a in the mechanical zero: half the rods' distance up, a radius towards y."""
     text = words(sections(page)[0])
     robot, drives = small.robot, small.robot.drive_zero
     root, tip = (place(robot, drives, f) for f in ("x_bar_a", "x_coupler"))
     expected = 0.5 * (root + tip) + np.array([0.0, 0.004, 0.0])
-    found = re.search(r"in the world at \(([-\d., ]+)\) mm", text)
-    assert [float(v) for v in found[1].split(",")] == pytest.approx(expected / MM, abs=SHOWN)
-    assert "on the +y side of rod a of leg x, its plunger pointing to -y" in text
-    assert "ball of 3 mm diameter touches over the middle of the rod, 125.0 mm from" in text
+    found = re.search(r"Contact in world coordinates: \(([-\d., ]+)\) mm", text)
+    assert [float(v) for v in found[1].split(",")] == pytest.approx(
+        expected / MM, abs=ROUNDED_PLACE
+    )
+    assert "on the +y side of rod a of leg x. Point its plunger to -y." in text
+    assert "ball of 3 mm diameter touches the middle of the rod, 125.0 mm from" in text
 
 
-def test_a_rod_that_lies_aside_in_the_first_posture_is_told(small):
-    """By how much the tip, over the rod's middle in the zero, is beside it: by Pinocchio's rod."""
+def test_lateral_offset_in_the_alignment_posture_is_stated(small):
+    """Distance of a tip that is centred in the mechanical zero from Pinocchio's rod."""
     readings = [r for r in small.readings if r.setup == "<b>yx" and r.posture == "<out>"]
     session = replace(small, readings=tuple(readings))
     text = words(sections(etree.HTML(sheet_files(session)["sheet.html"]))[0])
@@ -134,51 +136,70 @@ def test_a_rod_that_lies_aside_in_the_first_posture_is_told(small):
     across /= np.linalg.norm(across)
     # the plunger's line, through the rod as it was in the zero, from the rod's axis now
     aside = float((np.array([at_zero[0] - 0.125, 0.0, at_zero[2]]) - axis) @ across) / MM
-    found = re.search(r"touches (\d+\.\d) mm beside the middle of the rod, towards", text)
-    assert float(found[1]) == pytest.approx(abs(aside), abs=SHOWN)
+    found = re.search(r"touches the rod (\d+\.\d) mm off its middle, towards", text)
+    assert float(found[1]) == pytest.approx(abs(aside), abs=ROUNDED_PLACE)
     assert abs(aside) > 1.0
 
 
-def test_what_is_done_with_the_gauge_is_said(page):
+def test_alignment_posture_comes_before_the_first(small):
+    """The operator aligns the gauge there, then moves on and sets the gauge zero."""
+    setups = {**small.setups, "zx": replace(small.setups["zx"], aligned_at="in&")}
+    (section,) = [
+        s
+        for s in sections(etree.HTML(sheet_files(replace(small, setups=setups))["sheet.html"]))
+        if words(s.find("h2")).endswith(": zx")
+    ]
+    steps = [words(li) for li in section.xpath(".//ol/li")]
+    joints = next(row[3:6] for row in rows(section) if row[1] == "in&")
+    assert steps[0].startswith(f"Move to the alignment posture, in&: x_slide {joints[0]} mm")
+    assert steps[3].startswith("Move to the first posture, zero: x_slide 0.000 mm")
+    assert "gauge zero" in steps[4]
+    section = sections(etree.HTML(sheet_files(small)["sheet.html"]))[2]
+    steps = [words(li) for li in section.xpath(".//ol/li")]
+    assert steps[0].startswith("Move to the alignment posture, which is also the first posture")
+    assert "gauge zero" in steps[3]
+
+
+def test_steps_say_how_to_mount_and_set_the_gauge(page):
     ball, blade, line, pin = (words(s) for s in sections(page))
     for text in (ball, blade, line, pin):
-        assert "does the dial grow? If it falls, write every reading" in text
-        assert "half of its travel (5 mm) is taken, and turn the bezel until it shows 0" in text
+        assert "The dial must grow. If it falls, write every reading" in text
+        assert "half its travel (5 mm). Turn the bezel until the dial shows 0." in text
     assert "blade 20 mm wide" in blade
-    assert "on the -x side of rod b of leg y, its plunger pointing to +x" in blade
-    assert "it touches the line between the rods; in the world at (155.0, 0.0, 0.0) mm" in line
+    assert "on the -x side of rod b of leg y. Point its plunger to +x." in blade
+    assert "Its tip touches the line between the rods. Contact in world coordinates: (155.0" in line
     assert "pin of 4 mm diameter, 60 mm wide" in pin
-    # the leg moves aside by more than this dial has
-    assert "Even a perfect machine would show -32.7 mm in line 6" in blade
-    assert "Hold the plunger up on the way to line 6, in&: the dial would go -32.7 mm" in blade
+    # the leg moves sideways by more than the range of this dial
+    assert "Even a perfect machine shows -32.7 mm in line 6" in blade
+    assert "Lift the plunger on the way to line 6, in&: the dial would go -32.7 mm" in blade
     assert "Even a perfect" not in line
     assert "on the (0.71, 0.71, 0.00) side of rod b of leg z" in pin
 
 
-def test_what_holds_for_the_machine_is_said(page):
+def test_front_page_states_zero_travel_and_approach(page):
     text = words(page.find("body"))
     assert "must show about x_slide 0.000 mm, y_slide 5.000 mm, z_slide 250.000 mm" in text
     assert "x_slide -150.0 to 70.0 mm; y_slide -65.0 to 155.0 mm; z_slide 180.0 to 400.0 mm" in text
-    assert "its number must grow for x_slide, fall for y_slide, fall for z_slide" in text
+    assert "Its number must grow for x_slide, fall for y_slide, fall for z_slide" in text
     assert (
         "towards larger numbers of x_slide, smaller numbers of y_slide, smaller numbers of z_slide"
     ) in text
-    assert "touch nothing of the gauge: not its bezel" in text
-    assert "write controller: {offsets_mm: [0, 0, 0]} there" in text
-    assert words(page.find(".//code")) == "orthocal calibrate ."
+    assert "Do not touch bezel, stand or arm of the gauge after" in text
+    assert "into it: controller: {offsets_mm: [0, 0, 0]}." in text
+    assert words(page.findall(".//code")[-1]) == "orthocal calibrate ."
+    assert "`" not in text
 
 
-def test_offsets_that_were_entered_are_no_fault_of_the_robots_files(small):
-    """Home switches are off by what is to be found; entered, it shifts where joints may go."""
-    for active, told in (([0.0] * 3, " mm. If a number"), ([1e-3, 0.0, 0.0], "what was entered.")):
+def test_active_offsets_shift_the_stated_travel(small):
+    """Home switches may be off by a few mm: that is not a fault of the robot's files."""
+    for active in ([0.0] * 3, [1e-3, 0.0, 0.0]):
         text = sheet_files(small.with_controller(np.array(active)))["sheet.html"]
-        assert "zeros may be off by a few mm, which the calibration finds" in text
-        (limits,) = re.findall(r"Its joints may go: [^<]*", text)
-        assert told in limits
-        assert ("shifted by" in limits) == any(active)
+        assert "An error of a few mm is normal" in text
+        (travel,) = re.findall(r"Travel of the joints: [^<]*", text)
+        assert ("shifted by the active offsets" in travel) == any(active)
 
 
-def test_odd_names_are_texts(files, page):
+def test_names_from_files_are_texts(files, page):
     text = files["sheet.html"]
     assert page.xpath("//script") == []
     assert page.xpath("//b") == []
@@ -187,8 +208,8 @@ def test_odd_names_are_texts(files, page):
     assert "default-src 'none'" in text
 
 
-def test_pictures_are_whole_and_on_their_paper(page, files):
-    """A picture of the machine and one of the rods for each setup, with what they have to name."""
+def test_pictures_are_on_their_paper_and_labelled(page, files):
+    """A picture of the machine and one of the rods for each setup."""
     drawn = re.findall(r"<svg.*?</svg>", files["sheet.html"])
     assert len(drawn) == 2 * 4
     for svg in drawn:
@@ -207,7 +228,7 @@ def test_pictures_are_whole_and_on_their_paper(page, files):
         assert "rod b" in cut
 
 
-def test_a_tip_near_a_hinge_is_warned_of(small):
+def test_tip_near_a_hinge_causes_a_warning(small):
     sensor = small.setups["xy"].sensor
     near = replace(sensor, section=replace(sensor.section, value=0.99))
     setups = {**small.setups, "xy": replace(small.setups["xy"], sensor=near)}
@@ -216,7 +237,7 @@ def test_a_tip_near_a_hinge_is_warned_of(small):
 
 
 @pytest.mark.parametrize("name", ["raw_cycles", "experiment_2"])
-def test_sessions_that_are_there_have_sheets(request, name):
+def test_sessions_have_sheets(request, name):
     session = request.getfixturevalue(name)
     found = sheet_files(session)
     assert len(found) == 1 + len({r.setup for r in session.readings})
@@ -237,7 +258,7 @@ def test_a_planar_robot_has_a_sheet(root, tmp_path):
     assert len(rows(sections(etree.HTML(found["sheet.html"]))[0])) == 3
 
 
-def test_without_a_tool_there_are_joints_alone(root, tmp_path):
+def test_sheet_without_a_tool_has_joints_alone(root, tmp_path):
     folder = tmp_path / "biglide"
     shutil.copytree(root / "tests/robots/biglide", folder)
     yaml = folder / "biglide.yaml"
@@ -249,12 +270,12 @@ def test_without_a_tool_there_are_joints_alone(root, tmp_path):
     )
     found = sheet_files(load_plan(tmp_path / "plan.yaml"))
     assert list(found) == ["sheet.html"]
-    own = rows(sections(etree.HTML(found["sheet.html"]))[0])
-    assert [r[1:4] for r in own][1] == ["out", "210.000", "195.000"]
+    cells = rows(sections(etree.HTML(found["sheet.html"]))[0])
+    assert [r[1:4] for r in cells][1] == ["out", "210.000", "195.000"]
 
 
-def run(monkeypatch, capsys, *given):
-    monkeypatch.setattr(sys, "argv", ["orthocal", *map(str, given)])
+def run(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["orthocal", *map(str, arguments)])
     with pytest.raises(SystemExit) as ended:
         main()
     out, err = capsys.readouterr()
@@ -277,7 +298,7 @@ def test_the_command_writes_beside_the_session_or_elsewhere(monkeypatch, capsys,
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("arguments", "message"),
     [
         (["nowhere"], "nowhere: there is no such file"),
         (["examples/workshop/plan.yaml", "--shift-mm", "1,2"], "--shift-mm: found '1,2'; expected"),
@@ -285,9 +306,9 @@ def test_the_command_writes_beside_the_session_or_elsewhere(monkeypatch, capsys,
         (["examples/workshop/plan.yaml", "--feed", "0"], "--feed: found 0; expected 1 to 20000"),
     ],
 )
-def test_what_makes_no_sheet_is_refused(monkeypatch, capsys, root, tmp_path, given, message):
-    given[0] = str(root / given[0])
-    code, out, err = run(monkeypatch, capsys, "sheet", *given, "--out", tmp_path / "out")
+def test_bad_input_is_refused(monkeypatch, capsys, root, tmp_path, arguments, message):
+    arguments[0] = str(root / arguments[0])
+    code, out, err = run(monkeypatch, capsys, "sheet", *arguments, "--out", tmp_path / "out")
     assert (code, out) == (2, "")
     assert message in err
     assert len(err.splitlines()) == 1

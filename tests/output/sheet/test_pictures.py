@@ -1,0 +1,152 @@
+"""Pictures of the sheet: labels that cover nothing, outlines that are convex, texts as texts."""
+
+from __future__ import annotations
+
+import re
+from itertools import combinations, product
+
+import numpy as np
+import pytest
+from browser import open_browser, visit
+from lxml import etree
+from scipy.spatial import ConvexHull
+
+from orthocal import load_plan
+from orthocal.output.sheet.page import sheet_files
+from orthocal.output.sheet.pictures import Picture, outline
+
+ROUNDED = 0.05
+"""Browsers round the extent of glyphs, [mm]."""
+
+SECTIONS = {
+    "x": ("y", "z", "-y", "[0, 1, 1]"),
+    "y": ("x", "-z", "[-1, 0, 2]"),
+    "z": ("x", "-y", "[1, -1, 0]"),
+}
+TIPS = (
+    "touches: a, tip: {ball: {radius_mm: 1}}",
+    "touches: b, tip: {ball: {radius_mm: 8}}",
+    "touches: a, tip: {blade: {width_mm: 44}}",
+    "touches: b, tip: {blade: {width_mm: 60, radius_mm: 2}}",
+)
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    """Every leg, direction, rod and tip; aligned in `out`, where balls are off the middle."""
+    setups = [
+        f"  s{i}: {{leg: {leg}, direction: {way}, section: {{fraction: {at}}}{tip}}}"
+        for i, (leg, way, at, tip) in enumerate(
+            (leg, way, (0.3, 0.5, 0.7)[k % 3], tip)
+            for leg, ways in SECTIONS.items()
+            for k, (way, tip) in enumerate(product(ways, ("", *(f", {t}" for t in TIPS))))
+        )
+    ]
+    path = tmp_path_factory.mktemp("plan") / "plan.yaml"
+    path.write_text(
+        "robot: orthoglide\ngauge: {range_mm: [-5, 5]}\n"
+        "postures:\n  out: {tcp_mm: [2, -3, 3]}\n  far: {tcp_mm: [3, -4, 4]}\n"
+        "setups:\n" + "\n".join(setups) + "\n"
+    )
+    return load_plan(path)
+
+
+@pytest.fixture(scope="module")
+def drawn(plan):
+    """The pictures of all setups, and their SVG."""
+    pictures = []
+    to_svg = Picture.to_svg
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Picture, "to_svg", lambda p, t: (pictures.append(p), to_svg(p, t))[1])
+        page = sheet_files(plan)["sheet.html"]
+    return pictures, re.findall(r"<svg.*?</svg>", page)
+
+
+def overlap(one, other):
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+def test_no_label_overlaps_another_or_the_border(plan, drawn):
+    pictures, _ = drawn
+    assert len(pictures) == 2 * len(plan.setups) == 2 * 50
+    texts = [label.text for picture in pictures for label in picture.labels]
+    assert sum("off centre" in text for text in texts) == 20
+    for picture in pictures:
+        placed = picture.place_labels()
+        assert len(placed) == len(picture.labels)
+        for one, other in combinations(placed, 2):
+            assert not overlap(one[1], other[1]), (one[0].text, other[0].text)
+        for label, box in placed:
+            assert min(box.left, box.top) >= 0.0, label.text
+            assert box.right <= picture.width, label.text
+            assert box.bottom <= picture.height, label.text
+
+
+def test_labels_in_a_browser_are_inside_their_boxes(drawn, tmp_path):
+    """The real extent of the text, with the fonts that are installed."""
+    pictures, svgs = drawn
+    path = tmp_path / "sheet.html"
+    path.write_text("".join(svgs))
+    with open_browser() as browser, visit(browser, path.as_uri()) as found:
+        extents = found.page.evaluate(
+            """() => [...document.querySelectorAll('svg')].map((svg) =>
+                 [...svg.querySelectorAll('text')].map((text) => text.getBBox()).map((box) =>
+                   [box.x, box.y, box.x + box.width, box.y + box.height]))"""
+        )
+    for picture, texts in zip(pictures, extents, strict=True):
+        for one, other in combinations(texts, 2):
+            assert not overlap(one, other)
+        for (label, box), (left, top, right, bottom) in zip(
+            picture.place_labels(), texts, strict=True
+        ):
+            assert left >= box.left - ROUNDED, label.text
+            assert top >= box.top - ROUNDED, label.text
+            assert right <= box.right + ROUNDED, label.text
+            assert bottom <= box.bottom + ROUNDED, label.text
+
+
+def test_a_label_keeps_off_lines_and_stays_near_its_point():
+    picture = Picture(60.0, 40.0)
+    picture.line([(5.0, 20.0), (55.0, 20.0)])
+    picture.label((30.0, 20.0), "rod a")
+    ((label, box),) = picture.place_labels()
+    assert box.bottom < 20.0 or box.top > 20.0
+    assert np.hypot(0.5 * (box.left + box.right) - 30.0, 0.5 * (box.top + box.bottom) - 20.0) < 5.0
+    assert label.text == "rod a"
+
+
+def test_labels_without_room_are_left_out():
+    picture = Picture(20.0, 8.0)
+    for text in ("first", "second", "a label that is longer than the paper"):
+        picture.label((10.0, 4.0), text)
+    assert [label.text for label, _ in picture.place_labels()] == ["first"]
+
+
+def test_labels_are_texts():
+    picture = Picture(60.0, 40.0)
+    picture.label((-10.0, 90.0), "<script>&\x1b\nsecond")
+    svg = etree.fromstring(picture.to_svg('"<b>').encode())
+    assert svg.get("aria-label") == '"<b>'
+    assert [line.text for line in svg.iter("{*}tspan")] == [r"<script>&\x1b", "second"]
+
+
+@pytest.mark.parametrize("count", [3, 10, 200])
+def test_outlines_are_convex_hulls(count):
+    points = np.random.default_rng(count).normal(size=(count, 2))
+    corners = outline(points)
+    shifted = np.roll(corners, -1, axis=0)
+    area = 0.5 * abs(np.sum(corners[:, 0] * shifted[:, 1] - corners[:, 1] * shifted[:, 0]))
+    assert area == pytest.approx(ConvexHull(points).volume)
+
+
+def test_points_in_a_line_have_their_ends_as_outline():
+    points = np.array([[1.0, 1.0], [0.0, 0.0], [0.5, 0.5], [1.0, 1.0]])
+    assert outline(points).tolist() == [[0.0, 0.0], [1.0, 1.0]]
+
+
+def test_arrows_need_a_length():
+    picture = Picture(60.0, 40.0)
+    picture.arrow((1.0, 1.0), (1.0, 1.0), stroke="#000")
+    assert picture.parts == []
+    picture.arrow((1.0, 1.0), (9.0, 1.0), stroke="#000", both=True)
+    assert len(picture.parts) == 3
