@@ -1,4 +1,4 @@
-"""Whatever a spreadsheet writes comes back exactly, or is refused: never another number."""
+"""Property tests: readings of any spreadsheet dialect are imported exactly, or refused."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
 from orthocal.errors import SessionError
-from orthocal.io.tables.separated import SEPARATORS
+from orthocal.io.tables.delimited import SEPARATORS
 from orthocal.io.tables.table import read_table
 from orthocal.measurement.importing.headings import EXPECTED, UNITS, choose_columns, find_header
-from orthocal.measurement.importing.long_table import make_long
+from orthocal.measurement.importing.long_table import make_long_table
 
 NAMES = {"setup": ["xy", "yx"], "posture": ["zero", "x_max", "x_-40"]}
 PLACES = [(s, p) for s in NAMES["setup"] for p in NAMES["posture"]]
 EXAMPLES = int(os.environ.get("ORTHOCAL_EXAMPLES", "400"))
-"""Of any dialect; more by hand."""
+"""Number of examples; more in a long run."""
 
 HEADINGS = {
     "english": ("setup", "posture", "cycle", "reading", "note"),
@@ -113,7 +113,7 @@ def read(content: bytes, **options) -> dict[tuple[str, str, int], Decimal]:
     path = Path("table")
     table = read_table(path, content, find_header, expected=EXPECTED)
     columns = choose_columns(table.header, {}, where="table")
-    long = make_long(table, columns, names=NAMES, **options)
+    long = make_long_table(table, columns, names=NAMES, **options)
     found = {(r.setup, r.posture, int(r.cycle or 1)): Decimal(r.reading) for r in long.rows}
     assert len(found) == len(long.rows)
     return found
