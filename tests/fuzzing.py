@@ -544,7 +544,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
         inverse_rows,
     )
     from orthocal.kinematics.loop_closure import nominal_assembly
-    from orthocal.measurement.files.readings_table import read_points, stream_joints
+    from orthocal.measurement.files.coordinate_tables import read_points, stream_joints
     from orthocal.measurement.files.session_file import load_plan
     from orthocal.measurement.files.write_session import write_session
     from orthocal.measurement.importing.import_readings import TableOptions, import_readings

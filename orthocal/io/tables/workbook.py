@@ -47,6 +47,9 @@ LARGEST_PART = 2 * 2**20
 MOST_PARTS = 2_000
 """Maximum number of parts of a workbook."""
 
+MOST_ELEMENTS = 4 * MOST_CELLS
+"""Maximum number of XML elements of a part, for the time to read it."""
+
 LONGEST_FORMAT = 255
 """Maximum length of a number format; the limit of Excel."""
 
@@ -139,14 +142,15 @@ class _Workbook:
         self._archive = archive
         self._where = where
         self._unpacked = 0
-        main = next(t for kind, t in self._relations("").values() if kind == "officeDocument")
+        targets = {kind: target for kind, target in self._relations("").values()}
+        main = targets.get("officeDocument", "xl/workbook.xml")
         root, relations = self._tree(main), self._relations(main)
         self._sheets = [
             (e.get("name", ""), e.get("state", "visible") == "visible", target)
             for e in root.iter("{*}sheet")
             for key, value in e.attrib.items()
             if key.endswith("}id")
-            for kind, target in [relations[value]]
+            for kind, target in [relations.get(value, ("", ""))]
             if kind == "worksheet"
         ]
         by_kind = {kind: target for kind, target in relations.values()}
@@ -214,7 +218,12 @@ class _Workbook:
         Raises:
             SessionError: If it is too large, damaged, or not plain XML.
         """
-        info = self._archive.getinfo(part)
+        try:
+            info = self._archive.getinfo(part)
+        except KeyError:
+            raise SessionError(
+                f"is damaged: {shorten(part)} is missing", where=self._where
+            ) from None
         self._unpacked += info.file_size
         for size, limit in ((info.file_size, largest), (self._unpacked, LARGEST_CONTENT)):
             if size > limit:
@@ -279,12 +288,16 @@ class _StringTarget:
     """Texts of the items of the shared strings, from XML events."""
 
     def __init__(self) -> None:
+        self._elements = 0
         self._strings: list[str] = []
         self._text: list[str] = []
         self._collects = False
         self._phonetic = False
 
     def start(self, tag: str, attributes: Mapping[str, str]) -> None:
+        self._elements += 1
+        if self._elements > MOST_ELEMENTS:
+            raise ValueError(f"a part has more than {MOST_ELEMENTS} XML elements")
         name = _local_name(tag)
         if name == "rPh":
             self._phonetic = True
@@ -348,10 +361,9 @@ class _SheetTarget(_StringTarget):
         }
 
     def start(self, tag: str, attributes: Mapping[str, str]) -> None:
+        super().start(tag, attributes)
         begin = self._starts.get(_local_name(tag))
-        if begin is None:
-            super().start(tag, attributes)
-        else:
+        if begin is not None:
             begin(attributes)
 
     def end(self, tag: str) -> None:
@@ -373,7 +385,7 @@ class _SheetTarget(_StringTarget):
         )
 
     def _start_row(self, attributes: Mapping[str, str]) -> None:
-        line = int(attributes.get("r", self._line + 1))
+        line = _parse_index(attributes["r"]) if "r" in attributes else self._line + 1
         if line <= self._line:
             raise ValueError(f"row {line} follows row {self._line}")
         self._line = line

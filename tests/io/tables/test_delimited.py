@@ -8,7 +8,8 @@ import pytest
 from watchdog import cpu_limit
 
 from orthocal.errors import SessionError
-from orthocal.io.tables.cell import MOST_CELLS, MOST_COLUMNS, MOST_ROWS
+from orthocal.io.tables import delimited
+from orthocal.io.tables.cell import MOST_COLUMNS
 from orthocal.io.tables.delimited import (
     LARGEST_TEXT,
     LONGEST_ROW,
@@ -18,6 +19,9 @@ from orthocal.io.tables.delimited import (
 )
 
 MEGABYTE = 2**20
+
+ROWS, CELLS = 2_000, 5_000
+"""Bounds in place of those of the module, for short tests."""
 
 
 def find_first(rows):
@@ -50,13 +54,15 @@ def test_rows_have_their_line_numbers(text, expected):
         ('a\n"' + "b\n" * LONGEST_ROW, "t:65537: the row has more than"),
         ('"\n",' * LONGEST_ROW, "t:"),
         ("," * MOST_COLUMNS, f"t:1: has {MOST_COLUMNS + 1} columns"),
-        ("a\n" * (MOST_ROWS + 1), f"t: has more than {MOST_ROWS} rows"),
-        (("," * 499 + "a\n") * (MOST_CELLS // 500 + 1), f"t: has more than {MOST_CELLS} cells"),
+        ("a\n" * (ROWS + 1), f"t: has more than {ROWS} rows"),
+        (("," * 499 + "a\n") * (CELLS // 500 + 1), f"t: has more than {CELLS} cells"),
         ('a,"b', "t:1: is not valid CSV"),
     ],
     ids=["row", "open-quote", "row-of-many-lines", "columns", "rows", "cells", "quote"],
 )
-def test_tables_that_are_too_large(text, message):
+def test_tables_that_are_too_large(text, message, monkeypatch):
+    monkeypatch.setattr(delimited, "MOST_CELLS", CELLS)
+    monkeypatch.setattr(delimited, "MOST_ROWS", ROWS)
     with cpu_limit(), pytest.raises(SessionError) as caught:
         rows_of(text)
     assert str(caught.value).startswith(message)
@@ -65,8 +71,9 @@ def test_tables_that_are_too_large(text, message):
 @pytest.mark.parametrize(
     "text", ["," * 10, ",,,\n" * 3, '"\n",' * 3], ids=["row", "rows", "quotes"]
 )
-def test_memory_is_bounded_by_what_is_accepted(text):
+def test_memory_is_bounded_by_what_is_accepted(text, monkeypatch):
     """Ten megabytes of commas took 170 MB."""
+    monkeypatch.setattr(delimited, "MOST_ROWS", 1_000)
     text *= 10 * MEGABYTE // len(text)
     tracemalloc.start()
     try:

@@ -12,12 +12,21 @@ import pytest
 from watchdog import cpu_limit
 
 from orthocal.errors import SessionError
-from orthocal.io.tables.cell import MOST_CELLS, MOST_COLUMNS, MOST_ROWS
-from orthocal.io.tables.workbook import LARGEST_CONTENT, LARGEST_PART, MOST_PARTS, read_workbook
+from orthocal.io.tables import workbook
+from orthocal.io.tables.cell import MOST_COLUMNS, MOST_ROWS
+from orthocal.io.tables.workbook import (
+    LARGEST_CONTENT,
+    LARGEST_PART,
+    MOST_PARTS,
+    read_workbook,
+)
 
 SHEET = "xl/worksheets/sheet1.xml"
 STYLES = "xl/styles.xml"
 NAMESPACE = 'xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main"'
+CELLS, ELEMENTS = 5_000, 25_000
+"""Bounds in place of those of the module, for short tests."""
+
 CELL = '<c r="A1"><v>1</v></c>'
 
 
@@ -25,17 +34,17 @@ RELATIONS = "http://schemas.openxmlformats.org/package/2006/relationships"
 STRINGS = "xl/sharedStrings.xml"
 
 
-def saved(workbook):
+def saved(made):
     stream = io.BytesIO()
-    workbook.save(stream)
+    made.save(stream)
     return stream.getvalue()
 
 
 def book(rows=(("a", 1),)):
-    workbook = openpyxl.Workbook()
+    made = openpyxl.Workbook()
     for row in rows:
-        workbook.active.append(row)
-    return saved(workbook)
+        made.active.append(row)
+    return saved(made)
 
 
 def with_parts(parts):
@@ -175,8 +184,12 @@ def test_entities_are_not_resolved(encoding):
             f"sheet 'Sheet' row 1: has 16384 columns; expected at most {MOST_COLUMNS}",
         ),
         (
-            f"<row>{'<c><v>1</v></c>' * 500}</row>" * (MOST_CELLS // 500 + 1),
-            f"sheet 'Sheet': has more than {MOST_CELLS} cells",
+            f"<row>{'<c><v>1</v></c>' * 500}</row>" * (CELLS // 500 + 1),
+            f"sheet 'Sheet': has more than {CELLS} cells",
+        ),
+        (
+            "<x/>" * (ELEMENTS + 1),
+            f"is not a readable .xlsx workbook: a part has more than {ELEMENTS} XML elements",
         ),
         (
             '<row r="2"/><row r="1"/>',
@@ -191,9 +204,19 @@ def test_entities_are_not_resolved(encoding):
             "is not a readable .xlsx workbook: '-1' is not an index",
         ),
     ],
-    ids=["far-row", "far-column", "cells", "rows-out-of-order", "cells-out-of-order", "index"],
+    ids=[
+        "far-row",
+        "far-column",
+        "cells",
+        "elements",
+        "rows-out-of-order",
+        "cells-out-of-order",
+        "index",
+    ],
 )
-def test_sheets_that_are_refused(rows, message):
+def test_sheets_that_are_refused(rows, message, monkeypatch):
+    monkeypatch.setattr(workbook, "MOST_CELLS", CELLS)
+    monkeypatch.setattr(workbook, "MOST_ELEMENTS", ELEMENTS)
     assert refusal(with_sheet(rows)) == f"a.xlsx: {message}"
 
 
@@ -207,7 +230,7 @@ def test_sheets_that_are_refused(rows, message):
         ({"xl/workbook.bin": b""}, "is an .xlsb workbook; save it as .xlsx or CSV"),
         ({"[Content_Types].xml": None}, "is a ZIP archive, but not an .xlsx workbook"),
         ({SHEET: b"<worksheet>"}, "is not a readable .xlsx workbook: Premature end of data"),
-        ({SHEET: None}, "is not a readable .xlsx workbook: "),
+        ({SHEET: None}, f"is damaged: {SHEET} is missing"),
         ({"xl/workbook.xml": b"<a/>"}, "is a workbook without worksheets"),
         (
             {f"a{i}": b"" for i in range(2001)},
@@ -316,10 +339,10 @@ def test_hidden_rows_are_counted():
     ],
 )
 def test_number_formats(form, expected):
-    workbook = openpyxl.Workbook()
-    workbook.active["A1"] = 12.5
-    workbook.active["A1"].number_format = form
-    (cell,) = read_one(saved(workbook)).rows[0].cells
+    made = openpyxl.Workbook()
+    made.active["A1"] = 12.5
+    made.active["A1"].number_format = form
+    (cell,) = read_one(saved(made)).rows[0].cells
     assert (cell.text, cell.kind, cell.unit) == expected
 
 
@@ -327,8 +350,8 @@ def test_number_formats(form, expected):
     "epoch", [openpyxl.utils.datetime.WINDOWS_EPOCH, openpyxl.utils.datetime.MAC_EPOCH]
 )
 def test_dates_of_both_epochs(epoch):
-    workbook = openpyxl.Workbook()
-    workbook.epoch = epoch
-    workbook.active["A1"] = datetime.datetime(2026, 5, 1, 12)
-    (cell,) = read_one(saved(workbook)).rows[0].cells
+    made = openpyxl.Workbook()
+    made.epoch = epoch
+    made.active["A1"] = datetime.datetime(2026, 5, 1, 12)
+    (cell,) = read_one(saved(made)).rows[0].cells
     assert (cell.text, cell.kind) == ("2026-05-01 12:00:00", "date")
