@@ -6,6 +6,7 @@ from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from orthocal.errors import SessionError
 from orthocal.io.tables.cell import BLANK, Row, column_letters
@@ -25,14 +26,6 @@ class Table:
     """A table with headings."""
 
     path: Path
-    sheet: str | None
-    """Name of the worksheet; None for a text file."""
-    encoding: str | None
-    """Encoding; None for a workbook, as the next three."""
-    encoding_reason: str | None
-    separator: str | None
-    """Name of the separator."""
-    separator_reason: str | None
     header: tuple[str, ...]
     """Headings without blank ones at the end."""
     header_line: int
@@ -42,6 +35,14 @@ class Table:
     """Lines above the heading that are not blank."""
     rows: tuple[Row, ...]
     """Rows below the heading that are not blank."""
+    encoding: str | None = None
+    """Encoding of a text file."""
+    encoding_reason: str | None = None
+    separator: str | None = None
+    """Name of the separator of a text file."""
+    separator_reason: str | None = None
+    sheet: str | None = None
+    """Name of the worksheet of a workbook."""
     merged: tuple[MergedCells, ...] = ()
     """Cells that are merged downwards."""
     formulas: int = 0
@@ -112,18 +113,14 @@ def read_table(
     at = find_header(rows[:HEADER_ROWS])
     if at is None:
         raise _no_header(str(path), rows, expected, f" with {name} as separator")
-    return Table(
-        path=path,
-        sheet=None,
+    return _make_table(
+        path,
+        rows,
+        at,
         encoding=decoded.encoding,
         encoding_reason=decoded.reason,
         separator=name,
         separator_reason=reason,
-        header=tuple(c.text for c in rows[at].cells),
-        header_line=rows[at].line,
-        header_width=rows[at].width,
-        above=tuple(r.line for r in rows[:at]),
-        rows=rows[at + 1 :],
     )
 
 
@@ -144,22 +141,27 @@ def _read_sheet(
             f"several sheets have {expected}: {names}; choose one by --sheet NAME", where=str(path)
         )
     chosen, at = matching[0]
-    header = chosen.rows[at]
-    return Table(
-        path=path,
+    return _make_table(
+        path,
+        chosen.rows,
+        at,
         sheet=chosen.name,
-        encoding=None,
-        encoding_reason=None,
-        separator=None,
-        separator_reason=None,
-        header=tuple(c.text for c in header.cells),
-        header_line=header.line,
-        header_width=header.width,
-        above=tuple(r.line for r in chosen.rows[:at]),
-        rows=chosen.rows[at + 1 :],
         merged=chosen.merged,
         formulas=chosen.formulas,
         hidden=chosen.hidden,
+    )
+
+
+def _make_table(path: Path, rows: tuple[Row, ...], at: int, **origin: Any) -> Table:  # noqa: ANN401 - fields of a table
+    """Table whose headings are in one of some rows."""
+    return Table(
+        path=path,
+        header=tuple(c.text for c in rows[at].cells),
+        header_line=rows[at].line,
+        header_width=rows[at].width,
+        above=tuple(r.line for r in rows[:at]),
+        rows=rows[at + 1 :],
+        **origin,
     )
 
 

@@ -2,7 +2,7 @@
 
 A workbook is a ZIP archive of XML parts (ECMA-376, part 1) from an untrusted source. Only the parts
 with cells, their texts and their formats are read. Every part is bounded before it is unpacked.
-Cells are read as a stream of XML events without entities, in linear time.
+Cells are read one by one, without entities, in linear time.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import math
 import posixpath
 import re
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
@@ -33,6 +33,7 @@ from orthocal.io.tables.cell import (
     Row,
     make_row,
 )
+from orthocal.io.tables.numerals import format_decimal
 from orthocal.text import shorten, text_problem
 
 ZIP_SIGNATURE = b"PK\x03\x04"
@@ -47,11 +48,21 @@ LARGEST_PART = 2 * 2**20
 MOST_PARTS = 2_000
 """Maximum number of parts of a workbook."""
 
-MOST_ELEMENTS = 4 * MOST_CELLS
-"""Maximum number of XML elements of a part, for the time to read it."""
+MOST_TAGS = 5 * MOST_CELLS
+"""Maximum number of XML tags of a part; a cell takes four, with a formula six."""
 
 LONGEST_FORMAT = 255
 """Maximum length of a number format; the limit of Excel."""
+
+_SAFE = {
+    "resolve_entities": False,
+    "load_dtd": False,
+    "no_network": True,
+    "huge_tree": False,
+    "remove_comments": True,
+    "remove_pis": True,
+}
+"""Options of the XML parsers."""
 
 _DIRECTORY_ENTRY = b"PK\x01\x02"
 
@@ -157,9 +168,11 @@ class _Workbook:
         self._formats: list[NumberFormat] = []
         if "styles" in by_kind:
             self._formats = _read_formats(self._tree(by_kind["styles"]))
-        self._strings: list[str] = []
-        if "sharedStrings" in by_kind:
-            self._strings = self._parse(by_kind["sharedStrings"], _StringTarget())
+        self._strings = (
+            [_join_text(item) for item in self._elements(by_kind["sharedStrings"], "si")]
+            if "sharedStrings" in by_kind
+            else []
+        )
         old_epoch = any(e.get("date1904") in ("1", "true") for e in root.iter("{*}workbookPr"))
         self._epoch = datetime.datetime(*((1904, 1, 1) if old_epoch else (1899, 12, 30)))
 
@@ -178,19 +191,98 @@ class _Workbook:
                     f"has no sheet '{shorten(name)}'; sheets: {names}", where=self._where
                 )
             chosen = chosen[:1]
-        return [
-            self._parse(
-                part,
-                _SheetTarget(
-                    title,
-                    strings=self._strings,
-                    formats=self._formats,
-                    epoch=self._epoch,
-                    where=f"{self._where}: sheet '{title}'",
-                ),
-            )
-            for title, _, part in chosen
-        ]
+        return [self._read_sheet(title, part) for title, _, part in chosen]
+
+    def _read_sheet(self, title: str, part: str) -> Sheet:
+        where = f"{self._where}: sheet '{title}'"
+        rows: list[Row] = []
+        merged: list[MergedCells] = []
+        cells: list[Cell] = []
+        column, line, count, formulas, hidden = -1, 0, 0, 0, 0
+        for element in self._elements(part, "c", "row", "mergeCell"):
+            kind = _local_name(element)
+            if kind == "c":
+                address, before = element.get("r"), column
+                column = before + 1 if address is None else _parse_address(address)[1]
+                if column <= before:
+                    raise ValueError(f"cell {address} is out of order")
+                children = {_local_name(child): child for child in reversed(element)}
+                formulas += "f" in children
+                cell = self._read_cell(element, children, where)
+                if cell.is_blank:
+                    continue
+                if column >= MOST_COLUMNS:
+                    raise SessionError(
+                        f"has {column + 1} columns; expected at most {MOST_COLUMNS}", where=where
+                    )
+                cells += [BLANK] * (column - len(cells))
+                cells.append(cell)
+            elif kind == "row":
+                after = _parse_index(element.get("r", str(line + 1)))
+                if after <= line:
+                    raise ValueError(f"row {after} follows row {line}")
+                line, column = after, -1
+                hidden += element.get("hidden") in ("1", "true")
+                row = make_row(line, cells)
+                cells = []
+                if row is not None:
+                    rows.append(row)
+                    count += len(row.cells)
+                    if line > MOST_ROWS or count > MOST_CELLS:
+                        limit = f"{MOST_ROWS} rows" if line > MOST_ROWS else f"{MOST_CELLS} cells"
+                        raise SessionError(f"has more than {limit}", where=where)
+            else:
+                first, _, last = element.get("ref", "").partition(":")
+                (top, left), (bottom, right) = _parse_address(first), _parse_address(last or first)
+                if top < bottom and left == right:
+                    merged.append((left, top, bottom))
+        return Sheet(title, tuple(rows), tuple(sorted(merged)), formulas, hidden)
+
+    def _read_cell(self, element: Any, children: dict[str, Any], where: str) -> Cell:  # noqa: ANN401 - lxml has no types
+        """Content of a cell, by its type and its style.
+
+        Args:
+            element: Element of the cell.
+            children: Its first children, by their names.
+            where: File and worksheet, for messages.
+        """
+        if not children:
+            return BLANK
+        kind = element.get("t", "n")
+        if kind not in ("n", "b", "d", "e", "s", "str", "inlineStr"):
+            raise ValueError(f"'{shorten(kind)}' is not the type of a cell")
+        text = _join_text(element) if kind == "inlineStr" else ""
+        if kind != "inlineStr" and "v" in children:
+            text = children["v"].text
+        if not text:
+            return Cell("", kind="unsaved formula") if "f" in children else BLANK
+        if kind == "n":
+            return self._read_number(text, _parse_index(element.get("s", "0")))
+        if kind == "b":
+            return Cell("TRUE" if text in ("1", "true") else "FALSE", kind="boolean")
+        if kind == "d":
+            return Cell(text, kind="date")
+        if kind == "s":
+            text = self._strings[_parse_index(text)]
+        problem = text_problem(text.replace("\r", "\n"))
+        if problem:
+            raise SessionError(problem, where=where)
+        return Cell(text)
+
+    def _read_number(self, text: str, style: int) -> Cell:
+        """Number to the 15 digits that a spreadsheet program shows."""
+        value = math.nan
+        if len(text) <= LONGEST_NUMBER and _NUMBER.fullmatch(text):
+            value = float(text)
+        if not abs(value) <= 1e15:
+            return Cell(text)
+        form = self._formats[style] if self._formats else NumberFormat("number")
+        if form.kind == "date":
+            with suppress(OverflowError):  # a number beyond the calendar is shown as it is
+                text = str(self._epoch + datetime.timedelta(days=value))
+            return Cell(text, kind="date")
+        number = Decimal(f"{value:.15g}")
+        return Cell(format_decimal(number), number, form.kind, form.unit)
 
     def _relations(self, part: str) -> dict[str, tuple[str, str]]:
         """Kinds and targets of the relations of a part, by their identifiers."""
@@ -206,17 +298,23 @@ class _Workbook:
 
     def _tree(self, part: str) -> Any:  # noqa: ANN401 - lxml has no types
         """Root element of a small part."""
-        return etree.fromstring(self._unpack(part, LARGEST_PART), _parser())
+        return etree.fromstring(self._unpack(part, LARGEST_PART), etree.XMLParser(**_SAFE))
 
-    def _parse(self, part: str, target: _StringTarget) -> Any:  # noqa: ANN401 - what the target makes
-        """Result of a target that receives the XML events of a part."""
-        return etree.fromstring(self._unpack(part, LARGEST_CONTENT), _parser(target=target))
+    def _elements(self, part: str, *names: str) -> Iterator[Any]:
+        """Elements of a part in the order of their ends; each is freed after its use."""
+        stream = io.BytesIO(self._unpack(part, LARGEST_CONTENT))
+        tags = tuple(f"{{*}}{name}" for name in names)
+        for _, element in etree.iterparse(stream, tag=tags, **_SAFE):
+            yield element
+            element.clear()
+            while element.getprevious() is not None:
+                del element.getparent()[0]
 
     def _unpack(self, part: str, largest: int) -> bytes:
         """Content of a part.
 
         Raises:
-            SessionError: If it is too large, damaged, or not plain XML.
+            SessionError: If it is missing, too large, damaged, or not plain XML.
         """
         try:
             info = self._archive.getinfo(part)
@@ -244,14 +342,11 @@ class _Workbook:
                 f"is not a regular .xlsx workbook: {shorten(part)} is not plain XML",
                 where=self._where,
             )
+        if text.count(b"<") > MOST_TAGS:
+            raise SessionError(
+                f"has more than {MOST_TAGS} XML tags in {shorten(part)}", where=self._where
+            )
         return text
-
-
-def _parser(**options: object) -> Any:  # noqa: ANN401 - lxml has no types
-    """XML parser that resolves no entities and loads nothing."""
-    return etree.XMLParser(
-        resolve_entities=False, load_dtd=False, no_network=True, huge_tree=False, **options
-    )
 
 
 def _read_formats(styles: Any) -> list[NumberFormat]:  # noqa: ANN401 - lxml has no types
@@ -284,200 +379,14 @@ def parse_number_format(code: str) -> NumberFormat:
     return NumberFormat("number", "".join(a + b for a, b in _LITERAL.findall(positive)).strip())
 
 
-class _StringTarget:
-    """Texts of the items of the shared strings, from XML events."""
-
-    def __init__(self) -> None:
-        self._elements = 0
-        self._strings: list[str] = []
-        self._text: list[str] = []
-        self._collects = False
-        self._phonetic = False
-
-    def start(self, tag: str, attributes: Mapping[str, str]) -> None:
-        self._elements += 1
-        if self._elements > MOST_ELEMENTS:
-            raise ValueError(f"a part has more than {MOST_ELEMENTS} XML elements")
-        name = _local_name(tag)
-        if name == "rPh":
-            self._phonetic = True
-        elif name in ("t", "v"):
-            self._collects = not self._phonetic
-
-    def data(self, text: str) -> None:
-        if self._collects:
-            self._text.append(text)
-
-    def end(self, tag: str) -> None:
-        name = _local_name(tag)
-        if name == "rPh":
-            self._phonetic = False
-        elif name in ("t", "v"):
-            self._collects = False
-        elif name == "si":
-            self._strings.append(self._take_text())
-
-    def close(self) -> Any:  # noqa: ANN401 - a target makes what it likes
-        return self._strings
-
-    def _take_text(self) -> str:
-        text = "".join(self._text)
-        self._text.clear()
-        return text
+def _local_name(element: Any) -> str:  # noqa: ANN401 - lxml has no types
+    """Name of an element without its namespace, which has two forms (ECMA-376 and ISO 29500)."""
+    return str(element.tag.rpartition("}")[2])
 
 
-class _SheetTarget(_StringTarget):
-    """Rows of a worksheet, from XML events."""
-
-    def __init__(
-        self,
-        title: str,
-        *,
-        strings: list[str],
-        formats: list[NumberFormat],
-        epoch: datetime.datetime,
-        where: str,
-    ) -> None:
-        super().__init__()
-        self._title = title
-        self._shared = strings
-        self._formats = formats
-        self._epoch = epoch
-        self._where = where
-        self._rows: list[Row] = []
-        self._merged: list[MergedCells] = []
-        self._count = self._formulas = self._hidden = 0
-        self._line = 0
-        self._cells: list[Cell] = []
-        self._column = -1
-        self._type = "n"
-        self._style = 0
-        self._formula = False
-        self._starts: dict[str, Callable[[Mapping[str, str]], None]] = {
-            "row": self._start_row,
-            "c": self._start_cell,
-            "f": self._start_formula,
-            "mergeCell": self._add_merged,
-        }
-
-    def start(self, tag: str, attributes: Mapping[str, str]) -> None:
-        super().start(tag, attributes)
-        begin = self._starts.get(_local_name(tag))
-        if begin is not None:
-            begin(attributes)
-
-    def end(self, tag: str) -> None:
-        name = _local_name(tag)
-        if name == "c":
-            self._end_cell()
-        elif name == "row":
-            self._end_row()
-        else:
-            super().end(tag)
-
-    def close(self) -> Sheet:
-        return Sheet(
-            self._title,
-            tuple(self._rows),
-            tuple(sorted(self._merged)),
-            self._formulas,
-            self._hidden,
-        )
-
-    def _start_row(self, attributes: Mapping[str, str]) -> None:
-        line = _parse_index(attributes["r"]) if "r" in attributes else self._line + 1
-        if line <= self._line:
-            raise ValueError(f"row {line} follows row {self._line}")
-        self._line = line
-        self._cells, self._column = [], -1
-        self._hidden += attributes.get("hidden") in ("1", "true")
-
-    def _end_row(self) -> None:
-        row = make_row(self._line, self._cells)
-        self._cells = []
-        if row is None:
-            return
-        if row.line > MOST_ROWS:
-            raise SessionError(f"has more than {MOST_ROWS} rows", where=self._where)
-        self._count += len(row.cells)
-        if self._count > MOST_CELLS:
-            raise SessionError(f"has more than {MOST_CELLS} cells", where=self._where)
-        self._rows.append(row)
-
-    def _start_cell(self, attributes: Mapping[str, str]) -> None:
-        column = self._column + 1
-        if "r" in attributes:
-            line, column = _parse_address(attributes["r"])
-            if line != self._line or column <= self._column:
-                raise ValueError(f"cell {attributes['r']} is out of order")
-        self._column = column
-        self._type = attributes.get("t", "n")
-        self._style = _parse_index(attributes.get("s", "0"))
-        self._formula = False
-        self._text.clear()
-
-    def _start_formula(self, _: Mapping[str, str]) -> None:
-        self._formulas += not self._formula
-        self._formula = True
-
-    def _end_cell(self) -> None:
-        cell = self._make_cell(self._take_text())
-        if cell.is_blank:
-            return
-        if self._column >= MOST_COLUMNS:
-            raise SessionError(
-                f"has {self._column + 1} columns; expected at most {MOST_COLUMNS}",
-                where=f"{self._where} row {self._line}",
-            )
-        self._cells += [BLANK] * (self._column - len(self._cells))
-        self._cells.append(cell)
-
-    def _make_cell(self, text: str) -> Cell:
-        """Cell of a text, by the type and the style of the cell."""
-        if not text:
-            return Cell("", kind="unsaved formula") if self._formula else BLANK
-        if self._type == "n":
-            return self._make_number(text)
-        if self._type == "b":
-            return Cell("TRUE" if text in ("1", "true") else "FALSE", kind="boolean")
-        if self._type == "d":
-            return Cell(text, kind="date")
-        if self._type == "s":
-            text = self._shared[_parse_index(text)]
-        problem = text_problem(text.replace("\r", "\n"))
-        if problem:
-            raise SessionError(problem, where=f"{self._where} row {self._line}")
-        return Cell(text)
-
-    def _make_number(self, text: str) -> Cell:
-        """Number to the 15 digits that a spreadsheet program shows."""
-        value = math.nan
-        if len(text) <= LONGEST_NUMBER and _NUMBER.fullmatch(text):
-            value = float(text)
-        if not abs(value) <= 1e15:
-            return Cell(text)
-        number = Decimal(f"{value:.15g}")
-        plain = f"{number:f}" if number.adjusted() > -20 else str(number)
-        if "." in plain:
-            plain = plain.rstrip("0").rstrip(".")
-        form = self._formats[self._style] if self._formats else NumberFormat("number")
-        if form.kind == "date":
-            with suppress(OverflowError):  # a number beyond the calendar is shown as it is
-                plain = str(self._epoch + datetime.timedelta(days=value))
-            return Cell(plain, kind="date")
-        return Cell(plain, number, form.kind, form.unit)
-
-    def _add_merged(self, attributes: Mapping[str, str]) -> None:
-        first, _, last = attributes.get("ref", "").partition(":")
-        (top, left), (bottom, right) = _parse_address(first), _parse_address(last or first)
-        if top < bottom and left == right:
-            self._merged.append((left, top, bottom))
-        if len(self._merged) > MOST_ROWS:
-            raise SessionError(f"has more than {MOST_ROWS} merged cells", where=self._where)
-
-
-def _local_name(tag: str) -> str:
-    return tag.rpartition("}")[2]
+def _join_text(item: Any) -> str:  # noqa: ANN401 - lxml has no types
+    """Text of all runs of an item, without phonetic guides."""
+    return "".join(e.text or "" for e in item.iter("{*}t") if _local_name(e.getparent()) != "rPh")
 
 
 def _parse_index(text: str) -> int:

@@ -166,7 +166,7 @@ def _split_unit(plain: str) -> tuple[str, UnitName | None]:
 
 def _read_words(plain: str) -> Heading | None:
     """Meaning of a heading without a unit."""
-    plain = " ".join(_BREAK.split(plain)).strip(" .:")
+    plain = " ".join(re.split(r"[\s_\-]+", plain)).strip(" .:")
     if plain in _ROLES:
         return Heading(_ROLES[plain])
     if match := _NUMBERED.fullmatch(plain):
