@@ -1,4 +1,4 @@
-"""Tables as spreadsheets and hands write them: the exact readings of each, or the exact refusal."""
+"""Import of tables: the exact readings of every form of table, or its refusal."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ readings: readings.csv
 """
 
 THREE = (("xy", "zero", "", 1, "0"), ("xy", "x_max", "", 1, "-0.43"), ("yx", "zero", "", 1, "1.5"))
-"""What most of the forms say."""
+"""Readings of most forms."""
 
 WIDE = (
     ("xy", "zero", "", 1, "0.01"),
@@ -50,12 +50,12 @@ WIDE = (
 
 @dataclass(frozen=True)
 class Form:
-    """A table, and what comes of it."""
+    """A table, and its expected readings or refusal."""
 
     name: str
     content: bytes
     expected: tuple[tuple[str, str, str, int, str], ...] | str
-    """Readings in mm, or the refusal, in which {} is the table."""
+    """Readings in mm, or the refusal with {} for the path of the table."""
     options: dict[str, Any] = field(default_factory=dict)
 
 
@@ -109,7 +109,7 @@ def hide_second(made):
 
 
 def one(value, *, unit="mm"):
-    """The reading of a table of one."""
+    """The only reading of a table, in mm."""
     factor = {"mm": 1, "um": Decimal("0.001"), "inch": Decimal("25.4")}[unit]
     return (("xy", "zero", "", 1, str(Decimal(value) * factor)),)
 
@@ -136,7 +136,7 @@ FORMS = [
     text("all-quoted", '"Setup";"Posture";"Reading_mm"\n"xy";"zero";"0,00"\n"xy";"x_max";"-0,43"\n'
          '"yx";"zero";"1,5"\n'),
     text("lines-of-a-mac", GERMAN.replace("\r\n", "\r")),
-    text("said-separator", f"sep=;\n{GERMAN}"),
+    text("stated-separator", f"sep=;\n{GERMAN}"),
     text("capitals", ENGLISH.replace("setup,posture,reading_mm", " SETUP , Posture ,READING_MM")
          .replace("xy,", "XY,").replace("x_max", "X max")),
     text("bracketed-unit", GERMAN.replace("Messwert [mm]", "Ablesung (mm)")),
@@ -173,11 +173,11 @@ FORMS = [
          encoding="cp1252"),
     text("inches", 'setup;posture;reading (in)\nxy;zero;-.0125\n', one("-.0125", unit="inch")),
     text("inch-marks", 'setup|posture|reading\nxy|zero|0.005"\n', one("0.005", unit="inch")),
-    text("said-unit", UNITLESS, one("0.5"), unit="mm"),
-    text("said-inch", UNITLESS, one("0.5", unit="inch"), unit="inch"),
+    text("unit-from-option", UNITLESS, one("0.5"), unit="mm"),
+    text("inch-from-option", UNITLESS, one("0.5", unit="inch"), unit="inch"),
     text("no-unit", UNITLESS, "{}:2: neither the heading 'value' nor the cell has a unit; state it "
          "by --unit mm, um or inch"),
-    text("other-unit-than-said", UNITLESS.replace("value", "value_mm"),
+    text("other-unit-than-option", UNITLESS.replace("value", "value_mm"),
          "{}:2: the reading is in mm, which contradicts --unit um", unit="um"),
     text("other-unit-in-a-cell", HEAD + "xy;zero;0,5 µm\n",
          "{}:2: the reading is in um, and its heading says mm"),
@@ -194,7 +194,7 @@ FORMS = [
          "xy\tzero\t0,01\t-0,02\t-0,005\nxy\tx_max\t0,5\t0,52\t0,51\n", WIDE),
     text("wide-numbers", "setup;posture;1;2\nxy;zero;0,01;-0,02\nxy;x_max;0,5;0,52\n", WIDE,
          unit="mm"),
-    text("wide-told", "setup;posture;Uhr A [mm];Uhr B [mm]\nxy;zero;0,01;-0,02\n"
+    text("wide-assigned", "setup;posture;Uhr A [mm];Uhr B [mm]\nxy;zero;0,01;-0,02\n"
          "xy;x_max;0,5;0,52\n", WIDE,
          columns={"reading 2": "Uhr B [mm]", "reading1": "Uhr A [mm]"}),
     text("wide-half-read", "setup;posture;cycle 1;cycle 2\nxy;zero;0,01;-0,02\nxy;x_max;0,5;\n",
@@ -217,21 +217,21 @@ FORMS = [
     text("thousand-or-decimal-by-point", UNITLESS.replace("0,5", "-1.234"),
          "{}:2: the reading '-1.234' is -1234 with a decimal comma and -1.234 with a decimal "
          "point, " + WHICH, unit="um"),
-    text("told-by-another-cell", HEAD + "xy;zero;1,234\nxy;x_max;0,5\n",
+    text("sign-from-another-cell", HEAD + "xy;zero;1,234\nxy;x_max;0,5\n",
          (("xy", "zero", "", 1, "1.234"), ("xy", "x_max", "", 1, "0.5"))),
-    text("told-by-an-option", HEAD + "xy;zero;1,234\n", one("1.234"), decimal="comma"),
+    text("sign-from-an-option", HEAD + "xy;zero;1,234\n", one("1.234"), decimal="comma"),
     text("thousand-by-an-option", HEAD.replace("mm", "um") + "xy;zero;1,234\n",
          one("1234", unit="um"), decimal="point"),
     text("leading-zero", HEAD + "xy;zero;0,123\n", one("0.123")),
     text("both-signs", HEAD + "xy;zero;0,5\nxy;x_max;0.5\n",
          "{}:3: the reading '0.5' has a decimal point, and '0,5' in line 2 a decimal comma; use "
          "one decimal sign"),
-    text("other-sign-than-said", HEAD + "xy;zero;0,5\n",
+    text("other-sign-than-option", HEAD + "xy;zero;0,5\n",
          "{}:2: the reading is '0,5'; expected a number with a decimal point", decimal="point"),
     text("three-and-five", "setup,posture,Wert_um,Zyklus\nxy,zero,3,5\n",
          "{}:2: '3,5' may be two cells or one number with a decimal comma; for two cells use "
          "`orthocal import --separator comma`, for one number save the table with semicolons"),
-    text("three-and-five-said", "setup,posture,Wert_um,Zyklus\nxy,zero,3,5\n",
+    text("three-and-five-with-option", "setup,posture,Wert_um,Zyklus\nxy,zero,3,5\n",
          (("xy", "zero", "", 5, "0.003"),), separator="comma"),
     text("decimal-comma-between-commas", "setup,posture,reading_mm\nxy,zero,0,5\n",
          "{}:2: has 4 fields; expected 3; a decimal comma between commas? Save the table with "
@@ -253,8 +253,8 @@ FORMS = [
     text("two-readings-a-row", "setup;posture;Messwert_mm;Anzeige_mm\nxy;zero;0,5;0,6\n",
          "{}:1: several columns have the role reading: 'Messwert_mm' (#3) and 'Anzeige_mm' (#4); "
          "choose one by --column reading=HEADING"),
-    text("two-readings-told", "setup;posture;Messwert_mm;Anzeige_mm\nxy;zero;0,5;0,6\n", one("0.6"),
-         columns={"reading": "Anzeige_mm"}),
+    text("two-readings-assigned", "setup;posture;Messwert_mm;Anzeige_mm\nxy;zero;0,5;0,6\n",
+         one("0.6"), columns={"reading": "Anzeige_mm"}),
     text("beyond-the-gauge", HEAD + "xy;zero;500,5\n", "{}:2: reading_mm is 500.5; expected a "
          "number within ±300: no indicator reaches further"),
     text("nothing", "", "{}: is empty; expected the headings setup, posture and reading"),
@@ -263,7 +263,7 @@ FORMS = [
     Form("control-characters", b"\x00\x01\x02\x03" * 9,
          "{}:1: contains the control character 0x00; expected text (utf-8)"),
     Form("half-utf8", b"\xef\xbb\xbfsetup\xff", "{}: is not utf-8 text (byte 8)"),
-    Form("said-utf8", GERMAN.replace("-0", "–0").encode("cp1252"),
+    Form("requested-utf8", GERMAN.replace("-0", "–0").encode("cp1252"),
          "{}: is not utf-8 text (byte 59)", {"encoding": "utf-8"}),
     Form("old-workbook", b"\xd0\xcf\x11\xe0" + bytes(600),
          "{}: is an old .xls, or protected by a password; save it as .xlsx or CSV"),
@@ -300,7 +300,7 @@ FORMS = [
     book("workbook-two-sheets", {"Montag": CELLS, "Dienstag": CELLS},
          "{}: several sheets have the headings setup, posture and reading: 'Montag', 'Dienstag'; "
          "choose one by --sheet NAME"),
-    book("workbook-said-sheet", {"Montag": CELLS[:2], "Dienstag": CELLS}, sheet="dienstag"),
+    book("workbook-chosen-sheet", {"Montag": CELLS[:2], "Dienstag": CELLS}, sheet="dienstag"),
     book("workbook-hidden-sheet", {"Montag": CELLS, "Dienstag": CELLS}, edit=hide_second),
     book("workbook-no-such-sheet", {"Montag": CELLS},
          "{}: has no sheet 'Mittwoch'; sheets: 'Montag'", sheet="Mittwoch"),
@@ -314,7 +314,7 @@ FORMS = [
          "semicolon, tab, comma, pipe", separator="!"),
     text("no-such-encoding", ENGLISH, "--encoding: 'x' is not an encoding; expected one of utf-8, "
          "utf-16, utf-16-le, utf-16-be, cp1252, latin-1, cp1250, cp850, cp437, mac-roman",
-         encoding_said="x"),
+         encoding_option="x"),
     text("no-such-unit", ENGLISH, "--unit: 'm' is not a unit of readings; expected mm, um, inch, "
          "cm, thou", unit="m"),
     text("no-such-decimal", ENGLISH, "--decimal: ',' is not a decimal sign; expected point, comma",
@@ -327,7 +327,7 @@ FORMS = [
          "--column ROLE=HEADING", columns={"setup": "Aufbau"}),
     Form("mac-roman", GERMAN.replace("-0", "–0").encode("mac-roman"), THREE,
          {"encoding": "mac-roman"}),
-    Form("mac-roman-unsaid", GERMAN.replace("-0", "–0").encode("mac-roman"),
+    Form("mac-roman-undetected", GERMAN.replace("-0", "–0").encode("mac-roman"),
          "{}:3: the reading is 'Ð0,43'; expected a number"),
 ]  # fmt: skip
 
@@ -347,10 +347,10 @@ def session(folder):
 
 
 def read(session, form):
-    """What becomes of a form: its readings in mm, or the refusal."""
+    """Import of a form, or the message of its refusal."""
     table = session / "table"
     table.write_bytes(form.content)
-    options = {k.replace("encoding_said", "encoding"): v for k, v in form.options.items()}
+    options = {k.replace("encoding_option", "encoding"): v for k, v in form.options.items()}
     try:
         found = import_readings(table, session, TableOptions(**options))
     except SessionError as e:
@@ -359,12 +359,12 @@ def read(session, form):
     return found
 
 
-def test_there_are_forms_enough_and_their_names_are_their_own():
-    assert len({form.name for form in FORMS}) == len(FORMS) >= 40
+def test_names_of_forms_are_unique():
+    assert len({form.name for form in FORMS}) == len(FORMS)
 
 
 @pytest.mark.parametrize("form", FORMS, ids=lambda form: form.name)
-def test_a_form_gives_its_readings_or_is_refused(form, session):
+def test_a_table_is_imported_exactly_or_refused(form, session):
     found = read(session, form)
     if isinstance(form.expected, str):
         assert found == form.expected
@@ -406,7 +406,7 @@ def put(session, table, readings=PLANNED):
     return session / "table.csv"
 
 
-def test_a_planned_session_is_filled_in_its_own_order(session, orthocal):
+def test_a_planned_session_is_filled_in_its_order(session, orthocal):
     table = put(session, "setup;posture;Zyklus 1 [mm];2 [mm]\nxy;x_max;0,5;\nxy;zero;0,01;-0,02\n")
     code, out, err = orthocal("import", table, session)
     assert (code, err) == (0, f"Wrote {session}/readings.csv\n")
@@ -428,7 +428,7 @@ def test_a_planned_session_is_filled_in_its_own_order(session, orthocal):
     ]
 
 
-def test_the_rest_comes_later_and_what_is_there_stays(session, orthocal):
+def test_later_imports_add_readings(session, orthocal):
     first = put(session, HEAD + "xy;zero;0,01\n")
     assert orthocal("import", first, session)[0] == 0
     second = put(session, HEAD + "xy;zero;0,010\nxy;x_max;0,5\nyx;zero;1\n", None)
@@ -444,7 +444,7 @@ def test_the_rest_comes_later_and_what_is_there_stays(session, orthocal):
     assert (session / "readings.csv").stat().st_mtime_ns == before.st_mtime_ns
 
 
-def test_a_reading_that_is_there_is_not_written_over_unasked(session, orthocal):
+def test_an_existing_reading_is_overwritten_with_replace_only(session, orthocal):
     there = PLANNED.replace("zero,1,", "zero,1,0.02")
     table = put(session, HEAD + "xy;zero;0,01\n", there)
     code, out, err = orthocal("import", table, session)
@@ -460,7 +460,7 @@ def test_a_reading_that_is_there_is_not_written_over_unasked(session, orthocal):
     assert "zero,1,0.01\n" in (session / "readings.csv").read_text()
 
 
-def test_a_dry_run_says_the_same_and_writes_nothing(session, orthocal):
+def test_a_dry_run_prints_the_same_and_writes_nothing(session, orthocal):
     table = put(session, HEAD + "xy;zero;0,01\n")
     code, out, err = orthocal("import", table, session, "--dry-run")
     assert (code, err) == (0, "Nothing written (--dry-run)\n")
@@ -468,7 +468,7 @@ def test_a_dry_run_says_the_same_and_writes_nothing(session, orthocal):
     assert orthocal("import", table, session)[1] == out
 
 
-def test_json_has_all_that_was_understood(session, orthocal):
+def test_json_report(session, orthocal):
     table = put(session, "Setup;posture;T;Wert\nXY;zero;21;-12,5\n;;;\nxy;x_max;21;\nEnde\n")
     code, out, _ = orthocal("import", table, session, "--json", "--unit", "um")
     assert code == 0
@@ -488,7 +488,7 @@ def test_json_has_all_that_was_understood(session, orthocal):
     assert (document["filled"], document["empty"]) == (1, 3)
 
 
-def test_the_sessions_own_table_is_written_anew_where_that_is_said(session, orthocal):
+def test_the_readings_csv_itself_is_rewritten_with_replace_only(session, orthocal):
     own = session / "readings.csv"
     german = "Aufstellung;Stellung;Notiz;Wert_mm\nxy;zero;a;1,234\nxy;x_max;b;\n"
     put(session, "", german)
@@ -503,7 +503,7 @@ def test_the_sessions_own_table_is_written_anew_where_that_is_said(session, orth
     assert own.read_text() == "setup,posture,reading_mm\nxy,zero,1.234\nxy,x_max,\n"
 
 
-def test_what_contradicts_the_session_is_refused_and_nothing_is_written(session, orthocal):
+def test_readings_that_contradict_the_session_are_refused(session, orthocal):
     table = put(session, "setup;posture;minus;reading_mm\nxy;x_max;zero;0,5\n", PLANNED)
     code, _, err = orthocal("import", table, session)
     assert code == 2
@@ -511,7 +511,7 @@ def test_what_contradicts_the_session_is_refused_and_nothing_is_written(session,
     assert (session / "readings.csv").read_text() == PLANNED
 
 
-# ---- the same where a session is read
+# ---- a session's readings.csv
 
 CLEAN = {
     "semicolons": "setup;posture;reading_mm\nxy;zero;0,00\nxy;x_max;-0,43\nyx;zero;1,5\n",
@@ -526,7 +526,7 @@ CLEAN = {
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "cp1252"])
 @pytest.mark.parametrize("table", CLEAN.values(), ids=CLEAN.keys())
-def test_a_clean_table_is_a_sessions_without_any_flag(table, encoding, session):
+def test_a_clean_table_is_read_as_readings_csv(table, encoding, session):
     if encoding == "cp1252":
         table = table.replace("−", "–")
     (session / "readings.csv").write_bytes(table.encode(encoding))

@@ -397,10 +397,10 @@ def _parse_index(text: str) -> int:
 
 def _parse_address(text: str) -> tuple[int, int]:
     """Row from 1 and column from 0 of an address such as B3."""
-    found = _ADDRESS.fullmatch(text)
-    if not found:
+    match = _ADDRESS.fullmatch(text)
+    if not match:
         raise ValueError(f"'{shorten(text)}' is not the address of a cell")
     column = 0
-    for letter in found[1]:
+    for letter in match[1]:
         column = 26 * column + ord(letter) - ord("A") + 1
-    return int(found[2]), column - 1
+    return int(match[2]), column - 1

@@ -194,7 +194,7 @@ def find_header(rows: Sequence[Row], assigned: Mapping[str, str] | None = None) 
 def _read_headings(texts: Sequence[str], assigned: Mapping[str, str]) -> list[Heading | None]:
     """Meaning of every heading of a row; columns that the user assigned come first."""
     places = {key: _find_column(texts, name) for key, name in assigned.items()}
-    by_index = {found[0]: parse_role(key) for key, found in places.items() if len(found) == 1}
+    by_index = {at[0]: parse_role(key) for key, at in places.items() if len(at) == 1}
     roles = {parse_role(key).role for key in assigned}
     headings: list[Heading | None] = []
     for index, text in enumerate(texts):
