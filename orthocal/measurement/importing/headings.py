@@ -68,7 +68,7 @@ _UNIT_WORDS: dict[str, UnitName] = {
     **dict.fromkeys(("thou", "mil", "mils", "0.001 in", '0.001"', "0.001 inch"), "thou"),
 }
 
-LONGEST_HEADING = 200
+LONGEST_HEADING = 100
 """Maximum number of characters of a heading; longer cells are not headings."""
 
 _BRACKETED = re.compile(r"[\[(]([^\[\]()]*)[\])]")

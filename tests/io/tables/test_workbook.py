@@ -306,6 +306,19 @@ def test_shared_strings():
     assert [c.text for c in sheet.rows[0].cells] == ["cd", "", "a b"]
 
 
+def test_a_strict_workbook():
+    """ISO 29500 Strict has other namespaces than the files of most programs."""
+    with zipfile.ZipFile(io.BytesIO(book([["a", 0.5]]))) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    for old, new in (
+        ("schemas.openxmlformats.org/spreadsheetml/2006/main", "ooxml/spreadsheetml/main"),
+        ("schemas.openxmlformats.org/officeDocument/2006", "ooxml/officeDocument"),
+    ):
+        strict = f"purl.oclc.org/{new}"
+        parts = {n: part.replace(old.encode(), strict.encode()) for n, part in parts.items()}
+    assert [c.text for c in read_one(with_parts(parts)).rows[0].cells] == ["a", "0.5"]
+
+
 def test_numbers_have_the_digits_that_a_spreadsheet_shows():
     row = '<row r="1"><c r="A1"><v>0.30000000000000004</v></c><c r="B1"><v>-1E-3</v></c></row>'
     numbers = [c.number for c in read_one(with_sheet(row)).rows[0].cells]
