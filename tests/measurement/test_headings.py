@@ -69,7 +69,7 @@ def test_unit_of_an_assigned_column(heading, unit):
 )
 def test_a_long_heading_takes_no_time(part):
     """A heading of 24 kB took more than a minute."""
-    for length in (LONGEST_HEADING, 8_000, 1_000_000):
+    for length in (LONGEST_HEADING, 8_000, 200_000):
         heading = (part * length)[:length]
         with cpu_limit():
             read_heading(heading)
