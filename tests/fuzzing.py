@@ -544,7 +544,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
         inverse_rows,
     )
     from orthocal.kinematics.loop_closure import nominal_assembly
-    from orthocal.measurement.files.readings_table import read_points, stream_joints
+    from orthocal.measurement.files.coordinate_tables import read_points, stream_joints
     from orthocal.measurement.files.session_file import load_plan
     from orthocal.measurement.files.write_session import write_session
     from orthocal.measurement.importing.import_readings import TableOptions, import_readings
@@ -552,7 +552,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     from orthocal.observation.simulate import load_errors, simulate_session, truth_document
     from orthocal.output.scene.drawing import draw_scene
     from orthocal.output.text.accuracy import format_points
-    from orthocal.output.text.import_report import format_import, printed_import
+    from orthocal.output.text.import_report import format_import, format_import_json
     from orthocal.planning.equipment import Means
     from orthocal.planning.gauge_range import load_dial
     from orthocal.study.journal import open_journal
@@ -588,7 +588,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
             overwrite=True,
         )
         format_import(found)
-        json.loads(printed_import(found, written=False))
+        json.loads(format_import_json(found, written=False))
         (folder / "readings.csv").write_text(found.text, encoding="utf-8")
         load_plan(folder)
     elif kind == "program":

@@ -908,8 +908,8 @@ READINGS_CASES = [
         "decimal-comma-or-thousand",
         "setup;posture;minus;reading_mm\nxy;y_max;y_min;-1,234\n",
         ":2: the reading '-1,234' is -1.234 with a decimal comma and -1234 with a decimal point, "
-        "and no other reading tells which; write it with a decimal point, or say it to `orthocal "
-        "import --decimal comma|point`",
+        "and no other reading decides; write it with a decimal point, or use `orthocal import "
+        "--decimal comma|point`",
     ),
     readings_file(
         "german-column",
@@ -924,14 +924,14 @@ READINGS_CASES = [
     readings_file(
         "two-signs",
         "Aufstellung;Stellung;Messwert [mm]\nxy;y_max;0,43\nxy;y_min;0.3\n",
-        ":3: the reading '0.3' has a decimal point, and '0,43' in line 2 a decimal comma; write "
-        "all alike",
+        ":3: the reading '0.3' has a decimal point, and '0,43' in line 2 a decimal comma; use "
+        "one decimal sign",
     ),
     readings_file(
         "three-and-five",
         "Aufstellung,Stellung,Messwert [mm],Zyklus\nxy,y_max,3,5\n",
-        ":2: '3,5' may be two cells or one number with a decimal comma; if they are two, say "
-        "--separator comma to `orthocal import`, if one, save the table with semicolons",
+        ":2: '3,5' may be two cells or one number with a decimal comma; for two cells use "
+        "`orthocal import --separator comma`, for one number save the table with semicolons",
     ),
     readings_file(
         "workbook",

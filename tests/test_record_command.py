@@ -321,8 +321,8 @@ BAD = {
     ),
     "other rows": (
         lambda f: (f / "readings.csv").write_text("setup,posture,reading_mm\nyx,zero,0.1\n"),
-        "/readings.csv: holds other rows than session.yaml plans, and would be written over; move "
-        "it away, or name it in session.yaml by `readings: readings.csv`",
+        "/readings.csv: holds other rows than session.yaml plans and would be overwritten; move it "
+        "away, or add `readings: readings.csv` to session.yaml",
     ),
     "a YAML that cannot be added to": (
         lambda f: (f / "session.yaml").write_text(

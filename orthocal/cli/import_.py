@@ -1,4 +1,4 @@
-"""Readings that were written into a spreadsheet: import."""
+"""The command `import`."""
 
 from __future__ import annotations
 
@@ -10,59 +10,67 @@ import typer
 from orthocal.cli.options import Json, app
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import SessionError
-from orthocal.text import printable
+from orthocal.text import printable, shorten
 
 
 @app.command("import")
 def import_(
     table: Annotated[
-        Path, typer.Argument(metavar="TABLE", help="A CSV of any spreadsheet, or an .xlsx.")
+        Path,
+        typer.Argument(
+            metavar="TABLE", help="CSV file of any spreadsheet program, or .xlsx workbook."
+        ),
     ],
     session: Annotated[
         Path,
-        typer.Argument(metavar="SESSION", help="session.yaml, or the folder that holds it."),
+        typer.Argument(metavar="SESSION", help="session.yaml, or its directory."),
     ],
-    sheet: Annotated[str | None, typer.Option(help="Sheet of a workbook, by its name.")] = None,
+    sheet: Annotated[str | None, typer.Option(help="Worksheet of a workbook.")] = None,
     decimal: Annotated[
-        str | None, typer.Option(metavar="comma|point", help="The decimal sign of readings.")
+        str | None, typer.Option(metavar="comma|point", help="Decimal sign of the readings.")
     ] = None,
     separator: Annotated[
         str | None,
-        typer.Option(metavar="semicolon|tab|comma|pipe", help="What separates the cells."),
+        typer.Option(metavar="semicolon|tab|comma|pipe", help="Separator of the cells."),
     ] = None,
     unit: Annotated[
         str | None,
-        typer.Option(metavar="mm|um|inch|cm|thou", help="Of readings that state none."),
+        typer.Option(metavar="mm|um|inch|cm|thou", help="Unit of readings without a unit."),
     ] = None,
     encoding: Annotated[
-        str | None, typer.Option(help="utf-8, utf-16, cp1252, cp850, mac-roman ...")
+        str | None,
+        typer.Option(help="Encoding of the file: utf-8, utf-16, cp1252, cp850, mac-roman ..."),
     ] = None,
     column: Annotated[
         list[str] | None,
         typer.Option(
             metavar="ROLE=HEADING",
-            help="Which column is which: setup, posture, minus, cycle, reading, or 'reading 2' "
-            "for a cycle beside others; by its heading, or as #4.",
+            help="Role of a column: setup, posture, minus, cycle, reading, or 'reading 2' for "
+            "cycles side by side. The column is given by its heading, or by its number as #4.",
         ),
     ] = None,
     fill: Annotated[
-        bool, typer.Option("--fill", help="An empty setup or posture is the one above.")
+        bool, typer.Option("--fill", help="Copy an empty setup or posture from the row above.")
     ] = False,
     replace: Annotated[
-        bool, typer.Option("--replace", help="Write over readings that are there.")
+        bool, typer.Option("--replace", help="Overwrite existing readings that differ.")
     ] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what would be done, and write nothing.")
+        bool, typer.Option("--dry-run", help="Show the result without writing it.")
     ] = False,
     json: Json = False,
 ) -> None:
-    """Take the readings of a table into a session, and say what was understood."""
+    """Import readings from a spreadsheet, and show how the table was interpreted.
+
+    Encoding, separator, decimal sign and units are detected. An ambiguous table is refused with
+    the option that decides. Rows match those of the session by setup, posture, minus and cycle.
+    """
     from orthocal.measurement.importing.import_readings import (
         TableOptions,
         import_readings,
         write_import,
     )
-    from orthocal.output.text.import_report import format_import, printed_import
+    from orthocal.output.text.import_report import format_import, format_import_json
 
     options = TableOptions(
         sheet=sheet,
@@ -70,31 +78,34 @@ def import_(
         decimal=decimal,
         unit=unit,
         encoding=encoding,
-        columns=_read_columns(column or []),
+        columns=_parse_columns(column or []),
         fill=fill,
     )
-    found = import_readings(table, session, options, overwrite=replace)
-    written = found.changes and not dry_run
+    result = import_readings(table, session, options, overwrite=replace)
+    written = result.changes and not dry_run
     if written:
-        write_import(found)
+        write_import(result)
     if json:
-        put_out(printed_import(found, written=written).removesuffix("\n"))
+        put_out(format_import_json(result, written=written).removesuffix("\n"))
     else:
-        put_out(printable(format_import(found), keep="\n"))
+        put_out(printable(format_import(result), keep="\n"))
     if written:
-        put_note(f"Wrote {found.readings_path}")
+        put_note(f"Wrote {result.readings_path}")
+    elif result.changes:
+        put_note("Nothing written (--dry-run)")
     else:
-        put_note("Nothing was written" + ("" if found.changes else ": there is nothing new"))
+        put_note("Nothing written: the session already has all readings")
 
 
-def _read_columns(given: list[str]) -> dict[str, str]:
-    """Role to heading, of ROLE=HEADING."""
-    found: dict[str, str] = {}
-    for text in given:
+def _parse_columns(assignments: list[str]) -> dict[str, str]:
+    """Role and heading of every ROLE=HEADING."""
+    columns: dict[str, str] = {}
+    for text in assignments:
         role, separator, heading = text.partition("=")
+        role = role.strip()
         if not separator or not heading.strip():
-            raise SessionError(f"found '{text}'; expected ROLE=HEADING", where="--column")
-        if role.strip() in found:
-            raise SessionError(f"the {role.strip()} is said twice", where="--column")
-        found[role.strip()] = heading
-    return found
+            raise SessionError(f"found '{shorten(text)}'; expected ROLE=HEADING", where="--column")
+        if role in columns:
+            raise SessionError(f"assigns the role {shorten(role)} twice", where="--column")
+        columns[role] = heading
+    return columns

@@ -20,7 +20,7 @@ from orthocal.errors import ClosureError, SessionError
 from orthocal.units import MM
 
 if TYPE_CHECKING:
-    from orthocal.measurement.files.readings_table import Block
+    from orthocal.measurement.files.coordinate_tables import Block
     from orthocal.robot.model import Robot
 
 
@@ -51,7 +51,7 @@ def accuracy(
     from orthocal.assessment.tool_tables import accuracy_rows
     from orthocal.calibration.file import load_calibration
     from orthocal.kinematics.workspace import Workspace, cube
-    from orthocal.measurement.files.readings_table import read_points
+    from orthocal.measurement.files.coordinate_tables import read_points
     from orthocal.output.text.accuracy import (
         POINT_COLUMNS,
         accuracy_json,
@@ -113,7 +113,11 @@ def forward(
     """
     from orthocal.assessment.tool_tables import forward_blocks
     from orthocal.calibration.file import load_calibration
-    from orthocal.measurement.files.readings_table import TOOL_COLUMNS, format_rows, stream_joints
+    from orthocal.measurement.files.coordinate_tables import (
+        TOOL_COLUMNS,
+        format_rows,
+        stream_joints,
+    )
 
     result = load_calibration(calibration)
     blocks = _read_blocks(stream_joints, joints, result.robot)
@@ -141,7 +145,11 @@ def inverse(
     """
     from orthocal.assessment.tool_tables import inverse_blocks
     from orthocal.calibration.file import load_calibration
-    from orthocal.measurement.files.readings_table import drive_columns, format_rows, stream_points
+    from orthocal.measurement.files.coordinate_tables import (
+        drive_columns,
+        format_rows,
+        stream_points,
+    )
 
     result = load_calibration(calibration)
     blocks = _read_blocks(stream_points, targets, result.robot)

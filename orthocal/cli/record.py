@@ -164,7 +164,7 @@ class _Dialogue:
 
     def _answer(self, line: str) -> None:
         """Do what was typed; what cannot be done is said, and asked for again."""
-        from orthocal.measurement.importing.typed_numbers import read_typed
+        from orthocal.io.tables.numerals import parse_typed_reading
 
         word, *rest = line.split() or [""]
         try:
@@ -175,7 +175,7 @@ class _Dialogue:
             elif self._at is None:
                 raise SessionError("no row is asked for; `back 3` goes to row 3")
             else:
-                self._take(self._at, read_typed(line))
+                self._take(self._at, parse_typed_reading(line))
         except SessionError as e:
             self._say(self._wrap(f"Not taken: {e}."))
 

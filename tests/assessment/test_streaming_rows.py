@@ -14,7 +14,7 @@ from orthocal.calibration.file import write_calibration
 from orthocal.cli import printing
 from orthocal.errors import SessionError
 from orthocal.io.files import read_lines
-from orthocal.measurement.files import readings_table as table
+from orthocal.measurement.files import coordinate_tables as table
 
 HEADER = "x_mm,y_mm,z_mm\n"
 
@@ -28,7 +28,7 @@ def folder(experiment_2, tmp_path_factory):
 
 @pytest.fixture
 def orthocal(monkeypatch, capsys, folder):
-    monkeypatch.setattr(table, "ROWS_AT_ONCE", 4)
+    monkeypatch.setattr(table, "BLOCK_ROWS", 4)
 
     def run(command, text, *, path="-"):
         stream = io.TextIOWrapper(io.BytesIO(text.encode()))
@@ -112,7 +112,7 @@ def test_memory_does_not_grow_with_the_stream(folder, orthoglide, monkeypatch):
     from orthocal.assessment.tool_tables import inverse_blocks
     from orthocal.calibration.file import load_calibration
 
-    monkeypatch.setattr(table, "ROWS_AT_ONCE", 50)
+    monkeypatch.setattr(table, "BLOCK_ROWS", 50)
     calibration = load_calibration(folder)
 
     class Pipe(io.RawIOBase):

@@ -1,4 +1,4 @@
-"""Tables as spreadsheets and hands write them: the exact readings of each, or the exact refusal."""
+"""Import of tables: the exact readings of every form of table, or its refusal."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ readings: readings.csv
 """
 
 THREE = (("xy", "zero", "", 1, "0"), ("xy", "x_max", "", 1, "-0.43"), ("yx", "zero", "", 1, "1.5"))
-"""What most of the forms say."""
+"""Readings of most forms."""
 
 WIDE = (
     ("xy", "zero", "", 1, "0.01"),
@@ -50,12 +50,12 @@ WIDE = (
 
 @dataclass(frozen=True)
 class Form:
-    """A table, and what comes of it."""
+    """A table, and its expected readings or refusal."""
 
     name: str
     content: bytes
     expected: tuple[tuple[str, str, str, int, str], ...] | str
-    """Readings in mm, or the refusal, in which {} is the table."""
+    """Readings in mm, or the refusal with {} for the path of the table."""
     options: dict[str, Any] = field(default_factory=dict)
 
 
@@ -89,7 +89,7 @@ CELLS = [
 ]
 HEAD = "setup;posture;reading_mm\n"
 UNITLESS = "setup;posture;value\nxy;zero;0,5\n"
-WHICH = "and no other reading tells which; say which: --decimal comma or --decimal point"
+WHICH = "and no other reading decides; choose one by --decimal comma or --decimal point"
 
 
 def in_sheet(cell, **changes):
@@ -109,7 +109,7 @@ def hide_second(made):
 
 
 def one(value, *, unit="mm"):
-    """The reading of a table of one."""
+    """The only reading of a table, in mm."""
     factor = {"mm": 1, "um": Decimal("0.001"), "inch": Decimal("25.4")}[unit]
     return (("xy", "zero", "", 1, str(Decimal(value) * factor)),)
 
@@ -136,7 +136,7 @@ FORMS = [
     text("all-quoted", '"Setup";"Posture";"Reading_mm"\n"xy";"zero";"0,00"\n"xy";"x_max";"-0,43"\n'
          '"yx";"zero";"1,5"\n'),
     text("lines-of-a-mac", GERMAN.replace("\r\n", "\r")),
-    text("said-separator", f"sep=;\n{GERMAN}"),
+    text("stated-separator", f"sep=;\n{GERMAN}"),
     text("capitals", ENGLISH.replace("setup,posture,reading_mm", " SETUP , Posture ,READING_MM")
          .replace("xy,", "XY,").replace("x_max", "X max")),
     text("bracketed-unit", GERMAN.replace("Messwert [mm]", "Ablesung (mm)")),
@@ -159,7 +159,7 @@ FORMS = [
          columns={"setup": "A", "posture": "b", "reading": "#3"}, unit="mm"),
     text("fill", "setup;posture;Wert mm\nxy;zero;0,00\n;x_max;-0,43\nyx;zero;1,5\n", fill=True),
     text("not-filled", "setup;posture;Wert mm\nxy;zero;0,00\n;x_max;-0,43\n",
-         "{}:3: has a reading, and its setup is empty; --fill takes the setup above"),
+         "{}:3: has a reading but no setup; --fill copies the setup from the row above"),
     text("groups-by-point", HEAD.replace("mm", "um") + "xy;zero;1.234,5\n",
          one("1234.5", unit="um")),
     text("groups-by-comma", HEAD.replace("mm", "um") + "xy;zero;1,234.5\n",
@@ -173,12 +173,12 @@ FORMS = [
          encoding="cp1252"),
     text("inches", 'setup;posture;reading (in)\nxy;zero;-.0125\n', one("-.0125", unit="inch")),
     text("inch-marks", 'setup|posture|reading\nxy|zero|0.005"\n', one("0.005", unit="inch")),
-    text("said-unit", UNITLESS, one("0.5"), unit="mm"),
-    text("said-inch", UNITLESS, one("0.5", unit="inch"), unit="inch"),
-    text("no-unit", UNITLESS, "{}:2: neither the heading 'value' nor the cell says a unit; say it: "
-         "--unit mm, um or inch"),
-    text("other-unit-than-said", UNITLESS.replace("value", "value_mm"),
-         "{}:2: the reading is in mm, and --unit says um", unit="um"),
+    text("unit-from-option", UNITLESS, one("0.5"), unit="mm"),
+    text("inch-from-option", UNITLESS, one("0.5", unit="inch"), unit="inch"),
+    text("no-unit", UNITLESS, "{}:2: neither the heading 'value' nor the cell has a unit; state it "
+         "by --unit mm, um or inch"),
+    text("other-unit-than-option", UNITLESS.replace("value", "value_mm"),
+         "{}:2: the reading is in mm, which contradicts --unit um", unit="um"),
     text("other-unit-in-a-cell", HEAD + "xy;zero;0,5 µm\n",
          "{}:2: the reading is in um, and its heading says mm"),
     text("exponents", HEAD + "xy;zero;-1,25E-02\n", one("-0.0125")),
@@ -194,18 +194,17 @@ FORMS = [
          "xy\tzero\t0,01\t-0,02\t-0,005\nxy\tx_max\t0,5\t0,52\t0,51\n", WIDE),
     text("wide-numbers", "setup;posture;1;2\nxy;zero;0,01;-0,02\nxy;x_max;0,5;0,52\n", WIDE,
          unit="mm"),
-    text("wide-told", "setup;posture;Uhr A [mm];Uhr B [mm]\nxy;zero;0,01;-0,02\n"
+    text("wide-assigned", "setup;posture;Uhr A [mm];Uhr B [mm]\nxy;zero;0,01;-0,02\n"
          "xy;x_max;0,5;0,52\n", WIDE,
          columns={"reading 2": "Uhr B [mm]", "reading1": "Uhr A [mm]"}),
     text("wide-half-read", "setup;posture;cycle 1;cycle 2\nxy;zero;0,01;-0,02\nxy;x_max;0,5;\n",
          WIDE[:3], unit="mm"),
     text("wide-and-a-cycle", "setup;posture;cycle;reading 1;reading 2\nxy;zero;1;0,1;0,2\n",
-         "{}:1: has cycles side by side ('reading 1' ...) and a column 'cycle' as well; --column "
-         "says which one counts", unit="mm"),
+         "{}:1: has cycles side by side ('reading 1' ...) and a column 'cycle' as well; choose one "
+         "by --column", unit="mm"),
     text("cycles-below-each-other", "setup;posture;Zyklus;mm\nxy;zero;1;0,01\n",
          "{}: no row has the headings setup, posture and reading; row 1 has 'setup', 'posture', "
-         "'Zyklus', 'mm', with semicolon as separator. --column ROLE=HEADING says which column is "
-         "which"),
+         "'Zyklus', 'mm' with semicolon as separator; assign columns by --column ROLE=HEADING"),
     text("cycles-in-rows", "setup;posture;Zyklus;Wert mm\nxy;zero;1;0,01\nxy;zero;2;-0,02\n"
          "xy;x_max;1;0,5\nxy;x_max;2;0,52\n", WIDE),
     text("differences", "setup;posture;minus;reading_mm\nxy;x_max;zero;-0,43\n",
@@ -218,21 +217,21 @@ FORMS = [
     text("thousand-or-decimal-by-point", UNITLESS.replace("0,5", "-1.234"),
          "{}:2: the reading '-1.234' is -1234 with a decimal comma and -1.234 with a decimal "
          "point, " + WHICH, unit="um"),
-    text("told-by-another-cell", HEAD + "xy;zero;1,234\nxy;x_max;0,5\n",
+    text("sign-from-another-cell", HEAD + "xy;zero;1,234\nxy;x_max;0,5\n",
          (("xy", "zero", "", 1, "1.234"), ("xy", "x_max", "", 1, "0.5"))),
-    text("told-by-an-option", HEAD + "xy;zero;1,234\n", one("1.234"), decimal="comma"),
+    text("sign-from-an-option", HEAD + "xy;zero;1,234\n", one("1.234"), decimal="comma"),
     text("thousand-by-an-option", HEAD.replace("mm", "um") + "xy;zero;1,234\n",
          one("1234", unit="um"), decimal="point"),
     text("leading-zero", HEAD + "xy;zero;0,123\n", one("0.123")),
     text("both-signs", HEAD + "xy;zero;0,5\nxy;x_max;0.5\n",
-         "{}:3: the reading '0.5' has a decimal point, and '0,5' in line 2 a decimal comma; write "
-         "all alike"),
-    text("other-sign-than-said", HEAD + "xy;zero;0,5\n",
+         "{}:3: the reading '0.5' has a decimal point, and '0,5' in line 2 a decimal comma; use "
+         "one decimal sign"),
+    text("other-sign-than-option", HEAD + "xy;zero;0,5\n",
          "{}:2: the reading is '0,5'; expected a number with a decimal point", decimal="point"),
     text("three-and-five", "setup,posture,Wert_um,Zyklus\nxy,zero,3,5\n",
-         "{}:2: '3,5' may be two cells or one number with a decimal comma; if they are two, say "
-         "--separator comma to `orthocal import`, if one, save the table with semicolons"),
-    text("three-and-five-said", "setup,posture,Wert_um,Zyklus\nxy,zero,3,5\n",
+         "{}:2: '3,5' may be two cells or one number with a decimal comma; for two cells use "
+         "`orthocal import --separator comma`, for one number save the table with semicolons"),
+    text("three-and-five-with-option", "setup,posture,Wert_um,Zyklus\nxy,zero,3,5\n",
          (("xy", "zero", "", 5, "0.003"),), separator="comma"),
     text("decimal-comma-between-commas", "setup,posture,reading_mm\nxy,zero,0,5\n",
          "{}:2: has 4 fields; expected 3; a decimal comma between commas? Save the table with "
@@ -252,19 +251,19 @@ FORMS = [
          "{}:3: repeats xy zero of cycle 1, first in line 2; number repeated measurements in the "
          "column 'cycle'"),
     text("two-readings-a-row", "setup;posture;Messwert_mm;Anzeige_mm\nxy;zero;0,5;0,6\n",
-         "{}:1: several columns are the reading: 'Messwert_mm' (#3) and 'Anzeige_mm' (#4); say "
-         "which: --column reading=HEADING"),
-    text("two-readings-told", "setup;posture;Messwert_mm;Anzeige_mm\nxy;zero;0,5;0,6\n", one("0.6"),
-         columns={"reading": "Anzeige_mm"}),
+         "{}:1: several columns have the role reading: 'Messwert_mm' (#3) and 'Anzeige_mm' (#4); "
+         "choose one by --column reading=HEADING"),
+    text("two-readings-assigned", "setup;posture;Messwert_mm;Anzeige_mm\nxy;zero;0,5;0,6\n",
+         one("0.6"), columns={"reading": "Anzeige_mm"}),
     text("beyond-the-gauge", HEAD + "xy;zero;500,5\n", "{}:2: reading_mm is 500.5; expected a "
          "number within ±300: no indicator reaches further"),
     text("nothing", "", "{}: is empty; expected the headings setup, posture and reading"),
     text("no-rows", HEAD, "{}: holds no readings"),
     text("open-quote", f'{HEAD}xy;"zero;0,5\n', "{}:2: is not valid CSV: unexpected end of data"),
     Form("control-characters", b"\x00\x01\x02\x03" * 9,
-         "{}:1: holds the control character 0x00; expected text (utf-8)"),
+         "{}:1: contains the control character 0x00; expected text (utf-8)"),
     Form("half-utf8", b"\xef\xbb\xbfsetup\xff", "{}: is not utf-8 text (byte 8)"),
-    Form("said-utf8", GERMAN.replace("-0", "–0").encode("cp1252"),
+    Form("requested-utf8", GERMAN.replace("-0", "–0").encode("cp1252"),
          "{}: is not utf-8 text (byte 59)", {"encoding": "utf-8"}),
     Form("old-workbook", b"\xd0\xcf\x11\xe0" + bytes(600),
          "{}: is an old .xls, or protected by a password; save it as .xlsx or CSV"),
@@ -275,22 +274,22 @@ FORMS = [
     book("workbook-of-both", [CELLS[0], ["xy", "zero", "0,00"], *CELLS[2:]]),
     book("workbook-merged", [*CELLS[:2], [None, "x_max", -0.43], CELLS[3]], edit=merge),
     book("workbook-not-merged", [*CELLS[:2], [None, "x_max", -0.43]],
-         "{}: sheet 'Tabelle1' row 3: has a reading, and its setup is empty; --fill takes the "
-         "setup above"),
+         "{}: sheet 'Tabelle1' row 3: has a reading but no setup; --fill copies the setup from the "
+         "row above"),
     book("workbook-merged-readings", [*CELLS[:2], ["xy", "x_max"]],
-         "{}: sheet 'Tabelle1' C2: is merged with cells below; expected a cell for each reading",
+         "{}: sheet 'Tabelle1' C2: is merged with cells below; expected one cell for each reading",
          edit=lambda made: made.worksheets[0].merge_cells("C2:C3")),
     book("workbook-date", [*CELLS[:2], ["xy", "x_max", datetime.date(2026, 5, 1)]],
          "{}: sheet 'Tabelle1' C3: the reading is the date 2026-05-01 00:00:00; expected a number: "
-         "the spreadsheet took what was typed for a date"),
+         "the spreadsheet program took the typed number for a date"),
     book("workbook-truth", [CELLS[0], ["xy", "zero", True]],
          "{}: sheet 'Tabelle1' C2: the reading is TRUE; expected a number"),
     book("workbook-unsaved-formula", [CELLS[0], ["xy", "zero", "=1+1"]],
-         "{}: sheet 'Tabelle1' C2: the reading is a formula whose value was not saved: open the "
-         "table in a spreadsheet program and save it"),
+         "{}: sheet 'Tabelle1' C2: the reading is a formula without a saved value: open the "
+         "workbook in a spreadsheet program and save it"),
     book("workbook-percentage", [CELLS[0], ["xy", "zero", 0.12]],
-         "{}: sheet 'Tabelle1' C2: the reading is shown as a percentage or in thousands, and is "
-         "0.12; give its cell the format of a plain number",
+         "{}: sheet 'Tabelle1' C2: the reading is 0.12, shown as a percentage or in thousands; "
+         "format its cell as a plain number",
          edit=in_sheet("C2", number_format="0%")),
     book("workbook-unit-of-a-format", [["setup", "posture", "value"], ["xy", "zero", 12.5]],
          one("12.5", unit="um"), edit=in_sheet("C2", number_format='0.0" µm"')),
@@ -299,34 +298,36 @@ FORMS = [
                                        ["xy", "x_max", 0.5, 0.52]], WIDE, unit="mm"),
     book("workbook-sheets", {"Notizen": [["nichts"]], "Messung": CELLS}),
     book("workbook-two-sheets", {"Montag": CELLS, "Dienstag": CELLS},
-         "{}: several sheets have readings: 'Montag', 'Dienstag'; say which: --sheet NAME"),
-    book("workbook-said-sheet", {"Montag": CELLS[:2], "Dienstag": CELLS}, sheet="dienstag"),
+         "{}: several sheets have the headings setup, posture and reading: 'Montag', 'Dienstag'; "
+         "choose one by --sheet NAME"),
+    book("workbook-chosen-sheet", {"Montag": CELLS[:2], "Dienstag": CELLS}, sheet="dienstag"),
     book("workbook-hidden-sheet", {"Montag": CELLS, "Dienstag": CELLS}, edit=hide_second),
     book("workbook-no-such-sheet", {"Montag": CELLS},
          "{}: has no sheet 'Mittwoch'; sheets: 'Montag'", sheet="Mittwoch"),
     book("workbook-no-readings", {"Montag": [["a", "b"]], "Dienstag": [["c"]]},
          "{}: no sheet has the headings setup, posture and reading; sheets: 'Montag', 'Dienstag'"),
-    Form("archive", b"PK\x03\x04" + bytes(50), "{}: is not an .xlsx that can be read: File is not "
-         "a zip file"),
-    text("sheet-of-a-csv", ENGLISH, "--sheet: is of no use: {} is no .xlsx", sheet="a"),
+    Form("archive", b"PK\x03\x04" + bytes(50), "{}: is not a readable .xlsx workbook: File is "
+         "not a zip file"),
+    text("sheet-of-a-csv", ENGLISH, "--sheet: applies to .xlsx workbooks only; {} is not one",
+         sheet="a"),
     text("no-such-separator", ENGLISH, "--separator: '!' is not a separator; expected one of "
          "semicolon, tab, comma, pipe", separator="!"),
     text("no-such-encoding", ENGLISH, "--encoding: 'x' is not an encoding; expected one of utf-8, "
          "utf-16, utf-16-le, utf-16-be, cp1252, latin-1, cp1250, cp850, cp437, mac-roman",
-         encoding_said="x"),
-    text("no-such-unit", ENGLISH, "--unit: 'm' is no unit of readings; expected mm, um, inch, cm, "
-         "thou", unit="m"),
-    text("no-such-decimal", ENGLISH, "--decimal: ',' is no decimal sign; expected comma or point",
+         encoding_option="x"),
+    text("no-such-unit", ENGLISH, "--unit: 'm' is not a unit of readings; expected mm, um, inch, "
+         "cm, thou", unit="m"),
+    text("no-such-decimal", ENGLISH, "--decimal: ',' is not a decimal sign; expected point, comma",
          decimal=","),
-    text("no-such-role", ENGLISH, "--column: 'date' is no column of readings; expected one of "
+    text("no-such-role", ENGLISH, "--column: 'date' is not the role of a column; expected one of "
          "setup, posture, minus, cycle, reading, or reading 1, reading 2 ... for cycles side by "
          "side", columns={"date": "setup"}),
     text("no-such-column", ENGLISH, "{}: no row has the headings setup, posture and reading; row 1 "
-         "has 'setup', 'posture', 'reading_mm', with comma as separator. --column ROLE=HEADING "
-         "says which column is which", columns={"setup": "Aufbau"}),
+         "has 'setup', 'posture', 'reading_mm' with comma as separator; assign columns by "
+         "--column ROLE=HEADING", columns={"setup": "Aufbau"}),
     Form("mac-roman", GERMAN.replace("-0", "–0").encode("mac-roman"), THREE,
          {"encoding": "mac-roman"}),
-    Form("mac-roman-unsaid", GERMAN.replace("-0", "–0").encode("mac-roman"),
+    Form("mac-roman-undetected", GERMAN.replace("-0", "–0").encode("mac-roman"),
          "{}:3: the reading is 'Ð0,43'; expected a number"),
 ]  # fmt: skip
 
@@ -346,10 +347,10 @@ def session(folder):
 
 
 def read(session, form):
-    """What becomes of a form: its readings in mm, or the refusal."""
+    """Import of a form, or the message of its refusal."""
     table = session / "table"
     table.write_bytes(form.content)
-    options = {k.replace("encoding_said", "encoding"): v for k, v in form.options.items()}
+    options = {k.replace("encoding_option", "encoding"): v for k, v in form.options.items()}
     try:
         found = import_readings(table, session, TableOptions(**options))
     except SessionError as e:
@@ -358,12 +359,12 @@ def read(session, form):
     return found
 
 
-def test_there_are_forms_enough_and_their_names_are_their_own():
-    assert len({form.name for form in FORMS}) == len(FORMS) >= 40
+def test_names_of_forms_are_unique():
+    assert len({form.name for form in FORMS}) == len(FORMS)
 
 
 @pytest.mark.parametrize("form", FORMS, ids=lambda form: form.name)
-def test_a_form_gives_its_readings_or_is_refused(form, session):
+def test_a_table_is_imported_exactly_or_refused(form, session):
     found = read(session, form)
     if isinstance(form.expected, str):
         assert found == form.expected
@@ -372,7 +373,7 @@ def test_a_form_gives_its_readings_or_is_refused(form, session):
     assert not isinstance(found, str), found
     rows = [
         (r.setup, r.posture, r.minus, int(r.cycle or 1), Decimal(r.reading))
-        for r in found.long.rows
+        for r in found.long_table.rows
     ]
     assert rows == [(*key, Decimal(value)) for *key, value in form.expected]
     again = load_session(session)
@@ -405,7 +406,7 @@ def put(session, table, readings=PLANNED):
     return session / "table.csv"
 
 
-def test_a_planned_session_is_filled_in_its_own_order(session, orthocal):
+def test_a_planned_session_is_filled_in_its_order(session, orthocal):
     table = put(session, "setup;posture;Zyklus 1 [mm];2 [mm]\nxy;x_max;0,5;\nxy;zero;0,01;-0,02\n")
     code, out, err = orthocal("import", table, session)
     assert (code, err) == (0, f"Wrote {session}/readings.csv\n")
@@ -415,42 +416,42 @@ def test_a_planned_session_is_filled_in_its_own_order(session, orthocal):
     )
     assert out.splitlines() == [
         f"3 readings in {table}",
-        "  encoding       utf-8, ASCII alone",
-        "  separator      semicolon, it gives the columns",
-        "  decimal sign   comma, as in '0,5' (row 2)",
-        "  unit           mm, as the table says",
+        "  encoding       utf-8 (ASCII only)",
+        "  separator      semicolon (detected from the headings)",
+        "  decimal sign   comma (from '0,5' in row 2)",
+        "  unit           mm (stated in the table)",
         "  setup          'setup'",
         "  posture        'posture'",
         "  reading        'Zyklus 1 [mm]' as cycle 1, '2 [mm]' as cycle 2",
-        "  not yet read   1: row 2",
+        "  empty          1 reading: row 2",
         f"{session}/readings.csv: 3 filled in; 1 row still without a reading",
     ]
 
 
-def test_the_rest_comes_later_and_what_is_there_stays(session, orthocal):
+def test_later_imports_add_readings(session, orthocal):
     first = put(session, HEAD + "xy;zero;0,01\n")
     assert orthocal("import", first, session)[0] == 0
     second = put(session, HEAD + "xy;zero;0,010\nxy;x_max;0,5\nyx;zero;1\n", None)
     code, out, _ = orthocal("import", second, session)
     assert code == 0
-    assert out.endswith("1 filled in, 1 added, 1 there already; 2 rows still without a reading\n")
+    assert out.endswith("1 filled in, 1 added, 1 unchanged; 2 rows still without a reading\n")
     rows = (session / "readings.csv").read_text().splitlines()
     assert rows[1:] == ["xy,zero,1,0.01", "xy,x_max,1,0.50", "xy,zero,2,", "xy,x_max,2,",
                         "yx,zero,1,1.00"]  # fmt: skip
     before = (session / "readings.csv").stat()
     code, _, err = orthocal("import", second, session)
-    assert (code, err) == (0, "Nothing was written: there is nothing new\n")
+    assert (code, err) == (0, "Nothing written: the session already has all readings\n")
     assert (session / "readings.csv").stat().st_mtime_ns == before.st_mtime_ns
 
 
-def test_a_reading_that_is_there_is_not_written_over_unasked(session, orthocal):
+def test_an_existing_reading_is_overwritten_with_replace_only(session, orthocal):
     there = PLANNED.replace("zero,1,", "zero,1,0.02")
     table = put(session, HEAD + "xy;zero;0,01\n", there)
     code, out, err = orthocal("import", table, session)
     assert (code, out) == (2, "")
     assert err == (
-        f"orthocal: {session}/readings.csv:2: xy zero of cycle 1 is 0.01 mm in {table}:2, and 0.02 "
-        "mm here; --replace writes over what is there\n"
+        f"orthocal: {session}/readings.csv:2: xy zero of cycle 1 is 0.02 mm, but 0.01 mm in "
+        f"{table}:2; --replace overwrites existing readings\n"
     )
     assert (session / "readings.csv").read_text() == there
     code, out, _ = orthocal("import", table, session, "--replace")
@@ -459,15 +460,15 @@ def test_a_reading_that_is_there_is_not_written_over_unasked(session, orthocal):
     assert "zero,1,0.01\n" in (session / "readings.csv").read_text()
 
 
-def test_a_dry_run_says_the_same_and_writes_nothing(session, orthocal):
+def test_a_dry_run_prints_the_same_and_writes_nothing(session, orthocal):
     table = put(session, HEAD + "xy;zero;0,01\n")
     code, out, err = orthocal("import", table, session, "--dry-run")
-    assert (code, err) == (0, "Nothing was written\n")
+    assert (code, err) == (0, "Nothing written (--dry-run)\n")
     assert (session / "readings.csv").read_text() == PLANNED
     assert orthocal("import", table, session)[1] == out
 
 
-def test_json_has_all_that_was_understood(session, orthocal):
+def test_json_report(session, orthocal):
     table = put(session, "Setup;posture;T;Wert\nXY;zero;21;-12,5\n;;;\nxy;x_max;21;\nEnde\n")
     code, out, _ = orthocal("import", table, session, "--json", "--unit", "um")
     assert code == 0
@@ -479,30 +480,30 @@ def test_json_has_all_that_was_understood(session, orthocal):
     assert document["units"] == ["um"]
     assert (document["encoding"], document["separator"]) == ("utf-8", "semicolon")
     assert document["decimal"] == "comma"
-    assert document["not_used"] == ["'T'"]
-    assert document["left_out"] == [{"row": 5, "reason": "no reading"}]
-    assert document["not_yet_read"] == [4]
-    assert document["names"] == {"XY": "xy"}
+    assert document["unused"] == ["'T'"]
+    assert document["skipped"] == [{"row": 5, "reason": "no reading"}]
+    assert document["rows_without_reading"] == [4]
+    assert document["renamed"] == {"XY": "xy"}
     assert document["written"] == f"{session}/readings.csv"
     assert (document["filled"], document["empty"]) == (1, 3)
 
 
-def test_the_sessions_own_table_is_written_anew_where_that_is_said(session, orthocal):
+def test_the_readings_csv_itself_is_rewritten_with_replace_only(session, orthocal):
     own = session / "readings.csv"
     german = "Aufstellung;Stellung;Notiz;Wert_mm\nxy;zero;a;1,234\nxy;x_max;b;\n"
     put(session, "", german)
     code, _, err = orthocal("import", own, session, "--decimal", "comma")
     assert code == 2
     assert err == (
-        f"orthocal: {own}: is the session's own table; --replace writes it anew, with its readings "
-        "alone\n"
+        f"orthocal: {own}: is the session's own table; --replace rewrites it with its readings "
+        "only\n"
     )
     assert own.read_text() == german
     assert orthocal("import", own, session, "--decimal", "comma", "--replace")[0] == 0
     assert own.read_text() == "setup,posture,reading_mm\nxy,zero,1.234\nxy,x_max,\n"
 
 
-def test_what_contradicts_the_session_is_refused_and_nothing_is_written(session, orthocal):
+def test_readings_that_contradict_the_session_are_refused(session, orthocal):
     table = put(session, "setup;posture;minus;reading_mm\nxy;x_max;zero;0,5\n", PLANNED)
     code, _, err = orthocal("import", table, session)
     assert code == 2
@@ -510,7 +511,7 @@ def test_what_contradicts_the_session_is_refused_and_nothing_is_written(session,
     assert (session / "readings.csv").read_text() == PLANNED
 
 
-# ---- the same where a session is read
+# ---- a session's readings.csv
 
 CLEAN = {
     "semicolons": "setup;posture;reading_mm\nxy;zero;0,00\nxy;x_max;-0,43\nyx;zero;1,5\n",
@@ -525,7 +526,7 @@ CLEAN = {
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "cp1252"])
 @pytest.mark.parametrize("table", CLEAN.values(), ids=CLEAN.keys())
-def test_a_clean_table_is_a_sessions_without_any_flag(table, encoding, session):
+def test_a_clean_table_is_read_as_readings_csv(table, encoding, session):
     if encoding == "cp1252":
         table = table.replace("−", "–")
     (session / "readings.csv").write_bytes(table.encode(encoding))

@@ -1,4 +1,4 @@
-"""Whatever a spreadsheet writes comes back exactly, or is refused: never another number."""
+"""Property tests: readings of any spreadsheet dialect are imported exactly, or refused."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
 from orthocal.errors import SessionError
-from orthocal.io.tables.separated import SEPARATORS
+from orthocal.io.tables.delimited import SEPARATORS
 from orthocal.io.tables.table import read_table
 from orthocal.measurement.importing.headings import EXPECTED, UNITS, choose_columns, find_header
-from orthocal.measurement.importing.long_table import make_long
+from orthocal.measurement.importing.long_table import make_long_table
 
 NAMES = {"setup": ["xy", "yx"], "posture": ["zero", "x_max", "x_-40"]}
 PLACES = [(s, p) for s in NAMES["setup"] for p in NAMES["posture"]]
 EXAMPLES = int(os.environ.get("ORTHOCAL_EXAMPLES", "400"))
-"""Of any dialect; more by hand."""
+"""Number of examples; more in a long run."""
 
 HEADINGS = {
     "english": ("setup", "posture", "cycle", "reading", "note"),
@@ -36,7 +36,7 @@ readings |= st.decimals(-3, 3, places=2) | st.integers(1, 9).map(lambda v: Decim
 
 
 def written(value: Decimal, *, decimal: str, group: str, minus: str, digits: int | None) -> str:
-    """A number as a spreadsheet shows it."""
+    """A number as a spreadsheet program shows it."""
     text = f"{abs(value):f}" if digits is None else f"{abs(value):.{digits}f}"
     whole, _, fraction = text.partition(".")
     if group and len(whole) > 3:
@@ -47,7 +47,7 @@ def written(value: Decimal, *, decimal: str, group: str, minus: str, digits: int
 
 @st.composite
 def tables(draw):
-    """A table in any dialect, and what it says: place to mm."""
+    """A table in any dialect, and its readings in mm by setup, posture and cycle."""
     values = draw(st.lists(st.none() | readings, min_size=1, max_size=8))
     decimal = draw(st.sampled_from(["point", "comma"]))
     unit = draw(st.sampled_from(["mm", "um", "inch"]))
@@ -113,7 +113,7 @@ def read(content: bytes, **options) -> dict[tuple[str, str, int], Decimal]:
     path = Path("table")
     table = read_table(path, content, find_header, expected=EXPECTED)
     columns = choose_columns(table.header, {}, where="table")
-    long = make_long(table, columns, names=NAMES, **options)
+    long = make_long_table(table, columns, names=NAMES, **options)
     found = {(r.setup, r.posture, int(r.cycle or 1)): Decimal(r.reading) for r in long.rows}
     assert len(found) == len(long.rows)
     return found
@@ -121,7 +121,7 @@ def read(content: bytes, **options) -> dict[tuple[str, str, int], Decimal]:
 
 @settings(max_examples=EXAMPLES, deadline=None)
 @given(tables())
-def test_any_dialect_comes_back_exactly_or_is_refused(table):
+def test_any_dialect_is_imported_exactly_or_refused(table):
     content, truth = table
     try:
         found = read(content)
@@ -132,13 +132,13 @@ def test_any_dialect_comes_back_exactly_or_is_refused(table):
     assert found == truth
 
 
-TELLING = [Decimal("0.125"), Decimal("-1234.5"), Decimal(7), Decimal("1.234")]
-"""Readings of which one at least can be read with one decimal sign only."""
+DECISIVE = [Decimal("0.125"), Decimal("-1234.5"), Decimal(7), Decimal("1.234")]
+"""Readings of which one at least is a number with one decimal sign only."""
 
 
 @pytest.mark.parametrize("decimal", ["point", "comma"])
 @pytest.mark.parametrize("separator", SEPARATORS)
-def test_every_dialect_with_a_telling_number_is_read(separator, decimal):
+def test_every_dialect_with_a_decisive_number_is_read(separator, decimal):
     encodings = ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "cp1252"]
     for encoding, minus, group in itertools.product(encodings, "-−–", GROUPS[decimal]):
         if encoding == "cp1252" and (minus == "−" or group == "\u202f"):
@@ -146,16 +146,16 @@ def test_every_dialect_with_a_telling_number_is_read(separator, decimal):
         stream = io.StringIO()
         rows = csv.writer(stream, delimiter=SEPARATORS[separator])
         rows.writerow(["Aufstellung", "Stellung", "Zyklus", "Messwert in µm"])
-        for at, value in enumerate(TELLING):
+        for at, value in enumerate(DECISIVE):
             text = written(value, decimal=decimal, group=group, minus=minus, digits=None)
             rows.writerow(["xy", "zero", at + 1, text])
         found = read(stream.getvalue().encode(encoding))
-        assert [*found.values()] == [value / 1000 for value in TELLING]
+        assert [*found.values()] == [value / 1000 for value in DECISIVE]
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(readings, min_size=1, max_size=6), st.booleans(), st.sampled_from([*UNITS]))
-def test_numbers_of_a_workbook_come_back_exactly(values, as_text, unit):
+def test_numbers_of_a_workbook_are_imported_exactly(values, as_text, unit):
     book = openpyxl.Workbook()
     sheet = book.active
     sheet.append(["Setup", "Posture", "Cycle", f"Reading [{unit}]"])

@@ -18,9 +18,9 @@ from orthocal import load_session
 from orthocal.cli.record import record
 from orthocal.errors import OrthocalError, OutputError, SessionError
 from orthocal.hypotheses import prediction as foresight
+from orthocal.io.tables.numerals import parse_typed_reading
 from orthocal.measurement.files import session_file
 from orthocal.measurement.files.session_file import load_plan, load_rows
-from orthocal.measurement.importing.typed_numbers import read_typed
 from orthocal.measurement.recording import recording as module
 from orthocal.measurement.recording.recording import SUFFIX, open_recording
 from orthocal.runtime.interrupts import ending_at_interrupt
@@ -367,8 +367,8 @@ def test_killed_a_hundred_times_no_accepted_reading_is_lost(tmp_path, monkeypatc
     ],
 )
 def test_numbers_as_people_type_them(text, value):
-    assert read_typed(text) / MM == pytest.approx(value, abs=1e-15)
-    assert not np.signbit(read_typed("-0"))
+    assert parse_typed_reading(text) / MM == pytest.approx(value, abs=1e-15)
+    assert not np.signbit(parse_typed_reading("-0"))
 
 
 @pytest.mark.parametrize(
@@ -392,4 +392,4 @@ def test_numbers_as_people_type_them(text, value):
 )
 def test_what_may_be_meant_otherwise_is_asked_back(text, message):
     with pytest.raises(SessionError, match=re.escape(message)):
-        read_typed(text)
+        parse_typed_reading(text)

@@ -1,62 +1,67 @@
-"""Cells and rows: what a table is made of, whatever file it came from."""
+"""Cells and rows of a table, whatever file they come from."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from typing import Literal
 
 MOST_ROWS = 200_000
-"""Rows of a table, for its memory; a session has 50,000 readings at most."""
+"""Maximum number of rows of a table; a session has at most 50,000 readings."""
 
 MOST_CELLS = 600_000
-"""Cells of a table that are not blank rows: twelve for each reading that a session may have."""
+"""Maximum number of cells of a table, without blank cells at the end of a row."""
 
 MOST_COLUMNS = 500
-"""Columns of a table; a hundred cycles side by side are more than anybody reads."""
+"""Maximum number of columns of a table."""
+
+CellKind = Literal["text", "number", "date", "boolean", "unsaved formula", "scaled number"]
+"""Kind of a cell.
+
+An `unsaved formula` has no saved value. A `scaled number` is shown as a percentage or in thousands.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """What stands in a cell."""
+    """Content of one cell."""
 
     text: str
-    """As written; of a number from a workbook in plain decimals."""
+    """Text as written; plain decimals for a number of a workbook."""
     number: Decimal | None = None
-    """Of a workbook's number: there is no decimal sign to tell."""
-    kind: Literal["text", "number", "date", "truth", "unsaved", "shown otherwise"] = "text"
-    """`unsaved` is a formula whose value was not saved, `shown otherwise` a number that is shown as
-    a percentage or in thousands."""
+    """Value of a workbook's number, which has no decimal sign."""
+    kind: CellKind = "text"
     unit: str = ""
-    """What the format of a workbook's number writes behind it."""
+    """Unit that the number format of a workbook appends."""
 
     @property
     def is_blank(self) -> bool:
-        """Whether nothing stands there."""
+        """True for a cell without content."""
         return self.kind == "text" and not self.text.strip()
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A row that holds something."""
-
-    line: int
-    """Counted from 1, as an editor or a spreadsheet does."""
-    cells: tuple[Cell, ...]
-    """Without blank ones at the end."""
-    written: int
-    """Cells with the blank ones at the end."""
-
-    def cell(self, index: int | None) -> Cell:
-        """A cell; a blank one beyond the end."""
-        return self.cells[index] if index is not None and index < len(self.cells) else BLANK
 
 
 BLANK = Cell("")
 
 
-def make_row(line: int, cells: list[Cell]) -> Row | None:
-    """A row without blank cells at its end; None if it has no others."""
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A row with at least one cell that is not blank."""
+
+    line: int
+    """Number of the row, from 1, as in an editor or a spreadsheet program."""
+    cells: tuple[Cell, ...]
+    """Cells without the blank ones at the end."""
+    width: int
+    """Number of cells, including blank ones at the end."""
+
+    def cell(self, index: int | None) -> Cell:
+        """The cell of a column; a blank cell beyond the end."""
+        return self.cells[index] if index is not None and index < len(self.cells) else BLANK
+
+
+def make_row(line: int, cells: Sequence[Cell]) -> Row | None:
+    """Row without blank cells at its end; None for a blank row."""
     end = len(cells)
     while end and cells[end - 1].is_blank:
         end -= 1
@@ -64,10 +69,10 @@ def make_row(line: int, cells: list[Cell]) -> Row | None:
 
 
 def column_letters(index: int) -> str:
-    """Name of a column as spreadsheets count: A, B, ... Z, AA."""
+    """Name of a column in spreadsheet notation: A, B, ... Z, AA."""
     letters = ""
     index += 1
     while index:
-        index, rest = divmod(index - 1, 26)
-        letters = chr(ord("A") + rest) + letters
+        index, digit = divmod(index - 1, 26)
+        letters = chr(ord("A") + digit) + letters
     return letters

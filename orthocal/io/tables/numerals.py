@@ -1,7 +1,7 @@
-"""One cell to a number, and the decimal sign of a whole table.
+"""Numbers as text: numerals of table cells, their decimal sign, and typed readings.
 
-A numeral may be two numbers: `1,234` is 1.234 with a decimal comma and 1234 with a decimal point.
-What decides is the other cells; where they do not, that is said as data.
+A numeral can have two values: `1,234` is 1.234 with a decimal comma and 1234 with a decimal point.
+The other numerals of the table decide. Where they do not, the ambiguity is returned as data.
 """
 
 from __future__ import annotations
@@ -12,33 +12,36 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from typing import Literal
 
+from orthocal.errors import SessionError
 from orthocal.io.strict_yaml import LONGEST_NUMBER
+from orthocal.text import shorten
+from orthocal.units import MM
 
 Sign = Literal["point", "comma"]
-"""A decimal sign."""
-
-SIGNS: dict[Sign, str] = {"point": ".", "comma": ","}
+"""Decimal sign."""
 
 _MINUS = dict.fromkeys(map(ord, "\u2212\u2010\u2011\u2012\u2013\ufe63\uff0d"), "-")
-"""What spreadsheets and fonts make of a minus: minus sign, hyphens, dashes."""
+"""Typographic minus signs, hyphens and dashes that spreadsheets and fonts use for a minus."""
 
-_BLANK = " \t\n\u00a0\u2007\u2009\u202f"
-_UNSEEN = dict.fromkeys(map(ord, "\u200b\u200e\u200f\u2060\ufeff\u00ad\u202a\u202c"), "")
+_BLANKS = " \t\n\u00a0\u2007\u2009\u202f"
+_INVISIBLE = dict.fromkeys(map(ord, "\u200b\u200e\u200f\u2060\ufeff\u00ad\u202a\u202c"), "")
 
-UNREAD = frozenset(
+MISSING = frozenset(
     {"", "n/a", "na", "n.a.", "#n/a", "#nv", "nan", "k.a.", "k. a.", "tbd", "offen", "open", "?"}
 )
-"""What stands in cells that are not yet read, in small letters; and dashes alone."""
+"""Texts of cells without a reading, in lower case."""
 
 _DASHES = re.compile(r"[-\u2012-\u2015\u2212_./…]+")
 
 
 def _pattern(decimal: str, group: str) -> re.Pattern[str]:
-    grouped = rf"[1-9][0-9]{{0,2}}(?P<group>[{group}{_BLANK}'’])[0-9]{{3}}(?:(?P=group)[0-9]{{3}})*"
+    grouped = (
+        rf"[1-9][0-9]{{0,2}}(?P<group>[{group}{_BLANKS}'’])[0-9]{{3}}(?:(?P=group)[0-9]{{3}})*"
+    )
     whole = rf"(?P<whole>{grouped}|[0-9]+)"
     fraction = rf"{decimal}(?P<fraction>[0-9]*)"
     return re.compile(
-        rf"(?P<sign>[-+]?)[{_BLANK}]*(?:{whole}(?:{fraction})?|{decimal}(?P<only>[0-9]+))"
+        rf"(?P<sign>[-+]?)[{_BLANKS}]*(?:{whole}(?:{fraction})?|{decimal}(?P<only>[0-9]+))"
         r"(?:[eE](?P<power>[-+]?[0-9]{1,3}))?"
     )
 
@@ -48,43 +51,48 @@ _PATTERNS: dict[Sign, re.Pattern[str]] = {
     "comma": _pattern(",", r"\."),
 }
 
+_TYPED = re.compile(r"([-+]?) ?([0-9]+[.,]?[0-9]*|[.,][0-9]+)")
+_TYPED_UNIT = re.compile(r"(.*?)\s*(mm|µm|μm|um|m|in|inch|\"|'|″)", re.I)
+_SEVERAL_SEPARATORS = re.compile(r"[-+]? ?[0-9]+([.,' ][0-9]+){2,}|[-+]? ?[0-9]+[' ][0-9.,]+")
+_THOUSANDS = re.compile(r"[1-9][0-9]{0,2},[0-9]{3}")
+
 
 def tidy_text(text: str) -> str:
-    """A cell's text without blanks around it and without characters that nobody sees."""
-    return text.translate(_UNSEEN).strip(_BLANK)
+    """Text of a cell without surrounding blanks and invisible characters."""
+    return text.translate(_INVISIBLE).strip(_BLANKS)
 
 
 def plain_minus(text: str) -> str:
-    """A text in which every typographic minus is an ordinary one."""
+    """Text with a hyphen for every typographic minus."""
     return text.translate(_MINUS)
 
 
-def is_unread(text: str) -> bool:
-    """Whether a cell is empty, or says that nothing was read."""
+def is_missing(text: str) -> bool:
+    """True for an empty cell and for texts that mark a missing reading."""
     text = tidy_text(text)
-    return text.casefold() in UNREAD or _DASHES.fullmatch(text) is not None
+    return text.casefold() in MISSING or _DASHES.fullmatch(text) is not None
 
 
 def parse_numeral(text: str, sign: Sign) -> Decimal | None:
-    """The number that a text is with a decimal sign, exactly; None if it is none."""
-    text = tidy_text(text).translate(_MINUS)
+    """Exact value of a numeral with a decimal sign; None if it is not a number."""
+    text = plain_minus(tidy_text(text))
     if len(text) > LONGEST_NUMBER:
         return None
-    if text.startswith("'"):  # how spreadsheets mark a number that shall stay text
+    if text.startswith("'"):  # by which spreadsheet programs mark a number as text
         text = text[1:]
-    found = _PATTERNS[sign].fullmatch(text)
-    if not found:
+    match = _PATTERNS[sign].fullmatch(text)
+    if not match:
         return None
-    whole = re.sub("[^0-9]", "", found["whole"] or "")
-    fraction = found["fraction"] or found["only"] or ""
+    whole = re.sub("[^0-9]", "", match["whole"] or "")
+    fraction = match["fraction"] or match["only"] or ""
     try:
-        return Decimal(f"{found['sign']}{whole or '0'}.{fraction or '0'}e{found['power'] or '0'}")
+        return Decimal(f"{match['sign']}{whole or '0'}.{fraction or '0'}e{match['power'] or '0'}")
     except InvalidOperation:
         return None
 
 
-def shown(value: Decimal | None) -> str:
-    """A number as people write it, without zeros at its end."""
+def format_decimal(value: Decimal | None) -> str:
+    """Plain decimal notation without trailing zeros."""
     if value is None:
         return "no number"
     text = f"{value:f}" if -30 < value.adjusted() < 30 else f"{value:e}"
@@ -92,8 +100,8 @@ def shown(value: Decimal | None) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """A numeral, and where it stands."""
+class Numeral:
+    """A numeral and its line."""
 
     text: str
     line: int
@@ -101,38 +109,74 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class DecimalSign:
-    """The decimal sign of a table, or why it has none that is certain."""
+    """Decimal sign of a table, with the evidence."""
 
     sign: Sign | None
-    """None where two are possible, or where both are there."""
-    evidence: Seen | None
-    """A numeral that has this sign; None where no numeral has any."""
-    rival: Seen | None = None
-    """One that may be two numbers, or has the other sign."""
-    torn: bool = False
-    """Whether numerals contradict each other."""
+    """None if the numerals are ambiguous or contradict each other."""
+    evidence: Numeral | None
+    """A numeral that has this sign; None if no numeral has a decimal sign."""
+    rival: Numeral | None = None
+    """A numeral that is ambiguous, or has the other sign than the evidence."""
+
+    @property
+    def contradictory(self) -> bool:
+        """True if some numerals have a decimal comma and others a decimal point."""
+        return self.evidence is not None and self.rival is not None
 
 
-def tell_decimal(cells: Iterable[Seen]) -> DecimalSign:
-    """The decimal sign of numerals that were written by one hand.
+def infer_decimal_sign(numerals: Iterable[Numeral]) -> DecimalSign:
+    """Infer the common decimal sign of the numerals of a table.
 
-    One that can be read with only one sign decides for all; whole numbers without any sign say
-    nothing, and need none.
+    A numeral that is a number with one sign only decides for all. Whole numbers need no sign.
     """
-    only: dict[Sign, Seen] = {}
-    open_cell: Seen | None = None
-    for seen in cells:
-        point, comma = parse_numeral(seen.text, "point"), parse_numeral(seen.text, "comma")
+    unique: dict[Sign, Numeral] = {}
+    ambiguous: Numeral | None = None
+    for numeral in numerals:
+        point, comma = parse_numeral(numeral.text, "point"), parse_numeral(numeral.text, "comma")
         if point is None and comma is not None:
-            only.setdefault("comma", seen)
+            unique.setdefault("comma", numeral)
         elif comma is None and point is not None:
-            only.setdefault("point", seen)
-        elif point != comma and open_cell is None:
-            open_cell = seen
-    if len(only) == 2:
-        return DecimalSign(None, only["comma"], only["point"], torn=True)
-    for sign, seen in only.items():
-        return DecimalSign(sign, seen)
-    if open_cell is not None:
-        return DecimalSign(None, None, open_cell)
+            unique.setdefault("point", numeral)
+        elif point != comma and ambiguous is None:
+            ambiguous = numeral
+    if len(unique) == 2:
+        return DecimalSign(None, unique["comma"], unique["point"])
+    for sign, numeral in unique.items():
+        return DecimalSign(sign, numeral)
+    if ambiguous is not None:
+        return DecimalSign(None, None, ambiguous)
     return DecimalSign("point", None)
+
+
+def parse_typed_reading(text: str) -> float:
+    """Reading that was typed, [m].
+
+    Args:
+        text: Number in mm, such as 0.12, -0,35 or +1.2 mm.
+
+    Raises:
+        SessionError: If it is not a number, has another unit, or has two possible values.
+    """
+    shown = shorten(text.strip())
+    plain = " ".join(plain_minus(text).split()) if len(text) <= 2 * LONGEST_NUMBER else ""
+    unit = _TYPED_UNIT.fullmatch(plain)
+    if unit is not None:
+        plain = unit[1]
+        if unit[2].lower() != "mm":
+            raise SessionError(f"'{shown}' is in {unit[2]}; readings are in mm")
+    number = _TYPED.fullmatch(plain) if len(plain) <= LONGEST_NUMBER else None
+    if number is None:
+        if _SEVERAL_SEPARATORS.fullmatch(plain):
+            raise SessionError(
+                f"'{shown}' has more than one separator; write a decimal point alone, such as 1.23"
+            )
+        raise SessionError(f"'{shown}' is neither a number nor a command; help lists those")
+    sign, digits = number.groups()
+    if _THOUSANDS.fullmatch(digits):
+        decimal, grouped = digits.replace(",", "."), digits.replace(",", "")
+        raise SessionError(
+            f"'{shown}' may be {sign}{decimal} or {sign}{grouped}; write {sign}{decimal} with a "
+            f"point, or {sign}{grouped} without a separator"
+        )
+    value = float(digits.replace(",", ".")) * MM
+    return (-value if sign == "-" else value) + 0.0

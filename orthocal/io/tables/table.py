@@ -1,16 +1,23 @@
-"""A table of a file of any kind: its heading, its rows, and what was understood."""
+"""Table with headings, from a delimited text file or a workbook."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from orthocal.errors import SessionError
-from orthocal.io.tables.cell import BLANK, Cell, Row, column_letters
-from orthocal.io.tables.decoding import decode
-from orthocal.io.tables.separated import LOOKED_AT, FindHeader, find_separator, split
-from orthocal.io.tables.workbook import BEGINNING, CellRange, read_workbook
+from orthocal.io.tables.cell import BLANK, Row, column_letters
+from orthocal.io.tables.delimited import (
+    HEADER_ROWS,
+    FindHeader,
+    decode,
+    find_separator,
+    split_rows,
+)
+from orthocal.io.tables.workbook import ZIP_SIGNATURE, MergedCells, read_workbook
 from orthocal.text import shorten
 
 
@@ -19,64 +26,52 @@ class Table:
     """A table with headings."""
 
     path: Path
-    sheet: str | None
-    """Name of the sheet, of a workbook."""
-    encoding: str | None
-    """None of a workbook, as the following."""
-    encoding_reason: str
-    separator: str | None
-    """Name of the separator."""
-    separator_reason: str
     header: tuple[str, ...]
     """Headings without blank ones at the end."""
     header_line: int
-    header_written: int
-    """Cells of the heading with blank ones at the end."""
+    header_width: int
+    """Number of cells of the heading, including blank ones at the end."""
     above: tuple[int, ...]
     """Lines above the heading that are not blank."""
     rows: tuple[Row, ...]
-    """Those below the heading that hold something."""
-    merged: tuple[CellRange, ...] = ()
+    """Rows below the heading that are not blank."""
+    encoding: str | None = None
+    """Encoding of a text file."""
+    encoding_reason: str | None = None
+    separator: str | None = None
+    """Name of the separator of a text file."""
+    separator_reason: str | None = None
+    sheet: str | None = None
+    """Name of the worksheet of a workbook."""
+    merged: tuple[MergedCells, ...] = ()
+    """Cells that are merged downwards."""
     formulas: int = 0
+    """Number of cells with a formula."""
     hidden: int = 0
+    """Number of hidden rows."""
 
     def place(self, line: int, column: int | None = None) -> str:
-        """File and line of a row, or sheet and cell, for messages."""
+        """File and line of a row, or worksheet and cell, for messages."""
         if self.sheet is None:
             return f"{self.path}:{line}"
         at = f"row {line}" if column is None else f"{column_letters(column)}{line}"
         return f"{self.path}: sheet '{self.sheet}' {at}"
 
-    def spans(self, columns: Iterable[int]) -> dict[int, list[tuple[int, int]]]:
-        """First and last rows of cells that are merged downwards in some columns, by column."""
-        found: dict[int, list[tuple[int, int]]] = {}
-        wanted = set(columns)
-        for top, left, bottom, right in sorted(self.merged):
-            if top < bottom and left == right and left in wanted:
-                found.setdefault(left, []).append((top, bottom))
-        return found
-
-    def filled(self, columns: Iterable[int]) -> Iterator[Row]:
-        """Rows in which merged cells of some columns hold, each, what stands in their first."""
-        pending = {column: iter(spans) for column, spans in self.spans(columns).items()}
-        following = {column: next(spans) for column, spans in pending.items()}
-        current: dict[int, tuple[int, Cell]] = {}
+    def fill_merged(self, columns: Iterable[int]) -> Iterator[Row]:
+        """Rows in which every merged cell of some columns has the content of its first cell."""
+        tops = {row.line: row for row in self.rows}
+        spans = {c: [m for m in self.merged if m[0] == c] for c in columns}
+        spans = {column: merged for column, merged in spans.items() if merged}
         for row in self.rows:
             cells = list(row.cells)
-            for column in pending:
-                while column in following and following[column][0] <= row.line:
-                    top, bottom = following[column]
-                    current[column] = (bottom, row.cell(column) if top == row.line else BLANK)
-                    after = next(pending[column], None)
-                    if after is None:
-                        del following[column]
-                    else:
-                        following[column] = after
-                last, cell = current.get(column, (0, BLANK))
-                if row.line <= last:
-                    cells += [BLANK] * (column + 1 - len(cells))
-                    cells[column] = cell
-            yield Row(row.line, tuple(cells), row.written)
+            for column, merged in spans.items():
+                at = bisect_right(merged, row.line, key=lambda m: m[1]) - 1
+                if at < 0 or merged[at][2] < row.line:
+                    continue
+                top = tops.get(merged[at][1])
+                cells += [BLANK] * (column + 1 - len(cells))
+                cells[column] = BLANK if top is None else top.cell(column)
+            yield Row(row.line, tuple(cells), row.width)
 
 
 def read_table(
@@ -89,47 +84,43 @@ def read_table(
     separator: str | None = None,
     encoding: str | None = None,
 ) -> Table:
-    """The table of a file that has the headings that are looked for.
+    """Read the table of a file that has the expected headings.
 
     Args:
-        path: The file, for messages.
-        content: What it holds.
-        find_header: Tells which of some rows holds the headings, if any.
-        expected: The headings in words, for messages.
-        sheet: Sheet of a workbook; else the only one that has them.
-        separator: Name of the separator, where it is said.
-        encoding: Name of the encoding, where it is said.
+        path: Path of the file, for messages.
+        content: Content of the file.
+        find_header: Search for the expected headings.
+        expected: Description of the headings, for messages.
+        sheet: Worksheet of a workbook; by default the only one with these headings.
+        separator: Name of the separator; detected by default.
+        encoding: Name of the encoding; detected by default.
 
     Raises:
-        SessionError: If there is no such table, or if there are several.
+        SessionError: If the file has no such table, or several.
     """
-    if content.startswith(BEGINNING):
-        for flag, given in (("--separator", separator), ("--encoding", encoding)):
-            if given is not None:
-                raise SessionError(f"is of no use: {path} is an .xlsx", where=flag)
+    if content.startswith(ZIP_SIGNATURE):
+        for option, value in (("--separator", separator), ("--encoding", encoding)):
+            if value is not None:
+                raise SessionError(f"does not apply to the workbook {path}", where=option)
         return _read_sheet(path, content, find_header, expected, sheet)
     if sheet is not None:
-        raise SessionError(f"is of no use: {path} is no .xlsx", where="--sheet")
+        raise SessionError(f"applies to .xlsx workbooks only; {path} is not one", where="--sheet")
     decoded = decode(content, where=str(path), encoding=encoding)
     if not decoded.text.strip():
         raise SessionError(f"is empty; expected {expected}", where=str(path))
-    name, reason = find_separator(decoded.text, find_header, where=str(path), asked=separator)
-    rows = list(split(decoded.text, name, where=str(path)))
-    at = find_header(rows[:LOOKED_AT])
+    name, reason = find_separator(decoded.text, find_header, where=str(path), requested=separator)
+    rows = tuple(split_rows(decoded.text, name, where=str(path)))
+    at = find_header(rows[:HEADER_ROWS])
     if at is None:
-        raise _no_header(f"{path}", rows, expected, f", with {name} as separator")
-    return Table(
-        path=path,
-        sheet=None,
+        raise _no_header(str(path), rows, expected, f" with {name} as separator")
+    return _make_table(
+        path,
+        rows,
+        at,
         encoding=decoded.encoding,
         encoding_reason=decoded.reason,
         separator=name,
         separator_reason=reason,
-        header=tuple(c.text for c in rows[at].cells),
-        header_line=rows[at].line,
-        header_written=rows[at].written,
-        above=tuple(r.line for r in rows[:at]),
-        rows=tuple(rows[at + 1 :]),
     )
 
 
@@ -137,45 +128,51 @@ def _read_sheet(
     path: Path, content: bytes, find_header: FindHeader, expected: str, sheet: str | None
 ) -> Table:
     sheets = read_workbook(content, where=str(path), sheet=sheet)
-    fitting = [(s, at) for s in sheets if (at := find_header(s.rows[:LOOKED_AT])) is not None]
-    if not fitting:
-        if len(sheets) == 1:
-            place = f"{path}: sheet '{sheets[0].name}'"
-            raise _no_header(place, list(sheets[0].rows), expected, "")
-        names = ", ".join(f"'{s.name}'" for s in sheets)
+    matching = [(s, at) for s in sheets if (at := find_header(s.rows[:HEADER_ROWS])) is not None]
+    names = ", ".join(f"'{s.name}'" for s, _ in matching) or ", ".join(
+        f"'{s.name}'" for s in sheets
+    )
+    if not matching and len(sheets) == 1:
+        raise _no_header(f"{path}: sheet {names}", sheets[0].rows, expected, "")
+    if not matching:
         raise SessionError(f"no sheet has {expected}; sheets: {names}", where=str(path))
-    if len(fitting) > 1:
-        names = ", ".join(f"'{s.name}'" for s, _ in fitting)
+    if len(matching) > 1:
         raise SessionError(
-            f"several sheets have readings: {names}; say which: --sheet NAME", where=str(path)
+            f"several sheets have {expected}: {names}; choose one by --sheet NAME", where=str(path)
         )
-    found, at = fitting[0]
-    head = found.rows[at]
-    return Table(
-        path=path,
-        sheet=found.name,
-        encoding=None,
-        encoding_reason="",
-        separator=None,
-        separator_reason="",
-        header=tuple(c.text for c in head.cells),
-        header_line=head.line,
-        header_written=head.written,
-        above=tuple(r.line for r in found.rows[:at]),
-        rows=found.rows[at + 1 :],
-        merged=found.merged,
-        formulas=found.formulas,
-        hidden=found.hidden,
+    chosen, at = matching[0]
+    return _make_table(
+        path,
+        chosen.rows,
+        at,
+        sheet=chosen.name,
+        merged=chosen.merged,
+        formulas=chosen.formulas,
+        hidden=chosen.hidden,
     )
 
 
-def _no_header(place: str, rows: list[Row], expected: str, how: str) -> SessionError:
+def _make_table(path: Path, rows: tuple[Row, ...], at: int, **origin: Any) -> Table:  # noqa: ANN401 - fields of a table
+    """Table whose headings are in one of some rows."""
+    return Table(
+        path=path,
+        header=tuple(c.text for c in rows[at].cells),
+        header_line=rows[at].line,
+        header_width=rows[at].width,
+        above=tuple(r.line for r in rows[:at]),
+        rows=rows[at + 1 :],
+        **origin,
+    )
+
+
+def _no_header(place: str, rows: tuple[Row, ...], expected: str, how: str) -> SessionError:
+    """Error for a table without the expected headings; it shows the widest row."""
     if not rows:
         return SessionError(f"is empty; expected {expected}", where=place)
-    most = max(rows[:LOOKED_AT], key=lambda r: len(r.cells))
-    shown = shorten(", ".join(f"'{' '.join(c.text.split())}'" for c in most.cells))
+    widest = max(rows[:HEADER_ROWS], key=lambda r: len(r.cells))
+    shown = shorten(", ".join(f"'{' '.join(c.text.split())}'" for c in widest.cells))
     return SessionError(
-        f"no row has {expected}; row {most.line} has {shown}{how}. --column ROLE=HEADING says "
-        "which column is which",
+        f"no row has {expected}; row {widest.line} has {shown}{how}; assign columns by --column "
+        "ROLE=HEADING",
         where=place,
     )

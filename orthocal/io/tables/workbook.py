@@ -1,284 +1,406 @@
-"""Sheets of an .xlsx to rows, within bounds: a workbook is an archive of XML from a stranger."""
+"""Worksheets of an .xlsx workbook.
+
+A workbook is a ZIP archive of XML parts (ECMA-376, part 1) from an untrusted source. Only the parts
+with cells, their texts and their formats are read. Every part is bounded before it is unpacked.
+Cells are read one by one, without entities, in linear time.
+"""
 
 from __future__ import annotations
 
 import datetime
 import io
-import itertools
 import math
+import posixpath
 import re
-import warnings
 import zipfile
-import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
 from typing import Any
 
+from lxml import etree
+
 from orthocal.errors import SessionError
-from orthocal.io.tables.cell import BLANK, MOST_CELLS, MOST_COLUMNS, MOST_ROWS, Cell, Row, make_row
+from orthocal.io.strict_yaml import LONGEST_NUMBER
+from orthocal.io.tables.cell import (
+    BLANK,
+    MOST_CELLS,
+    MOST_COLUMNS,
+    MOST_ROWS,
+    Cell,
+    CellKind,
+    Row,
+    make_row,
+)
+from orthocal.io.tables.numerals import format_decimal
 from orthocal.text import shorten, text_problem
 
-BEGINNING = b"PK\x03\x04"
-"""What a workbook begins with: it is a ZIP archive."""
+ZIP_SIGNATURE = b"PK\x03\x04"
+"""First bytes of a workbook."""
 
 LARGEST_CONTENT = 32 * 2**20
-"""All of a workbook unpacked, [bytes]; 50,000 rows of ten cells take 22 MiB."""
+"""Maximum size of all unpacked parts, [bytes]; 50,000 rows of ten cells take 22 MiB."""
 
-LARGEST_PART = 4 * 2**20
-"""The same of styles and whatever else is not cells or their texts."""
+LARGEST_PART = 2 * 2**20
+"""Maximum size of a part other than cells and their texts, unpacked, [bytes]."""
 
 MOST_PARTS = 2_000
-MOST_SHEETS = 50
+"""Maximum number of parts of a workbook."""
 
-LARGEST_SHEETS = 4 * LARGEST_CONTENT
-"""Sheets times the size of the largest part, [bytes]: several may name the same part."""
+MOST_TAGS = 5 * MOST_CELLS
+"""Maximum number of XML tags of a part; a cell takes four, with a formula six."""
 
-_MERGED = re.compile(
-    rb'<(?:\w+:)?mergeCell\s[^>]*?ref="([A-Z]{1,3})([0-9]{1,7}):([A-Z]{1,3})([0-9]{1,7})"'
-)
-_HIDDEN = re.compile(rb'<(?:\w+:)?row\s[^>]*?hidden="(?:1|true)"')
-_FORMULA = re.compile(rb"<(?:\w+:)?f[\s/>]")
-_SHEET = re.compile(rb"<(?:\w+:)?sheet\s")
+LONGEST_FORMAT = 255
+"""Maximum length of a number format; the limit of Excel."""
+
+_SAFE = {
+    "resolve_entities": False,
+    "load_dtd": False,
+    "no_network": True,
+    "huge_tree": False,
+    "remove_comments": True,
+    "remove_pis": True,
+}
+"""Options of the XML parsers."""
+
+_DIRECTORY_ENTRY = b"PK\x01\x02"
+
+_PERCENT_FORMATS = {9, 10}
+_DATE_FORMATS = {*range(14, 23), *range(27, 37), *range(45, 48), *range(50, 59)}
+"""Numbers of the built-in formats of percentages and dates (ECMA-376, part 1, 18.8.30)."""
+
+_LITERAL = re.compile(r'"([^"]*)"|\\(.)|\[[^\]]*\]|_.|\*.')
+"""Parts of a number format that are literal text or layout."""
+_THOUSANDS = re.compile(r"[0#?],+(?![0#?,])")
+_DATE_CODE = re.compile(r"[dmhys]", re.I)
+_NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,3})?")
+_ADDRESS = re.compile(r"([A-Z]{1,3})([0-9]{1,10})")
 _DOCTYPE = re.compile(rb"<!(?:DOCTYPE|ENTITY)")
-_XML_BEGINS = (b"<", b"\xef\xbb\xbf<")
 
-_QUOTED = re.compile(r'"([^"]*)"|\\(.)|\[[^\]]*\]|_.|\*.')
-"""What a format of numbers writes or steers literally."""
-_SCALED = re.compile(r"[0#?],+(?![0#?,])")
-
-CellRange = tuple[int, int, int, int]
-"""First row, first column, last row, last column of merged cells, rows from 1, columns from 0."""
+MergedCells = tuple[int, int, int]
+"""Column from 0, first row and last row from 1 of cells of one column that are merged."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A sheet of a workbook."""
+    """A worksheet."""
 
     name: str
     rows: tuple[Row, ...]
-    """Those that hold something."""
-    merged: tuple[CellRange, ...]
+    """Rows that are not blank."""
+    merged: tuple[MergedCells, ...]
+    """Cells that are merged downwards."""
     formulas: int
-    """Cells whose value was computed by the spreadsheet program."""
+    """Number of cells with a formula."""
     hidden: int
-    """Rows that the program does not show."""
+    """Number of hidden rows."""
+
+
+@dataclass(frozen=True, slots=True)
+class NumberFormat:
+    """Meaning of a number format."""
+
+    kind: CellKind
+    """`number`, `date` or `scaled number`."""
+    unit: str = ""
+    """Text behind the number."""
 
 
 def read_workbook(content: bytes, *, where: str, sheet: str | None = None) -> list[Sheet]:
-    """The sheets of a workbook that are shown; or one that is named, shown or not.
+    """Read the visible sheets of a workbook, or one sheet by its name.
 
     Args:
-        content: The file.
-        where: Its path, for messages.
-        sheet: Name of a sheet.
+        content: Content of the file.
+        where: Path of the file, for messages.
+        sheet: Name of a sheet, visible or hidden.
 
     Raises:
-        SessionError: If it is no workbook, too large, or has no such sheet.
+        SessionError: If the file is not a workbook, is too large, or has no such sheet.
     """
+    parts = content.count(_DIRECTORY_ENTRY)
+    if parts > MOST_PARTS:
+        raise SessionError(f"has {parts} parts; expected at most {MOST_PARTS}", where=where)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            _check_parts(archive, where)
-            with _opened(content, saved=True) as book:
-                chosen = _choose(book, sheet, where)
-                return [_read_sheet(s, archive, content, where) for s in chosen]
+            _require_workbook(archive.namelist(), where)
+            return _Workbook(archive, where).read(sheet)
     except (SessionError, MemoryError):
         raise
-    except Exception as e:  # a stranger's archive: openpyxl fails in as many ways as there are
+    except Exception as e:  # a damaged archive makes zipfile and lxml raise many kinds of errors
         words = " ".join(str(e).split())
         raise SessionError(
-            f"is not an .xlsx that can be read: {shorten(words or type(e).__name__)}", where=where
+            f"is not a readable .xlsx workbook: {shorten(words or type(e).__name__)}", where=where
         ) from None
 
 
-def _check_parts(archive: zipfile.ZipFile, where: str) -> None:
-    """Refuse an archive that is no workbook, is too large unpacked, or defines entities."""
-    parts = archive.infolist()
-    names = {p.filename for p in parts}
+def _require_workbook(names: list[str], where: str) -> None:
+    """Refuse archives of other kinds."""
     if "mimetype" in names and "content.xml" in names:
         raise SessionError("is an OpenDocument table; save it as .xlsx or CSV", where=where)
     if "xl/workbook.bin" in names:
-        raise SessionError("is an .xlsb; save it as .xlsx or CSV", where=where)
+        raise SessionError("is an .xlsb workbook; save it as .xlsx or CSV", where=where)
     if "[Content_Types].xml" not in names:
-        raise SessionError("is an archive, but no .xlsx", where=where)
-    if len(parts) > MOST_PARTS or len(names) != len(parts):
-        raise SessionError(
-            f"holds {len(parts)} parts of {len(names)} names; expected at most {MOST_PARTS}, each "
-            "once",
-            where=where,
-        )
-    total = sum(p.file_size for p in parts)
-    if total > LARGEST_CONTENT:
-        raise SessionError(
-            f"has {total / 2**20:.0f} MiB unpacked; expected at most {LARGEST_CONTENT / 2**20:g} "
-            "MiB",
-            where=where,
-        )
-    largest = max((p.file_size for p in parts if p.filename.endswith(".xml")), default=0)
-    for part in parts:
-        if not part.filename.endswith((".xml", ".rels")):
-            continue
-        cells = part.filename.startswith("xl/worksheets/") or "haredStrings" in part.filename
-        if part.file_size > LARGEST_PART and not cells:
-            raise SessionError(
-                f"has {part.file_size / 2**20:.0f} MiB in {shorten(part.filename)}; expected at "
-                f"most {LARGEST_PART / 2**20:g} MiB",
-                where=where,
-            )
-        try:
-            text = archive.read(part)
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError):
-            raise SessionError(
-                f"is damaged, or protected by a password: {shorten(part.filename)} cannot be "
-                "unpacked",
-                where=where,
-            ) from None
-        if _DOCTYPE.search(text) or (text and not text.startswith(_XML_BEGINS)):
-            raise SessionError(
-                f"is not an .xlsx as spreadsheets write it: {shorten(part.filename)} is not plain "
-                "XML",
-                where=where,
-            )
-        count = 0 if cells else len(_SHEET.findall(text))
-        if count > MOST_SHEETS or count * largest > LARGEST_SHEETS:
-            raise SessionError(
-                f"has {count} sheets of up to {largest / 2**20:.0f} MiB; expected at most "
-                f"{MOST_SHEETS}, and {LARGEST_SHEETS / 2**20:g} MiB",
-                where=where,
-            )
+        raise SessionError("is a ZIP archive, but not an .xlsx workbook", where=where)
+    if len(set(names)) != len(names):
+        raise SessionError("has several parts of the same name", where=where)
 
 
-@contextmanager
-def _opened(content: bytes, *, saved: bool) -> Iterator[Any]:
-    """A workbook of openpyxl that is read cell by cell.
+class _Workbook:
+    """Parts of a workbook, unpacked within a budget."""
 
-    Args:
-        content: The file.
-        saved: Whether formulas have the values that were saved with them.
-    """
-    import openpyxl
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of charts, validations and styles, which are not read
-        book = openpyxl.load_workbook(
-            io.BytesIO(content), read_only=True, data_only=saved, keep_links=False
-        )
-        try:
-            yield book
-        finally:
-            book.close()
-
-
-def _choose(book: Any, name: str | None, where: str) -> list[Any]:  # noqa: ANN401 - openpyxl's
-    """Sheets of cells that are shown, or the one that is named."""
-    sheets = list(book.worksheets)
-    if not sheets:
-        raise SessionError("is an .xlsx without sheets of cells", where=where)
-    if name is None:
-        return [s for s in sheets if s.sheet_state == "visible"] or sheets
-    found = [s for s in sheets if s.title == name] or [
-        s for s in sheets if s.title.strip().casefold() == name.strip().casefold()
-    ]
-    if not found:
-        names = ", ".join(f"'{s.title}'" for s in sheets) or "none"
-        raise SessionError(f"has no sheet '{shorten(name)}'; sheets: {names}", where=where)
-    return found[:1]
-
-
-def _read_sheet(sheet: Any, archive: zipfile.ZipFile, content: bytes, where: str) -> Sheet:  # noqa: ANN401 - openpyxl's
-    source = archive.read(sheet._worksheet_path.lstrip("/"))
-    formulas = _find_formulas(content, sheet.title) if _FORMULA.search(source) else frozenset()
-    place = f"{where}: sheet '{sheet.title}'"
-    rows = []
-    count = 0
-    for line, given in _rows(sheet, place):
-        cells = [
-            _read_cell(cell, (line, column) in formulas, f"{place} row {line}")
-            for column, cell in enumerate(given)
+    def __init__(self, archive: zipfile.ZipFile, where: str) -> None:
+        self._archive = archive
+        self._where = where
+        self._unpacked = 0
+        targets = {kind: target for kind, target in self._relations("").values()}
+        main = targets.get("officeDocument", "xl/workbook.xml")
+        root, relations = self._tree(main), self._relations(main)
+        self._sheets = [
+            (e.get("name", ""), e.get("state", "visible") == "visible", target)
+            for e in root.iter("{*}sheet")
+            for key, value in e.attrib.items()
+            if key.endswith("}id")
+            for kind, target in [relations.get(value, ("", ""))]
+            if kind == "worksheet"
         ]
-        row = make_row(line, cells)
-        if row is None:
-            continue
-        count += len(row.cells)
-        if count > MOST_CELLS:
-            raise SessionError(f"has more than {MOST_CELLS} cells", where=place)
-        rows.append(row)
-    return Sheet(
-        sheet.title,
-        tuple(rows),
-        tuple(_merged(source)),
-        len(formulas),
-        len(_HIDDEN.findall(source)),
-    )
-
-
-def _rows(sheet: Any, place: str) -> Iterator[tuple[int, tuple[Any, ...]]]:  # noqa: ANN401 - openpyxl's
-    """Rows with their numbers, whatever size the sheet says that it has."""
-    sheet.reset_dimensions()
-    for line, row in enumerate(sheet.iter_rows(), start=1):
-        if line > MOST_ROWS:
-            raise SessionError(f"has more than {MOST_ROWS} rows", where=place)
-        if len(row) > MOST_COLUMNS and any(c.value is not None for c in row[MOST_COLUMNS:]):
-            raise SessionError(
-                f"has {len(row)} columns; expected at most {MOST_COLUMNS}",
-                where=f"{place} row {line}",
-            )
-        yield line, row[:MOST_COLUMNS]
-
-
-def _find_formulas(content: bytes, title: str) -> frozenset[tuple[int, int]]:
-    """Where there are formulas: row from 1, column from 0."""
-    with _opened(content, saved=False) as book:
-        return frozenset(
-            (line, column)
-            for line, row in _rows(book[title], title)
-            for column, cell in enumerate(row)
-            if cell.data_type == "f"
+        by_kind = {kind: target for kind, target in relations.values()}
+        self._formats: list[NumberFormat] = []
+        if "styles" in by_kind:
+            self._formats = _read_formats(self._tree(by_kind["styles"]))
+        self._strings = (
+            [_join_text(item) for item in self._elements(by_kind["sharedStrings"], "si")]
+            if "sharedStrings" in by_kind
+            else []
         )
+        old_epoch = any(e.get("date1904") in ("1", "true") for e in root.iter("{*}workbookPr"))
+        self._epoch = datetime.datetime(*((1904, 1, 1) if old_epoch else (1899, 12, 30)))
+
+    def read(self, name: str | None) -> list[Sheet]:
+        """Read the visible sheets, or the one that is named."""
+        if not self._sheets:
+            raise SessionError("is a workbook without worksheets", where=self._where)
+        chosen = [s for s in self._sheets if s[1]] or self._sheets
+        if name is not None:
+            chosen = [s for s in self._sheets if s[0] == name] or [
+                s for s in self._sheets if s[0].strip().casefold() == name.strip().casefold()
+            ]
+            if not chosen:
+                names = ", ".join(f"'{title}'" for title, _, _ in self._sheets)
+                raise SessionError(
+                    f"has no sheet '{shorten(name)}'; sheets: {names}", where=self._where
+                )
+            chosen = chosen[:1]
+        return [self._read_sheet(title, part) for title, _, part in chosen]
+
+    def _read_sheet(self, title: str, part: str) -> Sheet:
+        where = f"{self._where}: sheet '{title}'"
+        rows: list[Row] = []
+        merged: list[MergedCells] = []
+        cells: list[Cell] = []
+        column, line, count, formulas, hidden = -1, 0, 0, 0, 0
+        for element in self._elements(part, "c", "row", "mergeCell"):
+            kind = _local_name(element)
+            if kind == "c":
+                address, before = element.get("r"), column
+                column = before + 1 if address is None else _parse_address(address)[1]
+                if column <= before:
+                    raise ValueError(f"cell {address} is out of order")
+                children = {_local_name(child): child for child in reversed(element)}
+                formulas += "f" in children
+                cell = self._read_cell(element, children, where)
+                if cell.is_blank:
+                    continue
+                if column >= MOST_COLUMNS:
+                    raise SessionError(
+                        f"has {column + 1} columns; expected at most {MOST_COLUMNS}", where=where
+                    )
+                cells += [BLANK] * (column - len(cells))
+                cells.append(cell)
+            elif kind == "row":
+                after = _parse_index(element.get("r", str(line + 1)))
+                if after <= line:
+                    raise ValueError(f"row {after} follows row {line}")
+                line, column = after, -1
+                hidden += element.get("hidden") in ("1", "true")
+                row = make_row(line, cells)
+                cells = []
+                if row is not None:
+                    rows.append(row)
+                    count += len(row.cells)
+                    if line > MOST_ROWS or count > MOST_CELLS:
+                        limit = f"{MOST_ROWS} rows" if line > MOST_ROWS else f"{MOST_CELLS} cells"
+                        raise SessionError(f"has more than {limit}", where=where)
+            else:
+                first, _, last = element.get("ref", "").partition(":")
+                (top, left), (bottom, right) = _parse_address(first), _parse_address(last or first)
+                if top < bottom and left == right:
+                    merged.append((left, top, bottom))
+        return Sheet(title, tuple(rows), tuple(sorted(merged)), formulas, hidden)
+
+    def _read_cell(self, element: Any, children: dict[str, Any], where: str) -> Cell:  # noqa: ANN401 - lxml has no types
+        """Content of a cell, by its type and its style.
+
+        Args:
+            element: Element of the cell.
+            children: Its first children, by their names.
+            where: File and worksheet, for messages.
+        """
+        if not children:
+            return BLANK
+        kind = element.get("t", "n")
+        if kind not in ("n", "b", "d", "e", "s", "str", "inlineStr"):
+            raise ValueError(f"'{shorten(kind)}' is not the type of a cell")
+        text = _join_text(element) if kind == "inlineStr" else ""
+        if kind != "inlineStr" and "v" in children:
+            text = children["v"].text
+        if not text:
+            return Cell("", kind="unsaved formula") if "f" in children else BLANK
+        if kind == "n":
+            return self._read_number(text, _parse_index(element.get("s", "0")))
+        if kind == "b":
+            return Cell("TRUE" if text in ("1", "true") else "FALSE", kind="boolean")
+        if kind == "d":
+            return Cell(text, kind="date")
+        if kind == "s":
+            text = self._strings[_parse_index(text)]
+        problem = text_problem(text.replace("\r", "\n"))
+        if problem:
+            raise SessionError(problem, where=where)
+        return Cell(text)
+
+    def _read_number(self, text: str, style: int) -> Cell:
+        """Number to the 15 digits that a spreadsheet program shows."""
+        value = math.nan
+        if len(text) <= LONGEST_NUMBER and _NUMBER.fullmatch(text):
+            value = float(text)
+        if not abs(value) <= 1e15:
+            return Cell(text)
+        form = self._formats[style] if self._formats else NumberFormat("number")
+        if form.kind == "date":
+            with suppress(OverflowError):  # a number beyond the calendar is shown as it is
+                text = str(self._epoch + datetime.timedelta(days=value))
+            return Cell(text, kind="date")
+        number = Decimal(f"{value:.15g}")
+        return Cell(format_decimal(number), number, form.kind, form.unit)
+
+    def _relations(self, part: str) -> dict[str, tuple[str, str]]:
+        """Kinds and targets of the relations of a part, by their identifiers."""
+        folder, name = posixpath.split(part)
+        root = self._tree(posixpath.join(folder, "_rels", f"{name}.rels"))
+        return {
+            e.get("Id", ""): (
+                posixpath.basename(e.get("Type", "")),
+                posixpath.normpath(posixpath.join("/", folder, e.get("Target", "")))[1:],
+            )
+            for e in root.iter("{*}Relationship")
+        }
+
+    def _tree(self, part: str) -> Any:  # noqa: ANN401 - lxml has no types
+        """Root element of a small part."""
+        return etree.fromstring(self._unpack(part, LARGEST_PART), etree.XMLParser(**_SAFE))
+
+    def _elements(self, part: str, *names: str) -> Iterator[Any]:
+        """Elements of a part in the order of their ends; each is freed after its use."""
+        stream = io.BytesIO(self._unpack(part, LARGEST_CONTENT))
+        tags = tuple(f"{{*}}{name}" for name in names)
+        for _, element in etree.iterparse(stream, tag=tags, **_SAFE):
+            yield element
+            element.clear()
+            while element.getprevious() is not None:
+                del element.getparent()[0]
+
+    def _unpack(self, part: str, largest: int) -> bytes:
+        """Content of a part.
+
+        Raises:
+            SessionError: If it is missing, too large, damaged, or not plain XML.
+        """
+        try:
+            info = self._archive.getinfo(part)
+        except KeyError:
+            raise SessionError(
+                f"is damaged: {shorten(part)} is missing", where=self._where
+            ) from None
+        self._unpacked += info.file_size
+        for size, limit in ((info.file_size, largest), (self._unpacked, LARGEST_CONTENT)):
+            if size > limit:
+                raise SessionError(
+                    f"has {size / 2**20:.1f} MiB unpacked up to {shorten(part)}; expected at most "
+                    f"{limit / 2**20:g} MiB",
+                    where=self._where,
+                )
+        try:
+            text = self._archive.read(info)
+        except Exception:
+            raise SessionError(
+                f"is damaged or protected by a password: {shorten(part)} cannot be unpacked",
+                where=self._where,
+            ) from None
+        if _DOCTYPE.search(text) or not text.removeprefix(b"\xef\xbb\xbf").startswith(b"<"):
+            raise SessionError(
+                f"is not a regular .xlsx workbook: {shorten(part)} is not plain XML",
+                where=self._where,
+            )
+        if text.count(b"<") > MOST_TAGS:
+            raise SessionError(
+                f"has more than {MOST_TAGS} XML tags in {shorten(part)}", where=self._where
+            )
+        return text
 
 
-def _read_cell(cell: Any, formula: bool, place: str) -> Cell:  # noqa: ANN401 - openpyxl's
-    value = cell.value
-    if value is None:
-        return Cell("", kind="unsaved") if formula else BLANK
-    if isinstance(value, bool):
-        return Cell(str(value).upper(), kind="truth")
-    if isinstance(value, datetime.date | datetime.time | datetime.timedelta):
-        return Cell(str(value), kind="date")
-    if isinstance(value, int | float):
-        return _read_number(value, str(cell.number_format or ""))
-    text = str(value)
-    problem = text_problem(text.replace("\r", "\n"))
-    if problem:
-        raise SessionError(problem, where=place)
-    return Cell(text)
+def _read_formats(styles: Any) -> list[NumberFormat]:  # noqa: ANN401 - lxml has no types
+    """Number formats of the cell styles, in their order."""
+    codes = {
+        e.get("numFmtId"): e.get("formatCode", "") for e in styles.iterfind("{*}numFmts/{*}numFmt")
+    }
+    meanings = {key: parse_number_format(code) for key, code in codes.items()}
+    built_in = {str(n): NumberFormat("scaled number") for n in _PERCENT_FORMATS}
+    built_in |= {str(n): NumberFormat("date") for n in _DATE_FORMATS}
+    meanings = built_in | meanings
+    plain = NumberFormat("number")
+    return [meanings.get(e.get("numFmtId"), plain) for e in styles.iterfind("{*}cellXfs/{*}xf")]
 
 
-def _read_number(value: float, form: str) -> Cell:
-    """A number as the spreadsheet shows it at full length: to 15 digits."""
-    if not math.isfinite(value) or abs(value) > 1e15:
-        return Cell(str(value))
-    number = Decimal(value) if isinstance(value, int) else Decimal(f"{value:.15g}")
-    text = f"{number:f}" if number.adjusted() > -20 else str(number)
-    if "." in text:
-        text = text.rstrip("0").rstrip(".")
-    shown = form.split(";")[0]
-    bare = _QUOTED.sub("", shown)
-    if "%" in bare or _SCALED.search(bare):
-        return Cell(text, number, kind="shown otherwise")
-    unit = "".join(a + b for a, b in _QUOTED.findall(shown)).strip()
-    return Cell(text, number, "number", unit)
+def parse_number_format(code: str) -> NumberFormat:
+    """Meaning of a number format such as `0.0" mm"`.
+
+    Raises:
+        ValueError: If it is longer than spreadsheet programs permit.
+    """
+    if len(code) > LONGEST_FORMAT:
+        raise ValueError(f"a number format has more than {LONGEST_FORMAT} characters")
+    positive = code.split(";")[0]
+    bare = _LITERAL.sub("", positive)
+    if "%" in bare or _THOUSANDS.search(bare):
+        return NumberFormat("scaled number")
+    if _DATE_CODE.search(bare):
+        return NumberFormat("date")
+    return NumberFormat("number", "".join(a + b for a, b in _LITERAL.findall(positive)).strip())
 
 
-def _merged(source: bytes) -> Iterator[CellRange]:
-    for found in itertools.islice(_MERGED.finditer(source), MOST_ROWS):
-        left, top, right, bottom = (g.decode() for g in found.groups())
-        yield int(top), _column_index(left), int(bottom), _column_index(right)
+def _local_name(element: Any) -> str:  # noqa: ANN401 - lxml has no types
+    """Name of an element without its namespace, which has two forms (ECMA-376 and ISO 29500)."""
+    return str(element.tag.rpartition("}")[2])
 
 
-def _column_index(letters: str) -> int:
-    index = 0
-    for letter in letters:
-        index = 26 * index + ord(letter) - ord("A") + 1
-    return index - 1
+def _join_text(item: Any) -> str:  # noqa: ANN401 - lxml has no types
+    """Text of all runs of an item, without phonetic guides."""
+    return "".join(e.text or "" for e in item.iter("{*}t") if _local_name(e.getparent()) != "rPh")
+
+
+def _parse_index(text: str) -> int:
+    if not (text.isascii() and text.isdigit()):
+        raise ValueError(f"'{shorten(text)}' is not an index")
+    return int(text)
+
+
+def _parse_address(text: str) -> tuple[int, int]:
+    """Row from 1 and column from 0 of an address such as B3."""
+    match = _ADDRESS.fullmatch(text)
+    if not match:
+        raise ValueError(f"'{shorten(text)}' is not the address of a cell")
+    column = 0
+    for letter in match[1]:
+        column = 26 * column + ord(letter) - ord("A") + 1
+    return int(match[2]), column - 1

@@ -16,19 +16,18 @@ from pathlib import Path
 
 from orthocal.errors import SessionError
 from orthocal.io.documents import read_csv_rows
-from orthocal.io.tables.decoding import decode
+from orthocal.io.tables.delimited import SEPARATORS, decode, stated_separator
 from orthocal.io.tables.numerals import (
     DecimalSign,
-    Seen,
+    Numeral,
     Sign,
+    format_decimal,
+    infer_decimal_sign,
     parse_numeral,
     plain_minus,
-    shown,
-    tell_decimal,
 )
-from orthocal.io.tables.separated import SEPARATORS, said_separator
 from orthocal.io.tables.table import Table, read_table
-from orthocal.io.tables.workbook import BEGINNING
+from orthocal.io.tables.workbook import ZIP_SIGNATURE
 from orthocal.measurement.files.readings_checks import RawReading
 from orthocal.measurement.files.schema import MOST_READINGS
 from orthocal.measurement.importing.headings import EXPECTED, Columns, choose_columns, find_header
@@ -53,7 +52,7 @@ def is_house(header: Iterable[str]) -> bool:
 
 
 def decide_sign(
-    cells: Sequence[Seen], *, house: bool, ask: str, place: Callable[[int], str]
+    cells: Sequence[Numeral], *, house: bool, ask: str, place: Callable[[int], str]
 ) -> DecimalSign:
     """The decimal sign of readings, which have one only.
 
@@ -66,14 +65,14 @@ def decide_sign(
     Raises:
         SessionError: Where two signs are possible.
     """
-    found = tell_decimal(cells)
+    found = infer_decimal_sign(cells)
     if found.sign is not None:
         return found
     if found.rival is not None and found.evidence is not None:
         raise SessionError(
             f"the reading '{shorten(found.rival.text)}' has a decimal point, and "
             f"'{shorten(found.evidence.text)}' in line {found.evidence.line} a decimal comma; "
-            "write all alike",
+            "use one decimal sign",
             where=place(found.rival.line),
         )
     open_cells = (c for c in cells if _is_open(c.text) and not (house and "," not in c.text))
@@ -82,8 +81,8 @@ def decide_sign(
         return DecimalSign("point", None)
     comma, point = parse_numeral(rival.text, "comma"), parse_numeral(rival.text, "point")
     raise SessionError(
-        f"the reading '{rival.text}' is {shown(comma)} with a decimal comma and "
-        f"{shown(point)} with a decimal point, and no other reading tells which; {ask}",
+        f"the reading '{rival.text}' is {format_decimal(comma)} with a decimal comma and "
+        f"{format_decimal(point)} with a decimal point, and no other reading decides; {ask}",
         where=place(rival.line),
     )
 
@@ -104,7 +103,7 @@ def read_rows(path: Path, content: bytes) -> Iterator[RawReading]:
     Raises:
         SessionError: Naming file and line.
     """
-    if content.startswith(BEGINNING):
+    if content.startswith(ZIP_SIGNATURE):
         raise SessionError(
             "is a workbook; expected a CSV file: `orthocal import` makes one of it",
             where=str(path),
@@ -136,7 +135,7 @@ def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
         # what is wrong with a row is told when it is read
         with suppress(SessionError):
             for line, row in islice(rows(), MOST_READINGS + 1):
-                cells.append(Seen(row["reading_mm"], line))
+                cells.append(Numeral(row["reading_mm"], line))
         sign = _plain_sign(cells, path)
     for line, row in rows():
         yield RawReading(
@@ -150,12 +149,12 @@ def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
         )
 
 
-ASK = "write it with a decimal point, or say it to `orthocal import --decimal comma|point`"
+ASK = "write it with a decimal point, or use `orthocal import --decimal comma|point`"
 
 
-def _plain_sign(cells: Sequence[Seen], path: Path) -> Sign | None:
+def _plain_sign(cells: Sequence[Numeral], path: Path) -> Sign | None:
     """The decimal sign below the house's own headings, where a point is a decimal point."""
-    if not any("," in cell.text for cell in cells) or tell_decimal(cells).torn:
+    if not any("," in cell.text for cell in cells) or infer_decimal_sign(cells).contradictory:
         return "point"
     return decide_sign(cells, house=True, ask=ASK, place=lambda line: f"{path}:{line}").sign
 
@@ -179,7 +178,7 @@ def _clean_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
         columns = choose_columns(table.header, {}, where=f"{path}:{table.header_line}")
     except SessionError:
         return None
-    first = table.header_line == 1 or said_separator(decode(content, where="").text) is not None
+    first = table.header_line == 1 or stated_separator(decode(content, where="").text) is not None
     if table.above or not first:
         return None
     strange = [i for i in columns.extra]
@@ -197,14 +196,14 @@ def _clean_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
 def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
     require_whole_cells(table, columns)
     (reading,) = columns.readings
-    cells = [Seen(row.cell(reading.index).text, row.line) for row in table.rows]
+    cells = [Numeral(row.cell(reading.index).text, row.line) for row in table.rows]
     sign = decide_sign(cells, house=is_house(table.header), ask=ASK, place=table.place).sign
     width = len(table.header)
     for row in table.rows:
         where = table.place(row.line)
-        if len(row.cells) > width or row.written < width:
+        if len(row.cells) > width or row.width < width:
             names = SEPARATORS[table.separator or "comma"].join(table.header)
-            found = max(len(row.cells), row.written if row.written < width else 0)
+            found = max(len(row.cells), row.width if row.width < width else 0)
             raise SessionError(
                 f"has {found} fields; expected {width} ({shorten(names)})", where=where
             )
@@ -250,9 +249,9 @@ def require_whole_cells(table: Table, columns: Columns, *, sure: bool = False) -
     pairs = {(i, i + 1) for i in readings} | {(i - 1, i) for i in readings if i}
     pairs -= {(i - 1, i) for i in readings if i - 1 in columns.keys}
     for row in table.rows:
-        if row.written > table.header_written:
+        if row.width > table.header_width:
             raise SessionError(
-                f"has {row.written} fields; expected {table.header_written}; a decimal comma "
+                f"has {row.width} fields; expected {table.header_width}; a decimal comma "
                 "between commas? Save the table with semicolons, or its numbers in quotes",
                 where=table.place(row.line),
             )
@@ -263,7 +262,7 @@ def require_whole_cells(table: Table, columns: Columns, *, sure: bool = False) -
             if _WHOLE.fullmatch(a) and _DIGITS.fullmatch(b):
                 raise SessionError(
                     f"'{shorten(a)},{shorten(b)}' may be two cells or one number with a decimal "
-                    "comma; if they are two, say --separator comma to `orthocal import`, if one, "
+                    "comma; for two cells use `orthocal import --separator comma`, for one number "
                     "save the table with semicolons",
                     where=table.place(row.line),
                 )

@@ -1,9 +1,13 @@
-"""Headings of a table of readings: what each column is, in English or German, and in which unit."""
+"""Headings of a table of readings, in English or German.
+
+A heading gives the role of its column, the unit of its readings, and the cycle where several cycles
+are side by side.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from typing import Literal, cast, get_args
@@ -14,7 +18,7 @@ from orthocal.io.tables.numerals import tidy_text
 from orthocal.text import composed, shorten
 
 Role = Literal["setup", "posture", "minus", "cycle", "reading"]
-"""What a column is to a session."""
+"""Role of a column."""
 
 EXPECTED = "the headings setup, posture and reading"
 
@@ -41,7 +45,7 @@ WORDS: dict[Role, tuple[str, ...]] = {
         *("messwert", "messwerte", "ablesung", "anzeige", "wert", "messuhr", "gemessen"),
     ),
 }
-"""Headings without regard to capitals, blanks and underscores."""
+"""Headings of every role, in lower case, with single blanks."""
 
 _ROLES = {word: role for role, words in WORDS.items() for word in words}
 
@@ -53,7 +57,7 @@ UNITS: dict[UnitName, Decimal] = {
     "cm": Decimal(10),
     "thou": Decimal("0.0254"),
 }
-"""Units of readings, and what they are in mm, exactly."""
+"""Units of readings and their exact sizes, [mm]."""
 
 _UNIT_WORDS: dict[str, UnitName] = {
     **dict.fromkeys(("mm", "millimeter", "millimetre", "millimeters", "millimetres"), "mm"),
@@ -64,20 +68,24 @@ _UNIT_WORDS: dict[str, UnitName] = {
     **dict.fromkeys(("thou", "mil", "mils", "0.001 in", '0.001"', "0.001 inch"), "thou"),
 }
 
-_BRACKETED = re.compile(r"(.*?)\s*[\[(]\s*(?:in\s+)?([^\[\]()]*?)\s*[\])]\s*(.*)", re.S)
-_TAILED = re.compile(r"(.*?)(?:\s*[/,;:_]\s*(?:in\s+)?|\s+in\s+)(\S+)", re.S)
-_SPACED = re.compile(r"(.*?)\s+(\S+)", re.S)
+LONGEST_HEADING = 100
+"""Maximum number of characters of a heading; longer cells are not headings."""
+
+_BRACKETED = re.compile(r"[\[(]([^\[\]()]*)[\])]")
+_BREAK = re.compile(r"[\s_\-/,;:\[\]()]+")
+_THOU = re.compile(r"0[.,]001[ _]?(?:inch|in(?![a-z])|\")")
+_INCH = re.compile(r"(?:[/,;:_] ?|(?<![a-z])in |^)in\.?(?=_|$)")
 _NUMBERED = re.compile(r"([^0-9]*?)\s*(?:#|nr\.?|no\.?)?\s*([0-9]{1,4})\.?")
 _NUMBER_FIRST = re.compile(r"([0-9]{1,4})(?:\.|st|nd|rd|th)?\s+([^0-9]+)")
 
 
 @dataclass(frozen=True, slots=True)
 class Heading:
-    """What a heading says."""
+    """Meaning of a heading."""
 
     role: Role
     cycle: int | None = None
-    """Of a reading that stands beside others: which cycle it is."""
+    """Cycle of a column of readings beside others."""
     unit: UnitName | None = None
 
 
@@ -87,13 +95,13 @@ class ReadingColumn:
 
     index: int
     cycle: int | None
-    """None where a row says it."""
+    """Cycle of all readings of the column; None if the rows give it."""
     unit: UnitName | None
 
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Which column of a table is what."""
+    """Indices of the columns of a table, by their roles."""
 
     setup: int
     posture: int
@@ -101,176 +109,173 @@ class Columns:
     cycle: int | None
     readings: tuple[ReadingColumn, ...]
     extra: tuple[int, ...]
-    """Columns that have a heading and are nothing of a session's."""
+    """Columns with a heading that has no role."""
 
     @property
     def keys(self) -> tuple[int, ...]:
-        """Columns that say which reading a row is of."""
-        found = (self.setup, self.posture, self.minus, self.cycle)
-        return tuple(i for i in found if i is not None)
+        """Columns that identify a reading."""
+        indices = (self.setup, self.posture, self.minus, self.cycle)
+        return tuple(i for i in indices if i is not None)
 
 
 def parse_unit(text: str) -> UnitName | None:
-    """The unit of a word, such as µm; None if it is none."""
+    """The unit that a text such as µm names; None if it names none."""
     return _UNIT_WORDS.get(" ".join(tidy_text(text).casefold().split()))
 
 
 def read_heading(text: str) -> Heading | None:
-    """What a heading says, such as `Messwert 2 [mm]`; None if it is nothing of a session's."""
-    plain = " ".join(tidy_text(composed(text)).casefold().split())
-    found = _read_words(plain)
-    if found is not None:
-        return found
-    for rest, unit in _without_unit(plain):
-        inner = _read_words(rest)
-        if inner is not None and inner.role == "reading":
-            return Heading("reading", inner.cycle, unit)
-    return None
+    """Meaning of a heading such as `Messwert 2 [mm]`; None if it has no role."""
+    plain = _normalize(text)
+    heading = _read_words(plain)
+    if heading is not None:
+        return heading
+    words, unit = _split_unit(plain)
+    heading = None if unit is None else _read_words(words)
+    if heading is None or heading.role != "reading":
+        return None
+    return Heading("reading", heading.cycle, unit)
 
 
-def _without_unit(plain: str) -> Iterator[tuple[str, UnitName]]:
-    """A heading without its unit, and the unit: in brackets, at the end, or among its words."""
-    found = _BRACKETED.fullmatch(plain)
-    if found and (unit := parse_unit(found[2])):
-        yield f"{found[1]} {found[3]}", unit
-    for pattern in (_TAILED, _SPACED):
-        found = pattern.fullmatch(plain)
-        # "measured in" ends with no inch
-        if (
-            found
-            and (unit := parse_unit(found[2]))
-            and not (pattern is _SPACED and found[2] == "in")
-        ):
-            yield found[1], unit
-    words = plain.split("_")
-    for at, word in enumerate(words):
-        if unit := parse_unit(word):
-            yield " ".join(words[:at] + words[at + 1 :]), unit
+def _normalize(text: str) -> str:
+    """Heading in lower case with single blanks; empty if it is too long for a heading."""
+    if len(text) > LONGEST_HEADING:
+        return ""
+    return " ".join(tidy_text(composed(text)).casefold().split())
+
+
+def _split_unit(plain: str) -> tuple[str, UnitName | None]:
+    """Words of a heading without its unit, and the unit; no unit if there are several.
+
+    A unit in brackets precedes any other. The word "in" is a preposition after a blank, and the
+    inch after any other sign.
+    """
+    plain = _THOU.sub("thou", plain)
+    for bracket in _BRACKETED.finditer(plain):
+        if unit := parse_unit(bracket[1].removeprefix("in ")):
+            return f"{plain[: bracket.start()]} {plain[bracket.end() :]}", unit
+    words = [word for word in _BREAK.split(plain) if word]
+    units = [(at, unit) for at, w in enumerate(words) if w != "in" and (unit := parse_unit(w))]
+    if len({unit for _, unit in units}) == 1:
+        at, unit = units[0]
+        first = at - 1 if at and words[at - 1] == "in" else at
+        return " ".join(words[:first] + words[at + 1 :]), unit
+    if not units and (inch := _INCH.search(plain)):
+        return f"{plain[: inch.start()]} {plain[inch.end() :]}", "inch"
+    return plain, None
 
 
 def _read_words(plain: str) -> Heading | None:
-    """What a heading without a unit says."""
+    """Meaning of a heading without a unit."""
     plain = " ".join(re.split(r"[\s_\-]+", plain)).strip(" .:")
     if plain in _ROLES:
         return Heading(_ROLES[plain])
-    found = _NUMBERED.fullmatch(plain)
-    word, number = (found[1], found[2]) if found else ("", "")
-    if not found:
-        first = _NUMBER_FIRST.fullmatch(plain)
-        if not first:
-            return None
-        word, number = first[2], first[1]
+    if match := _NUMBERED.fullmatch(plain):
+        word, number = match.groups()
+    elif match := _NUMBER_FIRST.fullmatch(plain):
+        number, word = match.groups()
+    else:
+        return None
     word = word.strip(" .:")
     if not word or _ROLES.get(word) in ("cycle", "reading"):
         return Heading("reading", int(number))
     return None
 
 
-def find_header(rows: Sequence[Row], given: Mapping[str, str] | None = None) -> int | None:
-    """Which of some rows holds the headings of a table of readings, if any."""
+def find_header(rows: Sequence[Row], assigned: Mapping[str, str] | None = None) -> int | None:
+    """Index of the first row with the headings of a table of readings; None if there is none."""
     for at, row in enumerate(rows):
         texts = [c.text for c in row.cells]
-        roles = {h.role for h in _headings(texts, given or {}) if h is not None}
+        roles = {h.role for h in _read_headings(texts, assigned or {}) if h is not None}
         if {"setup", "posture", "reading"} <= roles:
             return at
     return None
 
 
-def _headings(texts: Sequence[str], given: Mapping[str, str]) -> list[Heading | None]:
-    """What each column is: as is said, or by its heading."""
-    said = {key: _find_named(texts, name) for key, name in given.items()}
-    roles = {_said_heading(key).role for key in said}
+def _read_headings(texts: Sequence[str], assigned: Mapping[str, str]) -> list[Heading | None]:
+    """Meaning of every heading of a row; columns that the user assigned come first."""
+    places = {key: _find_column(texts, name) for key, name in assigned.items()}
+    by_index = {at[0]: parse_role(key) for key, at in places.items() if len(at) == 1}
+    roles = {parse_role(key).role for key in assigned}
     headings: list[Heading | None] = []
     for index, text in enumerate(texts):
-        own = read_heading(text)
-        keys = [key for key, places in said.items() if places == [index]]
-        if keys:
-            heading = _said_heading(keys[0])
-            unit = (own.unit if own else None) or _trailing_unit(text)
-            headings.append(Heading(heading.role, heading.cycle, unit))
-        else:
-            headings.append(None if own is None or own.role in roles else own)
+        heading = read_heading(text)
+        if index in by_index:
+            unit = heading.unit if heading and heading.unit else _split_unit(_normalize(text))[1]
+            heading = Heading(by_index[index].role, by_index[index].cycle, unit)
+        elif heading is not None and heading.role in roles:
+            heading = None
+        headings.append(heading)
     return headings
 
 
-def _trailing_unit(text: str) -> UnitName | None:
-    """The unit at the end of a heading whose words are not known."""
-    plain = " ".join(tidy_text(composed(text)).casefold().split())
-    return next((unit for _, unit in _without_unit(plain)), None)
-
-
-def _said_heading(key: str) -> Heading:
-    """What `setup` or `reading 2` of a --column is.
+def parse_role(key: str) -> Heading:
+    """Parse the role of a --column option, such as `setup` or `reading 2`.
 
     Raises:
-        SessionError: If it is none of these.
+        SessionError: If it is not a role.
     """
-    found = re.fullmatch(r"([a-z]+)\s*([0-9]{1,4})?", key.strip().casefold())
-    role = found[1] if found else ""
-    if found is None or role not in get_args(Role) or (found[2] and role != "reading"):
+    match = re.fullmatch(r"([a-z]+)\s*([0-9]{1,4})?", key.strip().casefold())
+    role = match[1] if match else ""
+    if match is None or role not in get_args(Role) or (match[2] and role != "reading"):
         raise SessionError(
-            f"'{shorten(key)}' is no column of readings; expected one of "
+            f"'{shorten(key)}' is not the role of a column; expected one of "
             f"{', '.join(get_args(Role))}, or reading 1, reading 2 ... for cycles side by side",
             where="--column",
         )
-    return Heading(cast("Role", role), int(found[2]) if found[2] else None)
+    return Heading(cast("Role", role), int(match[2]) if match[2] else None)
 
 
-def require_role(key: str) -> None:
-    """Refuse what is no role of a column.
-
-    Raises:
-        SessionError: If it is neither setup, posture, minus, cycle nor reading.
-    """
-    _said_heading(key)
-
-
-def _find_named(texts: Sequence[str], name: str) -> list[int]:
-    """Columns with a heading, or with a number as `#4`."""
+def _find_column(texts: Sequence[str], name: str) -> list[int]:
+    """Indices of the columns with a heading, or with a number such as `#4`."""
     numbered = re.fullmatch(r"#([0-9]{1,4})", name.strip())
     if numbered:
         index = int(numbered[1]) - 1
         return [index] if 0 <= index < len(texts) else []
 
     def plain(text: str) -> str:
-        return " ".join(tidy_text(composed(text)).split())
+        return " ".join(tidy_text(composed(text)).split()) if len(text) <= LONGEST_HEADING else ""
 
-    exact = [i for i, text in enumerate(texts) if plain(text) == plain(name)]
-    alike = [i for i, t in enumerate(texts) if plain(t).casefold() == plain(name).casefold()]
-    return exact or alike
+    wanted = plain(name)
+    plain_texts = [plain(text) for text in texts]
+    exact = [i for i, text in enumerate(plain_texts) if text and text == wanted]
+    folded = wanted.casefold()
+    return exact or [i for i, text in enumerate(plain_texts) if text and text.casefold() == folded]
 
 
-def choose_columns(texts: Sequence[str], given: Mapping[str, str], *, where: str) -> Columns:
-    """Which column is what.
+def choose_columns(texts: Sequence[str], assigned: Mapping[str, str], *, where: str) -> Columns:
+    """Assign a role to every column.
 
     Args:
-        texts: The headings.
-        given: Role, or `reading 2`, to the heading of its column, or its number as `#4`.
+        texts: Headings.
+        assigned: Role, or `reading 2`, to the heading of its column, or its number such as `#4`.
         where: File and line, for messages.
 
     Raises:
         SessionError: If a role has no column, or several.
     """
-    for key, name in given.items():
-        places = _find_named(texts, name)
+    for key, name in assigned.items():
+        places = _find_column(texts, name)
         if len(places) != 1:
             shown = shorten(", ".join(f"'{' '.join(t.split())}'" for t in texts))
             problem = (
-                f"stands twice; --column {key}=#{places[0] + 1} says the first of them"
+                f"appears twice; --column {key}=#{places[0] + 1} selects the first one"
                 if places
-                else f"is not among the headings; found {shown}"
+                else f"is not among the headings {shown}"
             )
             raise SessionError(f"column '{shorten(name)}' {problem}", where=f"{where}: {key}")
-    headings = _headings(texts, given)
+    headings = _read_headings(texts, assigned)
     single: dict[str, int] = {}
     for role in ("setup", "posture", "minus", "cycle"):
         places = [i for i, h in enumerate(headings) if h is not None and h.role == role]
         if len(places) > 1:
-            raise _several(texts, places, role, where)
+            raise _several_columns(texts, places, role, where)
         if places:
             single[role] = places[0]
         elif role in ("setup", "posture"):
-            raise SessionError(f"no column is the {role}; --column {role}=HEADING", where=where)
+            raise SessionError(
+                f"no column has the role {role}; assign one by --column {role}=HEADING",
+                where=where,
+            )
     readings = [
         ReadingColumn(i, h.cycle, h.unit)
         for i, h in enumerate(headings)
@@ -278,49 +283,54 @@ def choose_columns(texts: Sequence[str], given: Mapping[str, str], *, where: str
     ]
     _check_readings(texts, readings, single.get("cycle"), where)
     used = {r.index for r in readings} | set(single.values())
-    extra = tuple(i for i, text in enumerate(texts) if i not in used and text.strip())
     return Columns(
         setup=single["setup"],
         posture=single["posture"],
         minus=single.get("minus"),
         cycle=single.get("cycle"),
         readings=tuple(readings),
-        extra=extra,
+        extra=tuple(i for i, text in enumerate(texts) if i not in used and text.strip()),
     )
 
 
 def _check_readings(
     texts: Sequence[str], readings: Sequence[ReadingColumn], cycle: int | None, where: str
 ) -> None:
-    """Refuse columns of readings of which it is not clear what they are."""
+    """Refuse missing and ambiguous columns of readings."""
     if not readings:
-        raise SessionError("no column is the reading; --column reading=HEADING", where=where)
-    single = [r.index for r in readings if r.cycle is None]
-    if single and len(readings) > 1:
-        raise _several(texts, [r.index for r in readings], "reading", where)
-    numbers = [r.cycle for r in readings if r.cycle is not None]
-    for r in readings:
-        if r.cycle is None:
+        raise SessionError(
+            "no column has the role reading; assign one by --column reading=HEADING", where=where
+        )
+    by_cycle: dict[int, list[int]] = {}
+    for column in readings:
+        if column.cycle is None:
+            if len(readings) > 1:
+                places = [r.index for r in readings if r.cycle is None]
+                raise _several_columns(texts, places, "reading", where)
             continue
-        if numbers.count(r.cycle) > 1:
-            raise _several(
-                texts, [o.index for o in readings if o.cycle == r.cycle], "reading", where
-            )
-        if r.cycle < 1:
+        if column.cycle < 1:
             raise SessionError(
-                f"column '{shorten(texts[r.index])}' is cycle {r.cycle}; expected 1, 2, 3 ...",
+                f"column '{shorten(texts[column.index])}' is cycle {column.cycle}; expected 1, 2, "
+                "3 ...",
                 where=where,
             )
-    if numbers and cycle is not None:
+        by_cycle.setdefault(column.cycle, []).append(column.index)
+    for places in by_cycle.values():
+        if len(places) > 1:
+            raise _several_columns(texts, places, "reading", where)
+    if by_cycle and cycle is not None:
         raise SessionError(
             f"has cycles side by side ('{shorten(texts[readings[0].index])}' ...) and a column "
-            f"'{shorten(texts[cycle])}' as well; --column says which one counts",
+            f"'{shorten(texts[cycle])}' as well; choose one by --column",
             where=where,
         )
 
 
-def _several(texts: Sequence[str], places: Sequence[int], role: str, where: str) -> SessionError:
+def _several_columns(
+    texts: Sequence[str], places: Sequence[int], role: str, where: str
+) -> SessionError:
     names = " and ".join(f"'{' '.join(texts[i].split())}' (#{i + 1})" for i in places[:4])
     return SessionError(
-        f"several columns are the {role}: {names}; say which: --column {role}=HEADING", where=where
+        f"several columns have the role {role}: {names}; choose one by --column {role}=HEADING",
+        where=where,
     )

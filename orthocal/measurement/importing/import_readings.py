@@ -1,10 +1,11 @@
-"""Readings of any table into a session: rows matched by setup, posture, minus and cycle."""
+"""Import of the readings of a table into a session."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 from typing import cast, get_args
 
@@ -24,9 +25,10 @@ from orthocal.measurement.importing.headings import (
     UnitName,
     choose_columns,
     find_header,
-    require_role,
+    parse_role,
 )
-from orthocal.measurement.importing.long_table import LongTable, make_long
+from orthocal.measurement.importing.long_table import LongTable, make_long_table
+from orthocal.text import shorten
 
 Key = tuple[str, str, str, int]
 """Setup, posture, minus and cycle of a reading."""
@@ -34,48 +36,51 @@ Key = tuple[str, str, str, int]
 
 @dataclass(frozen=True, slots=True)
 class TableOptions:
-    """What a table does not say itself."""
+    """Options for what a table leaves open."""
 
     sheet: str | None = None
-    """Name of the sheet of a workbook."""
+    """Worksheet of a workbook; by default the only one with readings."""
     separator: str | None = None
-    """semicolon, tab, comma or pipe."""
+    """semicolon, tab, comma or pipe; detected by default."""
     decimal: str | None = None
-    """comma or point."""
+    """Decimal sign, comma or point; inferred by default."""
     unit: str | None = None
-    """mm, um, inch, cm or thou: of readings that state none."""
+    """Unit of readings without a unit: mm, um, inch, cm or thou."""
     encoding: str | None = None
+    """Encoding of a text file; detected by default."""
     columns: Mapping[str, str] = field(default_factory=dict)
     """Role, such as `reading` or `reading 2`, to the heading of its column, or its number (#4)."""
     fill: bool = False
-    """Whether an empty setup or posture is the one above."""
+    """True to copy an empty setup or posture from the row above."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableImport:
-    """Readings of a table, and what a session's readings.csv is with them."""
+    """Readings of a table, merged into the readings.csv of a session."""
 
+    options: TableOptions
     table: Table
     columns: Columns
-    long: LongTable
+    long_table: LongTable
     session: Path
-    """The session.yaml."""
+    """Path of the session.yaml."""
     readings_path: Path
     text: str
-    """Of the readings.csv."""
+    """New content of the readings.csv."""
     filled: int
-    """Readings whose cell was empty."""
+    """Number of empty cells that get a reading."""
     replaced: int
+    """Number of readings that get another value."""
     unchanged: int
-    """Readings that were there already, the same."""
+    """Number of readings that the session already has."""
     added: int
-    """Readings that had no row."""
+    """Number of new rows."""
     empty: int
-    """Rows that have no reading still."""
+    """Number of rows still without a reading."""
 
     @property
     def changes(self) -> bool:
-        """Whether anything is new."""
+        """True if the readings.csv changes."""
         return bool(self.filled or self.replaced or self.added)
 
 
@@ -86,25 +91,26 @@ def import_readings(
     *,
     overwrite: bool = False,
 ) -> TableImport:
-    """Read a table for a session; nothing is written yet.
+    """Read a table and merge its readings into those of a session; writes nothing.
+
+    Rows match by setup, posture, minus and cycle.
 
     Args:
-        table: A CSV of any spreadsheet, or an .xlsx.
-        session: The session.yaml, or the folder that holds it; its readings.csv may be missing, or
-            have cells that are empty.
-        options: What the table does not say itself.
-        overwrite: Whether readings that are there may become others.
+        table: A CSV file of any spreadsheet program, or an .xlsx workbook.
+        session: The session.yaml or its directory. Its readings.csv may be missing or incomplete.
+        options: Options for what the table leaves open.
+        overwrite: True to replace readings of the session that differ.
 
     Raises:
-        SessionError: Naming file and row, what was found and what was expected; also where two
-            readings are possible, with the option that decides.
+        SessionError: Naming file and row, what was found and what was expected, and the option
+            that decides where a cell is ambiguous.
     """
     options = options or TableOptions()
     require_kind(options, TableOptions, expected="TableOptions")
     _check_options(options)
     path = Path(table)
     plan, readings_path = load_unread(session)
-    found = read_table(
+    content = read_table(
         path,
         read_file(path, error=SessionError),
         lambda rows: find_header(rows, options.columns),
@@ -113,69 +119,72 @@ def import_readings(
         separator=options.separator,
         encoding=options.encoding,
     )
-    columns = choose_columns(found.header, options.columns, where=found.place(found.header_line))
-    long = make_long(
-        found,
+    columns = choose_columns(
+        content.header, options.columns, where=content.place(content.header_line)
+    )
+    long_table = make_long_table(
+        content,
         columns,
         names={"setup": plan.setups, "posture": plan.postures},
         decimal=cast("Sign | None", options.decimal),
         unit=cast("UnitName | None", options.unit),
-        separator_said=options.separator is not None,
+        separator_known=options.separator is not None,
         fill=options.fill,
     )
-    check_readings(long.rows, plan, file=path)
-    there = _existing(readings_path, path, long, overwrite)
-    if there:
-        check_readings(there, plan, file=readings_path, unread=set())
-    merged = _merge(there, long.rows, readings_path, overwrite)
-    text = _house_text(merged.rows)
-    again = read_rows(readings_path, text.encode())
-    readings = check_readings(again, plan, file=readings_path, unread=set())
+    check_readings(long_table.rows, plan, file=path)
+    existing = _read_existing(readings_path, path, long_table, overwrite)
+    if existing:
+        check_readings(existing, plan, file=readings_path, unread=set())
+    rows, counts = _merge(existing, long_table.rows, overwrite)
+    text = _format_readings(rows)
+    written = read_rows(readings_path, text.encode())
+    readings = check_readings(written, plan, file=readings_path, unread=set())
     check_contacts(replace(plan, readings=readings))
     return TableImport(
-        table=found,
+        options=options,
+        table=content,
         columns=columns,
-        long=long,
+        long_table=long_table,
         session=plan.path or Path(session),
         readings_path=readings_path,
         text=text,
-        filled=merged.filled,
-        replaced=merged.replaced,
-        unchanged=merged.unchanged,
-        added=merged.added,
-        empty=sum(not r.reading for r in merged.rows),
+        filled=counts["filled"],
+        replaced=counts["replaced"],
+        unchanged=counts["unchanged"],
+        added=counts["added"],
+        empty=sum(not r.reading for r in rows),
     )
 
 
-def write_import(found: TableImport) -> None:
-    """Write the readings.csv of a session, whole or not at all.
+def write_import(result: TableImport) -> None:
+    """Write the readings.csv of a session atomically.
 
     Raises:
         OrthocalError: If it cannot be written.
     """
-    write_file(found.readings_path, found.text)
+    write_file(result.readings_path, result.text)
 
 
 def _check_options(options: TableOptions) -> None:
-    if options.decimal is not None and options.decimal not in get_args(Sign):
-        raise SessionError(
-            f"'{options.decimal}' is no decimal sign; expected comma or point", where="--decimal"
-        )
-    if options.unit is not None and options.unit not in UNITS:
-        raise SessionError(
-            f"'{options.unit}' is no unit of readings; expected {', '.join(UNITS)}", where="--unit"
-        )
+    for value, expected, option, kind in (
+        (options.decimal, get_args(Sign), "--decimal", "decimal sign"),
+        (options.unit, tuple(UNITS), "--unit", "unit of readings"),
+    ):
+        if value is not None and value not in expected:
+            raise SessionError(
+                f"'{shorten(value)}' is not a {kind}; expected {', '.join(expected)}", where=option
+            )
     for key in options.columns:
-        require_role(key)
+        parse_role(key)
 
 
-def _existing(
-    readings_path: Path, table: Path, long: LongTable, overwrite: bool
+def _read_existing(
+    readings_path: Path, table: Path, long_table: LongTable, overwrite: bool
 ) -> list[RawReading]:
-    """Rows of the session's readings.csv, where there is one.
+    """Rows of the session's readings.csv; none if there is no such file.
 
     Raises:
-        SessionError: If it is the table itself, and is not to be written over.
+        SessionError: If the table itself is this file, and must not be overwritten.
     """
     if not exists(readings_path):
         return []
@@ -184,20 +193,11 @@ def _existing(
         return list(read_rows(readings_path, content)) if content.strip() else []
     if not overwrite:
         raise SessionError(
-            "is the session's own table; --replace writes it anew, with its readings alone",
+            "is the session's own table; --replace rewrites it with its readings only",
             where=str(table),
         )
-    rows = [replace(row, reading="") for row in (*long.rows, *long.unread)]
+    rows = [replace(row, reading="") for row in (*long_table.rows, *long_table.missing)]
     return sorted(rows, key=lambda row: row.line)
-
-
-@dataclass(frozen=True, slots=True)
-class _Merged:
-    rows: Sequence[RawReading]
-    filled: int
-    replaced: int
-    unchanged: int
-    added: int
 
 
 def _key(row: RawReading) -> Key:
@@ -205,53 +205,53 @@ def _key(row: RawReading) -> Key:
 
 
 def _merge(
-    there: Sequence[RawReading], new: Sequence[RawReading], file: Path, overwrite: bool
-) -> _Merged:
-    """Rows in the session's order, with the new readings in their cells; others at the end."""
+    existing: Sequence[RawReading], new: Sequence[RawReading], overwrite: bool
+) -> tuple[list[RawReading], Counter[str]]:
+    """Merge new readings into the existing rows; further readings follow at the end.
+
+    Returns:
+        Rows, and numbers of rows that are filled, replaced, unchanged and added.
+
+    Raises:
+        SessionError: If a reading differs, unless it may be overwritten.
+    """
     pending = {_key(row): row for row in new}
     rows: list[RawReading] = []
-    filled = replaced = unchanged = 0
+    counts: Counter[str] = Counter()
     differing: list[tuple[RawReading, RawReading]] = []
-    for row in there:
-        given = pending.pop(_key(row), None)
-        if given is None:
+    for row in existing:
+        match = pending.pop(_key(row), None)
+        if match is None:
             rows.append(row)
-        elif not row.reading:
-            filled += 1
-            rows.append(replace(row, reading=given.reading))
-        elif _same(row.reading, given.reading):
-            unchanged += 1
-            rows.append(row)
+            continue
+        if not row.reading:
+            change = "filled"
+        elif Decimal(row.reading) == Decimal(match.reading):
+            change = "unchanged"
         else:
-            replaced += 1
-            differing.append((row, given))
-            rows.append(replace(row, reading=given.reading))
+            change = "replaced"
+            differing.append((row, match))
+        counts[change] += 1
+        rows.append(row if change == "unchanged" else replace(row, reading=match.reading))
     if differing and not overwrite:
-        row, given = differing[0]
-        more = f", as {len(differing) - 1} more" if len(differing) > 1 else ""
+        row, match = differing[0]
+        more = f" ({len(differing) - 1} more differ)" if len(differing) > 1 else ""
         raise SessionError(
-            f"{row.setup} {row.posture} of cycle {row.cycle or 1} is {given.reading} mm in "
-            f"{given.where}, and {row.reading} mm here{more}; --replace writes over what is there",
+            f"{row.setup} {row.posture} of cycle {row.cycle or 1} is {row.reading} mm, but "
+            f"{match.reading} mm in {match.where}{more}; --replace overwrites existing readings",
             where=row.where,
         )
-    rows += pending.values()
-    return _Merged(rows, filled, replaced, unchanged, len(pending))
+    counts["added"] = len(pending)
+    return [*rows, *pending.values()], counts
 
 
-def _same(a: str, b: str) -> bool:
-    try:
-        return Decimal(a) == Decimal(b)
-    except InvalidOperation:
-        return False
-
-
-def _house_text(rows: Sequence[RawReading]) -> str:
-    """A readings.csv; columns that no row needs are left out."""
-    needed = {
+def _format_readings(rows: Sequence[RawReading]) -> str:
+    """Content of a readings.csv without the optional columns that no row needs."""
+    optional = {
         "minus": any(r.minus for r in rows),
         "cycle": any(r.cycle not in ("", "1") for r in rows),
     }
-    columns = [c for c in COLUMNS if needed.get(c, True)]
+    columns = [c for c in COLUMNS if optional.get(c, True)]
     lines = [",".join(columns)]
     for r in rows:
         cells = {

@@ -20,10 +20,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from orthocal.errors import OrthocalError, OutputError, SessionError
-from orthocal.io.documents import Number, validate
-from orthocal.io.files import read_file, sync_folder, write_file
+from orthocal.io.documents import Number, read_yaml, validate
+from orthocal.io.files import exists, read_file, sync_folder, write_file
 from orthocal.io.journal import Journal, open_journal_file
-from orthocal.measurement.files.plan_table import add_name_of_rows
 from orthocal.measurement.files.readings_checks import check_range
 from orthocal.measurement.files.schema import LARGEST_READING_MM, MOST_READINGS
 from orthocal.measurement.files.session_file import load_rows
@@ -301,7 +300,38 @@ def _find_names(session: Session, unread: frozenset[int]) -> dict[Path, str | by
     if session.readings_path is not None or session.path is None:
         return {}
     csv, rows = _csv_of(session), _table(_rows(session.readings, unread))
-    return {csv: rows, session.path: add_name_of_rows(session, csv, rows)}
+    return {csv: rows, session.path: _yaml_with_readings(session.path, csv, rows)}
+
+
+def _yaml_with_readings(file: Path, csv: Path, text: str) -> bytes:
+    """Content of a session.yaml with the key `readings` added; everything else stays as it is.
+
+    Args:
+        file: The session.yaml, which has no readings yet.
+        csv: Path of the new readings.csv beside it.
+        text: Content of the readings.csv.
+
+    Raises:
+        SessionError: If the readings.csv exists with other rows, or the key cannot be appended.
+    """
+    if exists(csv) and read_file(csv, error=SessionError) != text.encode():
+        raise SessionError(
+            f"holds other rows than {file.name} plans and would be overwritten; move it away, or "
+            f"add `readings: {csv.name}` to {file.name}",
+            where=str(csv),
+        )
+    content = read_file(file, error=SessionError)
+    extended = content.rstrip() + f"\nreadings: {csv.name}\n".encode()
+    expected = read_yaml(file, error=SessionError, content=content) | {"readings": csv.name}
+    try:
+        document = read_yaml(file, error=SessionError, content=extended)
+    except SessionError:
+        document = None
+    if document != expected:
+        raise SessionError(
+            f"is missing; add `readings: {csv.name}` to it", where=f"{file}: readings"
+        )
+    return extended
 
 
 def _changed(session: Session) -> bool:

@@ -1,128 +1,155 @@
-"""What was understood of a table that was imported, in words and as JSON."""
+"""Report of an import of readings, as text and as JSON."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Sequence
 from typing import Any
 
+from orthocal.io.tables.cell import column_letters
+from orthocal.io.tables.table import Table
 from orthocal.measurement.files.readings_file import is_house
 from orthocal.measurement.importing.import_readings import TableImport
-from orthocal.measurement.importing.long_table import describe_column, list_lines
 from orthocal.output.text.layout import counted
 
-WORDS = {"um": "µm"}
-"""Units as people read them."""
+UNIT_SYMBOLS = {"um": "µm"}
+"""Symbols of units that have another symbol than their name."""
 
 MOST_NAMES = 6
-"""Names that are others in the session, of which it is said."""
+"""Maximum number of replaced names in the text."""
+
+MOST_RANGES = 8
+"""Maximum number of ranges of rows in the text."""
 
 
-def format_import(found: TableImport) -> str:
-    """What was understood, a line each, and what becomes of the session."""
-    lines = [f"{counted(len(found.long.rows), 'reading')} in {found.table.path}"]
-    understood = _understood(found)
-    width = max(len(name) for name, _ in understood)
-    lines += [f"  {name.ljust(width)}   {text}" for name, text in understood]
-    lines.append(_outcome(found))
-    return "\n".join(lines)
+def format_import(result: TableImport) -> str:
+    """Interpretation of the table, one line per item, and the changes of the session."""
+    items = _interpretation(result)
+    width = max(len(name) for name, _ in items)
+    return "\n".join(
+        [
+            f"{counted(len(result.long_table.rows), 'reading')} in {result.table.path}",
+            *(f"  {name.ljust(width)}   {text}" for name, text in items),
+            _describe_changes(result),
+        ]
+    )
 
 
-def _understood(found: TableImport) -> list[tuple[str, str]]:
-    table, long = found.table, found.long
-    lines = []
+def _interpretation(result: TableImport) -> list[tuple[str, str]]:
+    """Names and descriptions of what was detected in the table."""
+    table, long_table = result.table, result.long_table
     if table.sheet is not None:
-        lines.append(("sheet", f"'{table.sheet}'"))
+        items = [("sheet", f"'{table.sheet}'")]
     else:
-        lines.append(("encoding", f"{table.encoding}, {table.encoding_reason}"))
-        lines.append(("separator", f"{table.separator}, {table.separator_reason}"))
-    lines.append(("decimal sign", _decimal(found)))
-    reason = "as asked for" if long.unit_said else "as the table says"
-    lines.append(("unit", f"{', '.join(WORDS.get(u, u) for u in long.units)}, {reason}"))
-    for role, names in _columns(found):
-        lines.append((role, names))
-    if found.columns.extra:
-        names = ", ".join(describe_column(table, i) for i in found.columns.extra)
-        lines.append(("not used", f"columns {names}"))
+        items = [
+            ("encoding", f"{table.encoding} ({table.encoding_reason})"),
+            ("separator", f"{table.separator} ({table.separator_reason})"),
+        ]
+    items.append(("decimal sign", _describe_decimal_sign(result)))
+    reason = "requested" if long_table.unit_assumed else "stated in the table"
+    units = ", ".join(UNIT_SYMBOLS.get(unit, unit) for unit in long_table.units)
+    items.append(("unit", f"{units} ({reason})"))
+    items += _columns_by_role(result)
+    if result.columns.extra:
+        names = ", ".join(_describe_column(table, i) for i in result.columns.extra)
+        items.append(("unused", f"columns {names}"))
     if table.above:
-        above = [(line, "") for line in table.above]
-        lines.append(("left out", f"above the headings: row {list_lines(above)}"))
-    for reason in dict.fromkeys(reason for _, reason in long.left_out):
-        rows = [pair for pair in long.left_out if pair[1] == reason]
-        lines.append(("left out", f"{reason}: row {list_lines(rows)}"))
-    if long.unread:
-        rows = [(row.line, "") for row in long.unread]
-        lines.append(("not yet read", f"{len(rows)}: row {list_lines(rows)}"))
-    if long.renamed:
-        pairs = [f"'{written}' is {meant}" for written, meant in long.renamed]
+        items.append(("skipped", f"above the headings: {_format_rows(table.above)}"))
+    for reason in dict.fromkeys(reason for _, reason in long_table.skipped):
+        lines = [line for line, other in long_table.skipped if other == reason]
+        items.append(("skipped", f"{reason}: {_format_rows(lines)}"))
+    if long_table.missing:
+        lines = [row.line for row in long_table.missing]
+        items.append(("empty", f"{counted(len(lines), 'reading')}: {_format_rows(lines)}"))
+    if long_table.renamed:
+        pairs = [f"'{written}' as {name}" for written, name in long_table.renamed]
         more = f" and {len(pairs) - MOST_NAMES} more" if len(pairs) > MOST_NAMES else ""
-        lines.append(("names", ", ".join(pairs[:MOST_NAMES]) + more))
+        items.append(("names", ", ".join(pairs[:MOST_NAMES]) + more))
     if table.formulas:
-        lines.append(("formulas", f"{table.formulas}: their saved values"))
+        items.append(("formulas", f"{table.formulas}, imported with their saved values"))
     if table.hidden:
-        lines.append(("hidden rows", f"{table.hidden}: read as all others"))
-    return lines
+        items.append(("hidden rows", f"{table.hidden}, imported like all others"))
+    return items
 
 
-def _decimal(found: TableImport) -> str:
-    sign = found.long.decimal
-    if found.long.decimal_said:
-        return f"{sign.sign}, as asked for"
-    if sign.evidence is not None:
-        return f"{sign.sign}, as in '{sign.evidence.text}' (row {sign.evidence.line})"
-    if found.table.sheet is not None:
-        return "none needed: numbers of the workbook"
-    if is_house(found.table.header):
-        return "point, as in every readings.csv"
-    return "none needed: whole numbers alone"
+def _describe_decimal_sign(result: TableImport) -> str:
+    decimal = result.long_table.decimal
+    if result.options.decimal is not None:
+        return f"{decimal.sign} (requested)"
+    if decimal.evidence is not None:
+        return f"{decimal.sign} (from '{decimal.evidence.text}' in row {decimal.evidence.line})"
+    if result.table.sheet is not None:
+        return "not needed (numbers of the workbook)"
+    if is_house(result.table.header):
+        return "point (format of readings.csv)"
+    return "not needed (whole numbers only)"
 
 
-def _columns(found: TableImport) -> list[tuple[str, str]]:
-    columns, table = found.columns, found.table
-    named = [
-        ("setup", columns.setup),
-        ("posture", columns.posture),
-        ("minus", columns.minus),
-        ("cycle", columns.cycle),
+def _columns_by_role(result: TableImport) -> list[tuple[str, str]]:
+    columns, table = result.columns, result.table
+    roles = [
+        (role, _describe_column(table, index))
+        for role in ("setup", "posture", "minus", "cycle")
+        if (index := getattr(columns, role)) is not None
     ]
-    lines = [(role, describe_column(table, i)) for role, i in named if i is not None]
     readings = [
-        describe_column(table, r.index) + (f" as cycle {r.cycle}" if r.cycle is not None else "")
+        _describe_column(table, r.index) + (f" as cycle {r.cycle}" if r.cycle is not None else "")
         for r in columns.readings
     ]
-    return [*lines, ("reading", ", ".join(readings))]
+    return [*roles, ("reading", ", ".join(readings))]
 
 
-def _outcome(found: TableImport) -> str:
-    """What becomes of the session's readings.csv."""
+def _describe_column(table: Table, index: int) -> str:
+    """Heading of a column, or its letter if it has no heading."""
+    heading = " ".join(table.header[index].split()) if index < len(table.header) else ""
+    return f"'{heading}'" if heading else column_letters(index)
+
+
+def _format_rows(lines: Iterable[int]) -> str:
+    """Numbers of rows as ranges, such as `rows 3, 7-12`."""
+    ranges: list[list[int]] = []
+    numbers: Sequence[int] = sorted(set(lines))
+    for line in numbers:
+        if ranges and line == ranges[-1][1] + 1:
+            ranges[-1][1] = line
+        else:
+            ranges.append([line, line])
+    texts = [str(a) if a == b else f"{a}-{b}" for a, b in ranges[:MOST_RANGES]]
+    more = f" and {len(ranges) - MOST_RANGES} more" if len(ranges) > MOST_RANGES else ""
+    return f"{'row' if len(numbers) == 1 else 'rows'} {', '.join(texts)}{more}"
+
+
+def _describe_changes(result: TableImport) -> str:
+    """Changes of the session's readings.csv."""
     parts = [
         f"{number} {words}"
         for number, words in (
-            (found.filled, "filled in"),
-            (found.added, "added"),
-            (found.replaced, "replaced"),
-            (found.unchanged, "there already"),
+            (result.filled, "filled in"),
+            (result.added, "added"),
+            (result.replaced, "replaced"),
+            (result.unchanged, "unchanged"),
         )
         if number
     ]
-    rest = f"; {counted(found.empty, 'row')} still without a reading" if found.empty else ""
-    return f"{found.readings_path}: {', '.join(parts)}{rest}"
+    empty = f"; {counted(result.empty, 'row')} still without a reading" if result.empty else ""
+    return f"{result.readings_path}: {', '.join(parts)}{empty}"
 
 
-def printed_import(found: TableImport, *, written: bool) -> str:
-    """The same as JSON."""
-    table, long = found.table, found.long
+def format_import_json(result: TableImport, *, written: bool) -> str:
+    """Report of an import as a JSON document."""
+    table, long_table = result.table, result.long_table
     document: dict[str, Any] = {
         "table": str(table.path),
         "sheet": table.sheet,
         "encoding": table.encoding,
         "separator": table.separator,
-        "decimal": long.decimal.sign,
-        "units": list(long.units),
-        "columns": dict(_columns(found)),
-        "not_used": [describe_column(table, i) for i in found.columns.extra],
-        "left_out": [{"row": line, "reason": reason} for line, reason in long.left_out],
-        "not_yet_read": sorted({row.line for row in long.unread}),
-        "names": dict(long.renamed),
+        "decimal": long_table.decimal.sign,
+        "units": list(long_table.units),
+        "columns": dict(_columns_by_role(result)),
+        "unused": [_describe_column(table, i) for i in result.columns.extra],
+        "skipped": [{"row": line, "reason": reason} for line, reason in long_table.skipped],
+        "rows_without_reading": sorted({row.line for row in long_table.missing}),
+        "renamed": dict(long_table.renamed),
         "readings": [
             {
                 "row": row.line,
@@ -132,14 +159,14 @@ def printed_import(found: TableImport, *, written: bool) -> str:
                 "cycle": int(row.cycle or 1),
                 "reading_mm": float(row.reading),
             }
-            for row in long.rows
+            for row in long_table.rows
         ],
-        "session": str(found.session),
-        "filled": found.filled,
-        "added": found.added,
-        "replaced": found.replaced,
-        "unchanged": found.unchanged,
-        "empty": found.empty,
-        "written": str(found.readings_path) if written else None,
+        "session": str(result.session),
+        "filled": result.filled,
+        "added": result.added,
+        "replaced": result.replaced,
+        "unchanged": result.unchanged,
+        "empty": result.empty,
+        "written": str(result.readings_path) if written else None,
     }
     return json.dumps(document, indent=1, allow_nan=False) + "\n"

@@ -1,4 +1,4 @@
-"""Numerals: what each is with either decimal sign, and what a table of them tells."""
+"""Numerals: their values with either decimal sign, and the decimal sign of a table."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from decimal import Decimal
 
 import pytest
 
-from orthocal.io.tables.numerals import Seen, is_unread, parse_numeral, tell_decimal
+from orthocal.io.tables.numerals import Numeral, infer_decimal_sign, is_missing, parse_numeral
 
 CASES = {
     # text: with a decimal point, with a decimal comma
@@ -60,9 +60,9 @@ CASES = {
 
 
 @pytest.mark.parametrize("text", CASES)
-def test_a_numeral_with_either_sign(text):
-    found = [parse_numeral(text, sign) for sign in ("point", "comma")]
-    assert found == [None if v is None else Decimal(v) for v in CASES[text]]
+def test_value_with_either_decimal_sign(text):
+    values = [parse_numeral(text, sign) for sign in ("point", "comma")]
+    assert values == [None if v is None else Decimal(v) for v in CASES[text]]
 
 
 @pytest.mark.parametrize(
@@ -77,18 +77,18 @@ def test_a_numeral_with_either_sign(text):
         ([], ("point", None, None, False)),
     ],
 )
-def test_what_numerals_tell_of_their_sign(texts, expected):
-    found = tell_decimal([Seen(text, at) for at, text in enumerate(texts)])
-    evidence = found.evidence and found.evidence.text
-    rival = found.rival and found.rival.text
-    assert (found.sign, evidence, rival, found.torn) == expected
+def test_decimal_sign_of_a_table(texts, expected):
+    decimal = infer_decimal_sign([Numeral(text, at) for at, text in enumerate(texts)])
+    evidence = decimal.evidence and decimal.evidence.text
+    rival = decimal.rival and decimal.rival.text
+    assert (decimal.sign, evidence, rival, decimal.contradictory) == expected
 
 
 @pytest.mark.parametrize("text", ["", " ", "-", "–", "---", "n/a", "#N/A", "NaN", "k.A.", "…"])
-def test_cells_that_are_not_yet_read(text):
-    assert is_unread(text)
+def test_missing_readings(text):
+    assert is_missing(text)
 
 
 @pytest.mark.parametrize("text", ["0", "-0", "–1", "#DIV/0!", "x", "1-"])
-def test_cells_that_say_something(text):
-    assert not is_unread(text)
+def test_readings_that_are_not_missing(text):
+    assert not is_missing(text)

@@ -1,0 +1,129 @@
+"""CSV tables of drive coordinates and tool points, with units in the column names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.errors import SessionError
+from orthocal.io.documents import MOST_CSV_ROWS, csv_rows, parse_number
+from orthocal.io.files import read_lines
+from orthocal.robot.model import Robot
+from orthocal.units import DRIVE_UNITS, MM
+
+Array = NDArray[np.float64]
+
+Block = tuple[list[str], Array]
+"""File and line of some rows, for messages, and their values, shape (k, n_columns), [SI]."""
+
+BLOCK_ROWS = 512
+"""Number of rows of a block."""
+
+LONGEST_LINE = 2**17
+"""Maximum number of characters of a line."""
+
+TOOL_COLUMNS = {"x_mm": MM, "y_mm": MM, "z_mm": MM}
+"""Columns of tool points and their factors to SI units."""
+
+
+def drive_columns(robot: Robot) -> dict[str, float]:
+    """Columns of drive coordinates and their factors to SI units."""
+    return {f"{d.name}_{unit}": size for d in robot.drives for unit, size in [DRIVE_UNITS[d.unit]]}
+
+
+def read_points(path: Path, robot: Robot) -> Block:
+    """Read tool points: the coordinates that the drives control; others are ignored.
+
+    Returns:
+        File and line of every row, and values, shape (K, n_coordinates), [m].
+
+    Raises:
+        SessionError: Naming file and line.
+    """
+    columns, ignored = _point_columns(robot)
+    blocks = list(_stream(path, columns, ignored=ignored, name=str(path), most=MOST_CSV_ROWS))
+    return [name for names, _ in blocks for name in names], np.concatenate([v for _, v in blocks])
+
+
+def stream_joints(source: Path | BinaryIO, robot: Robot, *, name: str) -> Iterator[Block]:
+    """Read drive coordinates of any number, block by block.
+
+    Args:
+        source: A file, or an open stream.
+        robot: The robot.
+        name: Name of the source, for messages.
+
+    Raises:
+        SessionError: Naming file and line.
+    """
+    yield from _stream(source, drive_columns(robot), name=name)
+
+
+def stream_points(source: Path | BinaryIO, robot: Robot, *, name: str) -> Iterator[Block]:
+    """Read tool points of any number like `read_points`, block by block.
+
+    Args:
+        source: A file, or an open stream.
+        robot: The robot.
+        name: Name of the source, for messages.
+
+    Raises:
+        SessionError: Naming file and line.
+    """
+    columns, ignored = _point_columns(robot)
+    yield from _stream(source, columns, ignored=ignored, name=name)
+
+
+def format_rows(columns: dict[str, float], values: Array) -> str:
+    """Lines of CSV of values in SI units; rows with NaN become empty cells."""
+    scaled = values / np.array(list(columns.values()))
+    empty = "," * (len(columns) - 1)
+    return "".join(
+        (",".join(f"{v:.6f}" for v in row) if np.isfinite(row).all() else empty) + "\n"
+        for row in scaled
+    )
+
+
+def _point_columns(robot: Robot) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Columns of the coordinates that the drives control, and of the others."""
+    controlled = range(3) if robot.tcp is None else robot.tcp.coordinates
+    columns = {name: f for i, (name, f) in enumerate(TOOL_COLUMNS.items()) if i in controlled}
+    return columns, tuple(name for name in TOOL_COLUMNS if name not in columns)
+
+
+def _stream(
+    source: Path | BinaryIO,
+    columns: dict[str, float],
+    *,
+    ignored: tuple[str, ...] = (),
+    name: str,
+    most: int | None = None,
+) -> Iterator[Block]:
+    lines = read_lines(source, longest=LONGEST_LINE, name=name, error=SessionError)
+    rows = csv_rows(
+        lines,
+        name=name,
+        required=tuple(columns),
+        optional=ignored,
+        error=SessionError,
+        most=most,
+    )
+    empty = True
+    while block := list(islice(rows, BLOCK_ROWS)):
+        empty = False
+        places = [f"{name}:{line}" for line, _ in block]
+        values = [
+            [
+                parse_number(row[c], where=place, name=c, error=SessionError) * factor
+                for c, factor in columns.items()
+            ]
+            for place, (_, row) in zip(places, block, strict=True)
+        ]
+        yield places, np.array(values)
+    if empty:
+        raise SessionError("holds no rows", where=name)
