@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,12 +13,12 @@ import typer
 
 from orthocal.cli.options import Json, Tolerances, app, require_cube, split_globs
 from orthocal.cli.printing import put_note, put_out
-from orthocal.cli.progress import told
 from orthocal.errors import ParameterError
 
 if TYPE_CHECKING:
     from orthocal.robot.model import Robot
     from orthocal.session.session import Session
+    from orthocal.study.runner import Progress
     from orthocal.study.study import Study
 
 studies = typer.Typer(
@@ -30,6 +30,9 @@ app.add_typer(studies, name="study")
 
 FILES = ("study.json", "results.parquet", "study.svg")
 """What a study writes when it has ended, beside its results as they come."""
+
+PROGRESS_STEP = 0.1
+"""Share of a study between two lines of progress."""
 
 LEG_MM = 310.25
 """Of the machine for which the paper's displacements are 60 and -100 mm."""
@@ -316,8 +319,8 @@ def _finish(
     from orthocal.io.files import require_writable, write_files
     from orthocal.output.study.views import draw_study, render_study, study_json, summarise_study
     from orthocal.output.text.layout import print_rich
-    from orthocal.runtime.interrupts import raised_interrupt
-    from orthocal.runtime.worker_pool import available_cores, call_on_cores, lent
+    from orthocal.runtime.interrupts import message_at_interrupt
+    from orthocal.runtime.worker_pool import available_cores, call_in_parallel, worker_budget
     from orthocal.study.parquet import to_parquet
     from orthocal.study.runner import JOURNAL, run_study
 
@@ -328,22 +331,13 @@ def _finish(
     if out is not None:
         require_writable(out, [JOURNAL, *FILES])
     count = workers or available_cores()
-    try:
-        with raised_interrupt(), told(study) as report:
-            table = run_study(
-                study,
-                folder=out,
-                workers=count,
-                dask=dask,
-                anew=force,
-                report=report,
-            )
-    except KeyboardInterrupt:
-        kept = "with --out it could go on later" if out is None else "the same command goes on"
-        put_note(f"orthocal: stopped; {kept}")
-        raise
+    resume = "with --out it can be resumed" if out is None else "the same command resumes it"
+    with message_at_interrupt(f"orthocal: stopped; {resume}"):
+        table = run_study(
+            study, folder=out, workers=count, dask=dask, anew=force, report=_progress_lines(study)
+        )
     own = count if dask is None else 1
-    with lent(own):
+    with worker_budget(own):
         summary = summarise_study(table)
     document = study_json(table, summary)
     if json:
@@ -351,10 +345,40 @@ def _finish(
     else:
         print_rich(render_study(table, summary, all_rows=all_rows))
     if out is not None:
-        with lent(own):
-            rest = call_on_cores([lambda: to_parquet(table), lambda: draw_study(table, summary)])
+        with worker_budget(own):
+            rest = call_in_parallel([lambda: to_parquet(table), lambda: draw_study(table, summary)])
         write_files(out, dict(zip(FILES, (document, *rest), strict=True)))
         put_note(f"Wrote {', '.join(str(out / name) for name in FILES)}")
+
+
+def _progress_lines(study: Study) -> Callable[[Progress], None] | None:
+    """Function that prints a line on stderr after each tenth of a study of several tasks."""
+    if len(study.task_sizes) < 2:
+        return None
+    next_share = 0.0
+
+    def report(progress: Progress) -> None:
+        nonlocal next_share
+        if progress.seconds_left is None:
+            if progress.kept:
+                put_note(
+                    f"orthocal: resumed at {progress.kept} of {progress.total} {study.counted}"
+                )
+            return
+        share = progress.done / progress.total
+        if share < min(next_share, 1.0):
+            return
+        next_share = share + PROGRESS_STEP
+        left = "" if share >= 1.0 else f", about {_duration(progress.seconds_left)} left"
+        put_note(f"orthocal: {progress.done} of {progress.total} {study.counted}{left}")
+
+    return report
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 5400.0 else f"{seconds / 3600.0:.1f} h"
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import secrets
 import stat
 from codecs import getincrementaldecoder
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from io import IncrementalNewlineDecoder
 from itertools import chain
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import BinaryIO
 
 from orthocal.errors import OrthocalError, OutputError
 from orthocal.runtime.interrupts import postponed_interrupt, raised_interrupt
-from orthocal.text import control_character
+from orthocal.text import control_character, printable
 
 LARGEST_FILE = 64 * 2**20
 """Files above this size are refused, [bytes]."""
@@ -168,6 +168,36 @@ def _open_regular(path: Path, error: type[OrthocalError]) -> int:
         found = "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
         raise error(f"is {found}; expected a file", where=str(path))
     return descriptor
+
+
+@contextmanager
+def content_withheld_outside(directory: Path, *files: Path) -> Iterator[None]:
+    """Withhold the text of errors about files that a document names outside its own directory.
+
+    A document from a stranger may name any file of this machine, directly or by a symbolic link.
+    Messages about such a file name it and the line, and quote nothing of what it holds.
+
+    Args:
+        directory: Directory of the document.
+        files: Files that the code inside the block reads because the document names them.
+
+    Raises:
+        OrthocalError: Of the same kind as inside the block, without its text.
+    """
+    root = os.path.realpath(directory)
+    outside = [f for f in files if not Path(os.path.realpath(f)).is_relative_to(root)]
+    try:
+        yield
+    except OrthocalError as e:
+        for file in outside:
+            found = re.match(re.escape(printable(str(file))) + r"(:\d+)?", e.where or "")
+            if found:
+                raise type(e)(
+                    "cannot be used. Its content is not shown: the file is outside the directory "
+                    f"'{directory}'",
+                    where=found[0],
+                ) from None
+        raise
 
 
 def require_plain_name(path: Path, *, error: type[OrthocalError] = OrthocalError) -> None:

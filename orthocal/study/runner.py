@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from orthocal.errors import OrthocalError
-from orthocal.runtime.worker_pool import can_fork, lent, run_on_cores
+from orthocal.runtime.worker_pool import can_fork, run_in_parallel, worker_budget
 from orthocal.study.journal import Found, open_journal
 from orthocal.study.study import Cell, Study, prepare_once, run_task
 
@@ -99,9 +99,9 @@ def _run(study: Study, todo: Sequence[int], workers: int, dask: str | None) -> I
     if dask is not None:
         return _on_cluster(study, todo, dask)
     if can_fork():
-        with lent(workers):
+        with worker_budget(workers):
             prepare_once(study)  # every worker has it when it begins
-    return run_on_cores(partial(run_task, study), todo, workers, killed=KILLED)
+    return run_in_parallel(partial(run_task, study), todo, workers, killed=KILLED)
 
 
 def _one(study: Study, task: int) -> Done:

@@ -146,7 +146,7 @@ def test_workers_hold_no_lock(study, tmp_path, monkeypatch):
     locked = tmp_path / "held"
     descriptor = os.open(locked, os.O_RDWR | os.O_CREAT)
     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    tasks = cores.run_on_cores(partial(run_task, study), range(6), 2, killed="")
+    tasks = cores.run_in_parallel(partial(run_task, study), range(6), 2, killed="")
     next(tasks)
     os.close(descriptor)
     other = os.open(locked, os.O_RDWR)

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
 import sys
 
 import pytest
+from processes import children_of, is_running, until
 
 from orthocal.cli import main
 
@@ -83,15 +87,23 @@ def test_a_longer_leg_is_another_machine(monkeypatch, capsys):
     assert found[0] > 1.2 * found[1]
 
 
-def test_ctrl_c_says_how_to_go_on(monkeypatch, capsys, tmp_path):
-    def stop(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("orthocal.study.runner.run_task", stop)
-    for out, word in (([], "with --out it could go on"), (["--out", tmp_path], "the same command")):
-        code, _, err = run(monkeypatch, capsys, "sensitivity", "--free", "offsets", *out)
-        assert code == 130
-        assert f"orthocal: stopped; {word}" in err
+@pytest.mark.parametrize("out", [True, False])
+def test_interrupt_ends_workers_and_names_the_way_to_resume(tmp_path, root, out):
+    words = ["bootstrap", str(root / "examples/raw-cycles"), "--draws", "100000", "--workers", "2"]
+    words += ["--out", str(tmp_path)] if out else []
+    command = [sys.executable, "-m", "orthocal", "study", *words]
+    process = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, process_group=0
+    )
+    until(lambda: len(children_of(process.pid)) == 2)
+    children = [int(pid) for pid in children_of(process.pid)]
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers as well
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    last = errors.splitlines()[-1]
+    assert ("the same command resumes it" if out else "--out") in last
+    assert "Traceback" not in errors
+    until(lambda: not any(map(is_running, children)))
 
 
 @pytest.mark.parametrize(

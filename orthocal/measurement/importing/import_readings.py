@@ -10,7 +10,7 @@ from typing import cast, get_args
 
 from orthocal.arguments import require_kind
 from orthocal.errors import SessionError
-from orthocal.io.files import exists, read_file, write_file
+from orthocal.io.files import content_withheld_outside, exists, read_file, write_file
 from orthocal.io.tables.numerals import Sign
 from orthocal.io.tables.table import Table, read_table
 from orthocal.measurement.files.readings_checks import RawReading, check_readings, parse_cycle
@@ -124,9 +124,10 @@ def import_readings(
         fill=options.fill,
     )
     check_readings(long.rows, plan, file=path)
-    there = _existing(readings_path, path, long, overwrite)
-    if there:
-        check_readings(there, plan, file=readings_path, unread=set())
+    with content_withheld_outside((plan.path or Path(session)).parent, readings_path):
+        there = _existing(readings_path, path, long, overwrite)
+        if there:
+            check_readings(there, plan, file=readings_path, unread=set())
     merged = _merge(there, long.rows, readings_path, overwrite)
     text = _house_text(merged.rows)
     again = read_rows(readings_path, text.encode())
