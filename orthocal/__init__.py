@@ -60,7 +60,7 @@ _HOMES = {
     "Validation": "orthocal.assessment.validation",
     "Workspace": "orthocal.kinematics.workspace",
     "assess_tool": "orthocal.assessment.tool_error",
-    "build_accuracy_study": "orthocal.study.accuracy_options",
+    "build_accuracy_study": "orthocal.study.accuracy",
     "build_bootstrap_study": "orthocal.study.bootstrap",
     "build_linearisation_study": "orthocal.study.linearisation",
     "build_sensitivity_study": "orthocal.study.sensitivity",
@@ -238,7 +238,7 @@ if TYPE_CHECKING:
     from orthocal.sensors.protocol import Sensor
     from orthocal.sensors.registry import register_sensor
     from orthocal.session.session import Gauge, Posture, Reading, Session, Setup
-    from orthocal.study.accuracy_options import build_accuracy_study
+    from orthocal.study.accuracy import build_accuracy_study
     from orthocal.study.bootstrap import build_bootstrap_study
     from orthocal.study.linearisation import build_linearisation_study
     from orthocal.study.runner import StudyTable, run_study
