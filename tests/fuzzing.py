@@ -172,6 +172,7 @@ def lay_out(folder: Path) -> None:
 def lay_out_journals(folder: Path) -> None:
     """A recording and a study that were killed, the recording before its CSV was written."""
     from orthocal.measurement.recording.recording import open_recording
+    from orthocal.study.runner import open_results
 
     recorded = folder / "recorded"
     recorded.mkdir()
@@ -554,6 +555,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     from orthocal.output.text.import_report import format_import, printed_import
     from orthocal.planning.equipment import Means
     from orthocal.planning.gauge_range import load_dial
+    from orthocal.study.runner import open_results
 
     deep = rng.random() < thorough
     if kind in ("session", "readings"):
