@@ -97,7 +97,7 @@ def test_forty_thousand_keys_are_no_reason_to_wait(tmp_path, refused):
     assert len(read_json(path, error=SessionError)) == 100_000
     assert time.process_time() - began < PROMPT
     twice = ",".join(f'"{i}": 0' for i in [*range(40_000), 39_999])
-    assert "the key '39999' stands twice" in refused(f"{{{twice}}}", reader=read_json)
+    assert "the key '39999' occurs twice" in refused(f"{{{twice}}}", reader=read_json)
 
 
 def test_a_json_of_empty_lists_is_counted_first(refused):
