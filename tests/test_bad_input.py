@@ -394,7 +394,8 @@ SESSION_FILE_CASES = [
         "tab",
         "postures:\n  x_max",
         "postures:\n\tx_max",
-        ":12: is not valid YAML: found character that cannot start any token (a tab; indent with spaces)",
+        ":12: is not valid YAML: found character that cannot start any token (a tab; indent with "
+        "spaces)",
     ),
     session(
         "bracket-open",
@@ -1527,12 +1528,12 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "schema-other",
-        f"{CALIBRATION}: schema is 'orthocal/calibration/9'; expected 'orthocal/calibration/5'",
-        swap(FILE, "orthocal/calibration/5", "orthocal/calibration/9"),
+        f"{CALIBRATION}: schema is 'orthocal/calibration/9'; expected 'orthocal/calibration/6'",
+        swap(FILE, "orthocal/calibration/6", "orthocal/calibration/9"),
     ),
     calibration(
         "schema-missing",
-        f"{CALIBRATION}: schema: is missing; expected 'orthocal/calibration/5'",
+        f"{CALIBRATION}: schema: is missing; expected 'orthocal/calibration/6'",
         write(FILE, "{}"),
     ),
     calibration(

@@ -41,24 +41,18 @@ def test_main_job(root, workplace):
     assert (workplace / "main/report.html").is_file()
 
 
-def test_prepare(workplace):
+def test_prepare_measure_calibrate_and_use(root, workplace):
     words = ["--leg-mm", 250, "--travel-mm", "100:325", "--attachment-mm", 30]
     words += ["--rods-apart-mm", 60, "--rod-radius-mm", 4, "--counts", "up,up,up"]
     run("new", "mill", *words, "--at-zero-mm", 0, "--tolerance", "*.offset_mm=2", cwd=workplace)
     assert (workplace / "mill/first/sheet.html").is_file()
     run("view", "mill", "--html", "mill.html", cwd=workplace)
-
-
-def test_measure_and_calibrate(root, workplace):
     draw = ["--draw", "*", "--seed", 3]
     run("simulate", "mill/first", *draw, "--out", "readings", cwd=workplace)
     run("check", "readings", cwd=workplace)
     run("calibrate", "readings", "--out", "calibrated", cwd=workplace)
     run("compare", root / "examples/raw-cycles", cwd=workplace)
     assert json.loads((workplace / "calibrated/calibration.json").read_text("utf-8"))["schema"]
-
-
-def test_use(workplace):
     run("accuracy", "calibrated", cwd=workplace)
     out = ["--to", "linuxcnc", "--out", "linuxcnc"]
     run("export", "calibrated", *out, cwd=workplace)

@@ -114,7 +114,7 @@ def test_a_name_is_one_name_in_every_form_of_its_accents(session):
 
     twice = text.replace(f"  {apart}:", f"  {composed}: {{tcp_mm: [1, 2, 3]}}\n  {apart}:", 1)
     described.write_text(twice, encoding="utf-8")
-    with pytest.raises(OrthocalError, match="the key 'max_é' stands twice"):
+    with pytest.raises(OrthocalError, match="the key 'max_é' occurs twice"):
         load_session(session)
 
 

@@ -83,6 +83,8 @@ def _list_looks(session: Session, known: SensorUnknowns) -> Iterator[_Look]:
     aligned_at = session.alignment_postures
     active = session.robot.drive_zero - session.zero_drives
     for i, setup in enumerate(session.setups.values()):
+        if not known.of_setup[i]:  # it has no readings
+            continue
         seen = setup.sensor.set_by(session.robot)
         for index, unknown in zip(known.of_setup[i], setup.sensor.unknowns, strict=True):
             if unknown.name in seen:

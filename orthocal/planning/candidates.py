@@ -422,11 +422,4 @@ def _touching(session: Session) -> Session:
             "fewer sections or places",
             where="plan",
         )
-    used = {r.setup for r in readings}
-    stands = {r.posture for r in readings}
-    return replace(
-        session,
-        readings=readings,
-        setups={n: s for n, s in session.setups.items() if n in used},
-        postures={n: p for n, p in session.postures.items() if n in stands},
-    )
+    return replace(session, readings=readings).select(readings)

@@ -71,7 +71,7 @@ def list_usual_plans(
         if not readings:
             continue
         session = replace(candidates.session, setups=setups, readings=tuple(readings))
-        session = _only_used(session)
+        session = session.select(session.readings)
         found.append(_alternative(name, session, means, forecast, measured))
     return tuple(found)
 
@@ -180,8 +180,3 @@ def _with_blade(session: Session) -> Session:
         return replace(setup, sensor=sensor)
 
     return replace(session, setups={n: bladed(s) for n, s in session.setups.items()})
-
-
-def _only_used(session: Session) -> Session:
-    used = {r.posture for r in session.readings}
-    return replace(session, postures={n: p for n, p in session.postures.items() if n in used})

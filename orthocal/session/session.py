@@ -212,6 +212,22 @@ class Session:
             + paragraph(about)
         )
 
+    def select(self, readings: Sequence[Reading]) -> Session:
+        """The same session with some of its readings, and the setups and postures they need.
+
+        Gauges stay aligned where they were (`alignment_postures` of the whole session).
+        """
+        read = {r.setup for r in readings}
+        aligned_at = {n: p for n, p in self.alignment_postures.items() if n in read}
+        used = {p for r in readings for p in (r.posture, r.minus)} | set(aligned_at.values())
+        return replace(
+            self,
+            readings=tuple(readings),
+            setups={n: replace(self.setups[n], aligned_at=p) for n, p in aligned_at.items()},
+            postures={n: p for n, p in self.postures.items() if n in used},
+            sha256="",
+        )
+
     def with_controller(self, offsets: ArrayLike) -> Session:
         """The same session with other offsets active in the controller than it states.
 

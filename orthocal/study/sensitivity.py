@@ -62,11 +62,13 @@ class SensitivityStudy(Study):
         parameters = problem.machine_selection.parameters
         jacobian = problem.linearise(problem.reference)[1][:, : len(parameters)]
         by_std: dict[tuple[str, str], Array] = {}
+        read = {postures[i] for i in o.posture}
         if session.robot.tcp is not None:
             tool = ToolSensitivity(session.robot, free=problem.machine_selection.names)
             scaled = tool(problem.drives, names=postures) * problem.theta_scale[: len(parameters)]
             for posture, rows in zip(postures, scaled, strict=True):
-                by_std.update({(posture, axis): r for axis, r in zip(TOOL, rows, strict=True)})
+                if posture in read:
+                    by_std.update({(posture, axis): r for axis, r in zip(TOOL, rows, strict=True)})
         for i in range(o.size):
             key = postures[o.posture[i]], setups[o.setup[i]]
             by_std.setdefault(key, jacobian[i] * problem.noise[i])
@@ -125,12 +127,16 @@ def _at_points(session: Session, points: Array) -> Session:
     postures = {
         n: Posture(n, "tcp_mm", p, d) for n, p, d in zip(names, points, drives, strict=True)
     }
+    aligned_at = session.alignment_postures
+    setups = {n: replace(s, aligned_at=aligned_at[n]) for n, s in session.setups.items()}
+    alignment = {n: session.postures[n] for n in aligned_at.values()}
     readings = tuple(
         Reading(setup, posture, None, 1, 0.0, None)
         for setup in session.setups
         for posture in postures
     )
-    moved = replace(session, postures=postures, readings=readings)
+    postures = {**postures, **alignment}
+    moved = replace(session, setups=setups, postures=postures, readings=readings)
     check_contacts(moved)
     return moved
 

@@ -195,7 +195,7 @@ def test_what_a_killed_run_left_is_cleaned_up_by_the_next(tmp_path):
 
 def test_all_or_none_where_one_cannot_be(tmp_path):
     (tmp_path / "b").mkdir()
-    with pytest.raises(OrthocalError, match="is a folder"):
+    with pytest.raises(OrthocalError, match="is a directory"):
         write_files(tmp_path, {"a": "new", "b": "new"})
     assert not (tmp_path / "a").exists()
     assert leftovers(tmp_path) == []

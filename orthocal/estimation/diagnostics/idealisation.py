@@ -45,14 +45,7 @@ def find_idealised(session: Session) -> Idealised | None:
     few = tuple(chosen[:: -(-len(chosen) // MOST_READINGS)])
     if not few:
         return None
-    used = {r.posture for r in few} | {r.minus for r in few}
-    part = replace(
-        session,
-        readings=few,
-        postures={n: p for n, p in session.postures.items() if n in used},
-        setups={n: s for n, s in session.setups.items() if any(r.setup == n for r in few)},
-        parts=(),
-    )
+    part = replace(session.select(few), parts=())
     as_said = _first_order(part)
     touched = {n: next(iter(real[n])) for n in part.setups}
     setups = {n: replace(s, sensor=real[n][touched[n]]) for n, s in part.setups.items()}

@@ -236,14 +236,18 @@ def _follow(robot: Robot, way: Array) -> _Gone | None:
 def _touch(session: Session, setup: str, stops: list[Stop], ways: Sequence[_Gone]) -> list[Stop]:
     """The same stops, with what a perfect machine shows, and where the plunger is to be lifted."""
     places, drives, passive = (np.concatenate(part) for part in zip(*ways, strict=True))
-    names = [str(i) for i in range(len(places))]
+    names = [f"way {i}" for i in range(len(places))]
+    aligned = session.postures[session.alignment_postures[setup]]
+    at_alignment = nominal_assembly(session.robot).close(aligned.drives + session.active_offsets)
+    passive = np.vstack([passive, at_alignment])
     along = replace(
         session,
         postures={
             n: Posture(n, "tcp_mm", p, d - session.active_offsets)
             for n, p, d in zip(names, places, drives, strict=True)
-        },
-        setups={setup: session.setups[setup]},
+        }
+        | {aligned.name: aligned},
+        setups={setup: replace(session.setups[setup], aligned_at=aligned.name)},
         readings=tuple(Reading(setup, n, None, 1, 0.0, None) for n in names),
     )
     observations = build_observations(along)
