@@ -683,7 +683,7 @@ SESSION_SENSE_CASES = [
         "readings-with-null",
         "readings.csv",
         '"a\\0.csv"',
-        ":30: is not valid YAML: a text holds a control character",
+        ":30: is not valid YAML: a text contains a control character",
     ),
     Case(
         "model-unknown",

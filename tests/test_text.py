@@ -81,7 +81,7 @@ def test_strings_in_lists_of_a_json_are_looked_at_too(session):
     text = path.read_text(encoding="utf-8")
     assert '"told": [\n   "x_slide.offset"' in text
     path.write_text(text.replace('"told": [\n   "x_', '"told": [\n   "\\u001b[31mx_'))
-    with pytest.raises(OrthocalError, match="a text holds a control character"):
+    with pytest.raises(OrthocalError, match="a text contains a control character"):
         load_calibration(session)
 
 

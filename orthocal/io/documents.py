@@ -10,7 +10,7 @@ import dataclasses
 import io
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -149,6 +149,8 @@ def read_yaml(path: Path, *, error: type[OrthocalError], content: bytes | None =
         mark = e.problem_mark or e.context_mark
         line = "" if mark is None else f":{mark.line + 1}"
         problem = str(e.problem)
+        if problem.startswith("but "):  # PyYAML's sentence begins in the context
+            problem = f"{e.context}, {problem}"
         if mark is not None and text[mark.index : mark.index + 1] == "\t":
             problem += " (a tab; indent with spaces)"
         raise error(f"is not valid YAML: {problem}", where=f"{path}{line}") from None
@@ -285,21 +287,8 @@ def csv_rows(
     )
     try:
         header = [composed(name.strip()) for name in next(reader)]
-        for name in header:
-            if name not in required and name not in optional:
-                raise error(
-                    f"unknown column '{shorten(name)}'; expected {', '.join(required)}"
-                    + (f" and optionally {', '.join(optional)}" if optional else ""),
-                    where=f"{path}:1",
-                )
-            if header.count(name) > 1:
-                raise error(f"the column '{name}' occurs twice", where=f"{path}:1")
-        for name in required:
-            if name not in header:
-                raise error(
-                    f"the column '{name}' is missing; found {shorten(', '.join(header))}",
-                    where=f"{path}:1",
-                )
+        if invalid := _header_problem(header, required, optional):
+            raise error(invalid, where=f"{path}:1")
         for row in reader:
             line = reader.line_num
             if most is not None and line > most:
@@ -320,6 +309,22 @@ def csv_rows(
             )
     except csv.Error as e:
         raise error(f"is not valid CSV: {e}", where=f"{path}:{reader.line_num}") from None
+
+
+def _header_problem(
+    header: Sequence[str], required: Sequence[str], optional: Sequence[str]
+) -> str | None:
+    """First problem with the columns of a CSV file."""
+    for name in header:
+        if name not in required and name not in optional:
+            more = f" and optionally {', '.join(optional)}" if optional else ""
+            return f"unknown column '{shorten(name)}'; expected {', '.join(required)}{more}"
+        if header.count(name) > 1:
+            return f"the column '{name}' occurs twice"
+    missing = next((name for name in required if name not in header), None)
+    if missing is None:
+        return None
+    return f"the column '{missing}' is missing; found {shorten(', '.join(header))}"
 
 
 _DECIMAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?(nan|inf\w*)", re.I)
@@ -401,13 +406,13 @@ def explain_validation_error(exception: ValidationError, schema: type[Any]) -> t
     errors = exception.errors(include_url=False)
     first = min(errors, key=lambda e: e["type"] not in UNKNOWN_KEY)
     path = [part for part in first["loc"] if not _is_pydantic_tag(part)]
-    found, kind = first.get("input"), first["type"]
-    if "[key]" in first["loc"] and not isinstance(found, str):
-        return _join(path[:-1]), f"found the key {_show(found)}; expected text: put it in quotes"
+    value, kind = first.get("input"), first["type"]
+    if "[key]" in first["loc"] and not isinstance(value, str):
+        return _join(path[:-1]), f"found the key {_show(value)}; expected text: put it in quotes"
     key = _join(path)
     if kind in UNKNOWN_KEY:
-        known = _keys_at(schema, path[:-1])
-        hint = f"; known keys: {', '.join(known)}" if known else ""
+        keys = _keys_at(schema, path[:-1])
+        hint = f"; known keys: {', '.join(keys)}" if keys else ""
         return key, f"unknown key{hint}"
     if kind == "missing":
         return key, "is missing"
@@ -416,7 +421,7 @@ def explain_validation_error(exception: ValidationError, schema: type[Any]) -> t
         # a validator of several keys begins its message with "KEY|"
         inner, separator, problem = message.partition("|")
         return (_join([*path, inner] if inner else path), problem) if separator else (key, message)
-    shown = "nothing" if found is None else f"'{_show(found)}'"
+    shown = "nothing" if value is None else f"'{_show(value)}'"
     return key, f"found {shown}; expected {_expectation(kind, message, first.get('ctx') or {})}"
 
 
@@ -448,7 +453,7 @@ def _join(path: list[Any]) -> str:
 
 
 def _is_pydantic_tag(part: object) -> bool:
-    """Whether a part of a location is pydantic's name of a union branch, not a key."""
+    """True for a part of a location that is pydantic's name of a union branch, not a key."""
     return isinstance(part, str) and ("[" in part or part in {"float", "int", "str", "bool"})
 
 

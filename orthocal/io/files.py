@@ -216,7 +216,7 @@ def require_plain_name(path: Path, *, error: type[OrthocalError] = OrthocalError
 
 
 def is_folder(path: Path) -> bool:
-    """Whether a path is an existing directory; False for invalid names."""
+    """True for an existing directory; False for invalid names."""
     try:
         return path.is_dir()
     except (OSError, ValueError):
@@ -224,7 +224,7 @@ def is_folder(path: Path) -> bool:
 
 
 def exists(path: Path) -> bool:
-    """Whether a file or directory exists; False for invalid names."""
+    """True for an existing file or directory; False for invalid names."""
     try:
         return path.exists()
     except (OSError, ValueError):

@@ -99,7 +99,7 @@ def call_in_parallel(
 
 
 def can_fork() -> bool:
-    """Whether this process can be forked safely: it runs one thread, so no lock stays locked."""
+    """True if a fork is safe: with one thread, no lock stays locked in the child."""
     if sys.platform != "linux" or threading.active_count() > 1:
         return False
     try:

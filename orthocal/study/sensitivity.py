@@ -120,7 +120,7 @@ def build_sensitivity_study(
 
 
 def _at_points(session: Session, points: Array) -> Session:
-    """The same setups, each read with the tool at every point."""
+    """The session with every setup read at every point of the tool."""
     names = [f"point_{i + 1}" for i in range(len(points))]
     drives = nominal_assembly(session.robot).inverse(points, names=names)
     drives = drives - session.active_offsets

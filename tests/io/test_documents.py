@@ -169,7 +169,7 @@ def change(document, keys, value):
         (["identifiability", "rank"], 4, "identifiability.rank: found 4"),
         (["covariance"], [], "covariance: expected 3 × 3 numbers"),
         (["parameters", 0, "tolerance"], 0, "expected greater than 0"),
-        (["robot", "folder"], "a\x00b", "a text holds a control character"),
+        (["robot", "folder"], "a\x00b", "a text contains a control character"),
         (["robot", "folder"], "x" * 300, "is neither a robot of orthocal"),
         (["session", "title"], "\ud800", "half of a surrogate pair"),
         (["residuals"], [0] * 300_000, "residuals[0]: found '0'; expected keys and values"),

@@ -147,9 +147,9 @@ def _accuracy_answer(study: AccuracyStudy, s: AccuracySummary, predicted: float)
         "The controller corrects all identified errors.",
     ]
     if math.isfinite(predicted):
-        excess = s.after - predicted
+        difference = s.after - predicted
         limit = max(SIGNIFICANT * s.standard_error, LINEAR_PREDICTION_ERROR * predicted)
-        worse = ", significantly less" if excess > limit and not study.fixed else ""
+        worse = ", significantly less" if difference > limit and not study.fixed else ""
         kind = " for machines within their tolerances" if study.fixed else ""
         sentences.append(f"The covariance predicts {_um(predicted)} µm{kind}{worse}.")
     return " ".join(sentences)
