@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 studies = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="Simulate many machines or resample readings: accuracy, linearisation, scatter.",
+    help="Simulate many machines, or resample readings.",
 )
 app.add_typer(studies, name="study")
 
@@ -108,7 +108,7 @@ def accuracy(
     all_rows: AllRows = False,
     force: Force = False,
 ) -> None:
-    """Tool error that the readings of a plan leave: simulate and calibrate many machines."""
+    """Tool error after calibration of many simulated machines."""
     from orthocal.estimation.choice import Choice
     from orthocal.io.files import exists
     from orthocal.measurement.files.session_file import load_plan
@@ -191,7 +191,7 @@ def linearisation(
     json: Json = False,
     force: Force = False,
 ) -> None:
-    """Error of linearised identification as a machine's errors grow."""
+    """Error of linearised identification as errors grow."""
     from orthocal.robot.model import Robot
     from orthocal.session.session import Gauge
     from orthocal.study.linearisation import build_linearisation_study
@@ -250,7 +250,7 @@ def sensitivity(
     all_rows: AllRows = False,
     force: Force = False,
 ) -> None:
-    """Derivatives of the readings and of the tool position by each error."""
+    """Derivatives of readings and tool position by each error."""
     from orthocal.robot.model import Robot
     from orthocal.study.sensitivity import build_sensitivity_study
     from orthocal.units import MM
@@ -294,7 +294,7 @@ def bootstrap(
     all_rows: AllRows = False,
     force: Force = False,
 ) -> None:
-    """Scatter of the estimates that a session's own readings imply."""
+    """Scatter of estimates implied by a session's readings."""
     from orthocal.estimation.choice import Choice
     from orthocal.measurement.files.session_file import load_session
     from orthocal.study.bootstrap import build_bootstrap_study
