@@ -11,249 +11,115 @@ Five lines do the main job:
 
 from __future__ import annotations
 
+import ast
+import sys
+from functools import cache
 from importlib import import_module
+from inspect import getsource
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
-_HOMES = {
-    "Calibration": "orthocal.calibration.calibration",
-    "CalibrationFileError": "orthocal.errors",
-    "CalibrationProblem": "orthocal.estimation.problem",
-    "Choice": "orthocal.estimation.choice",
-    "ClosureError": "orthocal.errors",
-    "Comparison": "orthocal.assessment.comparison",
-    "Decision": "orthocal.assessment.findings.decision",
-    "ExportError": "orthocal.errors",
-    "ExportOptions": "orthocal.export.linuxcnc.export",
-    "Finding": "orthocal.assessment.findings.finding",
-    "Gauge": "orthocal.session.session",
-    "GcodeError": "orthocal.errors",
-    "LiveScene": "orthocal.viewer.live",
-    "Loss": "orthocal.estimation.loss",
-    "Machine": "orthocal.calibration.machine",
-    "Means": "orthocal.planning.equipment",
-    "MeasuringPlan": "orthocal.planning.plan",
-    "NonlinearProgram": "orthocal.estimation.solvers.ipopt",
-    "NotIdentifiableError": "orthocal.errors",
-    "OrthocalError": "orthocal.errors",
-    "OutputError": "orthocal.errors",
-    "ParameterError": "orthocal.errors",
-    "Posture": "orthocal.session.session",
-    "Reading": "orthocal.session.session",
-    "Robot": "orthocal.robot.model",
-    "RobotError": "orthocal.errors",
-    "Scene": "orthocal.viewer.scene",
-    "Sensor": "orthocal.sensors.protocol",
-    "Session": "orthocal.session.session",
-    "SessionError": "orthocal.errors",
-    "Setup": "orthocal.session.session",
-    "Sizes": "orthocal.robot.builder.dimensions",
-    "SolverError": "orthocal.errors",
-    "SolverOptions": "orthocal.estimation.options",
-    "Study": "orthocal.study.study",
-    "StudyTable": "orthocal.study.runner",
-    "TableImport": "orthocal.measurement.importing.import_readings",
-    "TableOptions": "orthocal.measurement.importing.import_readings",
-    "ToolAccuracy": "orthocal.assessment.tool_error",
-    "UnreachableError": "orthocal.errors",
-    "Validation": "orthocal.assessment.validation",
-    "Workspace": "orthocal.kinematics.workspace",
-    "assess_tool": "orthocal.assessment.tool_error",
-    "build_accuracy_study": "orthocal.study.accuracy_options",
-    "build_bootstrap_study": "orthocal.study.bootstrap",
-    "build_linearisation_study": "orthocal.study.linearisation",
-    "build_sensitivity_study": "orthocal.study.sensitivity",
-    "calibrate": "orthocal.calibration.calibrate",
-    "check_session": "orthocal.assessment.findings.session",
-    "compare_models": "orthocal.assessment.comparison",
-    "decide": "orthocal.assessment.findings.calibration",
-    "decide_comparison": "orthocal.assessment.findings.comparison",
-    "decide_validation": "orthocal.assessment.findings.validation",
-    "draw_errors": "orthocal.observation.simulate",
-    "draw_scene": "orthocal.output.scene.drawing",
-    "export_calibration": "orthocal.export.formats",
-    "find_changes": "orthocal.calibration.refit",
-    "import_readings": "orthocal.measurement.importing.import_readings",
-    "join_sessions": "orthocal.measurement.joining",
-    "load_calibration": "orthocal.calibration.file",
-    "load_plan": "orthocal.measurement.files.session_file",
-    "load_robot": "orthocal.robot.loading",
-    "load_session": "orthocal.measurement.files.session_file",
-    "make_robot": "orthocal.robot.builder.build",
-    "parameter_table": "orthocal.calibration.tables",
-    "reading_table": "orthocal.calibration.tables",
-    "plan_readings": "orthocal.planning.plan",
-    "register_sensor": "orthocal.sensors.registry",
-    "repeat_calibration": "orthocal.calibration.refit",
-    "restore_session": "orthocal.calibration.refit",
-    "run_study": "orthocal.study.runner",
-    "simulate_session": "orthocal.observation.simulate",
-    "summarize": "orthocal.output.text.summary",
-    "validate_calibration": "orthocal.assessment.validation",
-    "write_calibration": "orthocal.calibration.file",
-    "write_import": "orthocal.measurement.importing.import_readings",
-    "write_report": "orthocal.output.report.page",
-    "write_session": "orthocal.measurement.files.write_session",
-}
-
-__all__ = [
-    "Calibration",
-    "CalibrationFileError",
-    "CalibrationProblem",
-    "Choice",
-    "ClosureError",
-    "Comparison",
-    "Decision",
-    "ExportError",
-    "ExportOptions",
-    "Finding",
-    "Gauge",
-    "GcodeError",
-    "LiveScene",
-    "Loss",
-    "Machine",
-    "Means",
-    "MeasuringPlan",
-    "NonlinearProgram",
-    "NotIdentifiableError",
-    "OrthocalError",
-    "OutputError",
-    "ParameterError",
-    "Posture",
-    "Reading",
-    "Robot",
-    "RobotError",
-    "Scene",
-    "Sensor",
-    "Session",
-    "SessionError",
-    "Setup",
-    "Sizes",
-    "SolverError",
-    "SolverOptions",
-    "Study",
-    "StudyTable",
-    "TableImport",
-    "TableOptions",
-    "ToolAccuracy",
-    "UnreachableError",
-    "Validation",
-    "Workspace",
-    "assess_tool",
-    "build_accuracy_study",
-    "build_bootstrap_study",
-    "build_linearisation_study",
-    "build_sensitivity_study",
-    "calibrate",
-    "check_session",
-    "compare_models",
-    "decide",
-    "decide_comparison",
-    "decide_validation",
-    "draw_errors",
-    "draw_scene",
-    "export_calibration",
-    "find_changes",
-    "import_readings",
-    "join_sessions",
-    "load_calibration",
-    "load_plan",
-    "load_robot",
-    "load_session",
-    "make_robot",
-    "parameter_table",
-    "plan_readings",
-    "reading_table",
-    "register_sensor",
-    "repeat_calibration",
-    "restore_session",
-    "run_study",
-    "simulate_session",
-    "summarize",
-    "validate_calibration",
-    "write_calibration",
-    "write_import",
-    "write_report",
-    "write_session",
-]
-
-if TYPE_CHECKING:
-    from orthocal.assessment.comparison import Comparison, compare_models
-    from orthocal.assessment.findings.calibration import decide
-    from orthocal.assessment.findings.comparison import decide_comparison
-    from orthocal.assessment.findings.decision import Decision
-    from orthocal.assessment.findings.finding import Finding
-    from orthocal.assessment.findings.session import check_session
-    from orthocal.assessment.findings.validation import decide_validation
-    from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
-    from orthocal.assessment.validation import Validation, validate_calibration
-    from orthocal.calibration.calibrate import calibrate
-    from orthocal.calibration.calibration import Calibration
-    from orthocal.calibration.file import load_calibration, write_calibration
-    from orthocal.calibration.machine import Machine
-    from orthocal.calibration.refit import find_changes, repeat_calibration, restore_session
-    from orthocal.calibration.tables import parameter_table, reading_table
-    from orthocal.errors import (
-        CalibrationFileError,
-        ClosureError,
-        ExportError,
-        GcodeError,
-        NotIdentifiableError,
-        OrthocalError,
-        OutputError,
-        ParameterError,
-        RobotError,
-        SessionError,
-        SolverError,
-        UnreachableError,
-    )
-    from orthocal.estimation.choice import Choice
-    from orthocal.estimation.loss import Loss
-    from orthocal.estimation.options import SolverOptions
-    from orthocal.estimation.problem import CalibrationProblem
-    from orthocal.estimation.solvers.ipopt import NonlinearProgram
-    from orthocal.export.formats import export_calibration
-    from orthocal.export.linuxcnc.export import ExportOptions
-    from orthocal.kinematics.workspace import Workspace
-    from orthocal.measurement.files.session_file import load_plan, load_session
-    from orthocal.measurement.files.write_session import write_session
-    from orthocal.measurement.importing.import_readings import (
-        TableImport,
-        TableOptions,
-        import_readings,
-        write_import,
-    )
-    from orthocal.measurement.joining import join_sessions
-    from orthocal.observation.simulate import draw_errors, simulate_session
-    from orthocal.output.report.page import write_report
-    from orthocal.output.scene.drawing import draw_scene
-    from orthocal.output.text.summary import summarize
-    from orthocal.planning.equipment import Means
-    from orthocal.planning.plan import MeasuringPlan, plan_readings
-    from orthocal.robot.builder.build import make_robot
-    from orthocal.robot.builder.dimensions import Sizes
-    from orthocal.robot.loading import load_robot
-    from orthocal.robot.model import Robot
-    from orthocal.sensors.protocol import Sensor
-    from orthocal.sensors.registry import register_sensor
-    from orthocal.session.session import Gauge, Posture, Reading, Session, Setup
-    from orthocal.study.accuracy_options import build_accuracy_study
-    from orthocal.study.bootstrap import build_bootstrap_study
-    from orthocal.study.linearisation import build_linearisation_study
-    from orthocal.study.runner import StudyTable, run_study
-    from orthocal.study.sensitivity import build_sensitivity_study
-    from orthocal.study.study import Study
-    from orthocal.viewer.live import LiveScene
-    from orthocal.viewer.scene import Scene
+if TYPE_CHECKING:  # the public names; each is imported when it is first used
+    from orthocal.assessment.comparison import Comparison as Comparison
+    from orthocal.assessment.comparison import compare_models as compare_models
+    from orthocal.assessment.findings.calibration import decide as decide
+    from orthocal.assessment.findings.comparison import decide_comparison as decide_comparison
+    from orthocal.assessment.findings.decision import Decision as Decision
+    from orthocal.assessment.findings.finding import Finding as Finding
+    from orthocal.assessment.findings.session import check_session as check_session
+    from orthocal.assessment.findings.validation import decide_validation as decide_validation
+    from orthocal.assessment.tool_error import ToolAccuracy as ToolAccuracy
+    from orthocal.assessment.tool_error import assess_tool as assess_tool
+    from orthocal.assessment.validation import Validation as Validation
+    from orthocal.assessment.validation import validate_calibration as validate_calibration
+    from orthocal.calibration.calibrate import calibrate as calibrate
+    from orthocal.calibration.calibration import Calibration as Calibration
+    from orthocal.calibration.file import load_calibration as load_calibration
+    from orthocal.calibration.file import write_calibration as write_calibration
+    from orthocal.calibration.machine import Machine as Machine
+    from orthocal.calibration.refit import find_changes as find_changes
+    from orthocal.calibration.refit import repeat_calibration as repeat_calibration
+    from orthocal.calibration.refit import restore_session as restore_session
+    from orthocal.calibration.tables import parameter_table as parameter_table
+    from orthocal.calibration.tables import reading_table as reading_table
+    from orthocal.errors import CalibrationFileError as CalibrationFileError
+    from orthocal.errors import ClosureError as ClosureError
+    from orthocal.errors import ExportError as ExportError
+    from orthocal.errors import GcodeError as GcodeError
+    from orthocal.errors import NotIdentifiableError as NotIdentifiableError
+    from orthocal.errors import OrthocalError as OrthocalError
+    from orthocal.errors import OutputError as OutputError
+    from orthocal.errors import ParameterError as ParameterError
+    from orthocal.errors import RobotError as RobotError
+    from orthocal.errors import SessionError as SessionError
+    from orthocal.errors import SolverError as SolverError
+    from orthocal.errors import UnreachableError as UnreachableError
+    from orthocal.estimation.choice import Choice as Choice
+    from orthocal.estimation.loss import Loss as Loss
+    from orthocal.estimation.options import SolverOptions as SolverOptions
+    from orthocal.estimation.problem import CalibrationProblem as CalibrationProblem
+    from orthocal.estimation.solvers.ipopt import NonlinearProgram as NonlinearProgram
+    from orthocal.export.formats import export_calibration as export_calibration
+    from orthocal.export.linuxcnc.export import ExportOptions as ExportOptions
+    from orthocal.kinematics.workspace import Workspace as Workspace
+    from orthocal.measurement.files.session_file import load_plan as load_plan
+    from orthocal.measurement.files.session_file import load_session as load_session
+    from orthocal.measurement.files.write_session import write_session as write_session
+    from orthocal.measurement.importing.import_readings import TableImport as TableImport
+    from orthocal.measurement.importing.import_readings import TableOptions as TableOptions
+    from orthocal.measurement.importing.import_readings import import_readings as import_readings
+    from orthocal.measurement.importing.import_readings import write_import as write_import
+    from orthocal.measurement.joining import join_sessions as join_sessions
+    from orthocal.observation.simulate import draw_errors as draw_errors
+    from orthocal.observation.simulate import simulate_session as simulate_session
+    from orthocal.output.report.page import write_report as write_report
+    from orthocal.output.scene.drawing import draw_scene as draw_scene
+    from orthocal.output.text.summary import summarize as summarize
+    from orthocal.planning.equipment import Means as Means
+    from orthocal.planning.plan import MeasuringPlan as MeasuringPlan
+    from orthocal.planning.plan import plan_readings as plan_readings
+    from orthocal.robot.builder.build import make_robot as make_robot
+    from orthocal.robot.builder.dimensions import Sizes as Sizes
+    from orthocal.robot.loading import load_robot as load_robot
+    from orthocal.robot.model import Robot as Robot
+    from orthocal.sensors.protocol import Sensor as Sensor
+    from orthocal.sensors.registry import register_sensor as register_sensor
+    from orthocal.session.session import Gauge as Gauge
+    from orthocal.session.session import Posture as Posture
+    from orthocal.session.session import Reading as Reading
+    from orthocal.session.session import Session as Session
+    from orthocal.session.session import Setup as Setup
+    from orthocal.study.accuracy import build_accuracy_study as build_accuracy_study
+    from orthocal.study.bootstrap import build_bootstrap_study as build_bootstrap_study
+    from orthocal.study.linearisation import build_linearisation_study as build_linearisation_study
+    from orthocal.study.runner import StudyTable as StudyTable
+    from orthocal.study.runner import run_study as run_study
+    from orthocal.study.sensitivity import build_sensitivity_study as build_sensitivity_study
+    from orthocal.study.study import Study as Study
+    from orthocal.viewer.live import LiveScene as LiveScene
+    from orthocal.viewer.scene import Scene as Scene
 
 
-def __getattr__(name: str) -> Any:  # noqa: ANN401 - any of the names above
-    """Import what is asked for when it is asked for: start-up stays fast."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'orthocal' has no attribute '{name}'")
-    return getattr(import_module(_HOMES[name]), name)
+@cache
+def _public_names() -> dict[str, str]:
+    """Public names and the modules that define them, read from the imports above."""
+    source = ast.parse(getsource(sys.modules[__name__]))
+    block = next(node for node in source.body if isinstance(node, ast.If))
+    imports = (node for node in block.body if isinstance(node, ast.ImportFrom))
+    return {name.name: str(node.module) for node in imports for name in node.names}
+
+
+if not TYPE_CHECKING:  # type checkers report unknown names
+
+    def __getattr__(name: str) -> Any:  # noqa: ANN401 - any public name
+        """Import a public name on first use, so that start-up stays fast."""
+        if name == "__all__":
+            return sorted(_public_names())
+        if name.startswith("__") or name not in _public_names():
+            raise AttributeError(f"module 'orthocal' has no attribute '{name}'")
+        return getattr(import_module(_public_names()[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted({*globals(), *_public_names()})

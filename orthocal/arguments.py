@@ -1,4 +1,4 @@
-"""What is given to the Python interface, refused in words where it is of another kind."""
+"""Checks of the arguments of public functions, with messages that name the argument."""
 
 from __future__ import annotations
 
@@ -10,68 +10,71 @@ from numpy.typing import NDArray
 
 
 def require_kind(value: object, kinds: type | tuple[type, ...], *, expected: str) -> None:
-    """Refuse a value of another kind.
+    """Check the type of an argument.
 
     Args:
-        value: What was given.
-        kinds: What it may be.
-        expected: That in words, and where one comes from.
+        value: The argument.
+        kinds: Allowed types.
+        expected: Description of the allowed types and of the function that returns one.
 
     Raises:
-        TypeError: If it is none of them.
+        TypeError: If the type is not allowed.
     """
     if not isinstance(value, kinds):
         raise TypeError(f"found a {type(value).__name__}; expected {expected}")
 
 
 def require_names(values: object, *, argument: str) -> None:
-    """Refuse what is no list of texts.
+    """Check that an argument is a list of texts.
 
     Raises:
         TypeError: Naming the argument.
     """
-    names = not isinstance(values, str) and isinstance(values, Iterable)
-    if not (names and all(isinstance(v, str) for v in values)):  # type: ignore[attr-defined] # it is
+    if (
+        isinstance(values, str)
+        or not isinstance(values, Iterable)
+        or not all(isinstance(v, str) for v in values)
+    ):
         raise TypeError(f"{argument}: found {values!r}; expected a list of names or globs")
 
 
 def require_numbers(values: object, *, argument: str, counts: tuple[int, ...] = (1,)) -> None:
-    """Refuse what is no mapping of names to numbers.
+    """Check that an argument maps names to numbers.
 
     Args:
-        values: What was given.
-        argument: As what.
-        counts: How many numbers a name may have: 1 for a number, else a tuple of so many.
+        values: The argument.
+        argument: Its name.
+        counts: Allowed numbers of values per name: 1 for a number, n for a tuple of n numbers.
 
     Raises:
-        TypeError: Naming the argument, and the name whose value does not fit.
+        TypeError: Naming the argument and the invalid entry.
     """
     if not isinstance(values, Mapping):
-        found = type(values).__name__
-        raise TypeError(f"{argument}: found a {found}; expected a mapping of names to numbers")
+        kind = type(values).__name__
+        raise TypeError(f"{argument}: found a {kind}; expected a mapping of names to numbers")
     for name, value in values.items():
-        given = value if isinstance(value, tuple | list) else (value,)
-        fits = len(given) in counts and (len(given) > 1 or not isinstance(value, tuple | list))
-        if not (isinstance(name, str) and fits and all(isinstance(v, Real) for v in given)):
+        several = isinstance(value, tuple | list)
+        numbers = value if several else (value,)
+        fits = len(numbers) in counts and (len(numbers) > 1 or not several)
+        if not (isinstance(name, str) and fits and all(isinstance(v, Real) for v in numbers)):
             kinds = " or ".join("a number" if n == 1 else f"{n} numbers" for n in counts)
             raise TypeError(f"{argument}: found {name!r}: {value!r}; expected a name and {kinds}")
 
 
 def require_array(values: object, *, shape: tuple[int, ...], argument: str) -> NDArray[np.float64]:
-    """Finite real numbers of a shape, as an array of their own.
+    """A new array of finite real numbers of a given shape.
 
     Raises:
-        TypeError: If they are no real numbers.
-        ValueError: If there are not so many, or one is not finite.
+        TypeError: If the values are not real numbers.
+        ValueError: If the shape differs, or a number is not finite.
     """
     try:
-        given = np.asarray(values)
-        if given.dtype.kind not in "iuf":
+        if np.asarray(values).dtype.kind not in "iuf":
             raise TypeError
-        result = np.array(given, dtype=np.float64)
+        result = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
-        found = type(values).__name__
-        raise TypeError(f"{argument}: found a {found}; expected real numbers") from None
+        kind = type(values).__name__
+        raise TypeError(f"{argument}: found a {kind}; expected real numbers") from None
     if result.shape != shape:
         raise ValueError(f"{argument}: found the shape {result.shape}; expected {shape}")
     if not np.isfinite(result).all():
@@ -82,10 +85,10 @@ def require_array(values: object, *, shape: tuple[int, ...], argument: str) -> N
 
 
 def require_seed(seed: object) -> None:
-    """Refuse what is no seed.
+    """Check that an argument is a seed.
 
     Raises:
-        ValueError: If it is no whole number of at least 0.
+        ValueError: If it is not a whole number of at least 0.
     """
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"seed: found {seed!r}; expected a whole number of at least 0")

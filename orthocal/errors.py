@@ -1,20 +1,20 @@
-"""The errors orthocal raises: one tree, each with the exit code that the command line gives it."""
+"""The errors that orthocal raises, with the exit codes of the command line."""
 
 from __future__ import annotations
 
 from orthocal.text import printable
 
 LONGEST_MESSAGE = 2000
-"""Characters of an error's message; the middle of a longer one is left out."""
+"""Largest number of characters of a message; the middle of longer ones is omitted."""
 
 
 class OrthocalError(Exception):
     """Base of all errors of orthocal.
 
-    Its words can be shown anywhere: what comes from files and paths is escaped in them.
+    Messages can be shown anywhere: characters from files and paths are escaped.
 
     Attributes:
-        where: File and line or key that the error is about, or None.
+        where: File and line or key of the error, or None.
         problem: What was found and what was expected.
     """
 
@@ -26,21 +26,21 @@ class OrthocalError(Exception):
         super().__init__(self.problem if where is None else f"{self.where}: {self.problem}")
 
     def __reduce__(self) -> tuple[object, ...]:
-        # as it is: what it was made of, another process cannot tell
-        return _again, (type(self), self.args, self.__dict__)
+        # by its attributes: another process does not know the arguments of __init__
+        return _restore, (type(self), self.args, self.__dict__)
 
 
-def _again(
-    kind: type[OrthocalError], told: tuple[object, ...], state: dict[str, object]
+def _restore(
+    kind: type[OrthocalError], arguments: tuple[object, ...], state: dict[str, object]
 ) -> OrthocalError:
-    """An error as another process has raised it."""
-    error = kind.__new__(kind, *told)
+    """An error that another process has raised."""
+    error = kind.__new__(kind, *arguments)
     error.__dict__.update(state)
     return error
 
 
 def _shorten(problem: str) -> str:
-    """A message that nobody has to scroll for, whatever a file holds."""
+    """A message of limited length."""
     half = LONGEST_MESSAGE // 2
     if len(problem) <= LONGEST_MESSAGE:
         return problem
@@ -48,35 +48,35 @@ def _shorten(problem: str) -> str:
 
 
 class OutputError(OrthocalError):
-    """A file or a stream cannot be written, though its name is one: no room, no right, closed."""
+    """A file or stream cannot be written: disk full, no permission, closed."""
 
     exit_code = 1
 
 
 class RobotError(OrthocalError):
-    """A robot folder, its URDF or its YAML is not what it should be."""
+    """A robot directory, its URDF or its YAML is invalid."""
 
 
 class ParameterError(OrthocalError):
-    """An error parameter, a pattern, a unit or a value given by name does not exist or fit."""
+    """An error parameter, a pattern, a unit or a value is unknown or invalid."""
 
 
 class SessionError(OrthocalError):
-    """A session, its YAML or its CSV is not what it should be."""
+    """A session, its YAML or its CSV is invalid."""
 
 
 class CalibrationFileError(OrthocalError):
-    """A calibration file cannot be read, or does not belong to the robot it names."""
+    """A calibration file is invalid, or does not belong to the robot that it names."""
 
 
 class ExportError(OrthocalError):
-    """A calibration is not to be entered, or cannot be what a format needs."""
+    """A calibration should not be entered, or cannot be expressed in a format."""
 
     exit_code = 3
 
 
 class GcodeError(OrthocalError):
-    """A program of a controller holds what cannot be corrected."""
+    """A G-code program contains commands that cannot be corrected."""
 
 
 class ClosureError(OrthocalError):
@@ -84,8 +84,8 @@ class ClosureError(OrthocalError):
 
     Attributes:
         posture: Name of the posture.
-        reason: What is wrong there, to be read after the name of the posture.
-        residual: Largest closure residual that remained, [m], or None for a singular posture.
+        reason: Predicate of the message, whose subject is the posture.
+        residual: Largest closure residual, [m], or None for a singular posture.
     """
 
     def __init__(self, reason: str, *, posture: str, residual: float | None = None) -> None:
@@ -96,14 +96,14 @@ class ClosureError(OrthocalError):
 
 
 class UnreachableError(OrthocalError):
-    """A point or a set of joint coordinates has no solution in the closed forms of the paper."""
+    """A point or a set of drive coordinates has no solution in the paper's closed forms."""
 
 
 class NotIdentifiableError(OrthocalError):
-    """Neither readings nor a prior fix some parameters.
+    """Neither the readings nor a prior determine some parameters.
 
     Attributes:
-        parameters: Names of the parameters that nothing fixes.
+        parameters: Names of these parameters.
     """
 
     def __init__(
@@ -114,11 +114,11 @@ class NotIdentifiableError(OrthocalError):
 
 
 class SolverError(OrthocalError):
-    """The solver did not converge: there is no result.
+    """The solver did not converge; there is no result.
 
     Attributes:
-        status: The solver's own word.
-        iterations: Iterations it took.
+        status: Status that the solver reports.
+        iterations: Number of iterations.
     """
 
     exit_code = 1

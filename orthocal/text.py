@@ -1,4 +1,4 @@
-"""Characters as they can be shown: what steers a terminal or turns a line about is escaped."""
+"""Safe display of text: escapes for characters that control a terminal or the text direction."""
 
 from __future__ import annotations
 
@@ -6,31 +6,30 @@ import re
 import unicodedata
 
 _ESCAPED = frozenset({"Cc", "Cf", "Co", "Cs", "Zl", "Zp"})
-"""Unicode categories of control, format, private and surrogate characters and of line
-and paragraph separators. A terminal obeys the first, and the second change the order of others."""
+"""Unicode categories of control, format, private-use and surrogate characters and of line and
+paragraph separators. Terminals obey control characters; format characters reorder text."""
 
 _ORDINARY = re.compile(r"[ -~]*")
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 _NO_TEXT = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
-"""Control characters but newline and tabulator, and halves of surrogate pairs."""
+"""Control characters except newline and tab, and half surrogate pairs."""
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9 _.,:;=+-]")
 
 LONGEST_SHOWN = 58
-"""Characters of a value in a message."""
+"""Largest number of characters of a value in a message."""
 
 
 def printable(text: str, *, keep: str = "") -> str:
-    r"""A text with every character that is not one to be seen written as its escape, such as \x1b.
+    r"""A text with an escape such as \x1b for every invisible character.
 
-    Bytes of a path that are no UTF-8 come as lone surrogates, and are shown as the bytes that they
-    are.
+    Bytes of a path that are not UTF-8 are lone surrogates in Python; they are shown as bytes.
 
     Args:
-        text: From a file, a path or a command line.
-        keep: Characters that stay as they are, such as a newline between lines of our own.
+        text: Text from a file, a path or a command line.
+        keep: Characters that are not escaped, such as newlines.
     """
     if _ORDINARY.fullmatch(text):
         return text
@@ -38,30 +37,30 @@ def printable(text: str, *, keep: str = "") -> str:
 
 
 def control_character(text: str) -> str | None:
-    """The first control character or half of a surrogate pair in a text, escaped; else None."""
-    found = _CONTROL.search(text)
-    return _escape(found[0]) if found else None
+    """First control character or half surrogate pair in a text, escaped; None without any."""
+    match = _CONTROL.search(text)
+    return _escape(match[0]) if match else None
 
 
 def text_problem(value: object) -> str | None:
-    """What is wrong with the characters of a text, if anything."""
+    """Problem with the characters of a text; None for valid text and other values."""
     if not isinstance(value, str):
         return None
-    found = _NO_TEXT.search(value)
-    if not found:
+    match = _NO_TEXT.search(value)
+    if not match:
         return None
-    if "\ud800" <= found[0] <= "\udfff":
+    if "\ud800" <= match[0] <= "\udfff":
         return "half of a surrogate pair is not a character"
-    return "a text holds a control character"
+    return "a text contains a control character"
 
 
 def composed(text: str) -> str:
-    """A name in the one form of those that look alike: é is one character, not e and an accent."""
+    """A name in Unicode normal form C: é is one character, not e and an accent."""
     return unicodedata.normalize("NFC", text)
 
 
 def shorten(text: str) -> str:
-    """A value as it can stand in a message."""
+    """A value, shortened for a message."""
     return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 3]}..."
 
 

@@ -1,6 +1,6 @@
-"""Units at the edges, where people read and write numbers: inside all is in m, rad and 1.
+"""Conversion between SI, which is used inside, and the units that users read and write.
 
-A constant is one of its unit in SI: `0.5 * MM` is half a millimetre, `length / MM` a length in mm.
+Each constant is its unit in SI: `0.5 * MM` is half a millimetre, `length / MM` a length in mm.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ DEG = math.pi / 180.0
 PPM = 1e-6
 
 Unit = Literal["m", "rad", "1"]
-"""Unit of an error parameter or of a drive, SI."""
+"""SI unit of an error parameter or of a drive."""
 
 UNIT_SUFFIXES: dict[str, tuple[Unit, float]] = {
     "_mm": ("m", MM),
@@ -26,43 +26,43 @@ UNIT_SUFFIXES: dict[str, tuple[Unit, float]] = {
     "_rad": ("rad", 1.0),
     "_ppm": ("1", PPM),
 }
-"""Suffix of a name to unit and size of the unit that it names."""
+"""Suffix of a key to the SI unit and the size of the unit that the suffix names."""
 
 EDGE_UNITS: dict[Unit, tuple[str, float]] = {
     "m": ("mm", MM),
     "rad": ("mrad", MRAD),
     "1": ("ppm", PPM),
 }
-"""Unit to the one in which people read errors, and its size."""
+"""SI unit to the unit in which users read errors, and its size."""
 
 DRIVE_UNITS: dict[Unit, tuple[str, float]] = {"m": ("mm", MM), "rad": ("deg", DEG)}
-"""Unit to the one in which people read coordinates of drives and joints, and its size."""
+"""SI unit to the unit in which users read drive and joint coordinates, and its size."""
 
 
 class InUnit:
-    """Something with a `unit` that people read in another one."""
+    """Mixin for objects with an SI `unit` that users read in another unit."""
 
     __slots__ = ()
     unit: Unit
 
     @property
     def edge_unit(self) -> str:
-        """Unit in which people read it: mm, mrad or ppm."""
+        """Unit that users read: mm, mrad or ppm."""
         return EDGE_UNITS[self.unit][0]
 
     @property
     def edge_factor(self) -> float:
-        """Factor from SI to the unit in which people read it."""
+        """Factor from SI to the unit that users read."""
         return 1.0 / EDGE_UNITS[self.unit][1]
 
 
 def to_mm(value: float) -> float:
-    """Metres as mm, without the rounding that the factor brings."""
+    """A length in mm, rounded to 12 significant digits."""
     return tidy(value / MM)
 
 
 def tidy(value: float) -> float:
-    """A number without what a factor has left in its last digits."""
+    """A number rounded to 12 significant digits, without the rounding error of a conversion."""
     return float(f"{value:.12g}") + 0.0
 
 

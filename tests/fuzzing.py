@@ -172,7 +172,7 @@ def lay_out(folder: Path) -> None:
 def lay_out_journals(folder: Path) -> None:
     """A recording and a study that were killed, the recording before its CSV was written."""
     from orthocal.measurement.recording.recording import open_recording
-    from orthocal.study.journal import open_journal
+    from orthocal.study.runner import open_results
 
     recorded = folder / "recorded"
     recorded.mkdir()
@@ -187,9 +187,9 @@ def lay_out_journals(folder: Path) -> None:
         journal = (folder / KINDS["journal"]).read_bytes()
     (recorded / "readings.csv").write_bytes(csv)
     (folder / KINDS["journal"]).write_bytes(journal)
-    with open_journal(folder / "study.jsonl", STUDY) as found:
+    with open_results(folder / "study.jsonl", STUDY) as (_, store):
         for task in (2, 0):
-            found.add(task, {"draw": [task, task + 1], "error": [0.5, None]})
+            store(task, {"draw": [task, task + 1], "error": [0.5, None]})
 
 
 # ---- mutation
@@ -555,7 +555,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     from orthocal.output.text.import_report import format_import, format_import_json
     from orthocal.planning.equipment import Means
     from orthocal.planning.gauge_range import load_dial
-    from orthocal.study.journal import open_journal
+    from orthocal.study.runner import open_results
 
     deep = rng.random() < thorough
     if kind in ("session", "readings"):
@@ -601,8 +601,8 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
         with restored(folder / "recorded"), open_recording(folder / "recorded") as recording:
             assert recording.rows
     elif kind == "study":
-        with open_journal(folder / "study.jsonl", STUDY) as found:
-            assert set(found.found) <= set(range(4))
+        with open_results(folder / "study.jsonl", STUDY) as (stored, _):
+            assert set(stored) <= set(range(4))
     elif kind == "calibration":
         calibration = load_calibration(folder)
         find_entries(calibration)

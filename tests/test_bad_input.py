@@ -270,13 +270,13 @@ SESSION_KEY_CASES = [
         "key-twice",
         TITLE,
         TITLE + "\ntitle: 2",
-        ":8: is not valid YAML: the key 'title' stands twice",
+        ":8: is not valid YAML: the key 'title' occurs twice",
     ),
     session(
         "posture-twice",
         "  x_min:",
         "  x_max:",
-        ":13: is not valid YAML: the key 'x_max' stands twice",
+        ":13: is not valid YAML: the key 'x_max' occurs twice",
     ),
     session(
         "key-a-number",
@@ -394,19 +394,20 @@ SESSION_FILE_CASES = [
         "tab",
         "postures:\n  x_max",
         "postures:\n\tx_max",
-        ":12: is not valid YAML: found character '\\t' that cannot start any token",
+        ":12: is not valid YAML: found character that cannot start any token (a tab; indent with "
+        "spaces)",
     ),
     session(
         "bracket-open",
         "[60, 0, 0]}\n",
         "[60, 0, 0\n",
-        ":13: is not valid YAML: expected ',' or ']', but got ':'",
+        ":13: is not valid YAML: did not find expected ',' or ']'",
     ),
     session(
         "colon-in-text",
         "title: Experiment 2",
         "title: Experiment: 2",
-        ":7: is not valid YAML: mapping values are not allowed here",
+        ":7: is not valid YAML: mapping values are not allowed in this context",
     ),
     session(
         "alias",
@@ -438,7 +439,7 @@ SESSION_FILE_CASES = [
         "half-a-character",
         TITLE,
         'title: "\\ud800"',
-        ":7: is not valid YAML: half of a surrogate pair is not a character",
+        ":7: is not valid YAML: found invalid Unicode character escape code",
     ),
     session_file("list", "- robot\n- setups\n", ": holds a list; expected keys and values"),
     session_file("text", "calibrate this\n", ": holds text; expected keys and values"),
@@ -675,14 +676,14 @@ SESSION_SENSE_CASES = [
     ),
     Case(
         "session-readings-a-folder",
-        "{tmp}/machine: is a folder; expected a file",
+        "{tmp}/machine: is a directory; expected a file",
         (swap("session.yaml", "readings.csv", "machine"),),
     ),
     session(
         "readings-with-null",
         "readings.csv",
         '"a\\0.csv"',
-        ":30: is not valid YAML: a text holds a control character",
+        ":30: is not valid YAML: a text contains a control character",
     ),
     Case(
         "model-unknown",
@@ -691,7 +692,7 @@ SESSION_SENSE_CASES = [
     ),
     Case(
         "out-a-file",
-        "{tmp}/readings.csv: is a file; expected a folder",
+        "{tmp}/readings.csv: is a file; expected a directory",
         command="calibrate {tmp} --out {tmp}/readings.csv",
     ),
 ]
@@ -857,7 +858,7 @@ READINGS_CASES = [
         "column-twice",
         HEADER,
         "setup,posture,minus,minus,reading_mm",
-        ":1: the column 'minus' stands twice",
+        ":1: the column 'minus' occurs twice",
     ),
     readings("header-missing", HEADER + "\n", "", f":1: unknown column 'xy'; {COLUMNS}"),
     readings("fields-few", "y_min,-0.43", "-0.43", f":2: has 3 fields; expected 4 ({HEADER})"),
@@ -1548,7 +1549,7 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "key-twice",
-        f"{CALIBRATION}: is not valid JSON: the key 'model' stands twice",
+        f"{CALIBRATION}: is not valid JSON: the key 'model' occurs twice",
         swap(FILE, ' "model": "offsets",\n', ' "model": "offsets",\n "model": "lengths",\n'),
     ),
     calibration(
@@ -1890,7 +1891,7 @@ SIMULATE_CASES = [
     ),
     Case(
         "simulate-out-a-file",
-        "{tmp}/readings.csv: is a file; expected a folder",
+        "{tmp}/readings.csv: is a file; expected a directory",
         command="simulate {tmp}/plan.yaml --out {tmp}/readings.csv" + ONE_ERROR,
     ),
     Case(
@@ -2000,12 +2001,12 @@ VIEW_CASES = [
     ),
     Case(
         "view-html-is-a-folder",
-        "{tmp}/machine: is a folder; expected a file",
+        "{tmp}/machine: is a directory; expected a file",
         command="view orthoglide --html {tmp}/machine",
     ),
     Case(
         "view-html-in-a-file",
-        "{tmp}/session.yaml: is a file; expected a folder",
+        "{tmp}/session.yaml: is a file; expected a directory",
         command="view orthoglide --html {tmp}/session.yaml/page.html",
     ),
     Case(
@@ -2030,7 +2031,7 @@ VIEW_CASES = [
     ),
     Case(
         "report-in-a-file",
-        "{tmp}/session.yaml: is a file; expected a folder",
+        "{tmp}/session.yaml: is a file; expected a directory",
         command="report {tmp}/calibration.json --out {tmp}/session.yaml/page.html",
         base="machine",
         calibrated=True,
@@ -2044,7 +2045,7 @@ VIEW_CASES = [
     ),
     Case(
         "out-with-a-folder-in-the-way",
-        "{tmp}/out/calibration.json: is a folder; expected a file",
+        "{tmp}/out/calibration.json: is a directory; expected a file",
         (make_folder("out/calibration.json"),),
     ),
     Case(
@@ -2156,7 +2157,7 @@ PROGRAM_CASES = [
     ),
     Case(
         "program-folder",
-        "{tmp}/part.ngc: is a folder; expected a file",
+        "{tmp}/part.ngc: is a directory; expected a file",
         (remove("part.ngc"), make_folder("part.ngc")),
         CORRECT,
         "machine",
@@ -2164,7 +2165,7 @@ PROGRAM_CASES = [
     ),
     Case(
         "program-out-a-folder",
-        "{tmp}/out.ngc: is a folder; expected a file",
+        "{tmp}/out.ngc: is a directory; expected a file",
         (make_folder("out.ngc"),),
         CORRECT,
         "machine",

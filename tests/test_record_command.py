@@ -333,7 +333,7 @@ BAD = {
     ),
     "a folder for a journal": (
         lambda f: (f / f"readings.csv{SUFFIX}").mkdir(),
-        "/readings.csv.journal: is a folder; expected a file",
+        "/readings.csv.journal: is a directory; expected a file",
     ),
     "a journal of something else": (
         lambda f: (f / f"readings.csv{SUFFIX}").write_text("Dear diary\n"),

@@ -118,7 +118,7 @@ def plan(
     from orthocal.output.text.summary import print_summary
     from orthocal.planning.expected_error import CRITERIA
     from orthocal.planning.plan import plan_readings
-    from orthocal.runtime.worker_pool import available_cores, call_on_cores, lent
+    from orthocal.runtime.worker_pool import available_cores, call_in_parallel, worker_budget
     from orthocal.units import MM
 
     if criterion not in CRITERIA:
@@ -187,8 +187,8 @@ def plan(
             "posture again."
         )
         calls = [lambda: sheet_or_problem(found.session), lambda: draw_plan(found)]
-        with lent(count):
-            (sheet, problem), picture = call_on_cores(calls, killed=KILLED)
+        with worker_budget(count):
+            (sheet, problem), picture = call_in_parallel(calls, killed=KILLED)
         if problem:
             put_note(problem)
         extra = {"plan.json": document, "plan.svg": picture} | sheet

@@ -1,10 +1,9 @@
-"""What if: study."""
+"""The commands `orthocal study accuracy|linearisation|sensitivity|bootstrap`."""
 
 from __future__ import annotations
 
-import contextlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,88 +12,93 @@ import typer
 
 from orthocal.cli.options import Json, Tolerances, app, require_cube, split_globs
 from orthocal.cli.printing import put_note, put_out
-from orthocal.cli.progress import told
 from orthocal.errors import ParameterError
 
 if TYPE_CHECKING:
     from orthocal.robot.model import Robot
     from orthocal.session.session import Session
+    from orthocal.study.runner import Progress
     from orthocal.study.study import Study
 
 studies = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="What many machines, larger errors or other readings would do.",
+    help="Simulate many machines, or resample readings.",
 )
 app.add_typer(studies, name="study")
 
 FILES = ("study.json", "results.parquet", "study.svg")
-"""What a study writes when it has ended, beside its results as they come."""
+"""Files that a finished study writes beside its results.jsonl."""
+
+PROGRESS_STEP = 0.1
+"""Share of a study between two lines of progress."""
 
 LEG_MM = 310.25
-"""Of the machine for which the paper's displacements are 60 and -100 mm."""
+"""Leg length for which the paper's displacements are 60 and -100 mm."""
 
 MOST_MM = 1e4
 
 Out = Annotated[
     Path | None,
-    typer.Option(help="Folder for the results; there a study goes on where it was stopped."),
+    typer.Option(help="Directory for the results. A stopped study is resumed from there."),
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Of all that is drawn.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")]
 Workers = Annotated[
-    int | None, typer.Option(min=1, max=1024, help="Processes; by default all cores.")
+    int | None, typer.Option(min=1, max=1024, help="Number of processes. Default: all cores.")
 ]
 Dask = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="Of a Dask scheduler, to run it there.")
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Run on a Dask cluster; address of its scheduler."),
 ]
-Force = Annotated[bool, typer.Option("--force", help="Begin anew, whatever is there.")]
-AllRows = Annotated[bool, typer.Option("--all", help="List every parameter.")]
+Force = Annotated[bool, typer.Option("--force", help="Discard earlier results and start again.")]
+AllRows = Annotated[bool, typer.Option("--all", help="List all parameters.")]
 Model = Annotated[
-    str | None, typer.Option(help="What is identified; by default what the session says.")
+    str | None, typer.Option(help="Identified errors: a model. Default: the session's choice.")
 ]
 Free = Annotated[
     list[str] | None,
-    typer.Option(metavar="GLOBS", help="Names or globs, on top of the model or instead of one."),
+    typer.Option(metavar="GLOBS", help="Identified errors: names or globs, added to the model."),
 ]
 Subject = Annotated[
     str,
     typer.Argument(
         metavar="ROBOT|SESSION",
-        help="A robot of the Orthoglide's kind, read as in the paper; or a session.",
+        help="An Orthoglide-type robot, measured by the paper's plan; or a session.",
     ),
 ]
 LegMm = Annotated[
     float | None,
-    typer.Option("--leg-mm", help="Leg length of a machine of the Orthoglide's kind."),
+    typer.Option("--leg-mm", help="Leg length of an Orthoglide of other dimensions, mm."),
 ]
 
 
 @studies.command()
 def accuracy(
     plan: Annotated[
-        Path, typer.Argument(metavar="PLAN", help="A session.yaml, with readings or without.")
+        Path,
+        typer.Argument(metavar="PLAN", help="session.yaml; its readings are not used."),
     ],
     model: Model = None,
     free: Free = None,
-    machines: Annotated[int, typer.Option(min=2, max=1_000_000, help="How many.")] = 1000,
+    machines: Annotated[int, typer.Option(min=2, max=1_000_000, help="Number of machines.")] = 1000,
     draw: Annotated[
         list[str] | None,
         typer.Option(
             metavar="MODEL|GLOBS",
-            help="Errors that machines have, from their tolerances: all by default.",
+            help="Errors that are random, within their tolerances. Default: all.",
         ),
     ] = None,
     error: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="An error that all of them have."),
+        typer.Option(metavar="NAME=VALUE", help="An error that all machines have."),
     ] = None,
     errors: Annotated[
-        Path | None, typer.Option(help="YAML file with such errors (see a truth.yaml).")
+        Path | None, typer.Option(help="YAML file of errors that all machines have (truth.yaml).")
     ] = None,
     tolerance: Tolerances = None,
     half_side_mm: Annotated[
         float | None,
-        typer.Option("--half-side-mm", help="Half the side of the cube that counts."),
+        typer.Option("--half-side-mm", help="Half side of the cube for the tool error, mm."),
     ] = None,
     seed: Seed = 0,
     out: Out = None,
@@ -104,40 +108,37 @@ def accuracy(
     all_rows: AllRows = False,
     force: Force = False,
 ) -> None:
-    """How good a plan's readings leave machines: many are drawn, read and calibrated."""
+    """Tool error after calibration of many simulated machines."""
     from orthocal.estimation.choice import Choice
-    from orthocal.estimation.selection import read_tolerances
     from orthocal.io.files import exists
     from orthocal.measurement.files.session_file import load_plan
     from orthocal.observation.simulate import collect_errors
     from orthocal.robot.loading import packaged_robots
-    from orthocal.study.accuracy_options import build_accuracy_study
+    from orthocal.study.accuracy import build_accuracy_study
     from orthocal.units import MM
 
     if not exists(plan) and str(plan) in packaged_robots():
         raise ParameterError(
-            f"is a robot; expected a session.yaml: `orthocal plan {plan} --out ...` makes one",
+            f"is a robot; expected a session.yaml, which `orthocal plan {plan} --out ...` writes",
             where=str(plan),
         )
     session = load_plan(plan)
-    parameters = session.robot.parameters
-    given: dict[str, float] = {}
+    fixed: dict[str, float] = {}
     if error or errors is not None:
-        given = collect_errors(session.robot, file=errors, single=error or [])
-    read_tolerances(tolerance or [], parameters, where="--tolerance")
-    tolerances = _quantities(tolerance)
+        fixed = collect_errors(session.robot, file=errors, single=error or [])
+    tolerances = _tolerances(tolerance, session.robot)
     if half_side_mm is not None:
         require_cube(session.robot, half_side_mm)
     study = build_accuracy_study(
         session,
         Choice(model, free=split_globs(free), tolerances=tolerances),
-        drawn=_drawn(draw, session.robot),
-        given=given,
+        drawn=_parameter_globs(draw, session.robot),
+        fixed=fixed,
         machines=machines,
         seed=seed,
         half_side=None if half_side_mm is None else half_side_mm * MM,
     )
-    _finish(study, out, workers, dask, json=json, all_rows=all_rows, force=force)
+    _run(study, out, workers, dask, json=json, all_rows=all_rows, force=force)
 
 
 @studies.command()
@@ -145,14 +146,16 @@ def linearisation(
     subject: Subject = "orthoglide",
     free: Annotated[
         list[str] | None,
-        typer.Option(metavar="GLOBS", help="Errors that grow; by default offsets."),
+        typer.Option(metavar="GLOBS", help="Errors that grow. Default: offsets."),
     ] = None,
     largest_mm: Annotated[
-        float, typer.Option("--largest-mm", help="Of the errors; mrad of angles.")
+        float, typer.Option("--largest-mm", help="Largest size of the errors, mm or mrad.")
     ] = 50.0,
-    sizes: Annotated[int, typer.Option(min=1, max=10_000, help="Of errors, from 0.1 mm on.")] = 40,
+    sizes: Annotated[
+        int, typer.Option(min=1, max=10_000, help="Number of sizes, from 0.1 mm on.")
+    ] = 40,
     directions: Annotated[
-        int, typer.Option(min=1, max=10_000, help="Of errors, drawn at random.")
+        int, typer.Option(min=1, max=10_000, help="Number of random directions of the errors.")
     ] = 25,
     along: Annotated[
         str | None,
@@ -161,16 +164,25 @@ def linearisation(
     max_mm: Annotated[
         float | None,
         typer.Option(
-            "--max-mm", help="How far the tool goes out, in the paper's plan: 60, or as legs are."
+            "--max-mm",
+            help="Displacement of the paper's maximum postures. Default: 60 mm, scaled with legs.",
         ),
     ] = None,
-    min_mm: Annotated[float | None, typer.Option("--min-mm", help="And in: -100.")] = None,
+    min_mm: Annotated[
+        float | None,
+        typer.Option(
+            "--min-mm",
+            help="Displacement of its minimum postures. Default: -100 mm, scaled with legs.",
+        ),
+    ] = None,
     leg_mm: LegMm = None,
     sigma_mm: Annotated[
-        float | None, typer.Option("--sigma-mm", help="Noise of a reading; the paper's 0.02.")
+        float | None,
+        typer.Option("--sigma-mm", help="Standard deviation of a reading. The paper's: 0.02."),
     ] = None,
     resolution_mm: Annotated[
-        float | None, typer.Option("--resolution-mm", help="Of a reading; the paper's 0.01.")
+        float | None,
+        typer.Option("--resolution-mm", help="Resolution of a reading. The paper's: 0.01."),
     ] = None,
     seed: Seed = 0,
     out: Out = None,
@@ -179,35 +191,27 @@ def linearisation(
     json: Json = False,
     force: Force = False,
 ) -> None:
-    """What linearising costs as errors grow, against the exact solution."""
+    """Error of linearised identification as errors grow."""
     from orthocal.robot.model import Robot
     from orthocal.session.session import Gauge
     from orthocal.study.linearisation import build_linearisation_study
-    from orthocal.study.paper import PAPER_GAUGE, Displacements
+    from orthocal.study.paper_plan import PAPER_GAUGE, Displacements
     from orthocal.units import MM
 
-    share = leg_mm / LEG_MM if leg_mm is not None and leg_mm > 0.0 else 1.0
-    out_mm, in_mm = (
-        share * usual if given is None else given
-        for usual, given in ((60.0, max_mm), (-100.0, min_mm))
-    )
-    for name, value in (("--largest-mm", largest_mm), ("--max-mm", out_mm)):
-        if not 0.0 < value < MOST_MM:
-            raise ParameterError(
-                f"found {value:g}; expected a number above 0, and below {MOST_MM:g}", where=name
-            )
-    if not -MOST_MM < in_mm < 0.0:
-        raise ParameterError(
-            f"found {in_mm:g}; expected a number below 0, and above {-MOST_MM:g}", where="--min-mm"
-        )
-    for name, noise in (("--sigma-mm", sigma_mm), ("--resolution-mm", resolution_mm)):
-        if noise is not None and not 0.0 < noise < 1e3:
-            raise ParameterError(f"found {noise:g}; expected a number above 0", where=name)
-    with _subject(subject, leg_mm) as source:
-        known = PAPER_GAUGE if isinstance(source, Robot) else source.gauge
+    scale = leg_mm / LEG_MM if leg_mm is not None and leg_mm > 0.0 else 1.0
+    maximum = scale * 60.0 if max_mm is None else max_mm
+    minimum = scale * -100.0 if min_mm is None else min_mm
+    _require_between(largest_mm, 0.0, MOST_MM, "--largest-mm")
+    _require_between(maximum, 0.0, MOST_MM, "--max-mm")
+    _require_between(minimum, -MOST_MM, 0.0, "--min-mm")
+    for name, value in (("--sigma-mm", sigma_mm), ("--resolution-mm", resolution_mm)):
+        if value is not None:
+            _require_between(value, 0.0, 1e3, name)
+    with _robot_or_session(subject, leg_mm) as source:
+        usual = PAPER_GAUGE if isinstance(source, Robot) else source.gauge
         gauge = Gauge(
-            known.sigma if sigma_mm is None else sigma_mm * MM,
-            known.resolution if resolution_mm is None else resolution_mm * MM,
+            usual.sigma if sigma_mm is None else sigma_mm * MM,
+            usual.resolution if resolution_mm is None else resolution_mm * MM,
             None,
         )
         study = build_linearisation_study(
@@ -217,11 +221,11 @@ def linearisation(
             count=sizes,
             directions=directions,
             along=None if along is None else _numbers(along, "--along"),
-            displacements=Displacements(out_mm * MM, in_mm * MM),
+            displacements=Displacements(maximum * MM, minimum * MM),
             gauge=gauge,
             seed=seed,
         )
-    _finish(study, out, workers, dask, json=json, all_rows=False, force=force)
+    _run(study, out, workers, dask, json=json, all_rows=False, force=force)
 
 
 @studies.command()
@@ -229,12 +233,15 @@ def sensitivity(
     subject: Subject = "orthoglide",
     free: Annotated[
         list[str] | None,
-        typer.Option(metavar="MODEL|GLOBS", help="Errors; by default all that change something."),
+        typer.Option(
+            metavar="MODEL|GLOBS", help="Errors. Default: all that move a reading or the tool."
+        ),
     ] = None,
     at: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="X,Y,Z", help="Where the tool stands, mm, in every setup; may be repeated."
+            metavar="X,Y,Z",
+            help="Tool position, mm, at which every setup is read. Can be repeated.",
         ),
     ] = None,
     leg_mm: LegMm = None,
@@ -243,36 +250,41 @@ def sensitivity(
     all_rows: AllRows = False,
     force: Force = False,
 ) -> None:
-    """What each reading, and the tool, answers to each error in any posture."""
+    """Derivatives of readings and tool position by each error."""
     from orthocal.robot.model import Robot
     from orthocal.study.sensitivity import build_sensitivity_study
     from orthocal.units import MM
 
-    with _subject(subject, leg_mm) as source:
+    with _robot_or_session(subject, leg_mm) as source:
         robot = source if isinstance(source, Robot) else source.robot
         count = 0 if robot.tcp is None else len(robot.tcp.coordinates)
-        points = [[v * MM for v in _numbers(text, "--at")] for text in at or []]
-        for text, point in zip(at or [], points, strict=True):
+        points = []
+        for text in at or []:
+            point = _numbers(text, "--at")
             if len(point) != count:
                 raise ParameterError(
                     f"'{text}' has {len(point)} numbers; expected {count}", where="--at"
                 )
-        study = build_sensitivity_study(source, _drawn(free, robot), points=points or None)
-    _finish(study, out, 1, None, json=json, all_rows=all_rows, force=force)
+            points.append([v * MM for v in point])
+        study = build_sensitivity_study(
+            source, _parameter_globs(free, robot), points=points or None
+        )
+    _run(study, out, 1, None, json=json, all_rows=all_rows, force=force)
 
 
 @studies.command()
 def bootstrap(
     session: Annotated[
         Path,
-        typer.Argument(metavar="SESSION", help="session.yaml, or the folder that holds it."),
+        typer.Argument(metavar="SESSION", help="session.yaml, or the directory that contains it."),
     ],
     model: Model = None,
     free: Free = None,
     by: Annotated[
-        str, typer.Option(metavar="residuals|cycles", help="What is drawn anew.")
+        str,
+        typer.Option(metavar="residuals|cycles", help="Resample residuals or cycles of setups."),
     ] = "residuals",
-    draws: Annotated[int, typer.Option(min=2, max=1_000_000, help="How many.")] = 1000,
+    draws: Annotated[int, typer.Option(min=2, max=1_000_000, help="Number of draws.")] = 1000,
     tolerance: Tolerances = None,
     seed: Seed = 0,
     out: Out = None,
@@ -282,27 +294,26 @@ def bootstrap(
     all_rows: AllRows = False,
     force: Force = False,
 ) -> None:
-    """How far estimates scatter by what a session's own readings show."""
+    """Scatter of estimates implied by a session's readings."""
     from orthocal.estimation.choice import Choice
-    from orthocal.estimation.selection import read_tolerances
     from orthocal.measurement.files.session_file import load_session
     from orthocal.study.bootstrap import build_bootstrap_study
 
     if by not in ("residuals", "cycles"):
         raise ParameterError(f"found '{by}'; expected residuals or cycles", where="--by")
     measured = load_session(session)
-    read_tolerances(tolerance or [], measured.robot.parameters, where="--tolerance")
+    tolerances = _tolerances(tolerance, measured.robot)
     study = build_bootstrap_study(
         measured,
-        Choice(model, free=split_globs(free), tolerances=_quantities(tolerance)),
-        how="cycles" if by == "cycles" else "residuals",
+        Choice(model, free=split_globs(free), tolerances=tolerances),
+        by="cycles" if by == "cycles" else "residuals",
         draws=draws,
         seed=seed,
     )
-    _finish(study, out, workers, dask, json=json, all_rows=all_rows, force=force)
+    _run(study, out, workers, dask, json=json, all_rows=all_rows, force=force)
 
 
-def _finish(
+def _run(
     study: Study,
     out: Path | None,
     workers: int | None,
@@ -312,98 +323,115 @@ def _finish(
     all_rows: bool,
     force: bool,
 ) -> None:
-    """Run a study, print its answer, and write what was asked for."""
+    """Run a study, print its report and write its files."""
     from orthocal.io.files import require_writable, write_files
-    from orthocal.output.study.views import draw_study, render_study, study_json, summarise_study
+    from orthocal.output.study.contents import report_study, study_json
+    from orthocal.output.study.report import draw_figure, render_report
     from orthocal.output.text.layout import print_rich
-    from orthocal.runtime.interrupts import raised_interrupt
-    from orthocal.runtime.worker_pool import available_cores, call_on_cores, lent
-    from orthocal.study.parquet import to_parquet
-    from orthocal.study.runner import JOURNAL, run_study
+    from orthocal.runtime.interrupts import message_at_interrupt
+    from orthocal.runtime.worker_pool import available_cores, call_in_parallel, worker_budget
+    from orthocal.study.runner import JOURNAL, run_study, to_parquet
 
     if dask is not None and workers is not None:
         raise ParameterError(
-            "found with --dask, which has its own; expected one", where="--workers"
+            "cannot be combined with --dask, whose workers are counted by the scheduler",
+            where="--workers",
         )
     if out is not None:
         require_writable(out, [JOURNAL, *FILES])
     count = workers or available_cores()
-    try:
-        with raised_interrupt(), told(study) as report:
-            table = run_study(
-                study,
-                folder=out,
-                workers=count,
-                dask=dask,
-                anew=force,
-                report=report,
+    resume = "with --out it can be resumed" if out is None else "the same command resumes it"
+    with message_at_interrupt(f"orthocal: stopped; {resume}"):
+        table = run_study(
+            study, folder=out, workers=count, dask=dask, anew=force, report=_progress_lines(study)
+        )
+    with worker_budget(1 if dask is not None else count):
+        report = report_study(table, all_rows=all_rows)
+        document = study_json(table, report)
+        if json:
+            put_out(document.rstrip("\n"))
+        else:
+            print_rich(render_report(report))
+        if out is not None:
+            files = call_in_parallel(
+                [lambda: to_parquet(table), lambda: draw_figure(report.figure)]
             )
-    except KeyboardInterrupt:
-        kept = "with --out it could go on later" if out is None else "the same command goes on"
-        put_note(f"orthocal: stopped; {kept}")
-        raise
-    own = count if dask is None else 1
-    with lent(own):
-        summary = summarise_study(table)
-    document = study_json(table, summary)
-    if json:
-        put_out(document.rstrip("\n"))
-    else:
-        print_rich(render_study(table, summary, all_rows=all_rows))
-    if out is not None:
-        with lent(own):
-            rest = call_on_cores([lambda: to_parquet(table), lambda: draw_study(table, summary)])
-        write_files(out, dict(zip(FILES, (document, *rest), strict=True)))
-        put_note(f"Wrote {', '.join(str(out / name) for name in FILES)}")
+            write_files(out, dict(zip(FILES, (document, *files), strict=True)))
+            put_note(f"Wrote {', '.join(str(out / name) for name in FILES)}")
+
+
+def _progress_lines(study: Study) -> Callable[[Progress], None] | None:
+    """Function that prints a line on stderr after each tenth of a study of several tasks."""
+    if len(study.task_sizes) < 2:
+        return None
+    next_share = 0.0
+
+    def report(progress: Progress) -> None:
+        nonlocal next_share
+        if progress.seconds_left is None:
+            if progress.kept:
+                put_note(f"orthocal: resume at {progress.kept} of {progress.total} {study.counted}")
+            return
+        share = progress.done / progress.total
+        if share < min(next_share, 1.0):
+            return
+        next_share = share + PROGRESS_STEP
+        left = "" if share >= 1.0 else f", about {_duration(progress.seconds_left)} left"
+        put_note(f"orthocal: {progress.done} of {progress.total} {study.counted}{left}")
+
+    return report
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 5400.0 else f"{seconds / 3600.0:.1f} h"
 
 
 @contextmanager
-def _subject(subject: str, leg_mm: float | None) -> Iterator[Robot | Session]:
-    """What is studied: a robot, as it is or with legs of another length; or a session."""
+def _robot_or_session(subject: str, leg_mm: float | None) -> Iterator[Robot | Session]:
+    """The robot, if asked for with legs of another length, or the session to study."""
     from orthocal.output.text.subject import load_subject
+    from orthocal.robot.builder.build import Sizes, make_robot
     from orthocal.robot.model import Robot
     from orthocal.session.session import Session
     from orthocal.units import MM
 
-    found = load_subject(subject)
-    if not isinstance(found, Robot | Session):
+    source = load_subject(subject)
+    if not isinstance(source, Robot | Session):
         raise ParameterError("is a calibration; expected a robot or a session", where=subject)
     if leg_mm is None:
-        yield found
+        yield source
         return
-    if not isinstance(found, Robot) or found.name != "orthoglide":
-        raise ParameterError("is of the robot orthoglide; this is another", where="--leg-mm")
-    from orthocal.robot.builder.build import Sizes, make_robot
-
-    pattern, leg = Sizes(), leg_mm * MM
-    longer = leg / pattern.leg
-    sizes = Sizes(leg, longer * pattern.lower, longer * pattern.upper)
+    if not isinstance(source, Robot) or source.name != "orthoglide":
+        raise ParameterError("applies to the robot orthoglide alone", where="--leg-mm")
+    usual, leg = Sizes(), leg_mm * MM
+    scale = leg / usual.leg
+    sizes = Sizes(leg, scale * usual.lower, scale * usual.upper)
     sizes.require_machine("--leg-mm")
-    with contextlib.ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        yield make_robot(sizes, folder / "orthoglide")
+    with tempfile.TemporaryDirectory() as directory:
+        yield make_robot(sizes, Path(directory) / "orthoglide")
 
 
-def _drawn(texts: list[str] | None, robot: Robot) -> tuple[str, ...] | None:
-    """Patterns of names: those of a model, or as given."""
-    if not texts:
-        return None
-    found: list[str] = []
-    for glob in split_globs(texts):
-        own = glob in robot.parameters.models
-        found += robot.parameters.patterns(glob) if own else (glob,)
-    return tuple(found)
+def _parameter_globs(texts: list[str] | None, robot: Robot) -> tuple[str, ...] | None:
+    """Globs of error parameters; the name of a model stands for those of the model."""
+    models = robot.parameters.models
+    globs = split_globs(texts)
+    patterns = [robot.parameters.patterns(g) if g in models else (g,) for g in globs]
+    return tuple(pattern for each in patterns for pattern in each) if texts else None
 
 
-def _quantities(texts: list[str] | None) -> dict[str, float]:
-    """Numbers of options such as '*.offset_mm=2', by their names with units."""
+def _tolerances(texts: list[str] | None, robot: Robot) -> dict[str, float]:
+    """Values of --tolerance such as '*.offset_mm=2', by name with unit."""
+    from orthocal.estimation.selection import read_tolerances
     from orthocal.io.documents import parse_number
 
-    found = {}
+    read_tolerances(texts or [], robot.parameters, where="--tolerance")
+    values = {}
     for text in texts or []:
         key, _, number = text.partition("=")
-        found[key] = parse_number(number, where="--tolerance", name=key, error=ParameterError)
-    return found
+        values[key] = parse_number(number, where="--tolerance", name=key, error=ParameterError)
+    return values
 
 
 def _numbers(text: str, option: str) -> list[float]:
@@ -413,3 +441,10 @@ def _numbers(text: str, option: str) -> list[float]:
         parse_number(part.strip(), where=option, name="part", error=ParameterError)
         for part in text.split(",")
     ]
+
+
+def _require_between(value: float, low: float, high: float, option: str) -> None:
+    if not low < value < high:
+        raise ParameterError(
+            f"found {value:g}; expected a number between {low:g} and {high:g}", where=option
+        )

@@ -1,7 +1,6 @@
-"""Documents at the door: YAML, JSON and CSV that come from strangers.
+"""YAML, JSON and CSV from strangers: bounded reading, validation, messages that name the place.
 
-Nothing here knows what a robot or a session is. A reader gets the kind of error to raise, so that
-every message names the file and what was found in it.
+Every reader takes the kind of error to raise.
 """
 
 from __future__ import annotations
@@ -11,10 +10,11 @@ import dataclasses
 import io
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, TypeAdapter, ValidationError
@@ -36,10 +36,10 @@ def _refuse_truth_values(value: object) -> object:
 
 
 LARGEST_NUMBER = 1e9
-"""No length, angle or coordinate in a file is larger, whatever its unit."""
+"""Largest length, angle or coordinate in a file, in any unit."""
 
 SMALLEST_POSITIVE = 1e-9
-"""No standard deviation, tolerance or resolution in a file is smaller, whatever its unit."""
+"""Smallest standard deviation, tolerance or resolution in a file, in any unit."""
 
 
 def _refuse_huge(value: float) -> float:
@@ -49,8 +49,7 @@ def _refuse_huge(value: float) -> float:
 
 
 SMALLEST_IN_SI = 1e-16
-"""The same in SI units, below the smallest part per million; squares of quotients by it are still
-numbers."""
+"""Smallest standard deviation in SI units: quotients by it can still be squared."""
 
 
 def _at_least(smallest: float) -> AfterValidator:
@@ -68,37 +67,37 @@ Number = Annotated[
     Field(allow_inf_nan=False),
     AfterValidator(_refuse_huge),
 ]
-"""A number of sane size; YAML's yes and no are not numbers."""
+"""A number within ±LARGEST_NUMBER; YAML's yes and no are not numbers."""
 
 Count = Annotated[int, Field(ge=0, le=10**9)]
-"""A whole number of sane size."""
+"""A whole number from 0 to 10⁹."""
 
 Finite = Annotated[float, BeforeValidator(_refuse_truth_values), Field(allow_inf_nan=False)]
-"""A number of any size: one that follows from others and is not computed with."""
+"""A finite number of any size, for derived values."""
 
 PositiveNumber = Annotated[Number, Field(gt=0.0), _at_least(SMALLEST_POSITIVE)]
-"""A number of sane size above 0."""
+"""A number from SMALLEST_POSITIVE to LARGEST_NUMBER."""
 
 Name = Annotated[
     str,
     Field(min_length=1, max_length=200, pattern=r"^[^,;\s\"]+$"),
     AfterValidator(composed),
 ]
-"""A name that can stand in a CSV."""
+"""A name that needs no quotes in a CSV file."""
 
 PositiveInSI = Annotated[Number, Field(gt=0.0), _at_least(SMALLEST_IN_SI)]
-"""The same in SI units, where it was one in mm, mrad or ppm."""
+"""A positive number in SI units that users state in mm, mrad or ppm."""
 
 MOST_JSON_VALUES = 2_000_000
-"""Keys and values of a JSON file, for its memory; a calibration has forty a reading."""
+"""Largest number of keys and values of a JSON file; a calibration has forty per reading."""
 
 MOST_CSV_ROWS = 1_000_000
-"""Rows of a CSV file, for its memory."""
+"""Largest number of rows of a CSV file."""
 
 _LONG_NUMBER = re.compile(rf"[-+.eE0-9]{{{LONGEST_NUMBER + 1}}}")
 
 MOST_SHOWN = 20
-"""Items of a list or mapping up to which it is written out in a message."""
+"""Largest number of items of a list or mapping that a message shows."""
 
 
 def read_text(
@@ -108,16 +107,16 @@ def read_text(
     content: bytes | None = None,
     largest: int | None = None,
 ) -> str:
-    """Text of a UTF-8 file, with a byte order mark taken off.
+    """Text of a UTF-8 file, without a byte order mark.
 
     Args:
         path: The file.
         error: Kind of error to raise.
-        content: What it holds, where it was read already.
-        largest: Size above which it is refused, [bytes]; that of any file by default.
+        content: Content of the file, if it was read before.
+        largest: Largest size, [bytes]; default: LARGEST_FILE.
 
     Raises:
-        OrthocalError: Of the kind given, if the file is missing, too large or not text.
+        OrthocalError: Of kind `error`, if the file is missing, too large or not text.
     """
     if content is None:
         content = read_file(path, error=error)
@@ -133,15 +132,15 @@ def read_text(
 
 
 def read_yaml(path: Path, *, error: type[OrthocalError], content: bytes | None = None) -> Any:  # noqa: ANN401 - any document
-    """Content of a YAML file; duplicate keys, aliases and tags of other kinds are errors.
+    """Content of a YAML file; duplicate keys, aliases and other tags are errors.
 
     Args:
         path: The file.
         error: Kind of error to raise.
-        content: What it holds, where it was read already.
+        content: Content of the file, if it was read before.
 
     Raises:
-        OrthocalError: Of the kind given, naming file and line.
+        OrthocalError: Of kind `error`, naming file and line.
     """
     text = read_text(path, error=error, content=content, largest=LARGEST_YAML)
     try:
@@ -150,10 +149,12 @@ def read_yaml(path: Path, *, error: type[OrthocalError], content: bytes | None =
         mark = e.problem_mark or e.context_mark
         line = "" if mark is None else f":{mark.line + 1}"
         problem = str(e.problem)
-        if problem.startswith("but "):  # the sentence begins in the context
+        if problem.startswith("but "):  # PyYAML's sentence begins in the context
             problem = f"{e.context}, {problem}"
+        if mark is not None and text[mark.index : mark.index + 1] == "\t":
+            problem += " (a tab; indent with spaces)"
         raise error(f"is not valid YAML: {problem}", where=f"{path}{line}") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as e:
+    except (yaml.YAMLError, ValueError, OverflowError) as e:
         text = " ".join(str(e).split())
         raise error(f"is not valid YAML: {text or type(e).__name__}", where=str(path)) from None
 
@@ -162,7 +163,7 @@ def read_json(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
     """Content of a JSON file.
 
     Raises:
-        OrthocalError: Of the kind given, naming file and line.
+        OrthocalError: Of kind `error`, naming file and line.
     """
     text = read_text(path, error=error)
 
@@ -174,12 +175,12 @@ def read_json(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
         )
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        result: dict[str, Any] = {}
         for key, value in pairs:
-            if key in found:
-                raise ValueError(f"the key '{shorten(key)}' stands twice")
-            found[key] = value
-        return found
+            if key in result:
+                raise ValueError(f"the key '{shorten(key)}' occurs twice")
+            result[key] = value
+        return result
 
     def short(digits: str) -> str:
         if len(digits) > LONGEST_NUMBER:
@@ -187,7 +188,7 @@ def read_json(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
         return digits
 
     readers: dict[str, Any] = {}
-    if _LONG_NUMBER.search(text):  # only then: they take their time
+    if _LONG_NUMBER.search(text):  # these readers are slow
         readers = {"parse_int": lambda d: int(short(d)), "parse_float": lambda d: float(short(d))}
     try:
         document = json.loads(text, object_pairs_hook=unique, **readers)
@@ -200,16 +201,16 @@ def read_json(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
 
 
 def _check_texts(document: object) -> None:
-    """Refuse a document with characters that are none, wherever in it.
+    """Refuse control characters and half surrogate pairs in any text of a document.
 
     Raises:
-        ValueError: In words.
+        ValueError: With the problem.
     """
     pending: list[tuple[Any, int]] = [([document], 0)]
     while pending:
         value, depth = pending.pop()
         if depth > DEEPEST:
-            raise ValueError(f"lists and objects stand more than {DEEPEST} deep in each other")
+            raise ValueError(f"lists and objects are nested more than {DEEPEST} deep")
         for inner in value if isinstance(value, list) else (*value, *value.values()):
             if isinstance(inner, list | dict):
                 pending.append((inner, depth + 1))
@@ -227,19 +228,19 @@ def read_csv_rows(
     error: type[OrthocalError],
     content: bytes | None = None,
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    """Rows of a CSV file with a header, as (line number, column to text); blank lines skipped.
+    """Rows of a CSV file with a header: line number, and cells by column. Blank lines are skipped.
 
-    Semicolons are taken as separators where the header has no comma.
+    The separator is a semicolon if the header has no comma.
 
     Args:
         path: The file.
-        required: Columns that it must have.
-        optional: Columns that it may have.
+        required: Required columns.
+        optional: Optional columns.
         error: Kind of error to raise.
-        content: What it holds, where it was read already.
+        content: Content of the file, if it was read before.
 
     Raises:
-        OrthocalError: Of the kind given, naming file and line.
+        OrthocalError: Of kind `error`, naming file and line.
     """
     text = read_text(path, error=error, content=content)
     lines = io.StringIO(text, newline=None)
@@ -262,45 +263,32 @@ def csv_rows(
     error: type[OrthocalError],
     most: int | None = None,
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    """Rows of a CSV file as its lines come, as `read_csv_rows` has them.
+    """Rows of a CSV file from a stream of lines, as in `read_csv_rows`.
 
     Args:
-        lines: Its lines, each with what ends it.
-        name: Of the file, for messages.
-        required: Columns that it must have.
-        optional: Columns that it may have.
+        lines: Lines with their line ends.
+        name: Name of the file, for messages.
+        required: Required columns.
+        optional: Optional columns.
         error: Kind of error to raise.
-        most: Rows above which it is refused.
+        most: Largest number of rows.
 
     Raises:
-        OrthocalError: Of the kind given, naming file and line.
+        OrthocalError: Of kind `error`, naming file and line.
     """
     path, lines = name, iter(lines)
     first = next(lines, "")
     if not first.strip():
-        found = "is blank" if any(line.strip() for line in lines) else "is empty"
-        raise error(f"{found}; expected a header: {','.join(required)}", where=f"{path}:1")
+        problem = "is blank" if any(line.strip() for line in lines) else "is empty"
+        raise error(f"{problem}; expected a header: {','.join(required)}", where=f"{path}:1")
     delimiter = ";" if "," not in first and ";" in first else ","
     reader = csv.reader(
         chain([first], lines), delimiter=delimiter, skipinitialspace=True, strict=True
     )
     try:
         header = [composed(name.strip()) for name in next(reader)]
-        for name in header:
-            if name not in required and name not in optional:
-                raise error(
-                    f"unknown column '{shorten(name)}'; expected {', '.join(required)}"
-                    + (f" and optionally {', '.join(optional)}" if optional else ""),
-                    where=f"{path}:1",
-                )
-            if header.count(name) > 1:
-                raise error(f"the column '{name}' stands twice", where=f"{path}:1")
-        for name in required:
-            if name not in header:
-                raise error(
-                    f"the column '{name}' is missing; found {shorten(', '.join(header))}",
-                    where=f"{path}:1",
-                )
+        if invalid := _header_problem(header, required, optional):
+            raise error(invalid, where=f"{path}:1")
         for row in reader:
             line = reader.line_num
             if most is not None and line > most:
@@ -323,6 +311,22 @@ def csv_rows(
         raise error(f"is not valid CSV: {e}", where=f"{path}:{reader.line_num}") from None
 
 
+def _header_problem(
+    header: Sequence[str], required: Sequence[str], optional: Sequence[str]
+) -> str | None:
+    """First problem with the columns of a CSV file."""
+    for name in header:
+        if name not in required and name not in optional:
+            more = f" and optionally {', '.join(optional)}" if optional else ""
+            return f"unknown column '{shorten(name)}'; expected {', '.join(required)}{more}"
+        if header.count(name) > 1:
+            return f"the column '{name}' occurs twice"
+    missing = next((name for name in required if name not in header), None)
+    if missing is None:
+        return None
+    return f"the column '{missing}' is missing; found {shorten(', '.join(header))}"
+
+
 _DECIMAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?(nan|inf\w*)", re.I)
 
 
@@ -330,7 +334,7 @@ def parse_number(text: str, *, where: str, name: str, error: type[OrthocalError]
     """A finite number from a CSV field.
 
     Raises:
-        OrthocalError: Of the kind given, for text, NaN, infinity or a decimal comma.
+        OrthocalError: Of kind `error`, for text, NaN, infinity or a decimal comma.
     """
     try:
         if len(text) > LONGEST_NUMBER or not _DECIMAL.fullmatch(text):
@@ -356,26 +360,25 @@ def validate(
     error: type[OrthocalError],
     under: str = "",
 ) -> Record:
-    """Data as an instance of a pydantic model, or of a dataclass.
+    """Data as an instance of a pydantic model or of a dataclass.
 
     Args:
-        schema: What is expected.
-        data: The data.
-        where: File, for messages.
-        error: Kind of error.
-        under: Key of the file under which the data stand.
+        schema: The model or dataclass.
+        data: Plain data from a document.
+        where: Name of the file, for messages.
+        error: Kind of error to raise.
+        under: Key of the data in the file.
 
     Raises:
-        OrthocalError: Of the kind given, with the first key that does not fit.
+        OrthocalError: Of kind `error`, with the first invalid key.
     """
     if not isinstance(data, Mapping):
         kinds = {str: "text", int: "a number", float: "a number", list: "a list", bool: "a word"}
-        found = "nothing" if data is None else kinds.get(type(data), f"a {type(data).__name__}")
-        at = f"{where}: {under}" if under else where
-        raise error(f"holds {found}; expected keys and values", where=at)
+        kind = "nothing" if data is None else kinds.get(type(data), f"a {type(data).__name__}")
+        where = f"{where}: {under}" if under else where
+        raise error(f"holds {kind}; expected keys and values", where=where)
     try:
-        record: Record = _adapter(schema).validate_python(data)
-        return record
+        return cast("Record", _adapter(schema).validate_python(data))  # type: ignore[arg-type] # types are hashable
     except ValidationError as e:
         key, problem = explain_validation_error(e, schema)
         key = ".".join(part for part in (under, key) if part)
@@ -383,61 +386,54 @@ def validate(
 
 
 def write_plain(record: object, schema: type[Any]) -> dict[str, Any]:
-    """A dataclass as plain data, as `validate` reads it."""
-    plain: dict[str, Any] = _adapter(schema).dump_python(record, mode="json", by_alias=True)
-    return plain
+    """A dataclass as plain data that `validate` reads."""
+    adapter = _adapter(schema)  # type: ignore[arg-type] # types are hashable
+    return cast("dict[str, Any]", adapter.dump_python(record, mode="json", by_alias=True))
 
 
-_ADAPTERS: dict[type[Any], TypeAdapter[Any]] = {}
-
-
-def _adapter(schema: type[Any]) -> TypeAdapter[Any]:
-    """Built once a schema: that takes time."""
-    if schema not in _ADAPTERS:
-        _ADAPTERS[schema] = TypeAdapter(schema)
-    return _ADAPTERS[schema]
+@cache
+def _adapter(schema: Any) -> TypeAdapter[Any]:  # noqa: ANN401 - a hashable type
+    return TypeAdapter(schema)
 
 
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
-"""What pydantic calls a key that is not known, of a model and of a dataclass."""
+"""Pydantic's error types for an unknown key, of a model and of a dataclass."""
 
 
 def explain_validation_error(exception: ValidationError, schema: type[Any]) -> tuple[str, str]:
-    """Key and plain words for the first finding of a pydantic ValidationError."""
-    # an unknown key explains a missing one: name it first
-    findings = sorted(
-        exception.errors(include_url=False), key=lambda f: f["type"] not in UNKNOWN_KEY
-    )
-    first = findings[0]
+    """Key and problem of the first error in a pydantic ValidationError."""
+    # an unknown key may be a misspelled one that is missing: name it first
+    errors = exception.errors(include_url=False)
+    first = min(errors, key=lambda e: e["type"] not in UNKNOWN_KEY)
     path = [part for part in first["loc"] if not _is_pydantic_tag(part)]
-    found, kind = first.get("input"), first["type"]
-    if "[key]" in first["loc"] and not isinstance(found, str):
-        return _join(path[:-1]), f"found the key {_show(found)}; expected text: put it in quotes"
+    value, kind = first.get("input"), first["type"]
+    if "[key]" in first["loc"] and not isinstance(value, str):
+        return _join(path[:-1]), f"found the key {_show(value)}; expected text: put it in quotes"
     key = _join(path)
     if kind in UNKNOWN_KEY:
-        known = _keys_at(schema, path[:-1])
-        hint = f"; known keys: {', '.join(known)}" if known else ""
+        keys = _keys_at(schema, path[:-1])
+        hint = f"; known keys: {', '.join(keys)}" if keys else ""
         return key, f"unknown key{hint}"
     if kind == "missing":
         return key, "is missing"
-    words = str(first["msg"]).removeprefix("Value error, ")
+    message = str(first["msg"]).removeprefix("Value error, ")
     if kind in ("value_error", "assertion_error"):
-        # a validator over several keys begins its message with the one that it is about
-        inner, separator, rest = words.partition("|")
-        return (_join([*path, inner] if inner else path), rest) if separator else (key, words)
-    shown = "nothing" if found is None else f"'{_show(found)}'"
-    return key, f"found {shown}; expected {_expectation(kind, words, first.get('ctx') or {})}"
+        # a validator of several keys begins its message with "KEY|"
+        inner, separator, problem = message.partition("|")
+        return (_join([*path, inner] if inner else path), problem) if separator else (key, message)
+    shown = "nothing" if value is None else f"'{_show(value)}'"
+    return key, f"found {shown}; expected {_expectation(kind, message, first.get('ctx') or {})}"
 
 
 def _show(value: object) -> str:
-    """A value from a document, as it can stand in a message."""
+    """A value from a document, shortened for a message."""
     if isinstance(value, list | dict) and len(value) > MOST_SHOWN:
         return f"{'a list' if isinstance(value, list) else 'a mapping'} of {len(value)} items"
     return shorten(str(value))
 
 
-def _expectation(kind: str, words: str, context: Mapping[str, Any]) -> str:
-    """What pydantic expected, in words of this program."""
+def _expectation(kind: str, message: str, context: Mapping[str, Any]) -> str:
+    """The expected input, from pydantic's error type and message."""
     if kind in ("dict_type", "model_type", "dataclass_type", "mapping_type"):
         return "keys and values"
     if kind == "string_pattern_mismatch":
@@ -446,8 +442,8 @@ def _expectation(kind: str, words: str, context: Mapping[str, Any]) -> str:
         count = context["min_length" if kind == "too_short" else "max_length"]
         bound = "least" if kind == "too_short" else "most"
         return f"at {bound} {count} item{'' if count == 1 else 's'}"
-    words = words[0].lower() + words[1:]
-    return words.removeprefix("input should be ").removeprefix("a valid ")
+    expected = message[0].lower() + message[1:]
+    return expected.removeprefix("input should be ").removeprefix("a valid ")
 
 
 def _join(path: list[Any]) -> str:
@@ -457,25 +453,23 @@ def _join(path: list[Any]) -> str:
 
 
 def _is_pydantic_tag(part: object) -> bool:
-    """Whether a part of a location is pydantic's name for a branch of a union, not a key."""
+    """True for a part of a location that is pydantic's name of a union branch, not a key."""
     return isinstance(part, str) and ("[" in part or part in {"float", "int", "str", "bool"})
 
 
 def _keys_at(annotation: Any, path: list[Any]) -> list[str]:  # noqa: ANN401 - typing objects
-    """Names of the fields that a schema has at a location."""
+    """Known keys of a schema at a location."""
+    fields: dict[str, Any] | None = None
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         fields = {f.alias or n: f.annotation for n, f in annotation.model_fields.items()}
+    elif isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
+        hints = get_type_hints(annotation, include_extras=True)
+        names = [f.name for f in dataclasses.fields(annotation)]
+        fields = {_alias(hints[n]) or n: hints[n] for n in names}
+    if fields is not None:
         if not path:
             return list(fields)
         return _keys_at(fields[path[0]], path[1:]) if path[0] in fields else []
-    if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
-        hints = get_type_hints(annotation, include_extras=True)
-        named = {
-            _alias(hints[f.name]) or f.name: hints[f.name] for f in dataclasses.fields(annotation)
-        }
-        if not path:
-            return list(named)
-        return _keys_at(named[path[0]], path[1:]) if path[0] in named else []
     if get_origin(annotation) is Annotated:
         return _keys_at(get_args(annotation)[0], path)
     arguments = get_args(annotation)
@@ -483,10 +477,10 @@ def _keys_at(annotation: Any, path: list[Any]) -> list[str]:  # noqa: ANN401 - t
         return _keys_at(arguments[0], path[1:])
     if get_origin(annotation) in (dict, list):
         return _keys_at(arguments[-1], path[1:])
-    return next((found for a in arguments if (found := _keys_at(a, path))), [])
+    return next((keys for a in arguments if (keys := _keys_at(a, path))), [])
 
 
 def _alias(hint: Any) -> str | None:  # noqa: ANN401 - typing objects
-    """The key of a dataclass's field, where it is not its name."""
-    found = [m.alias for m in get_args(hint)[1:] if isinstance(m, FieldInfo) and m.alias]
-    return found[0] if found else None
+    """Key of a dataclass field in a file, if it differs from the field's name."""
+    aliases = (m.alias for m in get_args(hint)[1:] if isinstance(m, FieldInfo))
+    return next((alias for alias in aliases if alias), None)

@@ -1,7 +1,7 @@
-"""Fields of records that are kept as JSON: closed records, numbers that may be unknown, arrays.
+"""Field types of records that are stored as JSON: closed records, unknown numbers, arrays.
 
-A record is a dataclass; pydantic reads and writes it by these annotations. What is not a number in
-memory (NaN, infinity) is null in a file, and nothing else is.
+A record is a dataclass, which pydantic reads and writes by these annotations. A file holds null for
+NaN and infinity, and for nothing else.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ Array = NDArray[np.float64]
 Item = TypeVar("Item")
 
 CLOSED = ConfigDict(extra="forbid")
-"""Of a record that has no other keys than its own."""
+"""Configuration of a record that refuses unknown keys."""
 
 Many = Annotated[tuple[Item, ...], Field(fail_fast=True)]
-"""Any number of items, of which one that is wrong is told, however many there are."""
+"""Any number of items; validation stops at the first invalid one."""
 
 Size = Annotated[Number, Field(ge=0.0)]
 """A number that is not negative."""
@@ -51,11 +51,11 @@ def _finite_or_null(value: float) -> float | None:
 NumberOrNaN = Annotated[Number, _null_for(math.nan), PlainSerializer(_finite_or_null)]
 SizeOrNaN = Annotated[Size, _null_for(math.nan), PlainSerializer(_finite_or_null)]
 SizeOrInf = Annotated[Size, _null_for(math.inf), PlainSerializer(_finite_or_null)]
-"""Numbers that may be unknown, or infinite."""
+"""Numbers that may be unknown or infinite."""
 
 
 class _AsLists:
-    """An array in memory, lists of numbers in a file; null where they are not finite."""
+    """An array in memory; nested lists in a file, with null for numbers that are not finite."""
 
     def __init__(self, lists: Any) -> None:  # noqa: ANN401 - a type
         self.lists = lists
@@ -78,11 +78,11 @@ Matrix = Annotated[Array, _AsLists(Many[Many[NumberOrNaN]])]
 
 
 class As:
-    """A field that a function makes of what stands in a file, and another writes.
+    """A field with its own functions to read and write plain data.
 
     Args:
-        read: From plain data; raises ValueError, with the key within and "|" before its words.
-        write: To plain data.
+        read: Value from plain data; raises ValueError("KEY|PROBLEM").
+        write: Plain data from the value.
     """
 
     def __init__(self, read: Callable[[Any], object], write: Callable[[Any], object]) -> None:
@@ -114,7 +114,7 @@ def _to_lists(values: Array) -> object:
 
 
 def read_only(values: ArrayLike) -> Array:
-    """A copy of an array that cannot be written to."""
+    """A read-only copy of an array."""
     result = np.array(values, dtype=np.float64)
     result.setflags(write=False)
     return result

@@ -1,4 +1,4 @@
-"""Files and folders: read within bounds, written whole or not at all."""
+"""Files and directories: bounded reading, atomic writing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import secrets
 import stat
 from codecs import getincrementaldecoder
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from io import IncrementalNewlineDecoder
 from itertools import chain
 from pathlib import Path
@@ -17,26 +17,26 @@ from typing import BinaryIO
 
 from orthocal.errors import OrthocalError, OutputError
 from orthocal.runtime.interrupts import postponed_interrupt, raised_interrupt
-from orthocal.text import control_character
+from orthocal.text import control_character, printable
 
 LARGEST_FILE = 64 * 2**20
-"""Files above this size are refused, [bytes]."""
+"""Largest size of a file, [bytes]."""
 
 PART = 2**16
-"""Bytes that are read together."""
+"""Size of a block that is read at once, [bytes]."""
 
 _READ_FLAGS = (
     os.O_RDONLY
     | getattr(os, "O_BINARY", 0)
     | getattr(os, "O_CLOEXEC", 0)
     | getattr(os, "O_NOCTTY", 0)
-    | getattr(os, "O_NONBLOCK", 0)  # opening a pipe that nobody writes to would wait for ever
+    | getattr(os, "O_NONBLOCK", 0)  # opening a pipe without a writer would block
 )
 
 _WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 
 _NO_NAME = frozenset({errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP, errno.EILSEQ, errno.EINVAL})
-"""What is wrong with a name itself, whatever there is room and right for."""
+"""Errors of the name itself, not of space or permission."""
 
 _LEFTOVER = re.compile(r"\.orthocal-(\d+)-[0-9a-f]{16}\.tmp")
 
@@ -44,15 +44,15 @@ _LEFTOVER = re.compile(r"\.orthocal-(\d+)-[0-9a-f]{16}\.tmp")
 def read_file(
     path: Path, *, error: type[OrthocalError] = OrthocalError, largest: int = LARGEST_FILE
 ) -> bytes:
-    """All of a regular file: no device, no pipe, and not more than can be meant.
+    """Content of a regular file of limited size.
 
     Args:
         path: The file.
         error: Kind of error to raise.
-        largest: Size above which it is refused, [bytes].
+        largest: Largest size, [bytes].
 
     Raises:
-        OrthocalError: Of the kind given, if it is missing, no regular file, or too large.
+        OrthocalError: Of kind `error`, if the file is missing, not regular, or too large.
     """
     descriptor = _open_regular(path, error)
     try:
@@ -66,24 +66,24 @@ def read_file(
     finally:
         os.close(descriptor)
     if max(size, len(content)) > largest:
-        found = f"{size / 2**20:.0f} MiB" if size > largest else "more"
-        raise error(f"has {found}; expected at most {largest / 2**20:g} MiB", where=str(path))
+        actual = f"{size / 2**20:.0f} MiB" if size > largest else "more"
+        raise error(f"has {actual}; expected at most {largest / 2**20:g} MiB", where=str(path))
     return content
 
 
 def read_parts(
     path: Path | BinaryIO, *, longest: int, name: str, error: type[OrthocalError] = OrthocalError
 ) -> Iterator[bytes]:
-    """Lines of a file of any size, one at a time, each with what ends it.
+    """Lines of a file of any size with their line ends; long lines come in parts.
 
     Args:
-        path: A regular file, or a stream that is open.
-        longest: Bytes of a line above which it comes in parts.
-        name: For messages.
+        path: A regular file, or an open stream.
+        longest: Largest length of a part, [bytes].
+        name: Name for messages.
         error: Kind of error to raise.
 
     Raises:
-        OrthocalError: Of the kind given, if it is missing, no regular file, or cannot be read.
+        OrthocalError: Of kind `error`, if the file is missing, not regular, or cannot be read.
     """
     stream = open(_open_regular(path, error), "rb") if isinstance(path, Path) else path
     try:
@@ -99,48 +99,48 @@ def read_parts(
 def read_lines(
     path: Path | BinaryIO, *, longest: int, name: str, error: type[OrthocalError] = OrthocalError
 ) -> Iterator[str]:
-    """Lines of a UTF-8 text of any size, one at a time; all ends of lines are newlines.
+    """Lines of a UTF-8 text of any size; each line ends with a newline character.
 
     Args:
-        path: A regular file, or a stream that is open.
-        longest: Characters above which a line is refused.
-        name: For messages.
+        path: A regular file, or an open stream.
+        longest: Largest length of a line, [characters].
+        name: Name for messages.
         error: Kind of error to raise.
 
     Raises:
-        OrthocalError: Of the kind given, if it cannot be read, or is not UTF-8.
+        OrthocalError: Of kind `error`, if the file cannot be read or is not UTF-8.
     """
     decoder = getincrementaldecoder("utf-8-sig")()
     newlines = IncrementalNewlineDecoder(decoder, translate=True)
-    count, number, rest = 0, 0, ""
+    count, number, pending = 0, 0, ""
     parts = chain(read_parts(path, longest=PART, name=name, error=error), [b""])
     for part in parts:
-        kept = len(decoder.getstate()[0])
+        undecoded = len(decoder.getstate()[0])
         try:
-            rest += newlines.decode(part, final=not part)
+            pending += newlines.decode(part, final=not part)
         except UnicodeDecodeError as e:
-            byte = count - kept + e.start
+            byte = count - undecoded + e.start
             raise error(f"is not UTF-8 text (byte {byte})", where=name) from None
         count += len(part)
-        *lines, rest = rest.split("\n")
+        *lines, pending = pending.split("\n")
         for line in lines:
             number += 1
             yield f"{line}\n"
-        if len(rest) > longest:
+        if len(pending) > longest:
             raise error(
                 f"has a line of more than {longest} characters", where=f"{name}:{number + 1}"
             )
-    if rest:
-        yield rest
+    if pending:
+        yield pending
 
 
 def require_file(
     path: Path, *, error: type[OrthocalError] = OrthocalError, largest: int = LARGEST_FILE
 ) -> None:
-    """Refuse what `read_file` would refuse, for a file that other code will read.
+    """Check a file that other code will read, as `read_file` does.
 
     Raises:
-        OrthocalError: Of the kind given, as `read_file`.
+        OrthocalError: Of kind `error`, as `read_file`.
     """
     descriptor = _open_regular(path, error)
     size = os.fstat(descriptor).st_size
@@ -153,39 +153,70 @@ def require_file(
 
 
 def _open_regular(path: Path, error: type[OrthocalError]) -> int:
-    """Descriptor of a regular file: what was opened is what is looked at."""
+    """Descriptor of a regular file; the check is on the opened file, not on its name."""
     try:
         descriptor = os.open(path, _READ_FLAGS)
         mode = os.fstat(descriptor).st_mode
     except FileNotFoundError:
         raise error("there is no such file", where=str(path)) from None
     except ValueError:
-        raise error("holds a character that no name of a file can", where=str(path)) from None
+        raise error("contains a character that file names cannot have", where=str(path)) from None
     except OSError as e:
         raise error(f"cannot be read: {e.strerror}", where=str(path)) from None
     if not stat.S_ISREG(mode):
         os.close(descriptor)
-        found = "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
-        raise error(f"is {found}; expected a file", where=str(path))
+        kind = "a directory" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
+        raise error(f"is {kind}; expected a file", where=str(path))
     return descriptor
 
 
-def require_plain_name(path: Path, *, error: type[OrthocalError] = OrthocalError) -> None:
-    """Refuse a path that a document cannot name: it is written into what is made from it.
+@contextmanager
+def content_withheld_outside(directory: Path, *files: Path) -> Iterator[None]:
+    """Withhold the text of errors about files that a document names outside its own directory.
+
+    A document from a stranger may name any file of this machine, directly or by a symbolic link.
+    Messages about such a file name it and the line, and quote nothing of what it holds.
+
+    Args:
+        directory: Directory of the document.
+        files: Files that the code inside the block reads because the document names them.
 
     Raises:
-        OrthocalError: Of the kind given, for control characters and bytes that are no UTF-8.
+        OrthocalError: Of the same kind as inside the block, without its text.
     """
-    found = control_character(str(path))
-    if found:
+    root = os.path.realpath(directory)
+    outside = [f for f in files if not Path(os.path.realpath(f)).is_relative_to(root)]
+    try:
+        yield
+    except OrthocalError as e:
+        for file in outside:
+            place = re.match(re.escape(printable(str(file))) + r"(:\d+)?", e.where or "")
+            if place:
+                raise type(e)(
+                    "cannot be used. Its content is not shown: the file is outside the directory "
+                    f"'{directory}'",
+                    where=place[0],
+                ) from None
+        raise
+
+
+def require_plain_name(path: Path, *, error: type[OrthocalError] = OrthocalError) -> None:
+    """Refuse a path that cannot be written into a document.
+
+    Raises:
+        OrthocalError: Of kind `error`, for control characters and bytes that are not UTF-8.
+    """
+    character = control_character(str(path))
+    if character:
         raise error(
-            f"the path holds '{found}', which no document can name; rename the file or folder",
+            f"the path contains '{character}', which documents cannot contain; rename the file or "
+            "directory",
             where=str(path),
         )
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is such a folder; names that no file system takes are none."""
+    """True for an existing directory; False for invalid names."""
     try:
         return path.is_dir()
     except (OSError, ValueError):
@@ -193,7 +224,7 @@ def is_folder(path: Path) -> bool:
 
 
 def exists(path: Path) -> bool:
-    """Whether there is such a file or folder; names that no file system takes are none."""
+    """True for an existing file or directory; False for invalid names."""
     try:
         return path.exists()
     except (OSError, ValueError):
@@ -201,28 +232,28 @@ def exists(path: Path) -> bool:
 
 
 def require_writable(folder: Path, names: Iterable[str] = ()) -> None:
-    """Refuse a folder to be written to later that cannot be one: before the work is done.
+    """Check, before the work is done, that files can be written to a directory.
 
-    A file is made in it, or in the folder that it will be made in, and taken away again.
+    A temporary file is created there, or in the nearest existing parent, and removed.
 
     Args:
-        folder: The folder.
-        names: Of the files that will be written into it.
+        folder: The directory; it need not exist.
+        names: Names of the files that will be written.
 
     Raises:
-        OrthocalError: If it is a file, or has a name that no file system takes, or if there is
-            something else than a file with the name of one of the files.
-        OutputError: If nothing can be written there.
+        OrthocalError: If it is a file or has an invalid name, or if one of the files exists and
+            is not a regular file.
+        OutputError: If it cannot be written to.
     """
     try:
         for name in names:
             _require_replaceable(folder / name)
         if folder.exists() and not folder.is_dir():
-            raise OrthocalError("is a file; expected a folder", where=str(folder))
-        there = next((f for f in (folder, *folder.parents) if f.exists()), folder)
-        if not there.is_dir():
-            raise OrthocalError("is a file; expected a folder", where=str(there))
-        probe = there / _temporary_name()
+            raise OrthocalError("is a file; expected a directory", where=str(folder))
+        existing = next((f for f in (folder, *folder.parents) if f.exists()), folder)
+        if not existing.is_dir():
+            raise OrthocalError("is a file; expected a directory", where=str(existing))
+        probe = existing / _temporary_name()
         os.close(os.open(probe, _WRITE_FLAGS, 0o600))
         probe.unlink()
     except (OSError, ValueError) as e:
@@ -230,15 +261,15 @@ def require_writable(folder: Path, names: Iterable[str] = ()) -> None:
 
 
 def require_writable_file(path: Path, *, kinds: tuple[str, ...] = ()) -> None:
-    """Refuse a file to be written later that cannot be one: before the work is done.
+    """Check, before the work is done, that a file can be written.
 
     Args:
         path: The file.
-        kinds: What its name may end with; anything if empty.
+        kinds: Allowed suffixes; any suffix if empty.
 
     Raises:
-        OrthocalError: If it is a folder, its folder cannot be one, or its name ends otherwise.
-        OutputError: If nothing can be written there.
+        OrthocalError: If the path is a directory, or its suffix or parent is invalid.
+        OutputError: If the file cannot be written.
     """
     if kinds and path.suffix.lower() not in kinds and not is_folder(path):
         raise OrthocalError(f"expected a name that ends with {kinds[0]}", where=str(path))
@@ -251,14 +282,14 @@ def require_writable_file(path: Path, *, kinds: tuple[str, ...] = ()) -> None:
 
 
 def _require_replaceable(path: Path) -> None:
-    """Refuse what is there under the name of a file to be written, and is no file to write over."""
+    """Refuse to replace anything but a writable regular file."""
     target = _behind_links(path)
     try:
         mode = os.stat(target).st_mode
     except (FileNotFoundError, NotADirectoryError):
         return
     if stat.S_ISDIR(mode):
-        raise OrthocalError("is a folder; expected a file", where=str(path))
+        raise OrthocalError("is a directory; expected a file", where=str(path))
     if not stat.S_ISREG(mode):
         raise OrthocalError("is a device, a pipe or a socket; expected a file", where=str(path))
     if not os.access(target, os.W_OK):
@@ -266,48 +297,48 @@ def _require_replaceable(path: Path) -> None:
 
 
 Content = str | bytes | Iterable[bytes]
-"""Of a file: text, which is written as UTF-8, bytes, or parts of them."""
+"""Content of a file: text, which is written as UTF-8, bytes, or a sequence of parts."""
 
 
 def write_file(path: Path, content: Content) -> None:
-    """Write a file whole or not at all: beside it first, then renamed.
+    """Write a file atomically: a temporary file beside it is renamed.
 
     Raises:
-        OrthocalError: If it cannot be a file.
-        OutputError: If it cannot be written.
+        OrthocalError: If the path is invalid.
+        OutputError: If the file cannot be written.
     """
     require_writable_file(path)
     write_files(path.parent, {path.name: content})
 
 
 def write_files(folder: Path, files: Mapping[str, Content]) -> None:
-    """Write several files of one folder that belong together, all or none.
+    """Write several files of one directory that belong together, all or none.
 
-    All are written beside their places first. Then, with no Ctrl-C between, the old ones but the
-    first are taken away, the first is replaced, and the others follow: whenever the process is
-    killed, what is there is of one generation. A link is written through; modes stay, and new
-    files have the one that the user's mask gives.
+    All are written to temporary files first. Then, with Ctrl-C postponed, the old files except the
+    first are moved away, the first is replaced, and the others follow. Whenever the process is
+    killed, the remaining files are of one generation. Symbolic links are followed. Existing files
+    keep their mode; new files have the mode of the user's mask.
 
     Args:
-        folder: Where to; made if need be.
-        files: Name to content. Without the first the others mean nothing.
+        folder: The directory; created if necessary.
+        files: Name to content. The first is the one without which the others are useless.
 
     Raises:
-        OrthocalError: If the folder or a file cannot be one.
-        OutputError: If they cannot be written.
+        OrthocalError: If a path is invalid.
+        OutputError: If a file cannot be written.
     """
     require_writable(folder, files)
     try:
         with raised_interrupt():
             _write(folder, files)
     except FileExistsError:
-        raise OrthocalError("is a file; expected a folder", where=str(folder)) from None
+        raise OrthocalError("is a file; expected a directory", where=str(folder)) from None
     except (OSError, ValueError) as e:
         raise _refusal(e, folder) from None
 
 
 def sync_folder(folder: Path) -> None:
-    """Let names of files that were made or replaced survive a power cut, where that can be done."""
+    """Write the entries of a directory to disk, where the file system supports it."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -317,10 +348,10 @@ def sync_folder(folder: Path) -> None:
 
 
 def _write(folder: Path, files: Mapping[str, Content]) -> None:
-    """Stage all files, and put them in place; what was staged is taken away whatever happens."""
+    """Stage all files and put them in place; temporary files are removed in any case."""
     staged: dict[Path, Path] = {}
     aside: dict[Path, Path] = {}
-    made = [f for f in (folder, *folder.parents) if not f.exists()]
+    created = [f for f in (folder, *folder.parents) if not f.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
@@ -334,18 +365,18 @@ def _write(folder: Path, files: Mapping[str, Content]) -> None:
     finally:
         for temporary in (*staged.values(), *aside.values()):
             temporary.unlink(missing_ok=True)
-        for empty in made:  # nothing was written: as if it had never been tried
+        for empty in created:  # succeeds only if nothing was written
             with suppress(OSError):
                 empty.rmdir()
 
 
 def _put_in_place(staged: Mapping[Path, Path], aside: dict[Path, Path]) -> None:
-    """Rename files from where they were staged: never two generations side by side.
+    """Rename staged files without ever mixing two generations.
 
     Args:
-        staged: Place of each file to where it is written already; the first is the one without
-            which the others mean nothing.
-        aside: Filled with where old files were put that are to go.
+        staged: Target of each file to its temporary file; the first is the one without which the
+            others are useless.
+        aside: Filled with the targets and temporary names of old files to be removed.
     """
     first, *others = staged
     try:
@@ -365,12 +396,12 @@ def _put_in_place(staged: Mapping[Path, Path], aside: dict[Path, Path]) -> None:
 
 
 def _behind_links(path: Path) -> Path:
-    """What a link leads to, whether it is there or not; the path itself if it is none."""
+    """Target of a symbolic link, existing or not; other paths unchanged."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
 def _stage(temporary: Path, parts: Iterable[bytes], *, like: Path) -> None:
-    """Write a file to be renamed later, with the mode of the one whose place it will take."""
+    """Write a temporary file with the mode of the file that it will replace."""
     with open(os.open(temporary, _WRITE_FLAGS, 0o666), "wb") as stream:
         with suppress(FileNotFoundError):
             os.chmod(temporary, stat.S_IMODE(os.stat(like).st_mode))
@@ -384,10 +415,10 @@ def _temporary_name() -> str:
 
 
 def _clean_up(folder: Path) -> None:
-    """Take away what processes that were killed have left in a folder."""
+    """Remove the temporary files of killed processes from a directory."""
     for entry in os.scandir(folder):
-        found = _LEFTOVER.fullmatch(entry.name)
-        if found and not _is_alive(int(found[1])):
+        temporary = _LEFTOVER.fullmatch(entry.name)
+        if temporary and not _is_alive(int(temporary[1])):
             Path(entry.path).unlink(missing_ok=True)
 
 
@@ -396,14 +427,14 @@ def _is_alive(process: int) -> bool:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except OSError:  # it belongs to somebody else
+    except OSError:  # the process belongs to another user
         return True
     return True
 
 
 def _refusal(e: OSError | ValueError, where: Path) -> OrthocalError:
-    """The error of a path that cannot be written: of its name, or of what it stands for."""
+    """The error for a path that cannot be written: of its name, or of the file system."""
     if not isinstance(e, OSError):
-        return OrthocalError("holds a character that no name of a file can", where=str(where))
+        return OrthocalError("contains a character that file names cannot have", where=str(where))
     kind = OrthocalError if e.errno in _NO_NAME else OutputError
     return kind(f"cannot be written: {e.strerror}", where=str(where))

@@ -1,4 +1,4 @@
-"""Small pieces of HTML; every text in them is escaped."""
+"""HTML fragments with escaped text."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ def page(title: str, style: str, body: str, *, scripts: bool = False) -> str:
 
 
 def escape(text: str) -> str:
-    """A text as HTML that shows it: no markup, and no character that turns others about."""
+    """A text as HTML, without markup and without characters that change the text direction."""
     return html.escape(printable(text, keep="\n"))
 
 
 def prose(text: str) -> str:
-    """A text as HTML; what is between `s is what one types."""
+    """A text as HTML; words between backquotes are code."""
     return TYPED.sub(r"<code>\1</code>", escape(text))
 
 
 def paragraph(text: str, *, kind: str = "") -> str:
-    """A paragraph of prose; `kind` is a class."""
+    """A paragraph of prose, with an optional class `kind`."""
     return f"<p{_class(kind)}>{prose(text)}</p>"
 
 
@@ -54,7 +54,7 @@ def heading(text: str, *, level: int = 2) -> str:
 
 
 def items(texts: Iterable[str]) -> str:
-    """A list of prose, with bullets."""
+    """A bulleted list of prose."""
     return "<ul>" + "".join(f"<li>{prose(t)}</li>" for t in texts) + "</ul>"
 
 
@@ -62,9 +62,9 @@ def table(headers: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 
     """A table.
 
     Args:
-        headers: Of its columns; all empty for none.
-        rows: Cells.
-        left: Columns of words, at the left; those after are numbers.
+        headers: Headers of the columns; all empty for no header.
+        rows: Cells of each row.
+        left: Number of columns of words at the left; the others hold numbers.
     """
     words = [i < left or h == "unit" for i, h in enumerate(headers)]
 

@@ -1,7 +1,6 @@
-"""Files that grow by lines, each on disk before it counts; one process at a time has one.
+"""Append-only journals of JSON lines, each on disk before it counts; one process at a time.
 
-A process that is killed leaves at most a line without an end, which the next one takes away; what
-was written before stays.
+A killed process leaves at most one incomplete line, which the next process removes.
 """
 
 from __future__ import annotations
@@ -18,16 +17,16 @@ from orthocal.errors import OrthocalError, OutputError
 from orthocal.io.files import require_writable_file, sync_folder
 
 LONGEST_LINE = 2**26
-"""[bytes]"""
+"""Largest length of a line, [bytes]."""
 
 
 class Journal:
-    """Lines of JSON in a file that is open and locked.
+    """JSON lines in an open and locked file.
 
     Args:
         path: The file.
-        descriptor: Of it, open for reading and appending.
-        longest: Bytes of its longest line.
+        descriptor: Its descriptor, open for reading and appending.
+        longest: Largest length of a line, [bytes].
     """
 
     def __init__(self, path: Path, descriptor: int, *, longest: int = LONGEST_LINE) -> None:
@@ -36,13 +35,12 @@ class Journal:
         self._longest = longest
 
     def entries(self) -> Iterator[tuple[str, dict[str, Any] | None]]:
-        """What is there: where each line stands, and its object; None for a line that holds none.
+        """Place and object of each line; None for a line that is not an object.
 
-        Whoever has seen all of them without finding fault may write on: then the end of a line
-        that was never finished has been taken away.
+        Read all entries before the first `append`: reading to the end removes an incomplete line.
 
         Raises:
-            OutputError: If that cannot be taken away.
+            OutputError: If an incomplete line cannot be removed.
         """
         end, number = 0, 0
         with os.fdopen(os.dup(self._descriptor), "rb") as stream:
@@ -61,7 +59,7 @@ class Journal:
             raise OutputError(f"cannot be written: {e.strerror}", where=str(self.path)) from None
 
     def append(self, entry: Mapping[str, Any]) -> None:
-        """Write a line; on disk when this returns.
+        """Append a line, and return when it is on disk.
 
         Raises:
             OutputError: If it cannot be written.
@@ -79,23 +77,23 @@ class Journal:
 def open_journal_file(
     path: Path, *, busy: str, anew: bool = False, longest: int = LONGEST_LINE
 ) -> Iterator[Journal]:
-    """A journal that nobody else has; made if need be.
+    """A locked journal; the file is created if necessary.
 
     Args:
         path: The file.
-        busy: What is said where another process has it.
-        anew: Whether to throw away what is there.
-        longest: Bytes of its longest line.
+        busy: Message if another process has locked the file.
+        anew: Whether to discard its content.
+        longest: Largest length of a line, [bytes].
 
     Raises:
-        OrthocalError: If another process has it, or it cannot be a file.
+        OrthocalError: If another process has locked it, or the path is invalid.
         OutputError: If it cannot be written.
     """
     require_writable_file(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_CLOEXEC", 0)
-        made = not path.exists()
+        created = not path.exists()
         descriptor = os.open(path, flags, 0o666)
     except OSError as e:
         raise OutputError(f"cannot be written: {e.strerror}", where=str(path)) from None
@@ -103,7 +101,7 @@ def open_journal_file(
         _lock(descriptor, path, busy)
         if anew:
             os.ftruncate(descriptor, 0)
-        if made:
+        if created:
             sync_folder(path.parent)
         yield Journal(path, descriptor, longest=longest)
     finally:

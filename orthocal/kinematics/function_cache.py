@@ -57,7 +57,7 @@ def known_as(function: ca.Function) -> str | None:
 
 
 def _recall(key: str) -> ca.Function | None:
-    content = cache.recall(key)
+    content = cache.load(key)
     if content is None:
         return None
     try:
@@ -71,7 +71,7 @@ def _keep(key: str, function: ca.Function) -> None:
         text = function.serialize()
     except RuntimeError:  # some cannot be written
         return
-    cache.keep(key, text.encode("ascii"))
+    cache.store(key, text.encode("ascii"))
 
 
 class _Content:

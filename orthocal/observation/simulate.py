@@ -215,7 +215,7 @@ def _where(plan: Session, gauge: str, key: str) -> str:
 
 
 class _TruthKeys(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     errors: Annotated[dict[str, Number], Field(min_length=1)]
     zeros_mm: dict[str, Number] = {}

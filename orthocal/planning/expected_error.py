@@ -38,7 +38,7 @@ from orthocal.kinematics.workspace import (
 )
 from orthocal.observation.observations import build_observations
 from orthocal.robot.model import Robot
-from orthocal.runtime.worker_pool import call_on_cores, lent_cores
+from orthocal.runtime.worker_pool import call_in_parallel, current_worker_budget
 from orthocal.session.session import Session
 from orthocal.statistics.information import posterior_covariance
 from orthocal.statistics.noise import estimate_repeatability, noise_floor
@@ -195,8 +195,10 @@ class ToolForecast:
                 self._posterior(problem, others, drawn[i], noise, weight, passive[i]) for i in part
             ]
 
-        parts = np.array_split(np.arange(len(drawn)), lent_cores())
-        each = [f for part in call_on_cores([partial(posteriors, p) for p in parts]) for f in part]
+        parts = np.array_split(np.arange(len(drawn)), current_worker_budget())
+        each = [
+            f for part in call_in_parallel([partial(posteriors, p) for p in parts]) for f in part
+        ]
         found = [covariance for covariance, _ in each if covariance is not None]
         lost = sum(share / len(drawn) for _, share in each)
         if not found:

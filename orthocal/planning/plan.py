@@ -55,7 +55,7 @@ from orthocal.planning.selection import (
     information_of,
 )
 from orthocal.robot.model import Robot
-from orthocal.runtime.worker_pool import call_on_cores, lent, run_on_cores
+from orthocal.runtime.worker_pool import call_in_parallel, run_in_parallel, worker_budget
 from orthocal.session.session import Posture, Purpose, Reading, Session, Setup
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import UM
@@ -213,8 +213,8 @@ def plan_readings(
         lambda: forecast.about_nominal(whole),
         lambda: forecast.before if measured is None else forecast.after(measured),
     )
-    with lent(workers):
-        found_out = call_on_cores(calls, killed=KILLED)
+    with worker_budget(workers):
+        found_out = call_in_parallel(calls, killed=KILLED)
     curve, helps, compared, expected, first_round, here, known = found_out
     return MeasuringPlan(
         session=plan,
@@ -360,7 +360,7 @@ class _Trials:
     def best(self, options: Sequence[list[int]]) -> list[int]:
         """The numbers of readings of each setup that leave least."""
         work = partial(self.left, options)
-        left = dict(run_on_cores(work, range(len(options)), self.workers, killed=KILLED))
+        left = dict(run_in_parallel(work, range(len(options)), self.workers, killed=KILLED))
         return options[min(range(len(options)), key=left.__getitem__)]
 
     def left(self, options: Sequence[list[int]], which: int) -> float:

@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 from orthocal.errors import ParameterError
 from orthocal.planning.candidates import FEWEST, Candidates, HandSet, Kind
 from orthocal.planning.information_gain import Taking, beginnings
-from orthocal.runtime.worker_pool import run_on_cores
+from orthocal.runtime.worker_pool import run_in_parallel
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
@@ -120,7 +120,7 @@ def choose_setups(
     search = _Search(candidates.bare, prior, weigh, _draw_starts(candidates, counts, seed, starts))
     found: dict[int, Chosen] = {}
     told, best = 0, None
-    for start, chosen in run_on_cores(search, range(starts), workers, killed=KILLED):
+    for start, chosen in run_in_parallel(search, range(starts), workers, killed=KILLED):
         found[start] = chosen
         while told in found:
             if best is None or found[told].left < best.left:

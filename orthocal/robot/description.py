@@ -36,7 +36,7 @@ MOST_PARTS = 100
 
 
 class _Keys(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class ClosureKeys(_Keys):

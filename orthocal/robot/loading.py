@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthocal.errors import ParameterError, RobotError
 from orthocal.io.fields import read_only
-from orthocal.io.files import is_folder, read_file, require_plain_name
+from orthocal.io.files import content_withheld_outside, is_folder, read_file, require_plain_name
 from orthocal.robot.description import (
     DriveKeys,
     JointKeys,
@@ -96,7 +96,8 @@ def _load_folder(folder: Path) -> Robot:
     yaml_path, urdf_path = _find_files(folder)
     urdf, description = (read_file(p, error=RobotError) for p in (urdf_path, yaml_path))
     name = folder.resolve().name  # of a relative one it depends on where we are
-    return _build_robot(name, folder, yaml_path, urdf_path, urdf, description)
+    with content_withheld_outside(folder, yaml_path, urdf_path):
+        return _build_robot(name, folder, yaml_path, urdf_path, urdf, description)
 
 
 @lru_cache(maxsize=LOADED)

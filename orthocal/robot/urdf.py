@@ -356,10 +356,10 @@ def _validate_with_yourdfpy(text: str, path: Path) -> None:
     """Refuse what yourdfpy does not accept; what it did accept is remembered, for its import."""
     digest = hashlib.sha256(text.encode()).hexdigest()
     accepted = f"yourdfpy {version('yourdfpy')} accepts {digest}"
-    if cache.recall(accepted) == _YES:
+    if cache.load(accepted) == _YES:
         return
     _ask_yourdfpy(text, path)
-    cache.keep(accepted, _YES)
+    cache.store(accepted, _YES)
 
 
 def _ask_yourdfpy(text: str, path: Path) -> None:

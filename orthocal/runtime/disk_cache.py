@@ -1,10 +1,9 @@
-"""What takes long to find out and is always the same, kept in a folder of the user's own.
+"""Cache of slow, reproducible results in a directory of the user.
 
-The folder is ORTHOCAL_CACHE, or `orthocal` in XDG_CACHE_HOME or ~/.cache; ORTHOCAL_CACHE=off keeps
-nothing. It is used only where it is a real folder that belongs to the user and that nobody else can
-write to; a file likewise, and only where it holds what its checksum says, for the very key that is
-asked for. Whatever else is found is not trusted, and made anew. Nothing that goes wrong here ever
-stops a job.
+The directory is ORTHOCAL_CACHE, or `orthocal` in XDG_CACHE_HOME or ~/.cache; ORTHOCAL_CACHE=off
+disables the cache. Directory and files are used only if they belong to the user and nobody else can
+write to them, and if the checksum of key and content is right. Everything else is computed again.
+Failures of the cache never stop a job.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ from pathlib import Path
 VARIABLE = "ORTHOCAL_CACHE"
 
 OFF = frozenset({"", "0", "off", "no", "none"})
-"""Values of the variable by which nothing is kept."""
+"""Values of the variable that disable the cache."""
 
 LARGEST_TOTAL = 64 * 2**20
-"""Size of all files together, [bytes]; the oldest go first."""
+"""Largest size of all files together, [bytes]; the oldest are removed first."""
 
 LARGEST_ENTRY = 8 * 2**20
-"""Size of one file, [bytes]."""
+"""Largest size of one file, [bytes]."""
 
 MOST_ENTRIES = 400
 
@@ -36,11 +35,11 @@ _DIGEST = hashlib.sha256().digest_size
 _FOLLOW_NOTHING = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
-def recall(key: str) -> bytes | None:
-    """What was kept for a key; None where there is nothing that can be trusted.
+def load(key: str) -> bytes | None:
+    """Content stored for a key; None if there is none that can be trusted.
 
     Args:
-        key: Everything that what is kept depends on.
+        key: Everything that the content depends on.
     """
     try:
         with _folder(create=False) as folder:
@@ -49,12 +48,12 @@ def recall(key: str) -> bytes | None:
         return None
 
 
-def keep(key: str, content: bytes) -> None:
-    """Keep something for a key, whole or not at all.
+def store(key: str, content: bytes) -> None:
+    """Store content for a key, atomically.
 
     Args:
-        key: Everything that it depends on.
-        content: At most LARGEST_ENTRY.
+        key: Everything that the content depends on.
+        content: At most LARGEST_ENTRY bytes.
     """
     if len(content) > LARGEST_ENTRY:
         return
@@ -65,7 +64,7 @@ def keep(key: str, content: bytes) -> None:
 
 
 def cache_folder() -> Path | None:
-    """Where things are kept; None where nothing is."""
+    """Directory of the cache; None if it is disabled."""
     chosen = os.environ.get(VARIABLE)
     if chosen is not None:
         return None if chosen.strip().lower() in OFF else Path(chosen)
@@ -77,7 +76,7 @@ def cache_folder() -> Path | None:
 
 @contextmanager
 def _folder(*, create: bool) -> Iterator[int | None]:
-    """A descriptor of the folder; None where it is not to be used."""
+    """Descriptor of the directory; None if it cannot be trusted."""
     path = cache_folder()
     if path is None or not hasattr(os, "geteuid") or os.open not in os.supports_dir_fd:
         yield None
@@ -98,7 +97,7 @@ def _folder(*, create: bool) -> Iterator[int | None]:
 
 
 def _is_own(status: os.stat_result) -> bool:
-    """Whether it belongs to the user, and nobody else can write to it."""
+    """True for a file or directory that the user owns and nobody else can write to."""
     return status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
@@ -118,35 +117,35 @@ def _read(folder: int, key: str) -> bytes | None:
         status = os.fstat(descriptor)
         if not (stat.S_ISREG(status.st_mode) and _is_own(status)):
             return None
-        found = stream.read(len(_MAGIC) + _DIGEST + LARGEST_ENTRY + 1)
-    head, content = found[: len(_MAGIC) + _DIGEST], found[len(_MAGIC) + _DIGEST :]
+        data = stream.read(len(_MAGIC) + _DIGEST + LARGEST_ENTRY + 1)
+    head, content = data[: len(_MAGIC) + _DIGEST], data[len(_MAGIC) + _DIGEST :]
     return content if head == _MAGIC + _digest(key, content) else None
 
 
 def _write(folder: int, key: str, content: bytes) -> None:
-    beside = f"{secrets.token_hex(8)}.part"
+    temporary = f"{secrets.token_hex(8)}.part"
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _FOLLOW_NOTHING
-    descriptor = os.open(beside, flags, 0o600, dir_fd=folder)
+    descriptor = os.open(temporary, flags, 0o600, dir_fd=folder)
     try:
         with open(descriptor, "wb") as stream:
             stream.write(_MAGIC + _digest(key, content) + content)
-        os.rename(beside, _name(key), src_dir_fd=folder, dst_dir_fd=folder)
+        os.rename(temporary, _name(key), src_dir_fd=folder, dst_dir_fd=folder)
     except BaseException:
         with suppress(OSError):
-            os.unlink(beside, dir_fd=folder)
+            os.unlink(temporary, dir_fd=folder)
         raise
 
 
 def _make_room(folder: int) -> None:
-    """Drop the oldest until the rest is within bounds."""
-    found = []
+    """Remove the oldest files until the others are within the limits."""
+    entries = []
     for name in os.listdir(folder):
         if name.endswith((_SUFFIX, ".part")):
             with suppress(OSError):
                 status = os.stat(name, dir_fd=folder, follow_symlinks=False)
-                found.append((status.st_mtime, status.st_size, name))
-    total, count = sum(size for _, size, _ in found), len(found)
-    for _, size, name in sorted(found):
+                entries.append((status.st_mtime, status.st_size, name))
+    total, count = sum(size for _, size, _ in entries), len(entries)
+    for _, size, name in sorted(entries):
         if total <= LARGEST_TOTAL and count <= MOST_ENTRIES:
             break
         with suppress(OSError):

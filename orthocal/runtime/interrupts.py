@@ -1,7 +1,8 @@
-"""Ctrl-C where an exception alone would not do: inside C++, and between two renames.
+"""Ctrl-C where an exception is not enough: inside C++ code, during a fork, between two renames.
 
-Of the libraries in C++ some swallow a KeyboardInterrupt, some take it for a failed import or a
-wrong argument, and one aborts the process. So the command line does not raise any: it ends.
+Some C++ libraries swallow a KeyboardInterrupt, some report it as a failed import or a wrong
+argument, and one aborts the process. Python itself swallows one that is raised in a destructor or
+in a hook of `os.fork`. The command line therefore raises none: its process ends.
 """
 
 from __future__ import annotations
@@ -10,18 +11,35 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from types import FrameType
 from typing import Any
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+"""Exit code after Ctrl-C, as in shells."""
 
 Handler = Callable[[int, FrameType | None], Any]
 
 
+_MESSAGE: ContextVar[str] = ContextVar("message at an interrupt", default="")
+
+
 def _end(number: int, frame: FrameType | None) -> None:
+    if message := _MESSAGE.get():
+        with suppress(OSError):
+            os.write(2, f"{message}\n".encode())
     os._exit(INTERRUPTED)
+
+
+@contextmanager
+def message_at_interrupt(message: str) -> Iterator[None]:
+    """Print a message if Ctrl-C ends the process inside the block."""
+    token = _MESSAGE.set(message)
+    try:
+        yield
+    finally:
+        _MESSAGE.reset(token)
 
 
 @contextmanager
@@ -40,9 +58,9 @@ def ending_at_interrupt() -> Iterator[None]:
 
 @contextmanager
 def raised_interrupt() -> Iterator[None]:
-    """Raise a KeyboardInterrupt at Ctrl-C within, though the process would end elsewhere.
+    """Raise a KeyboardInterrupt at Ctrl-C inside the block, where the process would end elsewhere.
 
-    For what has something to clear away: files that are written only in part, another process.
+    For code that has something to clean up: partly written files, another process.
     """
     if signal.getsignal(signal.SIGINT) is not _end:
         yield
@@ -56,7 +74,7 @@ def raised_interrupt() -> Iterator[None]:
 
 @contextmanager
 def noticed_interrupt() -> Iterator[None]:
-    """Raise the KeyboardInterrupt of a Ctrl-C within, even if the code there swallowed it.
+    """Raise the KeyboardInterrupt of a Ctrl-C inside the block, even if code there swallowed it.
 
     CasADi stops its solver at one. It then returns as if the solver had not converged, goes on, or
     (Python 3.13) raises a SystemError because the interrupt is still pending.
@@ -64,47 +82,64 @@ def noticed_interrupt() -> Iterator[None]:
     Raises:
         KeyboardInterrupt: At the end, if there was a Ctrl-C.
     """
-    with _watched(pass_on=True) as seen:
+    with _recorded_interrupts(pass_on=True) as received:
         try:
             yield
         except Exception:
-            if seen:
+            if received:
                 raise KeyboardInterrupt from None
             raise
-        if seen:
+        if received:
             raise KeyboardInterrupt
 
 
 @contextmanager
 def postponed_interrupt() -> Iterator[None]:
-    """Let a Ctrl-C within count at the end only: for a few calls that belong together."""
-    with _watched(pass_on=False) as seen:
+    """Postpone a Ctrl-C to the end of the block: for a few calls that belong together."""
+    with _recorded_interrupts(pass_on=False) as received:
         yield
-    if seen:
+    if received:
         raise KeyboardInterrupt
 
 
 @contextmanager
-def _watched(*, pass_on: bool) -> Iterator[list[int]]:
-    """Note every SIGINT in a list.
+def blocked_interrupt() -> Iterator[None]:
+    """Let the operating system hold a Ctrl-C back to the end of the block.
 
-    Only the main thread can, and only where the handler is one of Python's: else nothing is noted.
+    Processes that are started inside the block inherit this: no Ctrl-C reaches them before they
+    have chosen what to do about it, and none is lost in the parent.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous)
+
+
+@contextmanager
+def _recorded_interrupts(*, pass_on: bool) -> Iterator[list[int]]:
+    """Record every SIGINT in a list.
+
+    Only the main thread can, and only where the handler is a Python function.
     """
     previous = signal.getsignal(signal.SIGINT)
-    seen: list[int] = []
+    received: list[int] = []
     if not callable(previous) or not _in_main_thread():
-        yield seen
+        yield received
         return
     handler: Handler = previous
 
-    def note(number: int, frame: FrameType | None) -> None:
-        seen.append(number)
+    def record(number: int, frame: FrameType | None) -> None:
+        received.append(number)
         if pass_on:
             handler(number, frame)
 
-    signal.signal(signal.SIGINT, note)
+    signal.signal(signal.SIGINT, record)
     try:
-        yield seen
+        yield received
     finally:
         signal.signal(signal.SIGINT, previous)
 

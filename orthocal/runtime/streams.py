@@ -1,4 +1,4 @@
-"""The standard streams of a process: closed, full, or with nobody who reads them any more."""
+"""Standard streams that are closed, on a full disk, or without a reader."""
 
 from __future__ import annotations
 
@@ -14,51 +14,51 @@ from orthocal.text import printable
 
 
 class ReaderGoneError(Exception):
-    """Whoever read the standard output has had enough, as `head` has: no error of anybody."""
+    """The reader of the standard output has closed it, as `head` does; this is not an error."""
 
 
 class _Guarded(io.TextIOBase):
-    """A standard stream whose failures are told in words of this program.
+    """A standard stream that raises orthocal's errors.
 
     Args:
-        stream: The stream, or None for one that was closed when the process began.
+        stream: The stream, or None if it was closed when the process started.
     """
 
     def __init__(self, stream: TextIO | None) -> None:
         self._stream = stream
         self._failure: Exception | None = None
-        """What went wrong first: it stays so, though somebody on the way may have swallowed it."""
+        """First failure; it is raised again if a library swallowed it."""
 
     @property
     def encoding(self) -> str:  # type: ignore[override] # a property there, too, but in C
-        """Of the stream."""
+        """Encoding of the stream."""
         return "utf-8" if self._stream is None else self._stream.encoding
 
     @property
     def errors(self) -> str:  # type: ignore[override] # likewise
-        """What it does with characters that it does not have."""
+        """Error handler of the encoding."""
         return "strict" if self._stream is None else self._stream.errors or "strict"
 
     def isatty(self) -> bool:
-        """Whether it is a terminal."""
+        """True for a terminal."""
         return self._stream is not None and self._stream.isatty()
 
     def fileno(self) -> int:
-        """Its descriptor."""
+        """Descriptor of the stream."""
         if self._stream is None:
             raise io.UnsupportedOperation("fileno")
         return self._stream.fileno()
 
     def writable(self) -> bool:
-        """It is written to."""
+        """True."""
         return True
 
     def write(self, text: str) -> int:
         """Write a text.
 
         Raises:
-            ReaderGoneError: If nobody reads it any more.
-            OutputError: If it cannot be written.
+            ReaderGoneError: If the reader has closed the stream.
+            OutputError: If the text cannot be written.
         """
         if text and self._stream is None:
             self._failure = _unwritable("it is closed")
@@ -66,7 +66,7 @@ class _Guarded(io.TextIOBase):
         return len(text)
 
     def flush(self) -> None:
-        """Write what was kept so far; raises as `write` does."""
+        """Write buffered text; raises as `write` does."""
         self._try(lambda stream: stream.flush())
 
     def _try(self, act: Callable[[TextIO], object]) -> None:
@@ -82,7 +82,7 @@ class _Guarded(io.TextIOBase):
             raise self._failure
 
     def _abandon(self) -> None:
-        """Let what is still kept go nowhere: Python writes it when it ends."""
+        """Discard buffered text, which Python would write when it ends."""
         with suppress(OSError, ValueError, io.UnsupportedOperation):
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, self.fileno())
@@ -90,13 +90,13 @@ class _Guarded(io.TextIOBase):
 
 
 class _Silent(_Guarded):
-    """The same for the stream of errors: where that cannot be written nothing else can be told.
+    """Standard error: failures are ignored, because they cannot be reported anywhere.
 
-    Whatever is written to it, by whichever library, steers no terminal.
+    Control characters are escaped, whichever library writes them.
     """
 
     def write(self, text: str) -> int:
-        """Write a text, its control characters as escapes."""
+        """Write a text with escaped control characters."""
         super().write(printable(text, keep="\n\t"))
         return len(text)
 
@@ -111,21 +111,21 @@ def _unwritable(reason: str) -> OutputError:
 
 @contextmanager
 def guarded_streams() -> Iterator[None]:
-    """Guard the standard streams of this process, and take a closed one's place.
+    """Guard the standard streams of this process, and open the closed ones on the null device.
 
-    Else the next file that is opened would get its number, and whatever C++ code has to say.
+    Otherwise the next opened file would receive their descriptors, and the output of C++ code.
     """
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
-    before = sys.stdout, sys.stderr
-    for stream in before:  # a terminal without ± prints a question mark
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free descriptor
+    original = sys.stdout, sys.stderr
+    for stream in original:  # a terminal without ± prints a question mark
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    sys.stdout, sys.stderr = _Guarded(before[0]), _Silent(before[1])
+    sys.stdout, sys.stderr = _Guarded(original[0]), _Silent(original[1])
     try:
         yield
     finally:
-        sys.stdout, sys.stderr = before
+        sys.stdout, sys.stderr = original

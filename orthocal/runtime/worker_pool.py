@@ -1,7 +1,8 @@
-"""Work on the cores of this machine, in processes that end with the one that asked.
+"""One pool of worker processes on this machine; the workers end with the process that started them.
 
-Where a process has but one thread it is doubled (fork): each worker then has all that was loaded
-and prepared before, and begins at once. Elsewhere workers begin from nothing (joblib).
+On Linux a process with one thread is forked: the workers share everything that is loaded and
+prepared, and begin at once. Elsewhere joblib starts new processes and sends them pickled work.
+Workers ignore Ctrl-C: the process that started them ends them.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import cache
@@ -22,83 +24,82 @@ from multiprocessing.context import ForkProcess
 from typing import Any, TypeVar
 
 from orthocal.errors import OrthocalError
+from orthocal.runtime.interrupts import blocked_interrupt
 
-WATCHING = 0.5
-"""How often a worker looks whether it is still wanted, [s]."""
+PARENT_CHECK_INTERVAL = 0.5
+"""Time between two checks of a worker whether its parent is alive, [s]."""
 
-_LENT: ContextVar[int] = ContextVar("cores that may be used", default=1)
+_BUDGET: ContextVar[int] = ContextVar("worker budget", default=1)
 
 T = TypeVar("T")
 
 Work = Callable[[int], T]
-"""What is done of a task, by its number. Where no process can be doubled it is pickled."""
+"""Result of a task by its number. It is pickled where processes cannot be forked."""
 
 
 def available_cores() -> int:
-    """Cores that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def run_on_cores(
-    work: Work[T], todo: Sequence[int], workers: int, *, killed: str
-) -> Iterator[tuple[int, T]]:
-    """What comes out of tasks as they end, in whichever order.
-
-    Args:
-        work: What is done of each.
-        todo: Numbers of the tasks.
-        workers: How many processes; with one, or one task, this one does all, in order.
-        killed: What is said if one of them is killed.
-
-    Raises:
-        OrthocalError: If a worker is killed.
-    """
-    count = min(workers, len(todo))
-    if count <= 1:
-        return ((task, work(task)) for task in todo)
-    if can_fork():
-        return _forked(work, todo, count, killed)
-    return _spawned(work, todo, count)
-
-
 @contextmanager
-def lent(count: int) -> Iterator[None]:
-    """Let what is computed within the block use so many cores, where it can."""
-    before = _LENT.set(count)
+def worker_budget(count: int) -> Iterator[None]:
+    """Allow the code inside the block up to `count` processes."""
+    token = _BUDGET.set(count)
     try:
         yield
     finally:
-        _LENT.reset(before)
+        _BUDGET.reset(token)
 
 
-def lent_cores() -> int:
-    """How many cores may be used here: one, unless somebody lends more."""
-    return _LENT.get()
+def current_worker_budget() -> int:
+    """Number of processes that may be used here: 1 unless a caller allows more."""
+    return _BUDGET.get()
 
 
-def call_on_cores(
-    calls: Sequence[Callable[[], Any]], *, killed: str = "a process was killed"
-) -> tuple[Any, ...]:
-    """What functions return, called side by side on the cores that are lent.
-
-    Where processes cannot be doubled they are called one after the other.
+def run_in_parallel(
+    work: Work[T], tasks: Sequence[int], workers: int, *, killed: str
+) -> Iterator[tuple[int, T]]:
+    """Numbers and results of tasks in the order in which they end.
 
     Args:
-        calls: The functions, those first that take longest; what they return is pickled.
-        killed: What is said if one of the processes is killed.
+        work: Result of a task by its number.
+        tasks: Numbers of the tasks.
+        workers: Number of processes. With one worker or one task, this process runs all in order.
+        killed: Message if a worker is killed.
 
     Raises:
         OrthocalError: If a worker is killed.
     """
-    count = min(lent_cores(), len(calls))
-    if count <= 1 or not can_fork():
-        return tuple(call() for call in calls)
-    found = dict(_forked(lambda k: calls[k](), range(len(calls)), count, killed))
-    return tuple(found[k] for k in range(len(calls)))
+    count = min(workers, len(tasks))
+    if count <= 1:
+        return ((task, work(task)) for task in tasks)
+    if can_fork():
+        return _run_forked(work, tasks, count, killed)
+    return _run_spawned(work, tasks, count, killed)
+
+
+def call_in_parallel(
+    calls: Sequence[Callable[[], Any]], *, killed: str = "a worker process was killed"
+) -> tuple[Any, ...]:
+    """Results of functions, called in parallel within the worker budget.
+
+    They are called one after the other where processes cannot be forked.
+
+    Args:
+        calls: The functions, the slowest first. Their results are pickled.
+        killed: Message if a worker is killed.
+
+    Raises:
+        OrthocalError: If a worker is killed.
+    """
+    count = min(current_worker_budget(), len(calls)) if can_fork() else 1
+    results = dict(run_in_parallel(lambda k: calls[k](), range(len(calls)), count, killed=killed))
+    return tuple(results[k] for k in range(len(calls)))
 
 
 def can_fork() -> bool:
-    """Whether this process may be doubled: what another thread holds would stay held for ever."""
+    """True if a fork is safe: with one thread, no lock stays locked in the child."""
     if sys.platform != "linux" or threading.active_count() > 1:
         return False
     try:
@@ -107,68 +108,75 @@ def can_fork() -> bool:
         return False
 
 
-def _forked(
-    work: Work[T], todo: Sequence[int], workers: int, killed: str
+def _run_forked(
+    work: Work[T], tasks: Sequence[int], workers: int, killed: str
 ) -> Iterator[tuple[int, T]]:
-    context, rest = multiprocessing.get_context("fork"), list(reversed(todo))
+    context, waiting = multiprocessing.get_context("fork"), list(reversed(tasks))
     running: dict[Connection[Any, Any], ForkProcess] = {}
     try:
         for _ in range(workers):
-            ours, theirs = context.Pipe()
-            asked = (work, theirs, os.getpid())
-            process = context.Process(target=_serve, args=asked, daemon=True)
-            process.start()
-            theirs.close()
-            running[ours] = process
-            ours.send(rest.pop())
+            connection, remote = context.Pipe()
+            arguments = (work, remote, os.getpid())
+            process = context.Process(target=_serve, args=arguments, daemon=True)
+            with blocked_interrupt():  # else the fork may swallow one, or print it in the worker
+                process.start()
+                running[connection] = process
+            remote.close()
+            connection.send(waiting.pop())
         while running:
             ready = wait(list(running))
-            for ours in [c for c in running if c in ready]:
-                yield _answer(ours, killed)
-                if rest:
-                    ours.send(rest.pop())
+            for connection in [c for c in running if c in ready]:
+                yield _receive(connection, killed)
+                if waiting:
+                    connection.send(waiting.pop())
                 else:
-                    ours.close()
-                    running.pop(ours).join()
+                    connection.close()
+                    running.pop(connection).join()
     finally:
-        for ours, process in running.items():
+        for connection, process in running.items():
             process.kill()
             process.join()
-            ours.close()
+            connection.close()
 
 
-def _answer(ours: Connection[Any, Any], killed: str) -> Any:  # noqa: ANN401 - what work makes
+def _receive(connection: Connection[Any, Any], killed: str) -> Any:  # noqa: ANN401 - a result
     try:
-        done = ours.recv()
+        answer = pickle.loads(connection.recv_bytes())
     except (EOFError, ConnectionError):
         raise OrthocalError(killed) from None
-    if isinstance(done, BaseException):
-        raise done
-    return done
+    if isinstance(answer, BaseException):
+        raise answer
+    return answer
 
 
-def _serve(work: Work[Any], theirs: Connection[Any, Any], parent: int) -> None:
-    """Do what is asked for until there is no more of it."""
-    _LENT.set(1)  # the others are busy
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    for descriptor in map(int, os.listdir("/proc/self/fd")):
-        if descriptor > 2 and descriptor != theirs.fileno():
-            with suppress(OSError):  # what the other one holds, its lock among it, is its own
-                os.close(descriptor)
-    _end_with(parent)
-    while True:
-        try:
-            task = theirs.recv()
-        except EOFError:
-            os._exit(0)
-        try:
-            theirs.send((task, work(task)))
-        except Exception as e:  # whatever it is, it is raised where it was asked for
-            theirs.send(_sendable(e))
+def _serve(work: Work[Any], connection: Connection[Any, Any], parent: int) -> None:
+    """Answer the requests of the parent until it closes the connection or is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _BUDGET.set(1)  # the other cores are busy
+    try:
+        for descriptor in map(int, os.listdir("/proc/self/fd")):
+            if descriptor > 2 and descriptor != connection.fileno():
+                with suppress(OSError):  # an inherited file would keep the parent's lock on it
+                    os.close(descriptor)
+        _end_with(parent)
+        while True:
+            connection.send_bytes(_answer(work, connection.recv()))
+    except (EOFError, OSError):
+        pass
+    finally:  # without the parent's cleanup, and without a traceback
+        os._exit(0)
 
 
-def _sendable(error: Exception) -> Exception:
-    """An error as it is, or what it says where it cannot be sent."""
+def _answer(work: Work[Any], task: int) -> bytes:
+    """Number and result of a task, or the error that the parent raises again; pickled."""
+    try:
+        return pickle.dumps((task, work(task)))
+    except Exception as e:
+        return pickle.dumps(_picklable(e))
+
+
+def _picklable(error: Exception) -> Exception:
+    """The error itself, or its text where it cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:  # pickling runs the error's own code
@@ -176,26 +184,33 @@ def _sendable(error: Exception) -> Exception:
     return error
 
 
-def _spawned(work: Work[T], todo: Sequence[int], workers: int) -> Iterator[tuple[int, T]]:
+def _run_spawned(
+    work: Work[T], tasks: Sequence[int], workers: int, killed: str
+) -> Iterator[tuple[int, T]]:
     from joblib import Parallel, delayed, parallel_config
 
-    with parallel_config(backend="loky", inner_max_num_threads=1):
-        parallel = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)
-        yield from parallel(delayed(_in_worker)(work, task, os.getpid()) for task in todo)
+    parent = os.getpid()
+    try:
+        with parallel_config(backend="loky", inner_max_num_threads=1), blocked_interrupt():
+            parallel = Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)
+            results = parallel(delayed(_work_and_watch)(work, task, parent) for task in tasks)
+        yield from results
+    except BrokenProcessPool:
+        raise OrthocalError(killed) from None
 
 
-def _in_worker(work: Work[T], task: int, parent: int) -> tuple[int, T]:
+def _work_and_watch(work: Work[T], task: int, parent: int) -> tuple[int, T]:
     _end_with(parent)
     return task, work(task)
 
 
 @cache
 def _end_with(parent: int) -> None:
-    """End this process when the one that asked for its work is gone: killed, it cannot say so."""
+    """End this process when its parent is gone: a killed parent cannot end it."""
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(WATCHING)
+            time.sleep(PARENT_CHECK_INTERVAL)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

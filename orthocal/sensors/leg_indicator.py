@@ -57,7 +57,7 @@ zero. What touches a line has no side that an oblique plunger could slide on."""
 class SectionKeys(BaseModel):
     """Where along the leg's nominal axis the gauge touches."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     coordinate_mm: Number | None = None
     from_root_mm: Number | None = None

@@ -42,7 +42,7 @@ Milliradians = Annotated[Number, Field(ge=0.0, le=LARGEST_TOLERANCE_MRAD)]
 class StandingKeys(BaseModel):
     """What a setup may say of how well its gauge stands; 0 where it is known exactly."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     direction_tolerance_mrad: Milliradians = DIRECTION / MRAD
     section_tolerance_mm: Millimetres = SECTION / MM

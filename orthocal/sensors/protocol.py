@@ -95,7 +95,7 @@ class Contact:
 class SetupKeys(BaseModel):
     """What a session.yaml may say of a setup, whatever stands there."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     sensor: str = "leg"
     """The kind of sensor."""

@@ -68,7 +68,7 @@ def touch_by_ball(*, at: ca.SX, along: ca.SX, radius: ca.SX, tip: ca.SX, directi
 class BallKeys(BaseModel):
     """A ball at the end of a plunger."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     radius_mm: Annotated[PositiveNumber, Field(le=LARGEST_TIP_MM)]
 
@@ -76,7 +76,7 @@ class BallKeys(BaseModel):
 class BladeKeys(BaseModel):
     """A straight edge across a rod."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     width_mm: Annotated[PositiveNumber, Field(le=LARGEST_TIP_MM)]
     radius_mm: Annotated[Number, Field(ge=0.0, le=LARGEST_TIP_MM)] = 0.0
@@ -86,7 +86,7 @@ class BladeKeys(BaseModel):
 class TipKeys(BaseModel):
     """What touches, as in a session.yaml: one of them."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     ball: BallKeys | None = None
     blade: BladeKeys | None = None

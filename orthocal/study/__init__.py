@@ -1,1 +1,1 @@
-"""What if: many machines, many readings, run by as many workers as there are."""
+"""Studies of many simulated machines or resampled readings, run in parallel."""

@@ -1,7 +1,7 @@
-"""How good a calibration leaves machines: many are drawn, read by a plan and calibrated.
+"""Study of accuracy: random machines are measured by a plan and calibrated.
 
-Each machine has its errors, its gauges stand as they may, and its readings have noise and rounding.
-What is identified may be less than what machines have wrong.
+Each machine has random errors, its gauges have random mounting errors, and its readings are noisy
+and rounded. The calibration may identify fewer errors than the machine has.
 """
 
 from __future__ import annotations
@@ -15,152 +15,184 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.errors import ClosureError, SolverError
-from orthocal.estimation.choice import Choice
+from orthocal.errors import ClosureError, SessionError, SolverError
+from orthocal.estimation.choice import Choice, choose
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.estimation.solvers.machine_readings import Fleet
 from orthocal.kinematics.loop_closure import Assembly
-from orthocal.kinematics.machine_batch import Machines
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace, gauss_cube
 from orthocal.observation.simulate import limits_of, show_readings
 from orthocal.planning.expected_error import (
     Expected,
     ToolForecast,
+    default_workspace,
     noise_of,
     weigh_readings,
 )
 from orthocal.robot.model import Robot
+from orthocal.robot.parameters import Parameter, ParameterSet
 from orthocal.session.session import Session
-from orthocal.study.shipped_functions import ShippedSession
+from orthocal.study.batch import (
+    columns_in_edge_units,
+    estimate_batch,
+    predict_batch,
+    tool_positions,
+)
+from orthocal.study.portable_session import PortableSession
+from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, prepare_once
 from orthocal.units import UM
 
 Array = NDArray[np.float64]
 
-MACHINES_A_TASK = 100
+PREDICTED_MACHINES = 60
+"""Machines over which the prediction is averaged: the Jacobian differs from machine to machine."""
 
-FORETOLD = 60
-"""Machines of which the mean is what is foretold: each is another one to first order."""
+PILOT_MACHINES = 9
+"""Machines whose residuals give the weight of a reading where the model omits errors."""
 
-PILOTS = 9
-"""Machines that tell by what readings are weighed where the model leaves errors out."""
-
-GOOD = "calibrated"
-NO_CONTACT = "a tip passes what it should touch"
-OUT_OF_RANGE = "a reading leaves the gauge's range"
-NO_MACHINE = "cannot be assembled in every posture"
-NO_SOLUTION = "the calibration does not converge"
+CALIBRATED = "calibrated"
+NO_CONTACT = "a tip misses the part it should touch"
+OUT_OF_RANGE = "a reading exceeds the gauge's range"
+NOT_ASSEMBLED = "the machine cannot be assembled in every posture"
+NOT_CONVERGED = "the calibration does not converge"
 
 
 @dataclass(frozen=True, eq=False)
 class AccuracyStudy(Study):
-    """Machines that are calibrated from the readings of a plan."""
+    """Random machines that are calibrated from the readings of a plan."""
 
     kind: ClassVar[str] = "accuracy"
     counted: ClassVar[str] = "machines"
+    cases_per_task: ClassVar[int] = 100
 
-    session: ShippedSession
-    """What is read where; readings do not matter."""
+    session: PortableSession
+    """The planned readings; their values are not used."""
     choice: Choice
-    """What is identified."""
+    """Identified errors."""
     drawn: tuple[str, ...]
-    """Errors that differ from machine to machine: names of parameters."""
-    tolerances: Mapping[str, float]
-    """Their standard deviations, [SI]."""
-    given: Mapping[str, float]
+    """Names of the errors that are random."""
+    prior_std: Mapping[str, float]
+    """Standard deviations of the random errors, [SI]."""
+    fixed: Mapping[str, float]
     """Errors that all machines have, [SI]."""
     machines: int
     seed: int
     half_side: float
-    """Of the cube in which the tool's error counts, [m]."""
+    """Half side of the cube in which the tool error is evaluated, [m]."""
 
     @property
     def record(self) -> dict[str, Any]:
-        """All that the table depends on."""
+        """Everything that the table depends on."""
         return {
             **self.session.record,
             "choice": self.choice.document,
-            "drawn": {n: self.tolerances[n] for n in self.drawn},
-            "given": dict(self.given),
+            "drawn": {n: self.prior_std[n] for n in self.drawn},
+            "fixed": dict(self.fixed),
             "machines": self.machines,
             "seed": self.seed,
             "half_side": self.half_side,
         }
 
     @property
-    def task_sizes(self) -> tuple[int, ...]:
-        """Machines of each task."""
-        whole, rest = divmod(self.machines, MACHINES_A_TASK)
-        return (MACHINES_A_TASK,) * whole + ((rest,) if rest else ())
+    def count(self) -> int:
+        """Number of machines."""
+        return self.machines
 
     def prepare(self) -> _Prepared:
-        """Problems of what is identified and of what machines have wrong, and the tool."""
+        """Problems of the identified and of all errors, and the workspace."""
         return _Prepared.of(self)
 
     def run(self, prepared: _Prepared, task: int) -> Columns:
-        """Errors that are left of each machine."""
-        first = task * MACHINES_A_TASK
-        numbers = range(first, first + self.task_sizes[task])
-        return _Calibrated.of(self, prepared, numbers).columns(prepared)
+        """Errors of each machine before and after its calibration."""
+        numbers = self.case_numbers(task)
+        p, measured = prepared, prepared.measure(self, numbers)
+        status = measured.status
+        theta = np.full((len(numbers), p.problem.n_free), np.nan)
+        good = np.flatnonzero(status == CALIBRATED)
+        if good.size:
+            values = measured.values[good]
+            theta[good], converged = estimate_batch(p.program, p.problem, values, p.sigma)
+            _set_reason(status, good[~converged], NOT_CONVERGED)
+        before, after = p.tool_errors(measured.errors, theta, status)
+        theta[status != CALIBRATED] = np.nan
+        aligned = p.align(after)
+        weights = p.workspace.weights
+
+        def rms(field: Array) -> list[float]:
+            return list(np.sqrt(weights @ (field**2).sum(axis=1)) / UM)
+
+        true = p.identified_part(measured.errors)
+        estimate = theta[:, : p.problem.n_machine]
+        true_columns = columns_in_edge_units("true.", p.problem, true)
+        error_columns = columns_in_edge_units("error.", p.problem, estimate - true)
+        pairs = zip(true_columns.items(), error_columns.items(), strict=True)
+        return {
+            "machine": list(numbers),
+            "status": list(status),
+            "before_um": rms(p.align(before)),
+            "tool_um": rms(aligned),
+            "tool_shift_out_um": rms(p.workspace.remove_shift(after)),
+            "tool_absolute_um": rms(after),
+            "tool_worst_um": list(np.sqrt((aligned**2).sum(axis=1).max(axis=0)) / UM),
+            **dict(column for pair in pairs for column in pair),
+        }
 
     @cached_property
-    def foretold(self) -> Expected:
-        """What is to be expected of such machines, by the analytic covariance about some of them.
+    def predicted(self) -> Expected:
+        """Predicted tool error of such machines, from the covariance at a sample of them.
 
-        Errors that are not identified are taken as they are drawn.
+        Errors that are not identified count with their prior covariance.
         """
         p: _Prepared = prepare_once(self)
-        others = {n: self.tolerances[n] for n in self.drawn}
+        others = {n: self.prior_std[n] for n in self.drawn}
         forecast = ToolForecast(p.robot, p.problem.machine_selection, p.workspace, others=others)
-        count = min(FORETOLD, self.machines)
-        machines = [self._identified(p, number) for number in range(count)]
+        count = min(PREDICTED_MACHINES, self.machines)
+        machines = [self._true_parameters(p, number) for number in range(count)]
         return forecast.after(p.session, weight=p.sigma, machines=machines)
 
     def draw(self, prepared: _Prepared, number: int) -> tuple[Array, np.random.Generator]:
-        """θ̂ of a machine and its gauges, and what draws its noise."""
+        """Scaled true errors of a machine and its gauges, and the generator of its noise."""
         rng = np.random.default_rng((self.seed, number))
         return rng.normal(size=prepared.truth.n_free), rng
 
-    def _identified(self, prepared: _Prepared, number: int) -> Array:
-        """What a machine's parameters and gauges really are, as far as they are identified."""
-        truth = prepared.truth
+    def _true_parameters(self, prepared: _Prepared, number: int) -> Array:
+        """True values of the identified parameters and of the nuisance parameters, [SI]."""
+        truth, n = prepared.truth, prepared.truth.n_machine
         drawn, _ = self.draw(prepared, number)
-        errors = truth.assembly.errors(
-            truth.theta_scale[: truth.n_machine] * drawn[: truth.n_machine]
-        )
-        own = drawn[truth.n_machine :] * truth.theta_scale[truth.n_machine :]
-        return np.append(prepared.true_values(errors[None])[0], own)
+        scaled = drawn * truth.theta_scale
+        errors = truth.assembly.errors(scaled[:n])
+        return np.append(prepared.identified_part(errors[None])[0], scaled[n:])
 
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """What all machines share."""
+    """Data shared by all machines."""
 
     session: Session
     problem: CalibrationProblem
-    """Of what is identified."""
+    """Of the identified errors."""
     truth: CalibrationProblem
-    """Of all that machines have wrong."""
+    """Of all errors that machines have."""
     program: BatchProgram
-    """With what all machines share."""
     workspace: Workspace
     drives: Array
-    """Commanded for the points of the workspace, shape (K, n_drives)."""
+    """Commanded for the points of the workspace, shape (K, n_drives), [m, rad]."""
     passive: Array
+    """Passive coordinates of the nominal machine there, shape (K, n_passive), [m, rad]."""
     positions: Array
-    """Of the tool of the nominal machine there, shape (K, 3), [m]."""
+    """Tool positions of the nominal machine there, shape (K, 3), [m]."""
     limits: Array
-    """Lowest and highest value of each row, shape (2, n_rows), [m]."""
+    """Smallest and largest value of each row, shape (2, n_rows), [m]."""
     sigma: float
-    """Standard deviation by which readings are weighed, [m]."""
+    """Standard deviation that weights a reading, [m]."""
 
     @property
     def robot(self) -> Robot:
-        """The robot."""
+        """The nominal robot."""
         return self.session.robot
 
     @classmethod
@@ -172,55 +204,75 @@ class _Prepared:
         assembly = Assembly(robot)
         nominal = assembly.inverse(workspace.points)
         drives = nominal - session.active_offsets
-        passive = assembly.close(drives)
         limits = [limits_of(session, r) or (-np.inf, np.inf) for r in session.readings]
-        found = cls(
+        prepared = cls(
             session=session,
             problem=problem,
-            truth=CalibrationProblem(session, _truth(study, robot), noise=problem.noise),
+            truth=CalibrationProblem(session, _true_selection(study, robot), noise=problem.noise),
             program=BatchProgram(problem),
             workspace=workspace,
             drives=drives,
-            passive=passive,
+            passive=assembly.close(drives),
             positions=assembly.tcp(nominal, assembly.close(nominal)),
             limits=np.array(limits).T,
             sigma=noise_of(session),
         )
-        found = replace(found, sigma=_weight(study, found))
-        good = np.zeros((0, problem.observations.size))
-        if found.program.takes_values:
-            read = found.read(study, range(min(MACHINES_A_TASK, study.machines)))
-            good = read.values[read.status == GOOD]
-            if not len(good):
-                return found
-        program = found.program.fixed_by(good, sigma=found.sigma, count=study.machines)
-        return replace(found, program=program)
+        prepared = replace(prepared, sigma=_weighting_sigma(study, prepared))
+        sample = np.zeros((0, problem.observations.size))
+        if prepared.program.takes_values:
+            numbers = range(min(study.cases_per_task, study.machines))
+            measured = prepared.measure(study, numbers)
+            sample = measured.values[measured.status == CALIBRATED]
+            if not len(sample):
+                return prepared
+        program = prepared.program.fixed_by(sample, sigma=prepared.sigma, count=study.machines)
+        return replace(prepared, program=program)
 
-    def read(self, study: AccuracyStudy, numbers: Sequence[int]) -> _Read:
-        """Machines, and what dials show of them."""
-        drawn, generators = zip(*(study.draw(self, n) for n in numbers), strict=True)
-        fleet, o = Fleet(self.truth, np.array(drawn)), self.problem.observations
-        status = np.where(fleet.close(), GOOD, NO_MACHINE).astype(object)
-        entries = fleet.predict() * self.problem.noise
+    def measure(self, study: AccuracyStudy, numbers: Sequence[int]) -> _Measured:
+        """Random machines and their readings."""
+        draws, generators = zip(*(study.draw(self, n) for n in numbers), strict=True)
+        theta, o, truth = np.array(draws), self.problem.observations, self.truth
+        predicted, closed = predict_batch(truth, theta)
+        status = np.where(closed, CALIBRATED, NOT_ASSEMBLED).astype(object)
+        entries = predicted * self.problem.noise
         for i, rng in enumerate(generators):
             entries[i], _ = show_readings(self.session, o, entries[i], rng=rng)
-        _mark(status, np.asarray(~np.isfinite(entries).all(axis=1)), NO_CONTACT)
+        _set_reason(status, np.asarray(~np.isfinite(entries).all(axis=1)), NO_CONTACT)
         rows = np.array([o.rows(v) for v in entries])
         beyond = (rows < self.limits[0]) | (rows > self.limits[1])
-        _mark(status, np.asarray(beyond.any(axis=1)), OUT_OF_RANGE)
-        truth = self.truth
-        machines = np.array(drawn)[:, : truth.n_machine]
-        return _Read(
-            truth.assembly.errors() + machines @ truth.columns.T,
-            entries / self.problem.noise,
-            rows,
-            status,
-        )
+        _set_reason(status, np.asarray(beyond.any(axis=1)), OUT_OF_RANGE)
+        errors = truth.assembly.errors() + theta[:, : truth.n_machine] @ truth.columns.T
+        return _Measured(errors, entries / self.problem.noise, rows, status)
 
-    def true_values(self, errors: Array) -> Array:
-        """What identified parameters really are, shape (n_sets, n_machine), [SI].
+    def tool_errors(
+        self, true: Array, theta: Array, status: NDArray[np.object_]
+    ) -> tuple[Array, Array]:
+        """Tool errors before and after calibration, each of shape (K, 3, n_sets), [m].
 
-        Of a sum of errors that differ from each other, the sum that is nearest to them.
+        Args:
+            true: All elementary errors, shape (n_sets, n_errors), [SI].
+            theta: Estimates, shape (n_sets, n_free), [SI].
+            status: Changed where the loops of a machine do not close.
+        """
+        names = self.problem.machine_selection.names
+        columns = self.problem.compiled.errors.columns(names)
+        estimated = self.problem.assembly.errors() + theta[:, : len(names)] @ columns.T
+        good = np.flatnonzero(status == CALIBRATED)
+        tools = np.full((2, *self.positions.shape, len(status)), np.nan)
+        for tool, errors in zip(tools, (true, estimated), strict=True):
+            if good.size:
+                positions, closed = tool_positions(
+                    self.robot, errors[good], self.drives, self.passive
+                )
+                _set_reason(status, good[~closed], NOT_ASSEMBLED)
+                tool[..., good] = positions
+        tools[..., status != CALIBRATED] = np.nan
+        return tools[0] - self.positions[..., None], tools[0] - tools[1]
+
+    def identified_part(self, errors: Array) -> Array:
+        """True values of the identified parameters, shape (n_sets, n_machine), [SI].
+
+        A parameter that moves several elementary errors has their least-squares value.
 
         Args:
             errors: All elementary errors, shape (n_sets, n_errors), [SI].
@@ -229,92 +281,101 @@ class _Prepared:
         return np.asarray(errors @ (columns / (columns**2).sum(axis=0)))
 
     def align(self, field: Array) -> Array:
-        """Tool errors, shape (K, 3, n), with shift and rotation taken out."""
+        """Tool errors, shape (K, 3, n), with translation and rotation removed."""
         if len(self.positions) < FEWEST_ALIGNED:
             return self.workspace.remove_shift(field)
         return self.workspace.remove_motion(field, self.positions)
 
 
 @dataclass(frozen=True, eq=False)
-class _Read:
-    """Machines, and what dials show of them."""
+class _Measured:
+    """Random machines and their readings."""
 
     errors: Array
     """All elementary errors, shape (n_sets, n_errors), [SI]."""
     values: Array
-    """As single readings, shape (n_sets, n_entries), [m of the first gauge]."""
+    """Single readings, shape (n_sets, n_entries), [m of the first gauge]."""
     rows: Array
-    """As rows of the session, shape (n_sets, n_rows), [m]."""
+    """Rows of the session, shape (n_sets, n_rows), [m]."""
     status: NDArray[np.object_]
-    """GOOD, or why a machine cannot be calibrated, shape (n_sets,)."""
+    """CALIBRATED, or the reason why a machine cannot be calibrated, shape (n_sets,)."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Calibrated:
-    """Machines, and what was identified of them."""
+def build_accuracy_study(
+    session: Session,
+    choice: Choice | str | None = None,
+    *,
+    drawn: Sequence[str] | None = None,
+    fixed: Mapping[str, float] | None = None,
+    machines: int = 1000,
+    seed: int = 0,
+    half_side: float | None = None,
+) -> AccuracyStudy:
+    """A study of the tool error that the readings of a plan leave.
 
-    numbers: Sequence[int]
-    status: list[str]
-    true: Array
-    """What identified parameters really are, shape (n_sets, n_machine), [SI]."""
-    found: Array
-    before: Array
-    """Errors of the tool as it is, shape (K, 3, n_sets), [m]; NaN without result."""
-    after: Array
-    """The same in a controller that knows all that was identified."""
+    Args:
+        session: The planned readings.
+        choice: Identified errors, or the name of a model; default: the session's choice, or `full`.
+            Its prior standard deviations also apply to the random errors.
+        drawn: Names or globs of the random errors; default: all errors of the machine, or none if
+            `fixed` is not empty.
+        fixed: Errors that all machines have, [SI].
+        machines: Number of machines.
+        seed: Seed of errors, gauges and noise.
+        half_side: Half side of the cube in which the tool error is evaluated, [m]; default: the
+            largest reachable cube of at most ±60 mm.
 
-    @classmethod
-    def of(cls, study: AccuracyStudy, p: _Prepared, numbers: Sequence[int]) -> _Calibrated:
-        read = p.read(study, numbers)
-        status, true = read.status, read.errors
-        theta = _identify(p, read.values, status)
-        names = p.problem.machine_selection.names
-        n, columns = len(names), p.problem.compiled.errors.columns(names)
-        errors = p.problem.assembly.errors() + theta[:, :n] @ columns.T
-        good = np.flatnonzero(status == GOOD)
-        tools = np.full((2, *p.positions.shape, len(status)), np.nan)
-        for tool, machines in zip(tools, (true, errors), strict=True):
-            if not good.size:
-                break
-            own = Machines(p.robot, machines[good], p.drives, p.passive)
-            _mark(status, np.isin(np.arange(len(status)), good[~own.close()]), NO_MACHINE)
-            tool[..., good] = np.moveaxis(own.tool(), 0, -1)
-        bad = status != GOOD
-        before, after = tools[0] - p.positions[..., None], tools[0] - tools[1]
-        for values in (before, after):
-            values[..., bad] = np.nan
-        theta[bad] = np.nan
-        return cls(numbers, list(status), p.true_values(true), theta[:, :n], before, after)
-
-    def columns(self, p: _Prepared) -> dict[str, list[Any]]:
-        """A row a machine."""
-        weights = p.workspace.weights
-        aligned = p.align(self.after)
-
-        def rms(field: Array) -> list[float]:
-            return list(np.sqrt(weights @ (field**2).sum(axis=1)) / UM)
-
-        columns: dict[str, list[Any]] = {
-            "machine": list(self.numbers),
-            "status": self.status,
-            "before_um": rms(p.align(self.before)),
-            "tool_um": rms(aligned),
-            "tool_shift_out_um": rms(p.workspace.remove_shift(self.after)),
-            "tool_absolute_um": rms(self.after),
-            "tool_worst_um": list(np.sqrt((aligned**2).sum(axis=1).max(axis=0)) / UM),
-        }
-        for i, parameter in enumerate(p.problem.machine_selection.parameters):
-            name = f"{parameter.name}_{parameter.edge_unit}"
-            columns[f"true.{name}"] = list(self.true[:, i] * parameter.edge_factor)
-            missed = (self.found[:, i] - self.true[:, i]) * parameter.edge_factor
-            columns[f"missed.{name}"] = list(missed)
-        return columns
+    Raises:
+        ParameterError: If a name or a number is invalid.
+        SessionError: If the noise of a gauge is missing.
+        RobotError: If the drives do not command the tool.
+    """
+    chosen = choose(choice, session, usual="full")
+    robot = session.robot
+    parameters = robot.parameters
+    chosen.select(parameters)
+    fixed = dict(fixed or {})
+    if drawn is None:
+        drawn = () if fixed else parameters.patterns("full")
+    names = _without_sums(parameters.select(drawn), parameters) if drawn else ()
+    fixed_terms = {term for n in fixed for term, _ in parameters[n].terms}
+    names = tuple(n for n in names if not fixed_terms & {t for t, _ in parameters[n].terms})
+    stated = parameters.read_tolerances(chosen.tolerances)
+    stated = {n: std for glob, std in stated.items() for n in parameters.select([glob])}
+    for name, gauge in session.gauges.items():
+        if gauge.sigma is None:
+            key = f"gauges.{name}.sigma_mm" if name else "gauge.sigma_mm"
+            raise SessionError(
+                "is missing: the study needs the noise of the gauge",
+                where=key if session.path is None else f"{session.path}: {key}",
+            )
+    if half_side is None:
+        half_side = default_workspace(robot).half_side or 0.0
+    return AccuracyStudy(
+        session=PortableSession.of(session.with_values(np.zeros(len(session.readings)))),
+        choice=chosen,
+        drawn=names,
+        prior_std={n: stated.get(n, parameters[n].tolerance) for n in names},
+        fixed=fixed,
+        machines=machines,
+        seed=seed,
+        half_side=half_side,
+    )
 
 
-def _truth(study: AccuracyStudy, robot: Robot) -> Selection:
-    """All that machines have wrong: what is drawn, by its tolerances, and what is given."""
+def _without_sums(names: Sequence[str], parameters: ParameterSet) -> tuple[str, ...]:
+    """Names without sums of errors that are in the list themselves, and would be drawn twice."""
+    return tuple(
+        n
+        for n in names
+        if len(parameters[n].terms) == 1 or not {t for t, _ in parameters[n].terms} & set(names)
+    )
+
+
+def _true_selection(study: AccuracyStudy, robot: Robot) -> Selection:
+    """All errors of the machines: random ones with their priors, and fixed ones."""
     parameters = tuple(
-        replace(robot.parameters[n], tolerance=study.tolerances[n]) for n in study.drawn
+        replace(robot.parameters[n], tolerance=study.prior_std[n]) for n in study.drawn
     )
     n = len(parameters)
     return Selection(
@@ -324,49 +385,124 @@ def _truth(study: AccuracyStudy, robot: Robot) -> Selection:
         mean=np.zeros(n),
         lower=np.full(n, -np.inf),
         upper=np.full(n, np.inf),
-        fixed=study.given,
+        fixed=study.fixed,
     )
 
 
-def _weight(study: AccuracyStudy, p: _Prepared) -> float:
-    """Standard deviation by which readings are weighed, [m].
+def _weighting_sigma(study: AccuracyStudy, p: _Prepared) -> float:
+    """Standard deviation that weights a reading, [m].
 
-    What is stated of the gauge, unless machines have errors that are not identified: then, as in
-    a calibration, what remains of the readings tells it, of a few machines in the middle.
+    It is the stated noise, unless machines have errors that are not identified. Then the residuals
+    give it, as in a calibration: the median of a few pilot machines.
     """
     columns = p.problem.compiled.errors.columns(p.problem.machine_selection.names)
-    known = columns @ np.linalg.pinv(columns)
-    if np.allclose(known @ p.truth.columns, p.truth.columns, atol=1e-12):
+    projector = columns @ np.linalg.pinv(columns)
+    if np.allclose(projector @ p.truth.columns, p.truth.columns, atol=1e-12):
         return p.sigma
-    numbers = range(min(PILOTS, study.machines))
-    read, found = p.read(study, numbers), []
-    for rows, status in zip(read.rows, read.status, strict=True):
-        if status != GOOD:
-            continue
+    measured = p.measure(study, range(min(PILOT_MACHINES, study.machines)))
+    options, sigmas = SolverOptions(solver="eliminated"), []
+    for rows in measured.rows[measured.status == CALIBRATED]:
         with suppress(SolverError, ClosureError):
-            options = SolverOptions(solver="eliminated")
-            found.append(fit_problem(p.problem.with_values(rows), options=options).sigma)
-    return max(float(np.median(found)), p.sigma) if found else p.sigma
+            sigmas.append(fit_problem(p.problem.with_values(rows), options=options).sigma)
+    return max(float(np.median(sigmas)), p.sigma) if sigmas else p.sigma
 
 
-def _identify(p: _Prepared, values: Array, status: NDArray[np.object_]) -> Array:
-    """θ of each machine that could be read, shape (n_sets, n_free), [SI]; NaN for others."""
-    theta = np.full((len(values), p.problem.n_free), np.nan)
-    good = np.flatnonzero(status == GOOD)
-    if not good.size:
-        return theta
-    sigma = p.sigma
+def _set_reason(status: NDArray[np.object_], which: NDArray[Any], reason: str) -> None:
+    """Record why machines, by flag or index, have no result; an earlier reason stays."""
+    selected = np.zeros(len(status), dtype=np.bool_)
+    selected[which] = True
+    status[selected & (status == CALIBRATED)] = reason
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EstimationError:
+    """Error of the estimates of one parameter."""
+
+    parameter: Parameter
+    rms: float
+    """[SI]"""
+    standard_error: float
+    """Sampling standard error of the RMS, [SI]."""
+    predicted: float
+    """Standard deviation from the covariance, [SI]."""
+    relative: float
+    """RMS divided by the prior standard deviation."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AccuracySummary:
+    """Summary of an accuracy study. Tool errors are aligned RMS errors unless stated."""
+
+    machines: int
+    """Number of calibrated machines."""
+    failed: Mapping[str, int]
+    """Reason to number of machines without a calibration."""
+    before: float
+    """[m]"""
+    after: float
+    """[m]"""
+    standard_error: float
+    """Sampling standard error of `after`, [m]."""
+    percentile_95: float
+    """95th percentile of the machines after calibration, [m]."""
+    worst_point: float
+    """Largest error in the workspace, RMS over the machines, [m]."""
+    shift_removed: float
+    """With the translation removed only, [m]."""
+    absolute: float
+    """[m]"""
+    predicted: Expected | None
+    """None where nothing can be predicted."""
+    parameters: tuple[EstimationError, ...]
+    """Sorted by `relative`, largest first."""
+
+
+def summarise_accuracy(study: AccuracyStudy, table: StudyTable) -> AccuracySummary:
+    """Summary of the table of an accuracy study."""
+    status = np.array(table.columns.get("status", []), dtype=object)
+    good = status == CALIBRATED
+
+    def column(name: str) -> Array:
+        values = np.array(table.columns.get(name, []), dtype=np.float64)
+        return values[good] if values.size else values
+
+    def tool(name: str) -> tuple[float, float]:
+        return _root_mean_square(column(name) * UM)
+
     try:
-        theta[good] = p.program.solve(values[good], sigma=sigma).theta
-    except (SolverError, ClosureError):  # which ones do not converge is found one by one
-        for i in good:
-            try:
-                theta[i] = BatchProgram(p.problem).solve(values[i : i + 1], sigma=sigma).theta[0]
-            except (SolverError, ClosureError):
-                status[i] = NO_SOLUTION
-    return theta
+        predicted = study.predicted if good.any() else None
+    except (ClosureError, np.linalg.LinAlgError):
+        predicted = None
+    errors = []
+    selection = study.choice.select(study.session.unpack().robot.parameters)
+    for i, p in enumerate(selection.parameters):
+        values = column(f"error.{p.name}_{p.edge_unit}") / p.edge_factor
+        rms, standard_error = _root_mean_square(values)
+        std = np.nan if predicted is None else float(np.sqrt(predicted.covariance[i, i]))
+        relative = rms / study.prior_std.get(p.name, p.tolerance)
+        errors.append(EstimationError(p, rms, standard_error, std, relative))
+    after, standard_error = tool("tool_um")
+    return AccuracySummary(
+        machines=int(good.sum()),
+        failed={str(s): int((status == s).sum()) for s in sorted(set(status[~good]))},
+        before=tool("before_um")[0],
+        after=after,
+        standard_error=standard_error,
+        percentile_95=float(np.quantile(column("tool_um") * UM, 0.95)) if good.any() else np.nan,
+        worst_point=tool("tool_worst_um")[0],
+        shift_removed=tool("tool_shift_out_um")[0],
+        absolute=tool("tool_absolute_um")[0],
+        predicted=predicted,
+        parameters=tuple(sorted(errors, key=lambda e: -e.relative)),
+    )
 
 
-def _mark(status: NDArray[np.object_], which: NDArray[np.bool_], word: str) -> None:
-    """Say why machines have no result that had none of the reasons before."""
-    status[which & (status == GOOD)] = word
+def _root_mean_square(values: Array) -> tuple[float, float]:
+    """RMS of a sample and its standard error."""
+    if not values.size:
+        return np.nan, np.nan
+    square = values**2
+    rms = float(np.sqrt(square.mean()))
+    if values.size < 2 or rms == 0.0:
+        return rms, np.nan
+    return rms, float(square.std(ddof=1) / np.sqrt(values.size) / (2.0 * rms))

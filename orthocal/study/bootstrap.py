@@ -1,7 +1,8 @@
-"""How far estimates scatter by what the readings themselves show: the session drawn anew.
+"""Bootstrap of a session: the scatter of the estimates that its own readings imply.
 
-From residuals, or from whole cycles of each setup, which may drift within themselves. Beside a
-prior that is what the readings' noise does to estimates, not all that is unknown.
+Each draw resamples the residuals, or whole cycles of each setup (which may drift inside a cycle),
+and repeats the calibration. With priors, the scatter shows the effect of noise on the estimates,
+not their total uncertainty.
 """
 
 from __future__ import annotations
@@ -24,117 +25,107 @@ from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
 from orthocal.session.session import Session
 from orthocal.statistics.zeros import project_out_zeros
+from orthocal.study.batch import columns_in_edge_units
+from orthocal.study.portable_session import PortableSession
 from orthocal.study.runner import StudyTable
-from orthocal.study.shipped_functions import ShippedSession
 from orthocal.study.study import Columns, Study, prepare_once
 
 Array = NDArray[np.float64]
 
-DRAWS_A_TASK = 250
+Resampled = Literal["residuals", "cycles"]
 
-How = Literal["residuals", "cycles"]
-
-ALL_TAKEN = 1e-6
-"""Part of a reading below which parameters and zeros leave nothing of its noise."""
+SMALLEST_SHARE = 1e-6
+"""Share of a reading's noise below which its residual cannot be rescaled."""
 
 
 @dataclass(frozen=True, eq=False)
 class BootstrapStudy(Study):
-    """A session drawn anew from its own residuals or cycles, and calibrated each time."""
+    """A session resampled from its own residuals or cycles, and calibrated each time."""
 
     kind: ClassVar[str] = "bootstrap"
     counted: ClassVar[str] = "draws"
 
-    session: ShippedSession
+    session: PortableSession
     choice: Choice
-    how: How
+    by: Resampled
     draws: int
     seed: int
 
     @property
     def record(self) -> dict[str, Any]:
-        """All that the table depends on."""
+        """Everything that the table depends on."""
         return {
             **self.session.record,
             "choice": self.choice.document,
-            "how": self.how,
+            "by": self.by,
             "draws": self.draws,
             "seed": self.seed,
         }
 
     @property
-    def task_sizes(self) -> tuple[int, ...]:
-        """Draws of each task."""
-        whole, rest = divmod(self.draws, DRAWS_A_TASK)
-        return (DRAWS_A_TASK,) * whole + ((rest,) if rest else ())
+    def count(self) -> int:
+        """Number of draws."""
+        return self.draws
 
     def prepare(self) -> _Prepared:
-        """The session's own fit, and what is drawn from it."""
+        """Fit of the session, and the data to draw from."""
         return _Prepared.of(self)
 
     def run(self, prepared: _Prepared, task: int) -> Columns:
         """Estimates of each draw."""
-        first = task * DRAWS_A_TASK
-        numbers = range(first, first + self.task_sizes[task])
+        numbers = self.case_numbers(task)
         values = prepared.draw_each(self, numbers)
-        fit = prepared.fit
-        theta = prepared.program.solve(values, sigma=fit.sigma).theta
-        columns: dict[str, list[Any]] = {"draw": list(numbers)}
-        for i, p in enumerate(fit.problem.machine_selection.parameters):
-            columns[f"{p.name}_{p.edge_unit}"] = (theta[:, i] * p.edge_factor).tolist()
-        return columns
+        theta = prepared.program.solve(values, sigma=prepared.fit.sigma).theta
+        estimates = columns_in_edge_units("", prepared.fit.problem, theta)
+        return {"draw": list(numbers), **estimates}
 
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """What all draws share."""
+    """Data shared by all draws."""
 
     fit: Fit
     values: Array
-    """Readings as single ones, shape (n_entries,), [m of the first gauge]."""
+    """Single readings, shape (n_entries,), [m of the first gauge]."""
     fitted: Array
-    """The same without noise, gauge zeros at 0."""
+    """Fitted readings, gauge zeros at 0, shape (n_entries,), [m of the first gauge]."""
     residuals: Array
-    """As large as the noise that parameters and zeros have taken part of, with mean 0."""
+    """Residuals rescaled to the size of the noise, with mean 0, [m of the first gauge]."""
     cycles: tuple[tuple[NDArray[np.int64], ...], ...]
-    """Entries of each cycle of each setup, those of a setup in the same order of postures."""
+    """Entries of each cycle of each setup, in the same order of postures."""
     program: BatchProgram
-    """With what all draws share."""
 
     @classmethod
     def of(cls, study: BootstrapStudy) -> _Prepared:
         session = study.session.unpack()
-        fit = fit_session(session, study.choice)
-        cycles = find_cycles(session, fit.problem.observations) if study.how == "cycles" else ()
-        found = cls(
+        problem = CalibrationProblem(session, study.choice.select(session.robot.parameters))
+        fit = fit_problem(problem, options=SolverOptions(solver="eliminated"))
+        prepared = cls(
             fit=fit,
-            values=fit.problem.values,
+            values=problem.values,
             fitted=fit.prediction,
-            residuals=_free_residuals(fit),
-            cycles=cycles,
-            program=BatchProgram(fit.problem, options=fit.program.options),
+            residuals=_rescaled_residuals(fit),
+            cycles=find_cycles(session, problem.observations) if study.by == "cycles" else (),
+            program=BatchProgram(problem, options=fit.program.options),
         )
-        numbers = range(min(DRAWS_A_TASK, study.draws))
-        program = found.program.fixed_by(
-            found.draw_each(study, numbers), sigma=fit.sigma, count=study.draws
-        )
-        return replace(found, program=program)
+        sample = prepared.draw_each(study, study.case_numbers(0))
+        program = prepared.program.fixed_by(sample, sigma=fit.sigma, count=study.draws)
+        return replace(prepared, program=program)
 
     def draw_each(self, study: BootstrapStudy, numbers: Sequence[int]) -> Array:
-        """Readings of these draws, shape (n_draws, n_entries)."""
-        rngs = (np.random.default_rng((study.seed, n)) for n in numbers)
-        return np.array([self.draw(rng, study.how) for rng in rngs])
+        """Readings of these draws, shape (n_draws, n_entries), [m of the first gauge]."""
+        generators = (np.random.default_rng((study.seed, n)) for n in numbers)
+        return np.array([self.draw(rng, study.by) for rng in generators])
 
-    def draw(self, rng: np.random.Generator, how: How) -> Array:
-        """The session's readings drawn anew, shape (n_entries,), [m of the first gauge]."""
-        if how == "residuals":
-            drawn = rng.choice(self.residuals, size=self.fitted.size)
-            return np.asarray(self.fitted + drawn)
+    def draw(self, rng: np.random.Generator, by: Resampled) -> Array:
+        """Resampled readings of the session, shape (n_entries,), [m of the first gauge]."""
+        if by == "residuals":
+            return np.asarray(self.fitted + rng.choice(self.residuals, size=self.fitted.size))
         values = np.array(self.values)
-        for own in self.cycles:
-            taken = rng.integers(len(own), size=len(own))
-            for place, which in zip(own, taken, strict=True):
-                values[place] = self.values[own[which]]
+        for cycles in self.cycles:
+            drawn = rng.integers(len(cycles), size=len(cycles))
+            for entries, k in zip(cycles, drawn, strict=True):
+                values[entries] = self.values[cycles[k]]
         return values
 
 
@@ -142,34 +133,27 @@ def build_bootstrap_study(
     session: Session,
     choice: Choice | str | None = None,
     *,
-    how: How = "residuals",
+    by: Resampled = "residuals",
     draws: int = 1000,
     seed: int = 0,
 ) -> BootstrapStudy:
-    """A study of how far estimates scatter by what a session's readings show.
+    """A study of the scatter of estimates that the readings of a session imply.
 
     Args:
         session: The session.
-        choice: What is identified, or the name of a model; by default what the session is for, or
-            offsets.
-        how: From residuals, or from the cycles of each setup.
-        draws: How often the session is drawn anew.
-        seed: Of the draws.
+        choice: Identified errors, or the name of a model; default: the session's choice, or
+            `offsets`.
+        by: Whether residuals or whole cycles of each setup are resampled.
+        draws: Number of draws.
+        seed: Seed of the draws.
 
     Raises:
-        SessionError: If there is nothing to draw from.
+        SessionError: If there is nothing to resample.
         NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
     """
-    chosen = choose(choice, session)
-    study = BootstrapStudy(ShippedSession.of(session), chosen, how, draws, seed)
-    prepare_once(study)  # refuses what cannot be drawn from
+    study = BootstrapStudy(PortableSession.of(session), choose(choice, session), by, draws, seed)
+    prepare_once(study)  # refuses a session that cannot be resampled
     return study
-
-
-def fit_session(session: Session, choice: Choice) -> Fit:
-    """The session's own calibration."""
-    problem = CalibrationProblem(session, choice.select(session.robot.parameters))
-    return fit_problem(problem, options=SolverOptions(solver="eliminated"))
 
 
 def find_cycles(
@@ -178,134 +162,127 @@ def find_cycles(
     """Entries of each cycle of each setup.
 
     Raises:
-        SessionError: If a setup has one cycle, or cycles in which other postures were read.
+        SessionError: If a setup has one cycle, or cycles with different postures.
     """
     cycle = np.zeros(observations.size, dtype=np.int64)
     for r, plus, minus in zip(session.readings, observations.plus, observations.minus, strict=True):
         cycle[[plus, minus] if minus >= 0 else [plus]] = r.cycle
-    names, found = list(session.setups), []
+    names, result = list(session.setups), []
     for setup in np.unique(observations.setup):
-        own = np.flatnonzero(observations.setup == setup)
-        parts = []
-        for c in np.unique(cycle[own]):
-            entries = own[cycle[own] == c]
-            parts.append(entries[np.argsort(observations.posture[entries], kind="stable")])
-        where = f"{session.path or 'session'}: setups.{names[setup]}"
-        if len(parts) < 2:
+        of_setup = np.flatnonzero(observations.setup == setup)
+        cycles = []
+        for c in np.unique(cycle[of_setup]):
+            entries = of_setup[cycle[of_setup] == c]
+            cycles.append(entries[np.argsort(observations.posture[entries], kind="stable")])
+        postures = {tuple(observations.posture[entries]) for entries in cycles}
+        problem = "has one cycle of readings; expected several in each setup"
+        if len(cycles) > 1:
+            problem = "has cycles with different postures; expected the same postures in each"
+        if len(cycles) < 2 or len(postures) > 1:
             raise SessionError(
-                "was read in one cycle; expected several in each setup, or --by residuals",
-                where=where,
+                f"{problem}, or --by residuals",
+                where=f"{session.path or 'session'}: setups.{names[setup]}",
             )
-        postures = [tuple(observations.posture[p]) for p in parts]
-        if len(set(postures)) > 1:
-            raise SessionError(
-                "has cycles in which other postures were read; expected the same in each, or "
-                "--by residuals",
-                where=where,
-            )
-        found.append(tuple(parts))
-    return tuple(found)
+        result.append(tuple(cycles))
+    return tuple(result)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scatter:
-    """How far the estimate of one parameter scatters."""
+    """Scatter of the estimates of one parameter."""
 
     parameter: Parameter
     estimate: float
-    """Of the session itself, [SI]."""
+    """Estimate from the session itself, [SI]."""
     std: float
-    """Of the draws, [SI]."""
-    doubt: float
-    """Of that, from so many draws, [SI]."""
+    """Standard deviation of the draws, [SI]."""
+    standard_error: float
+    """Sampling standard error of `std`, [SI]."""
     low: float
     high: float
-    """Ends of the interval that holds 95 % of the draws, [SI]."""
-    foretold: float
-    """What noise does to the estimate, by the analytic covariance, [SI]."""
-    unknown: float
-    """All that is unknown of it by the analytic covariance, the prior's part too, [SI]."""
+    """Ends of the interval that contains 95 % of the draws, [SI]."""
+    predicted: float
+    """Standard deviation by noise, from the covariance, [SI]."""
+    total_std: float
+    """Standard deviation that includes the prior, from the covariance, [SI]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BootstrapSummary:
-    """What a session drawn anew says."""
+    """Summary of a bootstrap study."""
 
     draws: int
     sigma: float
-    """Standard deviation of a reading by the session's own calibration, [m]."""
+    """Standard deviation of a reading in the session's own calibration, [m]."""
     parameters: tuple[Scatter, ...]
     fewest_cycles: int | None
-    """Of a setup; None where residuals were drawn."""
+    """Smallest number of cycles of a setup; None where residuals are resampled."""
 
 
 def summarise_bootstrap(study: BootstrapStudy, table: StudyTable) -> BootstrapSummary:
-    """What a session drawn anew says.
+    """Summary of the table of a bootstrap study.
 
-    Of few cycles the draws scatter too little, by √((c − 1)/c): their scatter is made up for that.
+    Draws from c cycles scatter too little, by √((c − 1)/c); the summary corrects this.
     """
-    fit: Fit = prepare_once(study).fit
-    problem = fit.problem
-    noise, whole = np.sqrt(_scatter(fit).diagonal()), np.sqrt(np.diag(fit.covariance()))
-    cycles = None
-    more = 1.0
-    if study.how == "cycles":
-        found = find_cycles(problem.session, problem.observations)
-        cycles = min(len(c) for c in found)
-        more = float(np.sqrt(cycles / (cycles - 1)))
+    prepared: _Prepared = prepare_once(study)
+    fit, correction, cycles = prepared.fit, 1.0, None
+    if study.by == "cycles":
+        cycles = min(len(c) for c in prepared.cycles)
+        correction = float(np.sqrt(cycles / (cycles - 1)))
+    noise = np.sqrt(_noise_covariance(fit).diagonal())
+    total = np.sqrt(np.diag(fit.covariance()))
     rows = []
-    for i, p in enumerate(problem.machine_selection.parameters):
+    for i, p in enumerate(fit.problem.machine_selection.parameters):
         values = np.array(table.columns[f"{p.name}_{p.edge_unit}"], dtype=np.float64)
-        values = values / p.edge_factor
-        middle = float(fit.solution.theta[i])
-        spread = middle + more * (values - middle)
-        std = float(spread.std(ddof=1)) if values.size > 1 else np.nan
-        low, high = np.quantile(spread, [0.025, 0.975])
+        estimate = float(fit.solution.theta[i])
+        draws = estimate + correction * (values / p.edge_factor - estimate)
+        std = float(draws.std(ddof=1)) if values.size > 1 else np.nan
+        low, high = np.quantile(draws, [0.025, 0.975])
         rows.append(
             Scatter(
                 parameter=p,
-                estimate=middle,
+                estimate=estimate,
                 std=std,
-                doubt=std / np.sqrt(2.0 * max(values.size - 1, 1)),
+                standard_error=std / np.sqrt(2.0 * max(values.size - 1, 1)),
                 low=float(low),
                 high=float(high),
-                foretold=float(noise[i]),
-                unknown=float(whole[i]),
+                predicted=float(noise[i]),
+                total_std=float(total[i]),
             )
         )
     return BootstrapSummary(len(table), fit.sigma, tuple(rows), cycles)
 
 
-def _free_residuals(fit: Fit) -> Array:
-    """Residuals made as large as the noise: parameters and zeros have taken part of each.
+def _rescaled_residuals(fit: Fit) -> Array:
+    """Residuals divided by √(1 − leverage): as large as the noise, with mean 0.
 
     Raises:
-        SessionError: If they have taken all of it.
+        SessionError: If parameters and gauge zeros explain all of the noise.
     """
     o = fit.problem.observations
-    inverse = fit.information.covariance(
-        sigma=fit.sigma, precision=fit.problem.prior_precision, held=fit.held
-    )
-    taken = leverages(fit.jacobian, o, inverse, fit.sigma)
-    left = 1.0 - taken - 1.0 / np.bincount(o.zero, minlength=o.n_zeros)[o.zero]
-    if not left.sum() > 1.0:
+    leverage = leverages(fit.jacobian, o, _posterior(fit), fit.sigma)
+    share = 1.0 - leverage - 1.0 / np.bincount(o.zero, minlength=o.n_zeros)[o.zero]
+    if not share.sum() > 1.0:
         raise SessionError(
-            "leaves no residuals to draw from: its readings are no more than what is identified; "
-            "expected more readings, or a smaller model",
+            "has no residuals to resample: there are not more independent readings than "
+            "parameters; expected more readings, or a smaller model",
             where=str(fit.problem.session.path or "session"),
         )
-    kept = left > ALL_TAKEN
-    own = fit.residual[kept] / np.sqrt(left[kept])
-    return np.asarray(own - own.mean())
+    usable = share > SMALLEST_SHARE
+    residuals = fit.residual[usable] / np.sqrt(share[usable])
+    return np.asarray(residuals - residuals.mean())
 
 
-def _scatter(fit: Fit) -> Array:
+def _posterior(fit: Fit) -> Array:
+    """Covariance of the scaled free parameters."""
+    return fit.information.covariance(
+        sigma=fit.sigma, precision=fit.problem.prior_precision, held=fit.held
+    )
+
+
+def _noise_covariance(fit: Fit) -> Array:
     """Covariance of the machine's estimates by noise alone, [SI]: C Jᵀ J C/σ²."""
     problem, n = fit.problem, fit.problem.n_machine
-    inverse = fit.information.covariance(
-        sigma=fit.sigma, precision=problem.prior_precision, held=fit.held
-    )
-    slopes = project_out_zeros(fit.jacobian, problem.observations)
-    gain = inverse @ slopes.T / fit.sigma
+    gain = _posterior(fit) @ project_out_zeros(fit.jacobian, problem.observations).T / fit.sigma
     scale = problem.theta_scale[:n]
     return np.asarray((gain @ gain.T)[:n, :n] * np.outer(scale, scale))

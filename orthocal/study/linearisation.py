@@ -1,12 +1,12 @@
-"""What linearising costs: solutions to first order against the exact one, as errors grow.
+"""Study of linearisation: first-order solutions against the exact one, as errors grow.
 
-Readings are exact, and gauges stand as they are said to: what is missed is missed by the equations.
-Noise and resolution stand beside it.
+Readings are exact and gauges have no mounting errors, so every error of an estimate comes from the
+equations. Noise and resolution are given for comparison.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -27,80 +27,70 @@ from orthocal.estimation.linear import (
     twelve_row_covariance,
 )
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.selection import Selection
-from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
-from orthocal.estimation.solvers.machine_readings import Fleet
 from orthocal.estimation.solvers.variable_projection import EliminatedProgram
 from orthocal.robot.model import Robot
 from orthocal.sensors.mounting import EXACT
 from orthocal.session.session import Gauge, Session
 from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
-from orthocal.study.paper import PAPER_GAUGE, Displacements, build_paper_plan
-from orthocal.study.shipped_functions import ShippedSession
+from orthocal.study.batch import linearise_batch, predict_batch
+from orthocal.study.paper_plan import PAPER_GAUGE, Displacements, build_paper_plan
+from orthocal.study.portable_session import PortableSession
+from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, prepare_once
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
-
-MACHINES_A_TASK = 250
+Flags = NDArray[np.bool_]
 
 IDENTIFIED = "identified"
-NO_MACHINE = "cannot be assembled"
+NOT_ASSEMBLED = "cannot be assembled"
+NO_CONTACT = "a tip misses the part it should touch"
 
 MOST_STEPS = 20
-"""Of Gauss-Newton, undamped."""
+"""Largest number of undamped Gauss-Newton steps."""
 
-EXACT_ENOUGH = 1e-6
-"""What a solution misses at most that is as good as the exact one, [m, rad]."""
+CONVERGED = 1e-6
+"""Largest error of an estimate that counts as exact, [m, rad]."""
 
 SOLVED = 1e-9
-"""What the exact solution misses at most, [m, rad]."""
+"""Largest error of the exact solution, [m, rad]."""
 
-LARGEST = 50.0
-"""Errors that are looked at by default, [mm]."""
+LARGEST_SIZE = 50.0
+"""Default of the largest error of a machine, [mm or mrad]."""
 
-SMALLEST = 0.1
+SMALLEST_SIZE = 0.1
+"""Smallest error of a machine, [mm or mrad]."""
 
 METHODS = ("six", "twelve", "twelve_gls", "first_order", "steps_2", "steps_3", "exact")
-"""The paper's equations, ordinary and generalised least squares; the general first-order solution,
-which is one Gauss-Newton step, two and three of them; the exact one."""
-
-METHOD_WORDS = {
-    "six": "the paper's six equations",
-    "twelve": "the paper's twelve",
-    "twelve_gls": "twelve, weighed by their covariance",
-    "first_order": "general first order",
-    "steps_2": "two Gauss-Newton steps",
-    "steps_3": "three Gauss-Newton steps",
-    "exact": "exact",
-}
+"""The paper's equations by ordinary and generalised least squares; the general first-order
+solution, which is one Gauss-Newton step; two and three steps; the exact solution."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearisationStudy(Study):
-    """Machines whose errors grow, identified to first order and exactly."""
+    """Machines with growing errors, identified to first order and exactly."""
 
     kind: ClassVar[str] = "linearisation"
     counted: ClassVar[str] = "machines"
 
-    session: ShippedSession
+    session: PortableSession
     free: tuple[str, ...]
-    """Names of the parameters that are identified, and are off."""
+    """Names of the parameters that have errors and are identified."""
     sizes: tuple[float, ...]
     """Largest error of each machine, [mm or mrad]."""
     directions: tuple[tuple[float, ...], ...]
-    """Errors of machines over the largest of them."""
+    """Errors of machines divided by the largest of them."""
     displacements: Displacements | None
-    """Of the paper's plan; None for another one, of which the paper's equations know nothing."""
+    """Displacements of the paper's plan; None for other plans, without the paper's equations."""
     sigma: float
     """Standard deviation of a reading, [m]."""
     resolution: float
-    """Of a reading, [m]."""
+    """Resolution of a reading, [m]."""
 
     @property
     def record(self) -> dict[str, Any]:
-        """All that the table depends on."""
+        """Everything that the table depends on."""
         d = self.displacements
         return {
             **self.session.record,
@@ -113,197 +103,191 @@ class LinearisationStudy(Study):
         }
 
     @property
-    def task_sizes(self) -> tuple[int, ...]:
-        """Machines of each task."""
-        whole, rest = divmod(len(self.sizes) * len(self.directions), MACHINES_A_TASK)
-        return (MACHINES_A_TASK,) * whole + ((rest,) if rest else ())
+    def count(self) -> int:
+        """Number of machines: each size in each direction."""
+        return len(self.sizes) * len(self.directions)
 
     def prepare(self) -> _Prepared:
-        """The problem, to first order, and the paper's equations."""
+        """The problem, its linearisation, and the paper's equations."""
         session = self.session.unpack()
         selection = Choice(free=self.free, prior=False).select(session.robot.parameters)
-        return _Prepared.of(session, selection, self.displacements)
+        problem = CalibrationProblem(session, selection)
+        return _Prepared.of(problem, self.displacements)
 
     def run(self, prepared: _Prepared, task: int) -> Columns:
-        """What each way misses of each machine, [mm or mrad]; None where it comes to nothing."""
-        first = task * MACHINES_A_TASK
-        numbers = np.arange(first, first + self.task_sizes[task])
+        """Errors of each method's estimates, [mm or mrad]; None where the method fails."""
+        numbers = np.array(self.case_numbers(task))
         sizes = np.array(self.sizes)[numbers // len(self.directions)]
-        which = numbers % len(self.directions)
-        errors = np.array(self.directions)[which] * sizes[:, None] * MM
-        return {"size": sizes.tolist(), "direction": which.tolist(), **prepared.identify(errors)}
+        directions = numbers % len(self.directions)
+        errors = np.array(self.directions)[directions] * sizes[:, None] * MM
+        columns = {"size": sizes.tolist(), "direction": directions.tolist()}
+        return {**columns, **prepared.identify(errors)}
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """Largest standard deviation of an estimate by noise, for each way, [m, rad]."""
-        found: dict[str, float] = prepare_once(self).standard_errors(self.sigma)
-        return found
+        """Largest standard error of an estimate by noise, for each method, [m, rad]."""
+        prepared: _Prepared = prepare_once(self)
+        return prepared.standard_errors(self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """What all machines share."""
+    """Data shared by all machines."""
 
     problem: CalibrationProblem
     linearisation: Linearisation
     program: EliminatedProgram
-    matrices: Mapping[int, Array] | None
-    """The paper's, by their number of rows."""
-    rows: Array | None
-    """Entries of the paper's twelve differences, less those of the zero, shape (12, n_entries)."""
+    matrices: Mapping[int, Array]
+    """The paper's matrices by their number of rows; empty for other plans."""
+    differences: Array
+    """The paper's twelve differences of readings, shape (12, n_entries)."""
 
     @classmethod
-    def of(
-        cls, session: Session, selection: Selection, displacements: Displacements | None
-    ) -> _Prepared:
-        problem = CalibrationProblem(session, selection)
+    def of(cls, problem: CalibrationProblem, displacements: Displacements | None) -> _Prepared:
         if problem.n_free > problem.n_machine:
             raise ParameterError(
-                f"{problem.free[problem.n_machine]} is not known: this study takes sensors for "
-                "exact, and knows how only of indicators",
+                f"{problem.free[problem.n_machine]} is a nuisance parameter; this study requires "
+                "exact sensors, which only indicators support",
                 where="sensors",
             )
         linearisation = linearise_at_reference(problem)
         require_determined(problem, linearisation.information)
-        matrices = rows = None
+        matrices, differences = {}, np.zeros((0, problem.observations.size))
         if displacements is not None:
-            length = next(iter(session.robot.legs.values())).length
-            matrices = {
-                n: leg_parallelism_matrix(
-                    length=length,
+            differences = _paper_differences(problem.session)
+            for n in (6, 12):
+                matrices[n] = leg_parallelism_matrix(
+                    length=next(iter(problem.robot.legs.values())).length,
                     displacement_max=displacements.maximum,
                     displacement_min=displacements.minimum,
                     rows=n,
                 )
-                for n in (6, 12)
-            }
-            rows = _differences(session)
-        return cls(problem, linearisation, EliminatedProgram(problem), matrices, rows)
+        return cls(problem, linearisation, EliminatedProgram(problem), matrices, differences)
+
+    def paper_methods(self) -> Iterator[tuple[str, Array, Array | None]]:
+        """Name, differences of readings (n_rows, n_entries) and covariance of each of them."""
+        if self.matrices:
+            twelve = self.differences
+            plus = [TWELVE_ROWS.index(f"{name}+") for name in SIX_ROWS]
+            minus = [TWELVE_ROWS.index(f"{name}-") for name in SIX_ROWS]
+            yield "six", twelve[plus] - twelve[minus], None
+            yield "twelve", twelve, None
+            yield "twelve_gls", twelve, twelve_row_covariance()
 
     def identify(self, errors: Array) -> dict[str, list[Any]]:
-        """What each way misses of machines with these errors, shape (n_sets, n_free), [SI]."""
+        """Errors of each method's estimates.
+
+        Args:
+            errors: True errors of the machines, shape (n_sets, n_free), [SI].
+        """
         problem = self.problem
-        read, good = self._read(errors)
-        change = read - problem.predict(problem.reference, problem.reference_passive)
-        found: dict[str, Array] = {}
+        readings, assembled = predict_batch(problem, errors / problem.theta_scale, retry=True)
+        good = assembled & np.isfinite(readings).all(axis=1)
+        columns: dict[str, list[Any]] = {}
 
-        def missed(theta: Array) -> Array:
-            return np.where(good, np.abs(theta - errors).max(axis=1) / MM, np.nan)
+        def add(name: str, theta: Array) -> None:
+            error = np.abs(theta - errors).max(axis=1) / MM
+            columns[name] = np.where(good, error, np.nan).tolist()
 
-        if self.matrices is not None and self.rows is not None:
-            twelve = change @ self.rows.T
-            six = np.stack([_max_less_min(twelve.T, name) for name in SIX_ROWS], axis=1)
-            for name, rows, covariance in (
-                ("six", six, None),
-                ("twelve", twelve, None),
-                ("twelve_gls", twelve, twelve_row_covariance()),
-            ):
-                matrix = self.matrices[rows.shape[1]]
-                unit = np.eye(rows.shape[1])  # what solves is linear: each row alone, then sums
-                own = [solve_equation_8(matrix, y, covariance=covariance).offsets for y in unit]
-                found[name] = missed(rows @ np.array(own))
+        change = readings - problem.predict(problem.reference, problem.reference_passive)
+        for name, differences, covariance in self.paper_methods():
+            matrix = self.matrices[len(differences)]
+            unit = np.eye(len(differences))  # the solver is linear: solve for each row once
+            solve = [solve_equation_8(matrix, y, covariance=covariance).offsets for y in unit]
+            add(name, change @ differences.T @ np.array(solve))
         centred = project_out_zeros(change.T, problem.observations).T
         unit = np.vstack([np.zeros(centred.shape[1]), np.eye(centred.shape[1])])
-        start, *own = (replace(self.linearisation, residual=y).solve(sigma=1.0) for y in unit)
-        foretold = errors / problem.theta_scale @ self.linearisation.slopes.T
-        theta = start + centred @ (np.array(own) - start)
-        found["first_order"] = missed(theta)
-        steps, trail, exact = self._iterate(read, theta, errors, good)
-        for k, found_there in enumerate(trail):
-            found[f"steps_{k + 2}"] = missed(found_there)
-        found["exact"] = missed(exact)
-        reading = _spread(centred - foretold, problem) / MM
+        start, *rows = (replace(self.linearisation, residual=y).solve(sigma=1.0) for y in unit)
+        first_order = start + centred @ (np.array(rows) - start)
+        add("first_order", first_order)
+        steps, iterates, exact = self._iterate(readings, first_order, errors, good)
+        for k, theta in enumerate(iterates):
+            add(f"steps_{k + 2}", theta)
+        add("exact", exact)
+        linear = errors / problem.theta_scale @ self.linearisation.slopes.T
+        spread = _largest_difference(centred - linear, problem) / MM
+        reason = np.where(assembled, NO_CONTACT, NOT_ASSEMBLED)
         return {
-            "status": np.where(good, IDENTIFIED, NO_MACHINE).tolist(),
-            "reading_mm": np.where(good, reading, np.nan).tolist(),
+            "status": np.where(good, IDENTIFIED, reason).tolist(),
+            "reading_mm": np.where(good, spread, np.nan).tolist(),
             "steps": [int(n) if n else None for n in steps],
-            **{name: values.tolist() for name, values in found.items()},
+            **columns,
         }
 
-    def _read(self, errors: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """What machines show, shape (n_sets, n_entries), [m], and which can be assembled."""
-        problem = self.problem
-        fleet = Fleet(problem, errors / problem.theta_scale)
-        good = fleet.close()
-        for i in np.flatnonzero(~good):
-            with suppress(ClosureError):
-                fleet.passive[i] = problem.close(errors[i])
-                good[i] = True
-        return fleet.predict(), good
-
     def _iterate(
-        self, read: Array, first: Array, errors: Array, good: NDArray[np.bool_]
+        self, readings: Array, first_order: Array, errors: Array, good: Flags
     ) -> tuple[NDArray[np.int64], list[Array], Array]:
-        """Gauss-Newton, undamped, from the first-order solution: one step.
+        """Undamped Gauss-Newton iterations; the first-order solution is the first step.
 
         Returns:
-            Steps after which a machine is as good as found, 0 for never, shape (n_sets,); what two
-            and three of them find; and what the exact solver finds, NaN for nothing.
+            Number of steps to convergence, 0 for none, shape (n_sets,); the estimates after two and
+            three steps; the estimates of the exact solver, NaN where it fails.
         """
-        theta = np.array(first)
-        steps, trail = np.zeros(len(read), dtype=np.int64), []
-        on = np.array(good)
+        theta, active = np.array(first_order), np.array(good)
+        steps, iterates = np.zeros(len(readings), dtype=np.int64), []
         with np.errstate(all="ignore"):
             for step in range(1, MOST_STEPS + 1):
-                off = np.abs(theta - errors).max(axis=1)
-                steps = np.where(on & (steps == 0) & (off <= EXACT_ENOUGH), step, steps)
+                error = np.abs(theta - errors).max(axis=1)
+                steps = np.where(active & (steps == 0) & (error <= CONVERGED), step, steps)
                 if 1 < step <= 3:
-                    trail.append(np.where(on[:, None], theta, np.nan))
-                on &= (off > SOLVED) | (step <= 3)
-                if not on.any():
+                    iterates.append(np.where(active[:, None], theta, np.nan))
+                active &= (error > SOLVED) | (step <= 3)
+                if not active.any():
                     break
-                theta[on], alive = self._step(read[on], theta[on])
-                on[np.flatnonzero(on)[~alive]] = False
-        exact = np.where((np.abs(theta - errors).max(axis=1) <= SOLVED)[:, None], theta, np.nan)
-        for i in np.flatnonzero(good & np.isnan(exact).any(axis=1)):
+                theta[active], alive = self.step(readings[active], theta[active])
+                active[np.flatnonzero(active)[~alive]] = False
+        solved = np.abs(theta - errors).max(axis=1) <= SOLVED
+        exact = np.where(solved[:, None], theta, np.nan)
+        for i in np.flatnonzero(good & ~solved):
             with suppress(SolverError, ClosureError):
-                exact[i] = self.program.solve(sigma=1e-6, values=read[i]).theta
-        return steps, trail, exact
+                exact[i] = self.program.solve(sigma=1e-6, values=readings[i]).theta
+        return steps, iterates, exact
 
-    def _step(self, read: Array, theta: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """One step of each machine, and which can be assembled before it."""
+    def step(self, readings: Array, theta: Array) -> tuple[Array, Flags]:
+        """One Gauss-Newton step of each machine, NaN where its readings cannot be predicted.
+
+        Args:
+            readings: Shape (n_sets, n_entries), [m of the first gauge].
+            theta: Shape (n_sets, n_free), [SI].
+        """
         problem = self.problem
-        fleet = Fleet(problem, theta / problem.theta_scale)
-        alive = fleet.close()
-        found = np.full_like(theta, np.nan)
+        predicted, jacobian, closed = linearise_batch(problem, theta / problem.theta_scale)
+        finite = np.isfinite(predicted).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
+        predicted, jacobian = predicted[finite], jacobian[finite]
+        alive = np.array(closed)
+        alive[np.flatnonzero(closed)[~finite]] = False
+        result = np.full_like(theta, np.nan)
         if alive.any():
-            about = FleetSlopes(problem, fleet.theta[alive], fleet.passive[alive])
-            jacobian = np.moveaxis(about.jacobian(), 0, -1)
-            shape = jacobian.shape
-            flat = project_out_zeros(jacobian.reshape(shape[0], -1), problem.observations)
-            slopes = np.moveaxis(flat.reshape(shape), -1, 0)
-            left = project_out_zeros((read[alive] - about.reading).T, problem.observations).T
-            inverse = np.linalg.pinv(slopes)
-            step = (inverse @ left[..., None])[..., 0]
-            found[alive] = theta[alive] + step * problem.theta_scale
-        return found, alive
+            by_entry = np.moveaxis(jacobian, 0, -1)
+            flat = by_entry.reshape(by_entry.shape[0], -1)
+            centred = project_out_zeros(flat, problem.observations).reshape(by_entry.shape)
+            residual = project_out_zeros((readings[alive] - predicted).T, problem.observations).T
+            inverse = np.linalg.pinv(np.moveaxis(centred, -1, 0))
+            step = (inverse @ residual[..., None])[..., 0]
+            result[alive] = theta[alive] + step * problem.theta_scale
+        return result, alive
 
     def standard_errors(self, sigma: float) -> dict[str, float]:
-        """Largest standard deviation of an estimate by noise, for each way, [m, rad]."""
+        """Largest standard error of an estimate by noise, for each method, [m, rad]."""
         result = {}
-        if self.matrices is not None and self.rows is not None:
-            six = np.array([_max_less_min(self.rows, name) for name in SIX_ROWS])
-            for name, differences, covariance in (
-                ("six", six, None),
-                ("twelve", self.rows, None),
-                ("twelve_gls", self.rows, twelve_row_covariance()),
-            ):
-                matrix = self.matrices[len(differences)]
-                whiten = np.eye(len(matrix))
-                if covariance is not None:
-                    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-                gain = np.linalg.pinv(whiten @ matrix) @ whiten @ differences
-                result[name] = sigma * float(np.sqrt((gain**2).sum(axis=1).max()))
-        slopes = self.linearisation.slopes / self.problem.theta_scale
-        own = sigma * float(np.sqrt(np.linalg.inv(slopes.T @ slopes).diagonal().max()))
-        return {**result, **{m: own for m in METHODS[3:]}}
+        for name, differences, covariance in self.paper_methods():
+            matrix = self.matrices[len(differences)]
+            whiten = np.eye(len(matrix))
+            if covariance is not None:
+                whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+            gain = np.linalg.pinv(whiten @ matrix) @ whiten @ differences
+            result[name] = sigma * float(np.sqrt((gain**2).sum(axis=1).max()))
+        jacobian = self.linearisation.slopes / self.problem.theta_scale
+        variances = np.linalg.inv(jacobian.T @ jacobian).diagonal()
+        general = sigma * float(np.sqrt(variances.max()))
+        return {**result, **dict.fromkeys(METHODS[3:], general)}
 
 
 def build_linearisation_study(
     source: Robot | Session,
     *,
     free: Sequence[str] = ("*.offset",),
-    largest: float = LARGEST,
+    largest: float = LARGEST_SIZE,
     count: int = 40,
     directions: int = 25,
     along: Sequence[float] | None = None,
@@ -312,66 +296,70 @@ def build_linearisation_study(
     gauge: Gauge | None = None,
     seed: int = 0,
 ) -> LinearisationStudy:
-    """A study of what linearising costs.
+    """A study of the errors of linearised identification.
 
     Args:
-        source: A robot of the Orthoglide's kind, read by the paper's plan; or a session, of any
-            robot, to whose readings the paper's equations say nothing.
+        source: An Orthoglide-type robot, measured by the paper's plan; or a session of any robot,
+            without the paper's equations.
         free: Names or globs of the errors that grow and are identified.
-        largest: Of the sizes, [mm or mrad].
-        count: Of sizes, from 0.1 mm on, each larger than the one before by the same factor.
-        directions: Of errors, drawn at random.
-        along: One direction instead, of as many numbers as errors.
-        sizes: Instead of `largest` and `count`, [mm or mrad].
-        displacements: Of the paper's postures.
-        gauge: Whose noise and resolution stand beside it; that of the session, or the paper's.
-        seed: Of the directions.
+        largest: Largest size, [mm or mrad].
+        count: Number of sizes, in a geometric sequence from 0.1 mm on.
+        directions: Number of random directions of the errors.
+        along: One direction instead: a number for each error.
+        sizes: Sizes instead of `largest` and `count`, [mm or mrad].
+        displacements: Displacements of the paper's postures.
+        gauge: Gauge whose noise and resolution are given for comparison; default: that of the
+            session, or the paper's.
+        seed: Seed of the directions.
 
     Raises:
-        ParameterError: If nothing can be identified, or numbers do not fit.
-        SessionError, RobotError: If the robot cannot be read by the paper's plan.
+        ParameterError: If nothing can be identified, or a number is invalid.
+        SessionError, RobotError: If the robot cannot be measured by the paper's plan.
     """
     robot = source if isinstance(source, Robot) else source.robot
     names = robot.parameters.select(free)
-    units = {robot.parameters[n].unit for n in names}
-    if not units <= {"m", "rad"}:
-        raise ParameterError("expected lengths and angles: a scale has no mm", where="--free")
+    if not {robot.parameters[n].unit for n in names} <= {"m", "rad"}:
+        raise ParameterError("expected lengths and angles; a scale has no mm", where="--free")
     if isinstance(source, Robot):
-        moved = displacements or Displacements()
-        session = build_paper_plan(source, moved, gauge or PAPER_GAUGE)
+        used = displacements or Displacements()
+        session = build_paper_plan(source, used, gauge or PAPER_GAUGE)
         offsets = tuple(f"{d.name}.offset" for d in robot.drives)
-        paper = moved if names == offsets else None
+        paper = used if names == offsets else None
     else:
         session, paper = source, None
     if along is None:
-        drawn = np.random.default_rng(seed).normal(size=(directions, len(names)))
+        vectors = np.random.default_rng(seed).normal(size=(directions, len(names)))
     else:
-        drawn = np.array([along], dtype=np.float64)
-        if drawn.shape[1] != len(names) or not np.abs(drawn).max() > 0.0:
+        vectors = np.array([along], dtype=np.float64)
+        if vectors.shape[1] != len(names) or not np.abs(vectors).max() > 0.0:
             raise ParameterError(
                 f"found {', '.join(f'{v:g}' for v in along)}; expected {len(names)} numbers, not "
                 f"all 0: {', '.join(names)}",
                 where="--along",
             )
-    # what is said to be the size of (1, −0.6, 0.3) is its largest
-    unit = drawn / np.abs(drawn).max(axis=1, keepdims=True)
-    steps = np.geomspace(min(SMALLEST, largest), largest, count) if sizes is None else sizes
-    shown = gauge or session.gauge
-    exact = {n: replace(s, sensor=_exactly(s.sensor)) for n, s in session.setups.items()}
-    session = replace(session, setups=exact).with_values(np.zeros(len(session.readings)))
+    # the size of (1, −0.6, 0.3) is its largest component
+    unit = vectors / np.abs(vectors).max(axis=1, keepdims=True)
+    if sizes is None:
+        sizes = np.geomspace(min(SMALLEST_SIZE, largest), largest, count).tolist()
+    gauge = gauge or session.gauge
+    setups = {
+        name: replace(setup, sensor=_without_mounting_errors(setup.sensor))
+        for name, setup in session.setups.items()
+    }
+    session = replace(session, setups=setups).with_values(np.zeros(len(session.readings)))
     return LinearisationStudy(
-        session=ShippedSession.of(session),
+        session=PortableSession.of(session),
         free=tuple(names),
-        sizes=tuple(float(f"{v:.4g}") for v in steps),
+        sizes=tuple(float(f"{v:.4g}") for v in sizes),
         directions=tuple(tuple(v.tolist()) for v in unit),
         displacements=paper,
-        sigma=noise_floor(shown.sigma, shown.resolution),
-        resolution=shown.resolution or 0.0,
+        sigma=noise_floor(gauge.sigma, gauge.resolution),
+        resolution=gauge.resolution or 0.0,
     )
 
 
-def _differences(session: Session) -> Array:
-    """Maximum and minimum less zero of each setup of the paper's plan, in the order of eq. (8)."""
+def _paper_differences(session: Session) -> Array:
+    """Maximum and minimum minus zero of each setup of the paper's plan, in the rows of eq. (8)."""
     row = {(r.setup, r.posture): i for i, r in enumerate(session.readings)}
     result = np.zeros((len(TWELVE_ROWS), len(row)))
     for k, name in enumerate(TWELVE_ROWS):
@@ -381,17 +369,102 @@ def _differences(session: Session) -> Array:
     return result
 
 
-def _max_less_min(twelve: Array, name: str) -> Array:
-    """A row of the reduced system, of the twelve."""
-    return np.asarray(twelve[TWELVE_ROWS.index(f"{name}+")] - twelve[TWELVE_ROWS.index(f"{name}-")])
-
-
-def _spread(values: Array, problem: CalibrationProblem) -> Array:
-    """Largest difference of two values that share a zero, shape (n_sets,)."""
+def _largest_difference(values: Array, problem: CalibrationProblem) -> Array:
+    """Largest difference of two values that share a gauge zero, shape (n_sets,)."""
     zero = problem.observations.zero
-    spans = [np.ptp(values[:, zero == z], axis=1) for z in np.unique(zero)]
-    return np.asarray(np.max(spans, axis=0))
+    ranges = [np.ptp(values[:, zero == z], axis=1) for z in np.unique(zero)]
+    return np.asarray(np.max(ranges, axis=0))
 
 
-def _exactly(sensor: Any) -> Any:  # noqa: ANN401 - whatever has a standing
+def _without_mounting_errors(sensor: Any) -> Any:  # noqa: ANN401 - any sensor with a mounting
     return replace(sensor, standing=EXACT) if hasattr(sensor, "standing") else sensor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MethodErrors:
+    """Errors of one method's estimates as the machine's errors grow."""
+
+    name: str
+    errors: Array
+    """Largest error of an estimate, RMS over the directions, by size, [mm or mrad]; NaN where the
+    method fails in a direction."""
+    standard_error: float
+    """Standard error by noise, [mm or mrad]."""
+    exceeds_resolution: float | None
+    """Size from which the error exceeds the resolution of a reading; None for no size."""
+    exceeds_noise: float | None
+    """Size from which the error exceeds the standard error."""
+    fails: float | None
+    """Size from which the method fails in a direction."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearisationSummary:
+    """Summary of a linearisation study."""
+
+    sizes: Array
+    """[mm or mrad]"""
+    methods: tuple[MethodErrors, ...]
+    reading: Array
+    """Largest error of a linearised difference of readings, RMS over the directions, [mm]."""
+    steps: tuple[int | None, ...]
+    """Gauss-Newton steps to convergence in every direction, by size; None for no convergence."""
+    resolution: float
+    """[mm]"""
+    measurable: float | None
+    """Largest size at which machines can be measured in every direction; None for no size."""
+
+
+def summarise_linearisation(study: LinearisationStudy, table: StudyTable) -> LinearisationSummary:
+    """Summary of the table of a linearisation study."""
+    columns = table.columns
+    size = np.array(columns["size"], dtype=np.float64)
+    good = np.array(columns["status"], dtype=object) == IDENTIFIED
+    sizes = np.unique(size)
+    complete = [float(s) for s in sizes if good[size == s].all()]
+    standard_errors, resolution = study.standard_errors, study.resolution / MM
+
+    def by_size(name: str) -> Array:
+        values = np.array(columns[name], dtype=np.float64)
+        samples = [values[(size == s) & good] for s in sizes]
+        return np.array([np.sqrt(np.mean(v**2)) if v.size else np.nan for v in samples])
+
+    methods = []
+    for name in (m for m in METHODS if m in columns):
+        errors, standard_error = by_size(name), standard_errors[name] / MM
+        failed = np.isnan(errors) & np.isin(sizes, complete)
+        if name == "exact":
+            failed |= errors > SOLVED / MM
+        methods.append(
+            MethodErrors(
+                name=name,
+                errors=errors,
+                standard_error=standard_error,
+                exceeds_resolution=_crossing(sizes, errors, resolution),
+                exceeds_noise=_crossing(sizes, errors, standard_error),
+                fails=float(sizes[failed].min()) if failed.any() else None,
+            )
+        )
+    # infinite without convergence; 0 where nothing could be measured
+    counts = np.array([n or np.inf for n in columns["steps"]], dtype=np.float64)
+    most = [counts[(size == s) & good].max(initial=0.0) for s in sizes]
+    return LinearisationSummary(
+        sizes=sizes,
+        methods=tuple(methods),
+        reading=by_size("reading_mm"),
+        steps=tuple(int(n) if 0.0 < n < np.inf else None for n in most),
+        resolution=resolution,
+        measurable=max(complete) if complete else None,
+    )
+
+
+def _crossing(sizes: Array, values: Array, level: float) -> float | None:
+    """Size from which values exceed a level, interpolated on logarithmic scales; None for none."""
+    above = np.flatnonzero(values > level)
+    if not above.size or not level > 0.0:
+        return None
+    k = int(above[0])
+    if k == 0 or not values[k - 1] > 0.0:
+        return float(sizes[k])
+    share = np.log(level / values[k - 1]) / np.log(values[k] / values[k - 1])
+    return float(sizes[k - 1] * (sizes[k] / sizes[k - 1]) ** share)

@@ -1,52 +1,64 @@
-"""Running a study: on the cores of this machine, or on a Dask cluster; stopped and continued."""
+"""Running a study on the cores of this machine or on a Dask cluster; it can be stopped and resumed.
+
+The results are a journal, results.jsonl in the directory of the study. Its first line identifies
+the study. Each further line holds one task, and is on disk before the task counts.
+"""
 
 from __future__ import annotations
 
+import io
+import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from orthocal.errors import OrthocalError
-from orthocal.runtime.worker_pool import can_fork, lent, run_on_cores
-from orthocal.study.journal import Found, open_journal
+from orthocal.io.journal import Journal, open_journal_file
+from orthocal.runtime.worker_pool import can_fork, run_in_parallel, worker_budget
 from orthocal.study.study import Cell, Study, prepare_once, run_task
 
 JOURNAL = "results.jsonl"
-"""In a study's folder."""
+"""File name of the results in a study's directory."""
 
-CONNECTING = 10.0
-"""How long a cluster may take to answer, [s]."""
+FORMAT = "orthocal/study/1"
 
-KILLED = "a process of the study was killed; with --out the same command goes on where it was"
+DASK_TIMEOUT = 10.0
+"""Time in which a Dask scheduler must answer, [s]."""
 
-Done = tuple[int, dict[str, list[Cell]]]
+DASK_RETRIES = 3
+"""Number of times a task is restarted after its worker was lost."""
 
-RETRIES = 3
-"""How often a task is begun anew whose worker is gone."""
+KILLED = "a process of the study was killed; with --out the same command resumes the study"
+
+TaskResult = tuple[int, dict[str, list[Cell]]]
+Results = dict[int, dict[str, list[Cell]]]
+"""Number of a task to its columns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """How far a study is."""
+    """Progress of a study."""
 
     done: int
-    """Of what it counts."""
+    """Number of finished cases."""
     total: int
     kept: int
-    """Of those done: that were there before."""
+    """Number of cases that earlier runs finished."""
     seconds_left: float | None
     """None before the first task of this run has ended."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyTable:
-    """What a study has found."""
+    """Result of a study."""
 
     study: Study
     columns: dict[str, list[Cell]]
-    """Name to cells, in the order of the tasks."""
+    """Column name to cells, in the order of the tasks."""
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), []))
@@ -61,54 +73,140 @@ def run_study(
     anew: bool = False,
     report: Callable[[Progress], None] | None = None,
 ) -> StudyTable:
-    """Run what is left of a study.
+    """Run the unfinished tasks of a study.
 
     Args:
         study: The study.
-        folder: Where its results are kept, each before it counts; there it goes on where it was
-            stopped.
-        workers: Processes of this machine.
-        dask: Address of a Dask scheduler, whose workers are taken instead.
-        anew: Whether to throw away what is there.
-        report: Told of each task that has ended.
+        folder: Directory of the results. A study that was stopped is resumed there.
+        workers: Number of processes on this machine.
+        dask: Address of a Dask scheduler, whose workers are used instead.
+        anew: Whether to discard the results in the directory.
+        report: Called after each task.
 
     Raises:
-        OrthocalError: If the folder is another study's, or the cluster does not answer.
+        OrthocalError: If the directory belongs to another study, or the scheduler does not answer.
     """
     path = None if folder is None else folder / JOURNAL
     sizes = study.task_sizes
-    with open_journal(path, study, anew=anew) as journal:
-        todo = [task for task in range(len(sizes)) if task not in journal.found]
-        kept = sum(sizes[task] for task in journal.found)
-        began, done = time.monotonic(), 0
+    total = sum(sizes)
+    with open_results(path, study, anew=anew) as (results, store):
+        waiting = [task for task in range(len(sizes)) if task not in results]
+        kept = sum(sizes[task] for task in results)
+        start, done = time.monotonic(), 0
         if report is not None:
-            report(Progress(kept, sum(sizes), kept, None))
-        for task, columns in _run(study, todo, workers, dask):
-            journal.add(task, columns)
+            report(Progress(kept, total, kept, None))
+        for task, columns in _run_tasks(study, waiting, workers, dask):
+            store(task, columns)
             done += sizes[task]
             if report is not None:
-                rest = sum(sizes) - kept - done
-                left = (time.monotonic() - began) * rest / done
-                report(Progress(kept + done, sum(sizes), kept, left))
-        return StudyTable(study, _table(journal.found))
+                seconds_left = (time.monotonic() - start) * (total - kept - done) / done
+                report(Progress(kept + done, total, kept, seconds_left))
+        return StudyTable(study, _join_columns(results))
 
 
-def _run(study: Study, todo: Sequence[int], workers: int, dask: str | None) -> Iterable[Done]:
-    if not todo:
+def to_parquet(table: StudyTable) -> bytes:
+    """A table as the bytes of a Parquet file, with the study's document in its metadata."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    arrow = pa.table({name: pa.array(cells) for name, cells in table.columns.items()})
+    document = json.dumps(table.study.document, sort_keys=True)
+    arrow = arrow.replace_schema_metadata({"orthocal_study": document})
+    stream = io.BytesIO()
+    pq.write_table(arrow, stream, compression="zstd")
+    return stream.getvalue()
+
+
+@contextmanager
+def open_results(
+    path: Path | None, study: Study, *, anew: bool = False
+) -> Iterator[tuple[Results, Callable[[int, dict[str, list[Cell]]], None]]]:
+    """Results that a study has so far, and a function that stores those of one more task.
+
+    Args:
+        path: The journal; None to store nothing on disk.
+        study: The study.
+        anew: Whether to discard what the journal holds.
+
+    Raises:
+        OrthocalError: If the journal belongs to another study, is damaged, or is in use.
+        OutputError: If it cannot be written.
+    """
+    if path is None:
+        results: Results = {}
+        yield results, results.__setitem__
+        return
+    busy = "is in use by another process; wait for it, or choose another directory"
+    with open_journal_file(path, busy=busy, anew=anew) as journal:
+        results = _read_results(journal, study)
+
+        def store(task: int, columns: dict[str, list[Cell]]) -> None:
+            journal.append({"task": task, "columns": columns})
+            results[task] = columns
+
+        yield results, store
+
+
+def _read_results(journal: Journal, study: Study) -> Results:
+    """Results in a journal; its first line is written if it is empty."""
+    results: Results = {}
+    first = True
+    for where, data in journal.entries():
+        if data is None:
+            raise OrthocalError(
+                "is not a line of a study: the file is damaged, or another kind of file. "
+                "--force starts the study again",
+                where=where,
+            )
+        if first:
+            _require_same_study(data, study, journal.path)
+            first = False
+        else:
+            task, columns = _read_entry(data, study, where)
+            results[task] = columns
+    if first:
+        journal.append({"format": FORMAT, "study": study.document, "digest": study.digest})
+    return results
+
+
+def _require_same_study(data: dict[str, Any], study: Study, path: Path) -> None:
+    if data.get("digest") == study.digest and data.get("format") == FORMAT:
+        return
+    stored = data.get("study")
+    if not isinstance(stored, dict) or "kind" not in stored:
+        raise OrthocalError("is not a study's file; --force overwrites it", where=str(path))
+    document = study.document
+    keys = sorted(k for k in {*stored, *document} if stored.get(k) != document.get(k))
+    raise OrthocalError(
+        f"belongs to another study (different: {', '.join(keys) or 'format'}). Choose another "
+        "directory, or start again with --force",
+        where=str(path),
+    )
+
+
+def _read_entry(data: dict[str, Any], study: Study, where: str) -> TaskResult:
+    task, columns = data.get("task"), data.get("columns")
+    if isinstance(task, int) and 0 <= task < len(study.task_sizes) and isinstance(columns, dict):
+        cells = list(columns.values())
+        if cells and all(isinstance(c, list) and len(c) == len(cells[0]) for c in cells):
+            return task, columns
+    raise OrthocalError("is damaged; --force starts the study again", where=where)
+
+
+def _run_tasks(
+    study: Study, tasks: Sequence[int], workers: int, dask: str | None
+) -> Iterable[TaskResult]:
+    if not tasks:
         return ()
     if dask is not None:
-        return _on_cluster(study, todo, dask)
+        return _run_on_dask(study, tasks, dask)
     if can_fork():
-        with lent(workers):
-            prepare_once(study)  # every worker has it when it begins
-    return run_on_cores(partial(run_task, study), todo, workers, killed=KILLED)
+        with worker_budget(workers):
+            prepare_once(study)  # forked workers share it
+    return run_in_parallel(partial(run_task, study), tasks, workers, killed=KILLED)
 
 
-def _one(study: Study, task: int) -> Done:
-    return task, run_task(study, task)
-
-
-def _on_cluster(study: Study, todo: Sequence[int], address: str) -> Iterator[Done]:
+def _run_on_dask(study: Study, tasks: Sequence[int], address: str) -> Iterator[TaskResult]:
     try:
         from distributed import Client, as_completed
     except ImportError:
@@ -116,7 +214,7 @@ def _on_cluster(study: Study, todo: Sequence[int], address: str) -> Iterator[Don
             "needs the extra `cluster`: pip install 'orthocal[cluster]'", where="--dask"
         ) from None
     try:
-        client = Client(address, timeout=CONNECTING, set_as_default=False)
+        client = Client(address, timeout=DASK_TIMEOUT, set_as_default=False)
     except (OSError, ValueError, TypeError) as e:
         raise OrthocalError(
             f"no Dask scheduler answers at '{address}' ({type(e).__name__}); expected an address "
@@ -125,19 +223,24 @@ def _on_cluster(study: Study, todo: Sequence[int], address: str) -> Iterator[Don
         ) from None
     with client:
         shared = client.scatter(study, broadcast=False, hash=False)
+        numbered = [shared] * len(tasks), list(tasks)
         futures = client.map(
-            _one, [shared] * len(todo), list(todo), pure=False, retries=RETRIES, batch_size=1000
+            _run_numbered, *numbered, pure=False, retries=DASK_RETRIES, batch_size=1000
         )
         for future in as_completed(futures, loop=client.loop):
             yield future.result()
 
 
-def _table(found: Found) -> dict[str, list[Cell]]:
-    """Columns of all tasks, in their order."""
+def _run_numbered(study: Study, task: int) -> TaskResult:
+    return task, run_task(study, task)
+
+
+def _join_columns(results: Results) -> dict[str, list[Cell]]:
+    """Columns of all tasks, in the order of the tasks."""
     columns: dict[str, list[Cell]] = {}
     count = 0
-    for task in sorted(found):
-        part = found[task]
+    for task in sorted(results):
+        part = results[task]
         size = len(next(iter(part.values()), []))
         for name in part:
             columns.setdefault(name, [None] * count)

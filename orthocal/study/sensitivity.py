@@ -1,7 +1,7 @@
-"""What each reading, and the tool, answers to each error, in any posture.
+"""Study of sensitivity: derivatives of readings and of the tool position by each error.
 
-The paper's factors among it: in its maximum postures the tool moves 1 along and tan α across with
-the offset of the drive that moved (equation 6).
+They contain the paper's factors: in a maximum posture, the offset of the drive that moved shifts
+the tool by 1 along its axis and by tan α across it (equation 6).
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity
+from orthocal.measurement.files.session_file import check_contacts
 from orthocal.robot.model import Robot
 from orthocal.session.session import Gauge, Posture, Reading, Session
-from orthocal.study.paper import Displacements, build_paper_plan
+from orthocal.study.paper_plan import Displacements, build_paper_plan
+from orthocal.study.portable_session import PortableSession
 from orthocal.study.runner import StudyTable
-from orthocal.study.shipped_functions import ShippedSession
 from orthocal.study.study import Columns, Study
 from orthocal.units import MM, UM
 
@@ -31,68 +32,56 @@ TOOL = ("tool x", "tool y", "tool z")
 
 @dataclass(frozen=True, eq=False)
 class SensitivityStudy(Study):
-    """First derivatives of all readings of a plan, and of the tool, about the nominal machine."""
+    """First derivatives of all readings of a plan, and of the tool, at the nominal machine."""
 
     kind: ClassVar[str] = "sensitivity"
     counted: ClassVar[str] = "tables"
 
-    session: ShippedSession
+    session: PortableSession
     names: tuple[str, ...]
-    """Of the parameters."""
+    """Names of the error parameters."""
 
     @property
     def record(self) -> dict[str, Any]:
-        """All that the table depends on."""
+        """Everything that the table depends on."""
         return {**self.session.record, "parameters": list(self.names)}
 
     @property
-    def task_sizes(self) -> tuple[int, ...]:
-        """One: all of it."""
-        return (1,)
+    def count(self) -> int:
+        """One table."""
+        return 1
 
     def prepare(self) -> CalibrationProblem:
         """The readings, with all parameters free."""
         return build_problem(self.session.unpack(), free=self.names, prior=True)
 
     def run(self, prepared: CalibrationProblem, task: int) -> Columns:
-        """A row a reading or coordinate of the tool, and parameter."""
-        problem, session = prepared, prepared.session
-        _, jacobian = problem.linearise(problem.reference)
-        seen: dict[tuple[str, str], Array] = {}
+        """A row for each parameter of each reading and tool coordinate."""
+        problem, session, o = prepared, prepared.session, prepared.observations
         setups, postures = list(session.setups), list(session.postures)
-        o = problem.observations
+        parameters = problem.machine_selection.parameters
+        jacobian = problem.linearise(problem.reference)[1][:, : len(parameters)]
+        by_std: dict[tuple[str, str], Array] = {}
         read = {postures[i] for i in o.posture}
         if session.robot.tcp is not None:
-            names = problem.machine_selection.names
-            tool = ToolSensitivity(session.robot, free=names)(problem.drives, names=postures)
-            for posture, slopes in zip(
-                postures, tool * problem.theta_scale[: len(names)], strict=True
-            ):
+            tool = ToolSensitivity(session.robot, free=problem.machine_selection.names)
+            scaled = tool(problem.drives, names=postures) * problem.theta_scale[: len(parameters)]
+            for posture, rows in zip(postures, scaled, strict=True):
                 if posture in read:
-                    seen.update(
-                        {(posture, word): row for word, row in zip(TOOL, slopes, strict=True)}
-                    )
+                    by_std.update({(posture, axis): r for axis, r in zip(TOOL, rows, strict=True)})
         for i in range(o.size):
             key = postures[o.posture[i]], setups[o.setup[i]]
-            seen.setdefault(key, jacobian[i, : problem.n_machine] * problem.noise[i])
-        rows: dict[str, list[Any]] = {
-            "posture": [],
-            "reads": [],
-            "parameter": [],
-            "slope": [],
-            "unit": [],
-            "um_per_tolerance": [],
+            by_std.setdefault(key, jacobian[i] * problem.noise[i])
+        scales = np.array([p.tolerance * p.edge_factor for p in parameters])
+        n = len(by_std)
+        return {
+            "posture": [posture for posture, _ in by_std for _ in parameters],
+            "output": [output for _, output in by_std for _ in parameters],
+            "parameter": [p.name for p in parameters] * n,
+            "derivative": [v for row in by_std.values() for v in (row / MM / scales).tolist()],
+            "unit": [f"mm/{p.edge_unit}" for p in parameters] * n,
+            "um_per_prior_std": [v for row in by_std.values() for v in (row / UM).tolist()],
         }
-        for (posture, reads), slopes in seen.items():
-            parameters = problem.machine_selection.parameters
-            for p, by_tolerance in zip(parameters, slopes, strict=True):
-                rows["posture"].append(posture)
-                rows["reads"].append(reads)
-                rows["parameter"].append(p.name)
-                rows["slope"].append(by_tolerance / MM / (p.tolerance * p.edge_factor))
-                rows["unit"].append(f"mm/{p.edge_unit}")
-                rows["um_per_tolerance"].append(by_tolerance / UM)
-        return rows
 
 
 def build_sensitivity_study(
@@ -102,24 +91,24 @@ def build_sensitivity_study(
     points: Sequence[Sequence[float]] | None = None,
     displacements: Displacements | None = None,
 ) -> SensitivityStudy:
-    """A study of what readings answer to errors.
+    """A study of the derivatives of readings and tool position by errors.
 
     Args:
-        source: A robot of the Orthoglide's kind, read by the paper's plan; or a session of any.
-        free: Names or globs of the errors; by default all that change something.
-        points: Where the tool stands instead, in every setup: coordinates that the drives control,
-            shape (K, n_coordinates), [m].
-        displacements: Of the paper's postures.
+        source: An Orthoglide-type robot, measured by the paper's plan; or a session of any robot.
+        free: Names or globs of the errors; default: all that move a reading or the tool.
+        points: Tool positions to read every setup at, instead of its postures: coordinates that
+            the drives control, shape (K, n_coordinates), [m].
+        displacements: Displacements of the paper's postures.
 
     Raises:
-        ParameterError: If a name is unknown, or the robot cannot be read by the paper's plan.
+        ParameterError: If a name is unknown, or the robot cannot be measured by the paper's plan.
         ClosureError: If a point cannot be reached.
+        SessionError: If a sensor has no contact at a point.
     """
     session: Session
     if isinstance(source, Robot):
-        session = build_paper_plan(
-            source, displacements or Displacements(), Gauge(None, None, None)
-        )
+        gauge = Gauge(None, None, None)
+        session = build_paper_plan(source, displacements or Displacements(), gauge)
     else:
         session = source
     if points is not None:
@@ -127,11 +116,11 @@ def build_sensitivity_study(
     parameters = session.robot.parameters
     names = parameters.select(free if free is not None else parameters.patterns("full"))
     session = session.with_values(np.zeros(len(session.readings)))
-    return SensitivityStudy(ShippedSession.of(session), tuple(names))
+    return SensitivityStudy(PortableSession.of(session), tuple(names))
 
 
 def _at_points(session: Session, points: Array) -> Session:
-    """The same setups, each read with the tool at every point."""
+    """The session with every setup read at every point of the tool."""
     names = [f"point_{i + 1}" for i in range(len(points))]
     drives = nominal_assembly(session.robot).inverse(points, names=names)
     drives = drives - session.active_offsets
@@ -146,33 +135,39 @@ def _at_points(session: Session, points: Array) -> Session:
         for setup in session.setups
         for posture in postures
     )
-    return replace(session, setups=setups, postures={**postures, **alignment}, readings=readings)
+    postures = {**postures, **alignment}
+    moved = replace(session, setups=setups, postures=postures, readings=readings)
+    check_contacts(moved)
+    return moved
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensitivitySummary:
-    """What readings answer to errors, as a matrix."""
+    """Derivatives as a matrix."""
 
     rows: tuple[tuple[str, str], ...]
-    """Posture, and what is read there."""
+    """Posture, and the setup or tool coordinate."""
     parameters: tuple[str, ...]
     units: tuple[str, ...]
-    """Of the slopes, by parameter."""
-    slopes: Array
+    """Units of the derivatives, by parameter."""
+    derivatives: Array
     """Shape (n_rows, n_parameters), [units]."""
-    per_tolerance: Array
-    """The same for an error of one tolerance, [m]."""
+    per_prior_std: Array
+    """Change by one prior standard deviation of each error, shape (n_rows, n_parameters), [m]."""
 
 
 def summarise_sensitivity(study: SensitivityStudy, table: StudyTable) -> SensitivitySummary:
-    """What readings answer to errors, as a matrix."""
-    c, n = table.columns, len(study.names)
-    pairs = list(zip(c["posture"], c["reads"], strict=True))[::n]
-    shape = (len(pairs), n)
+    """Summary of the table of a sensitivity study."""
+    columns, n = table.columns, len(study.names)
+    pairs = list(zip(columns["posture"], columns["output"], strict=True))[::n]
+
+    def matrix(name: str) -> Array:
+        return np.array(columns[name], dtype=np.float64).reshape(len(pairs), n)
+
     return SensitivitySummary(
-        rows=tuple((str(p), str(r)) for p, r in pairs),
+        rows=tuple((str(posture), str(output)) for posture, output in pairs),
         parameters=study.names,
-        units=tuple(str(u) for u in c["unit"][:n]),
-        slopes=np.array(c["slope"], dtype=np.float64).reshape(shape),
-        per_tolerance=np.array(c["um_per_tolerance"], dtype=np.float64).reshape(shape) * UM,
+        units=tuple(str(u) for u in columns["unit"][:n]),
+        derivatives=matrix("derivative"),
+        per_prior_std=matrix("um_per_prior_std") * UM,
     )

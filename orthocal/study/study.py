@@ -1,10 +1,9 @@
-"""What a study is: numbered tasks that make the rows of one table, on whichever worker."""
+"""The protocol of a study: numbered tasks that produce the rows of one table."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache
@@ -18,45 +17,57 @@ from orthocal.kinematics.backend.lanes import expect_many
 
 Cell = float | int | str | bool | None
 Columns = Mapping[str, Sequence[Cell]]
-"""Part of a table: name of each column to its cells, as many in each."""
+"""Part of a table: column name to cells, the same number in each column."""
 
 DIGITS = 9
-"""Of a number in a table. The last ones of a sum depend on how a processor adds up."""
+"""Significant digits of a number in a table: later ones depend on the processor's summation."""
 
 
 class Study(ABC):
-    """A study. Two that say the same of themselves make the same table, byte by byte."""
+    """A study. Two studies with equal documents produce the same table, byte by byte."""
 
     kind: ClassVar[str]
     counted: ClassVar[str]
-    """What its rows are, such as machines."""
+    """Plural noun for the cases of the study, such as machines."""
+    cases_per_task: ClassVar[int] = 250
 
     @property
     @abstractmethod
     def record(self) -> dict[str, Any]:
-        """All that the table depends on, as plain data."""
+        """Everything that the table depends on, as plain data."""
 
     @property
     @abstractmethod
-    def task_sizes(self) -> tuple[int, ...]:
-        """How much of what is counted each task is; as many as there are tasks."""
+    def count(self) -> int:
+        """Number of cases."""
 
     @abstractmethod
-    def prepare(self) -> Any:  # noqa: ANN401 - whatever its own `run` needs
-        """What all tasks share, made once a worker."""
+    def prepare(self) -> Any:  # noqa: ANN401 - the argument of `run`
+        """Data shared by all tasks, prepared once per worker."""
 
     @abstractmethod
     def run(self, prepared: Any, task: int) -> Columns:  # noqa: ANN401 - as above
-        """The rows of one task: they depend on nothing but the study and the task's number."""
+        """Rows of one task; they depend on the study and the task's number alone."""
+
+    @property
+    def task_sizes(self) -> tuple[int, ...]:
+        """Number of cases of each task."""
+        full, remainder = divmod(self.count, self.cases_per_task)
+        return (self.cases_per_task,) * full + ((remainder,) if remainder else ())
+
+    def case_numbers(self, task: int) -> range:
+        """Numbers of the cases of one task."""
+        first = task * self.cases_per_task
+        return range(first, min(first + self.cases_per_task, self.count))
 
     @cached_property
     def document(self) -> dict[str, Any]:
-        """The record, with the version that makes the table."""
+        """The record with the version of orthocal that produces the table."""
         return {"kind": self.kind, "orthocal": __version__, **self.record}
 
     @cached_property
     def digest(self) -> str:
-        """Of the document."""
+        """SHA-256 of the document."""
         text = json.dumps(self.document, sort_keys=True, allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -68,35 +79,35 @@ class Study(ABC):
 
 
 def run_task(study: Study, task: int) -> dict[str, list[Cell]]:
-    """The rows of one task as they are kept: on one thread, numbers of so many digits."""
+    """Rows of one task as they are stored: computed on one thread, with rounded numbers."""
     with threadpool_limits(1):
-        found = study.run(prepare_once(study), task)
-    return {name: _tidy(cells) for name, cells in found.items()}
+        columns = study.run(prepare_once(study), task)
+    return {name: _round_column(cells) for name, cells in columns.items()}
 
 
 @lru_cache(maxsize=1)
 def prepare_once(study: Study) -> Any:  # noqa: ANN401 - as `prepare`
-    """What all tasks of a study share, made once in this process."""
+    """Data shared by all tasks of a study, prepared once in this process."""
     expect_many()
     return study.prepare()
 
 
-def _tidy(cells: Sequence[Cell]) -> list[Cell]:
+def _round_column(cells: Sequence[Cell]) -> list[Cell]:
     values = np.asarray(cells) if len(cells) and type(cells[0]) is np.float64 else None
     if values is None or values.dtype != np.float64:
-        return [tidy_cell(v) for v in cells]
-    # all at once: one by one they take twice as long
-    told = f"%.{DIGITS - 1}e " * len(values) % tuple(values.tolist())
-    return [None if text == "nan" else float(text) + 0.0 for text in told.split()]
+        return [round_cell(v) for v in cells]
+    # in one format operation: half the time of a loop
+    text = f"%.{DIGITS - 1}e " * len(values) % tuple(values.tolist())
+    return [None if number == "nan" else float(number) + 0.0 for number in text.split()]
 
 
-def tidy_cell(value: object) -> Cell:
-    """A cell as it is kept: NaN is None, numbers have so many digits."""
-    if type(value) is float:
-        return None if value != value else float(f"{value:.{DIGITS - 1}e}") + 0.0
-    if value is None or isinstance(value, str | bool | int):
+def round_cell(value: object) -> Cell:
+    """A cell as it is stored: None for NaN, numbers with `DIGITS` significant digits."""
+    if value is None or isinstance(value, str | bool):
         return value
-    if isinstance(value, np.bool_ | np.integer):
-        return bool(value) if isinstance(value, np.bool_) else int(value)
-    number = float(value)  # type: ignore[arg-type] # what is left is a number
-    return None if math.isnan(number) else float(f"{number:.{DIGITS - 1}e}") + 0.0
+    if isinstance(value, np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    number = float(value)  # type: ignore[arg-type] # the other kinds are numbers
+    return None if number != number else float(f"{number:.{DIGITS - 1}e}") + 0.0

@@ -31,7 +31,7 @@ from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import Means
 from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.selection import choose_setups, error_left
-from orthocal.study.accuracy_options import build_accuracy_study
+from orthocal.study.accuracy import build_accuracy_study
 from orthocal.study.linearisation import build_linearisation_study
 from orthocal.study.study import run_task
 

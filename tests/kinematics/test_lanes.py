@@ -156,8 +156,8 @@ def test_instructions_are_kept_on_disk(orthoglide, tmp_path, monkeypatch):
             assert ours.dtype == theirs.dtype
             assert np.array_equal(ours, theirs)
     # what is of another length is not taken, whatever its checksum says
-    content = lanes.cache.recall
-    monkeypatch.setattr(lanes.cache, "recall", lambda key: content(key)[:-8])
+    content = lanes.cache.load
+    monkeypatch.setattr(lanes.cache, "load", lambda key: content(key)[:-8])
     assert np.array_equal(lanes.find_listing(function).table, expected.table)
     assert len(made) == 2
 

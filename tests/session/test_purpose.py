@@ -15,7 +15,7 @@ from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
 from orthocal.session.session import Purpose
-from orthocal.study.shipped_functions import ShippedSession
+from orthocal.study.portable_session import PortableSession
 
 TOLERANCES = {"*_fork.rx_mrad": 3.0, "*_swivel.rx_mrad": 2.0, "*.offset_mm": 0.4}
 FORK = "x_fork.rx"
@@ -117,7 +117,7 @@ def test_one_machine_has_one_tolerance(raw_cycles, stated, tmp_path):
 
 
 def test_a_worker_gets_them(stated):
-    there = ShippedSession.of(stated).unpack()
+    there = PortableSession.of(stated).unpack()
     assert there.purpose == stated.purpose
     assert there.robot.parameters[FORK].tolerance == pytest.approx(3e-3)
 

@@ -1,4 +1,4 @@
-"""Studies of many machines: against the analytic covariance, and machine by machine."""
+"""Study of accuracy: against the covariance, and single machines against Pinocchio."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from orthocal.errors import ParameterError, SessionError
 from orthocal.kinematics.loop_closure import Assembly
 from orthocal.kinematics.workspace import cube, gauss_cube
 from orthocal.session.session import Gauge
-from orthocal.study.accuracy import GOOD, OUT_OF_RANGE
-from orthocal.study.accuracy_options import build_accuracy_study
-from orthocal.study.accuracy_summary import summarise_accuracy
-from orthocal.study.paper import Displacements, build_paper_plan
+from orthocal.study.accuracy import (
+    CALIBRATED,
+    OUT_OF_RANGE,
+    build_accuracy_study,
+    summarise_accuracy,
+)
+from orthocal.study.paper_plan import Displacements, build_paper_plan
 from orthocal.study.runner import StudyTable, run_study
 from orthocal.study.study import run_task
 
@@ -35,42 +38,42 @@ def summary(study):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["full", "offsets"])
-def test_what_the_covariance_promises_comes(workshop, model):
-    """All errors drawn, whatever is identified of them, gauges as they may stand."""
-    found = summary(build_accuracy_study(workshop, Choice(model, tolerances=NEAR), machines=300))
-    assert found.machines > 290
-    assert abs(found.after - found.foretold.headline.rms) < 3.0 * found.doubt
-    assert found.doubt < 0.05 * found.after
-    for m in found.missed:
-        assert abs(m.rms - m.foretold) < 4.5 * m.doubt + 0.02 * m.foretold
+def test_tool_error_agrees_with_the_covariance(workshop, model):
+    """All errors are random, all or offsets are identified, gauges have mounting errors."""
+    result = summary(build_accuracy_study(workshop, Choice(model, tolerances=NEAR), machines=300))
+    assert result.machines > 290
+    assert abs(result.after - result.predicted.headline.rms) < 3.0 * result.standard_error
+    assert result.standard_error < 0.05 * result.after
+    for e in result.parameters:
+        assert abs(e.rms - e.predicted) < 4.5 * e.standard_error + 0.02 * e.predicted
 
 
-def test_standard_errors_of_the_papers_plan_are_those_that_were_computed_independently():
-    """1.942 σ of a single reading, twelve differences weighed by their covariance."""
+def test_standard_errors_of_the_papers_plan():
+    """1.942 σ of a single reading, computed independently: twelve differences, weighted."""
     robot = load_robot("orthoglide")
     plan = build_paper_plan(robot, Displacements(), Gauge(SIGMA, None, None))
     choice = Choice("offsets", tolerances={"*.offset_mm": 0.05})
     study = build_accuracy_study(plan, choice, drawn=["*.offset"], machines=2000)
     columns = run_study(study).columns
-    errors = np.array([columns[f"missed.{a}_slide.offset_mm"] for a in "xyz"])
+    errors = np.array([columns[f"error.{a}_slide.offset_mm"] for a in "xyz"])
     spread = np.sqrt((errors**2).mean(axis=1)) * 1e-3 / SIGMA
     doubt = 1.942 / np.sqrt(2.0 * 2000)
     assert np.abs(spread - 1.942).max() < 3.0 * doubt + 0.0005
 
 
-def test_without_noise_the_truth_comes_back(orthoglide):
+def test_estimates_without_noise_equal_the_truth(orthoglide):
     plan = build_paper_plan(orthoglide, Displacements(), Gauge(1e-12, None, None))
     choice = Choice("offsets", tolerances={"*.offset_mm": 2.0})
     table = run_study(build_accuracy_study(plan, choice, drawn=["*.offset"], machines=60))
     for axis in "xyz":
-        missed = np.array(table.columns[f"missed.{axis}_slide.offset_mm"])
+        missed = np.array(table.columns[f"error.{axis}_slide.offset_mm"])
         assert np.abs(missed).max() * 1e-3 < TRUTH_BACK
         assert np.std(table.columns[f"true.{axis}_slide.offset_mm"]) > 1.0
     assert max(table.columns["tool_um"]) < 1e-3
 
 
-def test_one_machines_row_is_what_pinocchio_says_of_its_tool(workshop):
-    """Errors at the tool: as drawn and as identified, loops closed by Pinocchio."""
+def test_tool_error_of_one_machine_agrees_with_pinocchio(workshop):
+    """Tool errors with true and estimated errors, loops closed by Pinocchio."""
     choice = Choice("offsets", tolerances=NEAR)
     study = build_accuracy_study(workshop, choice, machines=4, half_side=0.05)
     rows = run_task(study, 0)
@@ -81,7 +84,7 @@ def test_one_machines_row_is_what_pinocchio_says_of_its_tool(workshop):
     truth = dict(zip(study.drawn, drawn * prepared.truth.theta_scale, strict=False))
     found = {
         f"{a}_slide.offset": 1e-3
-        * (rows[f"true.{a}_slide.offset_mm"][2] + rows[f"missed.{a}_slide.offset_mm"][2])
+        * (rows[f"true.{a}_slide.offset_mm"][2] + rows[f"error.{a}_slide.offset_mm"][2])
         for a in "xyz"
     }
     real, known, nominal = (
@@ -94,7 +97,7 @@ def test_one_machines_row_is_what_pinocchio_says_of_its_tool(workshop):
         assert rows[column][2] == pytest.approx(rms * 1e6, rel=1e-6)
 
 
-def test_gauss_points_give_the_mean_square_of_a_fine_grid(orthoglide):
+def test_gauss_points_agree_with_a_fine_grid(orthoglide):
     few, many = gauss_cube(orthoglide, half_side=0.06), cube(orthoglide, points_a_side=21)
 
     def square(space):
@@ -104,19 +107,19 @@ def test_gauss_points_give_the_mean_square_of_a_fine_grid(orthoglide):
     assert square(few) == pytest.approx(square(many), rel=1e-3)
 
 
-def test_errors_may_be_given_instead(workshop):
+def test_fixed_errors(workshop):
     study = build_accuracy_study(
-        exact(workshop), Choice("offsets"), given={"x_slide.offset": 1e-3}, machines=3
+        exact(workshop), Choice("offsets"), fixed={"x_slide.offset": 1e-3}, machines=3
     )
     rows = run_task(study, 0)
     assert rows["true.x_slide.offset_mm"] == [1.0] * 3
     assert rows["true.y_slide.offset_mm"] == [0.0] * 3
-    assert np.abs(rows["missed.x_slide.offset_mm"]).max() < 0.05
-    assert len(set(rows["missed.x_slide.offset_mm"])) == 3
+    assert np.abs(rows["error.x_slide.offset_mm"]).max() < 0.05
+    assert len(set(rows["error.x_slide.offset_mm"])) == 3
     assert len(set(rows["before_um"])) == 1
 
 
-def test_readings_beyond_the_gauge_are_told_not_counted(workshop):
+def test_readings_out_of_range_are_counted(workshop):
     from dataclasses import replace
 
     narrow = replace(workshop, gauges={"": Gauge(SIGMA, 1e-5, (-0.5e-3, 0.5e-3))})
@@ -125,20 +128,24 @@ def test_readings_beyond_the_gauge_are_told_not_counted(workshop):
     status = table.columns["status"]
     found = summarise_accuracy(study, table)
     assert found.failed[OUT_OF_RANGE] == status.count(OUT_OF_RANGE) > 50
-    assert found.machines == status.count(GOOD)
+    assert found.machines == status.count(CALIBRATED)
     bad = status.index(OUT_OF_RANGE)
     assert table.columns["tool_um"][bad] is None
 
 
-def test_a_table_of_no_good_machine_says_so(workshop):
-    from orthocal.output.study.views import study_json, summarise_study
+def test_report_without_a_calibrated_machine(workshop):
+    from orthocal.output.study.contents import report_study
+    from orthocal.output.study.report import draw_figure
 
     study = build_accuracy_study(workshop, "offsets", machines=2)
     rows = run_task(study, 0)
     for name in rows:
         rows[name] = [OUT_OF_RANGE] * 2 if name == "status" else [None] * 2
     table = StudyTable(study, rows)
-    assert "None of the machines could be calibrated" in study_json(table, summarise_study(table))
+    report = report_study(table)
+    assert report.document["machines"] == 0
+    assert not report.tables
+    assert draw_figure(report.figure).startswith("<?xml")
 
 
 @pytest.mark.parametrize(
@@ -146,15 +153,15 @@ def test_a_table_of_no_good_machine_says_so(workshop):
     [
         ({"choice": "all"}, ParameterError, "'all' is not a model"),
         ({"drawn": ["nothing.*"]}, ParameterError, "nothing"),
-        ({"given": {"x_slide.offset_mm": 1.0}}, ParameterError, "not an error parameter"),
+        ({"fixed": {"x_slide.offset_mm": 1.0}}, ParameterError, "not an error parameter"),
     ],
 )
-def test_what_makes_no_sense_is_refused(workshop, arguments, error, message):
+def test_invalid_arguments(workshop, arguments, error, message):
     with pytest.raises(error, match=message):
         build_accuracy_study(workshop, **arguments)
 
 
-def test_unknown_noise_is_refused(workshop):
+def test_missing_noise(workshop):
     from dataclasses import replace
 
     silent = replace(workshop, gauges={"": Gauge(None, 1e-5, None)})

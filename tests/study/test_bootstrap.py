@@ -1,4 +1,4 @@
-"""Sessions drawn anew: what scatters is what the covariance says of noise."""
+"""Bootstrap of sessions: the scatter agrees with the covariance of noise."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CYCLES = 40
 
 @pytest.fixture(scope="module")
 def many_cycles(root, tmp_path_factory):
-    """The raw plan in 40 cycles, of a machine without other errors than offsets."""
+    """The raw plan in 40 cycles, on a machine that has offsets only."""
     text = (root / "examples/raw-cycles/plan.yaml").read_text()
     folder = tmp_path_factory.mktemp("cycles")
     (folder / "plan.yaml").write_text(text.replace("cycles: 3", f"cycles: {CYCLES}"))
@@ -24,21 +24,21 @@ def many_cycles(root, tmp_path_factory):
     return simulate_session(exact(load_plan(folder / "plan.yaml")), errors, seed=1).session
 
 
-@pytest.mark.parametrize("how", ["residuals", "cycles"])
-def test_estimates_scatter_as_the_covariance_says(many_cycles, how):
-    study = build_bootstrap_study(many_cycles, "offsets", how=how, draws=1000)
+@pytest.mark.parametrize("by", ["residuals", "cycles"])
+def test_scatter_agrees_with_the_covariance(many_cycles, by):
+    study = build_bootstrap_study(many_cycles, "offsets", by=by, draws=1000)
     found = summarise_bootstrap(study, run_study(study))
-    assert found.fewest_cycles == (CYCLES if how == "cycles" else None)
+    assert found.fewest_cycles == (CYCLES if by == "cycles" else None)
     for p in found.parameters:
-        # the residuals' own spread is known to 1/√(2 dof), that of 40 cycles of 6 setups too
-        assert p.std / p.foretold == pytest.approx(1.0, abs=0.15)
+        # the standard error of the ratio is 1/√(2 dof), for residuals and for 40 cycles of 6 setups
+        assert p.std / p.predicted == pytest.approx(1.0, abs=0.15)
         assert p.low < p.estimate < p.high
         assert p.high - p.low == pytest.approx(2 * 1.96 * p.std, rel=0.08)
-        assert p.doubt == pytest.approx(p.std / np.sqrt(2 * 999), rel=1e-9)
+        assert p.standard_error == pytest.approx(p.std / np.sqrt(2 * 999), rel=1e-9)
 
 
-def test_a_draw_of_cycles_takes_whole_ones(raw_cycles):
-    study = build_bootstrap_study(raw_cycles, "offsets", how="cycles", draws=10)
+def test_draws_consist_of_complete_cycles(raw_cycles):
+    study = build_bootstrap_study(raw_cycles, "offsets", by="cycles", draws=10)
     prepared = study.prepare()
     drawn = prepared.draw(np.random.default_rng(0), "cycles")
     o = prepared.fit.problem.observations
@@ -47,7 +47,7 @@ def test_a_draw_of_cycles_takes_whole_ones(raw_cycles):
         assert {tuple(drawn[c]) for c in cycles} <= known
 
 
-def test_residuals_are_as_large_as_the_noise(many_cycles):
+def test_rescaled_residuals_have_the_size_of_the_noise(many_cycles):
     prepared = build_bootstrap_study(many_cycles, "offsets", draws=2).prepare()
     sigma = many_cycles.gauge.sigma
     resolution = many_cycles.gauge.resolution or 0.0
@@ -56,23 +56,23 @@ def test_residuals_are_as_large_as_the_noise(many_cycles):
     assert abs(prepared.residuals.mean()) < 1e-18
 
 
-def test_beside_a_prior_noise_is_not_all_that_is_unknown(root):
+def test_total_std_includes_the_prior(root):
     session = load_session(root / "examples/sweep")
     study = build_bootstrap_study(session, "lengths", draws=60)
     found = summarise_bootstrap(study, run_study(study))
-    assert all(p.foretold < p.unknown for p in found.parameters)
+    assert all(p.predicted < p.total_std for p in found.parameters)
 
 
-def test_nothing_to_draw_from_is_told(root):
-    with pytest.raises(SessionError, match="leaves no residuals to draw from"):
+def test_session_without_residuals_or_cycles(root):
+    with pytest.raises(SessionError, match="has no residuals to resample"):
         build_bootstrap_study(load_session(root / "examples/workshop"), "full")
-    with pytest.raises(SessionError, match=r"setups\.\w+: was read in one cycle"):
-        build_bootstrap_study(load_session(root / "examples/workshop"), how="cycles")
+    with pytest.raises(SessionError, match=r"setups\.\w+: has one cycle of readings"):
+        build_bootstrap_study(load_session(root / "examples/workshop"), by="cycles")
 
 
-def test_cycles_of_other_postures_are_told(raw_cycles):
+def test_cycles_with_different_postures(raw_cycles):
     from dataclasses import replace
 
     short = replace(raw_cycles, readings=raw_cycles.readings[1:])
-    with pytest.raises(SessionError, match="has cycles in which other postures were read"):
-        build_bootstrap_study(short, how="cycles")
+    with pytest.raises(SessionError, match="has cycles with different postures"):
+        build_bootstrap_study(short, by="cycles")

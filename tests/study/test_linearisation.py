@@ -1,4 +1,4 @@
-"""What linearising costs: numbers that were computed independently, and the solvers themselves."""
+"""Study of linearisation: independent numbers, and the exact solvers."""
 
 from __future__ import annotations
 
@@ -15,8 +15,14 @@ from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.kinematics import orthoglide as closed_forms
 from orthocal.robot.builder.build import Sizes, make_robot
 from orthocal.session.session import Gauge
-from orthocal.study.linearisation import METHODS, build_linearisation_study
-from orthocal.study.linearisation_summary import summarise_linearisation
+from orthocal.study.batch import predict_batch
+from orthocal.study.linearisation import (
+    IDENTIFIED,
+    METHODS,
+    NO_CONTACT,
+    build_linearisation_study,
+    summarise_linearisation,
+)
 from orthocal.study.runner import run_study
 from orthocal.study.study import run_task
 
@@ -37,13 +43,13 @@ def method(summary, name):
     return next(m for m in summary.methods if m.name == name)
 
 
-def test_readings_are_wrong_by_what_was_computed_independently(orthoglide):
+def test_linearisation_errors_of_readings(orthoglide):
     study = build_linearisation_study(orthoglide, sizes=[1.0, 2.0, 5.0], along=ALONG)
     found = run_task(study, 0)["reading_mm"]
     assert np.abs(np.array(found) - [0.0015, 0.006, 0.039]).max() * 1e-3 < THREE_DECIMALS_MM
 
 
-def test_and_by_the_papers_closed_forms(orthoglide):
+def test_linearisation_errors_agree_with_the_closed_forms(orthoglide):
     """Maximum less minimum of the leg's middle, from equations (2) and (3) alone."""
     length, offsets = 0.31025, np.array(ALONG) * 2e-3
     row = run_task(build_linearisation_study(orthoglide, sizes=[2.0], along=ALONG), 0)
@@ -74,7 +80,7 @@ def test_and_by_the_papers_closed_forms(orthoglide):
     assert row["reading_mm"][0] == pytest.approx(spread * 1e3, rel=1e-4)
 
 
-def test_standard_errors_are_those_that_were_computed_independently(study):
+def test_standard_errors(study):
     found = {name: v / study.sigma for name, v in study.standard_errors.items()}
     assert found["six"] == pytest.approx(1.984, abs=5e-4)
     assert found["twelve"] == pytest.approx(2.066, abs=5e-4)
@@ -82,29 +88,21 @@ def test_standard_errors_are_those_that_were_computed_independently(study):
     assert found["first_order"] == pytest.approx(found["twelve_gls"], rel=1e-9)
 
 
-def test_noise_spreads_solutions_as_standard_errors_say(study):
+def test_scatter_agrees_with_the_standard_errors(study):
     """Monte-Carlo, each of the paper's three ways."""
-    from orthocal.estimation.linear import SIX_ROWS, solve_equation_8, twelve_row_covariance
-    from orthocal.study.linearisation import _max_less_min
+    from orthocal.estimation.linear import solve_equation_8
 
     prepared, rng, count = study.prepare(), np.random.default_rng(0), 4000
     noise = rng.normal(size=(count, prepared.problem.observations.size)) * study.sigma
-    twelve = noise @ prepared.rows.T
-    six = np.stack([_max_less_min(twelve.T, name) for name in SIX_ROWS], axis=1)
-    ways = {
-        "six": (six, None),
-        "twelve": (twelve, None),
-        "twelve_gls": (twelve, twelve_row_covariance()),
-    }
-    for name, (rows, covariance) in ways.items():
-        matrix = prepared.matrices[rows.shape[1]]
-        found = [solve_equation_8(matrix, y, covariance=covariance).offsets for y in rows]
-        spread = np.std(found, axis=0).max()
-        expected = study.standard_errors[name]
-        assert abs(spread / expected - 1.0) < 4.0 / np.sqrt(2.0 * count)
+    for name, differences, covariance in prepared.paper_methods():
+        matrix = prepared.matrices[len(differences)]
+        rows = noise @ differences.T
+        offsets = [solve_equation_8(matrix, y, covariance=covariance).offsets for y in rows]
+        scatter = np.std(offsets, axis=0).max()
+        assert abs(scatter / study.standard_errors[name] - 1.0) < 4.0 / np.sqrt(2.0 * count)
 
 
-def test_the_exact_solution_is_the_truth_and_ipopts(study):
+def test_exact_solution_equals_the_truth_and_ipopt(study):
     rows = run_task(study, 0)
     assert max(rows["exact"]) < 1e-6
     prepared = study.prepare()
@@ -116,14 +114,14 @@ def test_the_exact_solution_is_the_truth_and_ipopts(study):
         assert np.abs(found - errors).max() < 1e-9
 
 
-def test_a_step_is_gauss_newtons(study):
+def test_batch_step_equals_single_gauss_newton_steps(study):
     """Slopes of many machines at once, and steps of each alone."""
     prepared = study.prepare()
     problem = prepared.problem
     errors = np.array(study.directions[:4]) * 20e-3
-    read, _ = prepared._read(errors)
+    read, _ = predict_batch(problem, errors / problem.theta_scale)
     theta = 0.8 * errors
-    found, alive = prepared._step(read, theta)
+    found, alive = prepared.step(read, theta)
     assert alive.all()
     from orthocal.statistics.zeros import project_out_zeros
 
@@ -135,7 +133,7 @@ def test_a_step_is_gauss_newtons(study):
         assert np.abs(step - expected).max() < 1e-12
 
 
-def test_slopes_of_many_machines_are_each_ones_own(root):
+def test_batch_jacobians_equal_single_jacobians(root):
     """All errors, what is not known of gauges among them."""
     plan = load_plan(root / "examples/workshop/plan.yaml")
     choice = Choice("full")
@@ -148,33 +146,33 @@ def test_slopes_of_many_machines_are_each_ones_own(root):
         assert np.abs(own - expected).max() < 1e-12
 
 
-def test_what_is_missed_grows_with_the_square_and_each_step_squares_it(summary):
+def test_order_of_convergence(summary):
     first = method(summary, "first_order")
-    assert first.missed[4] / first.missed[0] == pytest.approx(
+    assert first.errors[4] / first.errors[0] == pytest.approx(
         (summary.sizes[4] / summary.sizes[0]) ** 2, rel=0.1
     )
-    assert first.beyond_resolution == pytest.approx(1.94, rel=0.1)
-    assert first.beyond_noise == pytest.approx(3.83, rel=0.1)
-    assert method(summary, "steps_2").beyond_resolution > 10.0
+    assert first.exceeds_resolution == pytest.approx(1.94, rel=0.1)
+    assert first.exceeds_noise == pytest.approx(3.83, rel=0.1)
+    assert method(summary, "steps_2").exceeds_resolution > 10.0
     assert summary.steps[-1] <= 6
-    assert all(m.ends is None for m in summary.methods)
-    assert method(summary, "exact").beyond_resolution is None
+    assert all(m.fails is None for m in summary.methods)
+    assert method(summary, "exact").exceeds_resolution is None
 
 
-def test_where_undamped_steps_come_to_nothing_is_told(tmp_path):
+def test_gauss_newton_diverges_on_short_legs(tmp_path):
     """A machine of short legs, 60 mm off."""
     robot = make_robot(Sizes(leg=0.15, lower=0.06, upper=0.24, attachment=0.02), tmp_path / "m")
-    from orthocal.study.paper import Displacements
+    from orthocal.study.paper_plan import Displacements
 
     study = build_linearisation_study(
         robot, sizes=[1.0, 60.0], directions=4, displacements=Displacements(0.03, -0.05)
     )
     found = summarise_linearisation(study, run_study(study))
     assert found.steps[0] is not None
-    assert found.steps[1] is None or found.steps[1] > 5 or found.assembled < 60.0
+    assert found.steps[1] is None or found.steps[1] > 5 or found.measurable < 60.0
 
 
-def test_longer_legs_bend_less(tmp_path, orthoglide):
+def test_longer_legs_are_less_nonlinear(tmp_path, orthoglide):
     longer = make_robot(Sizes(leg=0.6205, lower=0.43, upper=0.7), tmp_path / "long")
     errors = [
         run_task(build_linearisation_study(r, sizes=[2.0], along=ALONG), 0)["first_order"][0]
@@ -183,7 +181,7 @@ def test_longer_legs_bend_less(tmp_path, orthoglide):
     assert errors[1] < 0.6 * errors[0]
 
 
-def test_any_errors_of_any_session(root):
+def test_session_and_other_errors(root):
     plan = load_plan(root / "examples/workshop/plan.yaml")
     study = build_linearisation_study(
         plan, free=["*.offset", "*_leg.length"], sizes=[0.5], directions=3
@@ -195,7 +193,17 @@ def test_any_errors_of_any_session(root):
     assert study.resolution == 10e-6
 
 
-def test_biglide_has_no_paper_but_a_session_does(biglide):
+def test_machines_without_contact_are_counted(root):
+    """Large errors move the rod away from the ball of some gauge."""
+    plan = load_plan(root / "examples/workshop/plan.yaml")
+    study = build_linearisation_study(plan, sizes=[1.0, 50.0], directions=2)
+    table = run_study(study)
+    assert table.columns["status"][:2] == [IDENTIFIED] * 2
+    assert NO_CONTACT in table.columns["status"][2:]
+    assert summarise_linearisation(study, table).measurable == 1.0
+
+
+def test_paper_plan_requires_an_orthoglide(biglide):
     with pytest.raises(ParameterError, match="has no legs x, y, z along these axes"):
         build_linearisation_study(biglide)
 
@@ -208,18 +216,18 @@ def test_biglide_has_no_paper_but_a_session_does(biglide):
         ({"along": [0.0, 0.0, 0.0]}, ParameterError, "not all 0"),
     ],
 )
-def test_what_makes_no_sense_is_refused(orthoglide, arguments, error, message):
+def test_invalid_arguments(orthoglide, arguments, error, message):
     with pytest.raises(error, match=message):
         build_linearisation_study(orthoglide, **arguments)
 
 
-def test_what_readings_cannot_tell_is_refused(orthoglide):
+def test_unidentifiable_errors(orthoglide):
     study = build_linearisation_study(orthoglide, free=["x_slide.offset", "x_swivel.x"])
     with pytest.raises(NotIdentifiableError):
         study.prepare()
 
 
-def test_a_gauges_own_noise_stands_beside_it(orthoglide):
+def test_noise_and_resolution_of_the_gauge(orthoglide):
     study = build_linearisation_study(orthoglide, gauge=Gauge(1e-6, 2e-6, None))
     assert study.resolution == 2e-6
     assert study.sigma == pytest.approx(np.hypot(1e-6, 2e-6 / np.sqrt(12)))

@@ -1,4 +1,4 @@
-"""Studies that are stopped, killed, shared out: the same table, byte by byte."""
+"""Studies that are stopped, killed or distributed produce the same table, byte by byte."""
 
 from __future__ import annotations
 
@@ -19,15 +19,13 @@ from processes import children_of, is_running, until
 
 from orthocal import load_session
 from orthocal.errors import OrthocalError
-from orthocal.output.study.views import study_json, summarise_study
+from orthocal.output.study.contents import report_study, study_json
 from orthocal.runtime import worker_pool as cores
 from orthocal.study import runner as running
 from orthocal.study.bootstrap import build_bootstrap_study
-from orthocal.study.journal import open_journal
 from orthocal.study.linearisation import build_linearisation_study
-from orthocal.study.parquet import to_parquet
-from orthocal.study.runner import JOURNAL, run_study
-from orthocal.study.study import run_task, tidy_cell
+from orthocal.study.runner import JOURNAL, open_results, run_study, to_parquet
+from orthocal.study.study import round_cell, run_task
 
 KILLS = 20
 FORK = multiprocessing.get_context("fork")
@@ -38,7 +36,7 @@ def session_of(root):
 
 
 def results(table):
-    return to_parquet(table), study_json(table, summarise_study(table))
+    return to_parquet(table), study_json(table, report_study(table))
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +52,7 @@ def undisturbed(study):
     return run_study(study)
 
 
-def test_killed_twenty_times_it_is_the_same_byte_by_byte(study, undisturbed, tmp_path):
+def test_killed_and_resumed_twenty_times(study, undisturbed, tmp_path):
     rng = np.random.default_rng(0)
     began = time.monotonic()
     run_task(study, 1)
@@ -69,14 +67,14 @@ def test_killed_twenty_times_it_is_the_same_byte_by_byte(study, undisturbed, tmp
         os.kill(child.pid, signal.SIGKILL)
         child.join()
         if (tmp_path / JOURNAL).exists():
-            with open_journal(tmp_path / JOURNAL, study) as journal:
-                assert kept <= set(journal.found)  # what was found stays
-                kept = set(journal.found)
+            with open_results(tmp_path / JOURNAL, study) as (stored, _):
+                assert kept <= set(stored)
+                kept = set(stored)
     again = run_study(study, folder=tmp_path)
     assert results(again) == results(undisturbed)
 
 
-def test_a_line_without_an_end_is_done_again(study, undisturbed, tmp_path):
+def test_an_incomplete_line_is_computed_again(study, undisturbed, tmp_path):
     run_study(study, folder=tmp_path)
     file = tmp_path / JOURNAL
     whole = file.read_bytes()
@@ -88,12 +86,14 @@ def test_a_line_without_an_end_is_done_again(study, undisturbed, tmp_path):
 
 @pytest.mark.parametrize("forked", [True, False])
 @pytest.mark.parametrize("workers", [2, 3])
-def test_any_number_of_workers_finds_the_same(study, undisturbed, workers, forked, monkeypatch):
+def test_results_do_not_depend_on_the_number_of_workers(
+    study, undisturbed, workers, forked, monkeypatch
+):
     monkeypatch.setattr(cores, "can_fork", lambda: forked)
     assert results(run_study(study, workers=workers)) == results(undisturbed)
 
 
-def test_a_process_with_threads_is_not_doubled():
+def test_a_process_with_threads_is_not_forked():
     code = (
         "import threading, time\nfrom orthocal.runtime.worker_pool import can_fork\n"
         "assert can_fork()\n"
@@ -104,7 +104,7 @@ def test_a_process_with_threads_is_not_doubled():
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)
 
 
-def test_a_worker_that_is_killed_is_told(study, tmp_path, monkeypatch):
+def test_a_killed_worker(study, tmp_path, monkeypatch):
     monkeypatch.setattr(cores, "can_fork", lambda: True)
     here = os.getpid()
     run = running.run_task
@@ -118,14 +118,14 @@ def test_a_worker_that_is_killed_is_told(study, tmp_path, monkeypatch):
     monkeypatch.setattr(running, "run_task", kill_itself)
     with pytest.raises(OrthocalError, match="a process of the study was killed"):
         run_study(study, workers=2, folder=tmp_path)
-    assert not doubled()
-    with open_journal(tmp_path / JOURNAL, study) as journal:
-        assert journal.found
-        assert 5 not in journal.found
+    assert not forked_workers()
+    with open_results(tmp_path / JOURNAL, study) as (stored, _):
+        assert stored
+        assert 5 not in stored
 
 
 @pytest.mark.parametrize("sendable", [True, False])
-def test_what_a_worker_raises_is_raised(study, monkeypatch, sendable):
+def test_an_error_of_a_worker_is_raised(study, monkeypatch, sendable):
     class OwnError(Exception):
         """Of no module: it cannot be sent."""
 
@@ -146,15 +146,15 @@ def test_workers_hold_no_lock(study, tmp_path, monkeypatch):
     locked = tmp_path / "held"
     descriptor = os.open(locked, os.O_RDWR | os.O_CREAT)
     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    tasks = cores.run_on_cores(partial(run_task, study), range(6), 2, killed="")
+    tasks = cores.run_in_parallel(partial(run_task, study), range(6), 2, killed="")
     next(tasks)
     os.close(descriptor)
     other = os.open(locked, os.O_RDWR)
     until(lambda: is_free(other))  # while both are still there
-    assert len(doubled()) == 2
+    assert len(forked_workers()) == 2
     os.close(other)
     tasks.close()
-    assert not doubled()
+    assert not forked_workers()
 
 
 def is_free(descriptor):
@@ -165,11 +165,11 @@ def is_free(descriptor):
     return True
 
 
-def doubled():
+def forked_workers():
     return [p for p in multiprocessing.active_children() if isinstance(p, FORK.Process)]
 
 
-def test_what_is_there_is_not_done_again(study, tmp_path, monkeypatch):
+def test_finished_tasks_are_not_computed_again(study, tmp_path, monkeypatch):
     run_study(study, folder=tmp_path)
     monkeypatch.setattr("orthocal.study.runner.run_task", None)
     told = []
@@ -177,7 +177,7 @@ def test_what_is_there_is_not_done_again(study, tmp_path, monkeypatch):
     assert [(p.done, p.kept) for p in told] == [(3000, 3000)]
 
 
-def test_progress_and_time_left_are_told(study):
+def test_progress(study):
     told = []
     run_study(study, report=told.append)
     assert [p.done for p in told] == [250 * i for i in range(13)]
@@ -186,10 +186,12 @@ def test_progress_and_time_left_are_told(study):
     assert told[-1].seconds_left == 0.0
 
 
-def test_another_studys_folder_is_refused(study, root, tmp_path):
+def test_directory_of_another_study(study, root, tmp_path):
     run_study(study, folder=tmp_path)
     other = build_bootstrap_study(session_of(root), draws=3000, seed=1)
-    with pytest.raises(OrthocalError, match=r"results\.jsonl: is of another study.* seed;"):
+    with pytest.raises(
+        OrthocalError, match=r"results\.jsonl: belongs to another study \(different: seed\)"
+    ):
         run_study(other, folder=tmp_path)
     found = run_study(other, folder=tmp_path, anew=True)
     assert results(found) == results(run_study(other))
@@ -198,17 +200,20 @@ def test_another_studys_folder_is_refused(study, root, tmp_path):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda lines: [b"nothing\n", *lines], r"results\.jsonl:1: is no line of a study"),
-        (lambda lines: [lines[0], b"[1]\n", *lines[1:]], r"jsonl:2: is no line of a study"),
+        (lambda lines: [b"nothing\n", *lines], r"results\.jsonl:1: is not a line of a study"),
+        (lambda lines: [lines[0], b"[1]\n", *lines[1:]], r"jsonl:2: is not a line of a study"),
         (lambda lines: [lines[0], b'{"task": 99, "columns": {"a": [1]}}\n'], "jsonl:2: is damaged"),
         (lambda lines: [lines[0], b'{"task": 0, "columns": {"a": [1], "b": []}}\n'], "is damaged"),
-        (lambda lines: [b"{}\n", *lines[1:]], r"jsonl: is no study's; --force writes over it"),
-        (lambda lines: [b"[" * 100_000 + b"\n"], "is no line of a study"),
+        (
+            lambda lines: [b"{}\n", *lines[1:]],
+            r"jsonl: is not a study's file; --force overwrites it",
+        ),
+        (lambda lines: [b"[" * 100_000 + b"\n"], "is not a line of a study"),
     ],
 )
-def test_a_damaged_journal_is_refused(study, tmp_path, spoil, message):
-    with open_journal(tmp_path / JOURNAL, study) as journal:
-        journal.add(0, {"draw": [0]})
+def test_a_damaged_journal(study, tmp_path, spoil, message):
+    with open_results(tmp_path / JOURNAL, study) as (_, store):
+        store(0, {"draw": [0]})
     file = tmp_path / JOURNAL
     spoilt = b"".join(spoil(file.read_bytes().splitlines(keepends=True)))
     file.write_bytes(spoilt)
@@ -219,8 +224,8 @@ def test_a_damaged_journal_is_refused(study, tmp_path, spoil, message):
 
 def test_two_processes_do_not_write_one_journal(study, tmp_path):
     with (
-        open_journal(tmp_path / JOURNAL, study),
-        pytest.raises(OrthocalError, match="is being written by another process"),
+        open_results(tmp_path / JOURNAL, study),
+        pytest.raises(OrthocalError, match="is in use by another process"),
     ):
         run_study(study, folder=tmp_path)
 
@@ -237,11 +242,11 @@ def test_pandas_and_polars_open_the_table(undisturbed, tmp_path):
             assert list(frame[name]) == cells
 
 
-def test_cells_are_plain_and_short():
-    assert tidy_cell(np.float64(1 / 3)) == 0.333333333
-    assert tidy_cell(np.nan) is None
-    assert tidy_cell(-1e-300 * 1e-300) == 0.0
-    assert (tidy_cell(np.int64(3)), tidy_cell(np.bool_(1)), tidy_cell("a")) == (3, True, "a")
+def test_cells_are_rounded():
+    assert round_cell(np.float64(1 / 3)) == 0.333333333
+    assert round_cell(np.nan) is None
+    assert round_cell(-1e-300 * 1e-300) == 0.0
+    assert (round_cell(np.int64(3)), round_cell(np.bool_(1)), round_cell("a")) == (3, True, "a")
 
 
 @pytest.fixture
@@ -277,7 +282,7 @@ def cluster():
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
-def test_a_cluster_one_of_whose_workers_is_killed_finds_the_same(cluster, study, undisturbed):
+def test_a_cluster_with_a_killed_worker(cluster, study, undisturbed):
     address, workers = cluster
     killed = []
 
@@ -294,13 +299,13 @@ def test_a_cluster_one_of_whose_workers_is_killed_finds_the_same(cluster, study,
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nowhere", "", "tcp://["])
-def test_a_cluster_that_does_not_answer_is_told(study, monkeypatch, address):
-    monkeypatch.setattr("orthocal.study.runner.CONNECTING", 1.0)
+def test_a_cluster_that_does_not_answer(study, monkeypatch, address):
+    monkeypatch.setattr("orthocal.study.runner.DASK_TIMEOUT", 1.0)
     with pytest.raises(OrthocalError, match="--dask: no Dask scheduler answers at"):
         run_study(study, dask=address)
 
 
-def test_workers_end_when_nobody_wants_them_any_more(root, tmp_path):
+def test_workers_end_with_their_parent(root, tmp_path):
     words = ["study", "bootstrap", str(root / "examples/raw-cycles"), "--draws", "100000"]
     words += ["--workers", "2", "--out", str(tmp_path)]
     run = subprocess.Popen(
@@ -317,7 +322,7 @@ def test_workers_end_when_nobody_wants_them_any_more(root, tmp_path):
     until(lambda: not any(is_running(p) for p in children))
 
 
-def test_a_robot_that_is_not_there_any_more_is_made_of_its_files(orthoglide, tmp_path):
+def test_a_robot_whose_directory_is_gone(orthoglide, tmp_path):
     """As on another machine, or where its files were changed meanwhile."""
     from orthocal.robot.builder.build import Sizes, make_robot
 
@@ -327,9 +332,9 @@ def test_a_robot_that_is_not_there_any_more_is_made_of_its_files(orthoglide, tmp
     expected = run_study(study).columns
     for file in (tmp_path / "mine").iterdir():
         file.write_text("something else")
-    from orthocal.study import shipped_functions as shipping
+    from orthocal.study import portable_session
 
-    shipping._unpack.cache_clear()
+    portable_session._unpack.cache_clear()
     from orthocal.study.study import prepare_once
 
     prepare_once.cache_clear()

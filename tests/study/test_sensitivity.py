@@ -1,4 +1,4 @@
-"""What readings answer to errors: the paper's factors, and central differences of rigid bodies."""
+"""Study of sensitivity: the paper's factors, and central differences with Pinocchio."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import pytest
 from machines import place
 
 from orthocal import load_plan
-from orthocal.errors import ClosureError, ParameterError
-from orthocal.study.paper import Displacements
+from orthocal.errors import ClosureError, ParameterError, SessionError
+from orthocal.study.paper_plan import Displacements
 from orthocal.study.runner import run_study
 from orthocal.study.sensitivity import build_sensitivity_study, summarise_sensitivity
 
@@ -22,11 +22,11 @@ def offsets(orthoglide):
 
 
 def row(summary, posture, reads):
-    return summary.slopes[summary.rows.index((posture, reads))]
+    return summary.derivatives[summary.rows.index((posture, reads))]
 
 
 @pytest.mark.parametrize(("posture", "moved"), [("x_max", 60.0), ("x_min", -100.0)])
-def test_the_papers_factors_come_out(offsets, posture, moved):
+def test_factors_of_the_paper(offsets, posture, moved):
     """Equation (6) at the tool: 1 and tan α; equation (7) in readings."""
     alpha = np.arcsin(moved * 1e-3 / LENGTH)
     t, s = np.tan(alpha), np.sin(alpha)
@@ -38,7 +38,7 @@ def test_the_papers_factors_come_out(offsets, posture, moved):
     assert set(offsets.units) == {"mm/mm"}
 
 
-def test_the_tools_slopes_are_those_of_rigid_bodies(orthoglide):
+def test_derivatives_agree_with_central_differences(orthoglide):
     """Any errors, any place: central differences, loops closed by Pinocchio."""
     names = ["x_swivel.rz", "y_coupler.x", "z_slide.scale", "frame.y_foot_end.ry"]
     point = [0.02, -0.03, 0.04]
@@ -59,10 +59,10 @@ def test_the_tools_slopes_are_those_of_rigid_bodies(orthoglide):
         assert found.units[i] == f"mm/{parameter.edge_unit}"
         along_x = found.rows.index(("point_1", "tool x"))
         expected_um = expected[0] * parameter.tolerance
-        assert found.per_tolerance[along_x, i] == pytest.approx(expected_um, abs=1e-10)
+        assert found.per_prior_std[along_x, i] == pytest.approx(expected_um, abs=1e-10)
 
 
-def test_a_sessions_own_readings_are_in_it(root):
+def test_all_readings_of_a_session(root):
     plan = load_plan(root / "examples/workshop/plan.yaml")
     study = build_sensitivity_study(plan)
     table = run_study(study)
@@ -72,13 +72,20 @@ def test_a_sessions_own_readings_are_in_it(root):
     assert len(table) == len(found.rows) * 129
 
 
-def test_out_of_reach_is_told(orthoglide):
+def test_points_without_contact(root):
+    """The ball of a gauge is at a fixed place on the base."""
+    plan = load_plan(root / "examples/workshop/plan.yaml")
+    with pytest.raises(SessionError, match="point_1"):
+        build_sensitivity_study(plan, points=[[0.01, 0.02, 0.03]])
+
+
+def test_unreachable_points(orthoglide):
     with pytest.raises(ClosureError, match="point_1"):
         build_sensitivity_study(orthoglide, points=[[0.5, 0.0, 0.0]])
     with pytest.raises(ClosureError, match="x_max"):
         build_sensitivity_study(orthoglide, displacements=Displacements(0.5, -0.1))
 
 
-def test_unknown_names_are_told(orthoglide):
+def test_unknown_names(orthoglide):
     with pytest.raises(ParameterError, match="nothing"):
         build_sensitivity_study(orthoglide, ["nothing"])

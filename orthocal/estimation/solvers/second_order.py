@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
 from orthocal.observation.expansion import Expansion
-from orthocal.runtime.worker_pool import call_on_cores, lent_cores
+from orthocal.runtime.worker_pool import call_in_parallel, current_worker_budget
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -70,8 +70,8 @@ def find_curvature(problem: CalibrationProblem) -> CurvedReadings | None:
 def _find_curvature(problem: CalibrationProblem) -> CurvedReadings:
     n, m = problem.n_free, problem.observations.size
     about = problem.expand(problem.reference, problem.reference_passive)
-    parts = np.array_split(np.arange(n), lent_cores())
-    found = call_on_cores([partial(_differences, problem, about, part) for part in parts])
+    parts = np.array_split(np.arange(n), current_worker_budget())
+    found = call_in_parallel([partial(_differences, problem, about, part) for part in parts])
     curvature = np.concatenate(found)
     for k in range(n):  # by either parameter first
         half = 0.5 * (curvature[k, :, k:] + curvature[k:, :, k].T)

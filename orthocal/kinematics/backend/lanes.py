@@ -130,17 +130,17 @@ def find_listing(function: ca.Function) -> Listing | None:
     None where one of them is not known here.
     """
     key = _key_of(function)
-    found = None if key is None else _read(cache.recall(key), function)
+    found = None if key is None else _read(cache.load(key), function)
     if found is None and (found := list_instructions(function)) is not None and key is not None:
         arrays = found.table, found.constants, np.array(found.n_work), found.first_out
-        cache.keep(key, b"".join(a.tobytes() for a in arrays))
+        cache.store(key, b"".join(a.tobytes() for a in arrays))
     return found
 
 
 def recall_listing(function: ca.Function) -> Listing | None:
     """The instructions of a function as kept on disk; None where they are not."""
     key = _key_of(function)
-    return None if key is None else _read(cache.recall(key), function)
+    return None if key is None else _read(cache.load(key), function)
 
 
 def _key_of(function: ca.Function) -> str | None:

@@ -48,7 +48,7 @@ OFFSET_KEYS: dict[str, tuple[Unit, float]] = {
 
 
 class _Keys(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class GaugeKeys(_Keys):

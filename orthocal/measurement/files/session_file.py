@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 from orthocal.errors import ClosureError, ParameterError, RobotError, SessionError
 from orthocal.io.documents import read_yaml, validate
 from orthocal.io.fields import read_only
-from orthocal.io.files import exists, is_folder, read_file, require_plain_name
+from orthocal.io.files import (
+    content_withheld_outside,
+    exists,
+    is_folder,
+    read_file,
+    require_plain_name,
+)
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.measurement.files.readings_checks import check_readings
 from orthocal.measurement.files.readings_file import read_rows
@@ -67,8 +73,9 @@ def _load_session(
     """A session with readings; where `unread` is given cells may be empty, and it tells which."""
     plan, readings_path = _build_unread(file, keys)
     table = read_file(readings_path, error=SessionError)
-    rows = read_rows(readings_path, table)
-    readings = check_readings(rows, plan, file=readings_path, unread=unread)
+    with content_withheld_outside(file.parent, readings_path):
+        rows = read_rows(readings_path, table)
+        readings = check_readings(rows, plan, file=readings_path, unread=unread)
     digest = hashlib.sha256(content + b"\0" + table).hexdigest()
     session = replace(plan, readings=readings, readings_path=readings_path, sha256=digest)
     check_contacts(session)

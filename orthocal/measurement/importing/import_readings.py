@@ -11,7 +11,7 @@ from typing import cast, get_args
 
 from orthocal.arguments import require_kind
 from orthocal.errors import SessionError
-from orthocal.io.files import exists, read_file, write_file
+from orthocal.io.files import content_withheld_outside, exists, read_file, write_file
 from orthocal.io.tables.numerals import Sign
 from orthocal.io.tables.table import Table, read_table
 from orthocal.measurement.files.readings_checks import RawReading, check_readings, parse_cycle
@@ -132,9 +132,10 @@ def import_readings(
         fill=options.fill,
     )
     check_readings(long_table.rows, plan, file=path)
-    existing = _read_existing(readings_path, path, long_table, overwrite)
-    if existing:
-        check_readings(existing, plan, file=readings_path, unread=set())
+    with content_withheld_outside((plan.path or Path(session)).parent, readings_path):
+        existing = _read_existing(readings_path, path, long_table, overwrite)
+        if existing:
+            check_readings(existing, plan, file=readings_path, unread=set())
     rows, counts = _merge(existing, long_table.rows, overwrite)
     text = _format_readings(rows)
     written = read_rows(readings_path, text.encode())

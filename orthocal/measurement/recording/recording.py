@@ -83,7 +83,7 @@ Key = tuple[str, str, str | None, Annotated[int, Field(ge=1, lt=10**9)]]
 class Change(BaseModel):
     """Something that was done to the rows, as the journal keeps it."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     done: Literal["read", "emptied", "added", "dropped"]
     """A value was read for a row; all rows of its setup were emptied; one was put in after it; it

@@ -1,1 +1,1 @@
-"""Studies as text, plain data and pictures: a file a kind."""
+"""Reports of studies as text, JSON and figures."""

@@ -57,9 +57,10 @@ def _render(result: Result, details: bool, all_rows: bool) -> RenderableType:
     expected = "a Calibration, a Comparison, a Validation, a MeasuringPlan or a StudyTable"
     require_kind(result, kinds, expected=expected)
     if isinstance(result, StudyTable):
-        from orthocal.output.study.views import render_study, summarise_study
+        from orthocal.output.study.contents import report_study
+        from orthocal.output.study.report import render_report
 
-        return render_study(result, summarise_study(result), all_rows=all_rows or details)
+        return render_report(report_study(result, all_rows=all_rows or details))
     if isinstance(result, MeasuringPlan):
         from orthocal.output.text.plan import render_plan
 

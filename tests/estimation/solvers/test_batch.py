@@ -186,7 +186,7 @@ def test_curved_readings_leave_the_third_order(sweep):
 def test_curvature_is_the_same_from_any_number_of_processes(sweep, monkeypatch):
     monkeypatch.setattr(cores, "can_fork", lambda: True)
     alone = find_curvature(sweep)
-    with cores.lent(3):
+    with cores.worker_budget(3):
         together = find_curvature(sweep)
     assert np.array_equal(together.curvature, alone.curvature)
 

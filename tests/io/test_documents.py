@@ -97,7 +97,7 @@ def test_forty_thousand_keys_are_no_reason_to_wait(tmp_path, refused):
     assert len(read_json(path, error=SessionError)) == 100_000
     assert time.process_time() - began < PROMPT
     twice = ",".join(f'"{i}": 0' for i in [*range(40_000), 39_999])
-    assert "the key '39999' stands twice" in refused(f"{{{twice}}}", reader=read_json)
+    assert "the key '39999' occurs twice" in refused(f"{{{twice}}}", reader=read_json)
 
 
 def test_a_json_of_empty_lists_is_counted_first(refused):
@@ -169,7 +169,7 @@ def change(document, keys, value):
         (["identifiability", "rank"], 4, "identifiability.rank: found 4"),
         (["covariance"], [], "covariance: expected 3 × 3 numbers"),
         (["parameters", 0, "tolerance"], 0, "expected greater than 0"),
-        (["robot", "folder"], "a\x00b", "a text holds a control character"),
+        (["robot", "folder"], "a\x00b", "a text contains a control character"),
         (["robot", "folder"], "x" * 300, "is neither a robot of orthocal"),
         (["session", "title"], "\ud800", "half of a surrogate pair"),
         (["residuals"], [0] * 300_000, "residuals[0]: found '0'; expected keys and values"),

@@ -1,4 +1,4 @@
-"""The paper's plan for a machine of the Orthoglide's kind (section 3.1)."""
+"""The paper's measurement plan for an Orthoglide-type machine (section 3.1)."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from orthocal.session.session import Gauge, Posture, Reading, Session, Setup
 
 @dataclass(frozen=True, slots=True)
 class Displacements:
-    """How far the tool goes in the paper's postures, [m]."""
+    """Tool displacements in the paper's maximum and minimum postures, [m]."""
 
     maximum: float = 0.06
     minimum: float = -0.1
 
 
 PAPER_GAUGE = Gauge(20e-6, 10e-6, None)
-"""Repeats to 0.02 mm, shows 10 µm (paper, section 4)."""
+"""Repeatability 0.02 mm, resolution 10 µm (paper, section 4)."""
 
 
 def build_paper_plan(robot: Robot, displacements: Displacements, gauge: Gauge) -> Session:
-    """The paper's plan (section 3.1): each leg read in its middle, in two directions.
+    """The paper's plan (section 3.1): each leg is read at its middle, in two directions.
 
-    Zero, maximum and minimum along each axis, on a machine of the Orthoglide's kind.
+    The postures are zero, maximum and minimum along the axis of the leg.
 
     Raises:
-        ParameterError: If the machine is of another kind.
+        ParameterError: If the machine is not of the Orthoglide type.
         ClosureError: If it cannot reach a posture.
     """
     axes = "xyz"
@@ -41,7 +41,7 @@ def build_paper_plan(robot: Robot, displacements: Displacements, gauge: Gauge) -
     fits = fits and all(np.abs(leg.axis[i]) > 0.999 for i, leg in enumerate(legs))
     if not fits:
         raise ParameterError(
-            "has no legs x, y, z along these axes: the paper's plan is none for it; name a session",
+            "has no legs x, y, z along these axes, which the paper's plan needs; name a session",
             where=robot.name,
         )
     points = {"zero": np.zeros(3)}
@@ -50,8 +50,8 @@ def build_paper_plan(robot: Robot, displacements: Displacements, gauge: Gauge) -
         points[f"{axis}_min"] = displacements.minimum * np.eye(3)[i]
     drives = nominal_assembly(robot).inverse(np.array(list(points.values())), names=list(points))
     postures = {
-        name: Posture(name, "tcp_mm", point, own)
-        for (name, point), own in zip(points.items(), drives, strict=True)
+        name: Posture(name, "tcp_mm", point, coordinates)
+        for (name, point), coordinates in zip(points.items(), drives, strict=True)
     }
     setups, readings = {}, []
     for leg in axes:

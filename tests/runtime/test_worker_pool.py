@@ -17,30 +17,30 @@ def forking(monkeypatch):
 
 def test_calls_return_in_their_order_from_other_processes(forking):
     calls = [lambda k=k: (k, os.getpid()) for k in range(5)]
-    with cores.lent(2):
-        found = cores.call_on_cores(calls)
+    with cores.worker_budget(2):
+        found = cores.call_in_parallel(calls)
     assert [k for k, _ in found] == list(range(5))
     assert os.getpid() not in {process for _, process in found}
     assert len({process for _, process in found}) == 2
     # nobody lends any more
-    assert {process for _, process in cores.call_on_cores(calls)} == {os.getpid()}
+    assert {process for _, process in cores.call_in_parallel(calls)} == {os.getpid()}
 
 
 def test_a_worker_is_lent_no_more_cores(forking):
     def inner():
-        return cores.lent_cores(), cores.call_on_cores([os.getpid, os.getpid])
+        return cores.current_worker_budget(), cores.call_in_parallel([os.getpid, os.getpid])
 
-    with cores.lent(2):
-        first, second = cores.call_on_cores([inner, inner])
-    for lent, processes in (first, second):
-        assert lent == 1
+    with cores.worker_budget(2):
+        first, second = cores.call_in_parallel([inner, inner])
+    for budget, processes in (first, second):
+        assert budget == 1
         assert len(set(processes)) == 1
 
 
 def test_what_is_lent_is_given_back(forking):
-    with pytest.raises(ParameterError, match="--setups: found 0"), cores.lent(3):
-        cores.call_on_cores([_refuse, os.getpid])
-    assert cores.lent_cores() == 1
+    with pytest.raises(ParameterError, match="--setups: found 0"), cores.worker_budget(3):
+        cores.call_in_parallel([_refuse, os.getpid])
+    assert cores.current_worker_budget() == 1
 
 
 def _refuse():
@@ -49,13 +49,13 @@ def _refuse():
 
 def test_where_processes_cannot_be_doubled_calls_are_made_here(monkeypatch):
     monkeypatch.setattr(cores, "can_fork", lambda: False)
-    with cores.lent(2):
-        assert set(cores.call_on_cores([os.getpid] * 3)) == {os.getpid()}
+    with cores.worker_budget(2):
+        assert set(cores.call_in_parallel([os.getpid] * 3)) == {os.getpid()}
 
 
 def test_a_process_that_is_killed_is_told(forking):
     def die():
         os.kill(os.getpid(), 9)
 
-    with cores.lent(2), pytest.raises(cores.OrthocalError, match="it was killed"):
-        cores.call_on_cores([die, os.getpid], killed="it was killed")
+    with cores.worker_budget(2), pytest.raises(cores.OrthocalError, match="it was killed"):
+        cores.call_in_parallel([die, os.getpid], killed="it was killed")

@@ -1,4 +1,4 @@
-"""A session and its robot as a worker gets them, in whichever process and on whichever machine."""
+"""A session and its robot in a form that can be sent to workers on any machine."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from orthocal.session.session import Session
 
 
 @dataclass(frozen=True, slots=True)
-class ShippedRobot:
-    """The files of a robot."""
+class PortableRobot:
+    """Files of a robot."""
 
     name: str
     folder: str
-    """Where it is; elsewhere it is made of the files."""
+    """Directory of the files; where it does not exist, the robot is loaded from their content."""
     sha256: str
     urdf: bytes
     description: bytes
     tolerances: tuple[tuple[str, float], ...] = ()
-    """Other ones than its files', as a session states them."""
+    """Prior standard deviations that a session states in place of the robot's."""
 
     @classmethod
-    def of(cls, robot: Robot) -> ShippedRobot:
-        """The files of a nominal robot.
+    def of(cls, robot: Robot) -> PortableRobot:
+        """Files of a nominal robot.
 
         Raises:
-            RobotError: If they cannot be read any more.
+            RobotError: If a file cannot be read any more.
         """
         urdf, description = (read_file(p, error=RobotError) for p in (robot.urdf, robot.yaml))
         folder = str(robot.folder.resolve())
@@ -43,47 +43,49 @@ class ShippedRobot:
         return cls(robot.name, folder, robot.sha256, urdf, description, stated)
 
     def unpack(self) -> Robot:
-        """The robot; that which is there where nothing has changed."""
+        """The robot, from its directory if the files there are unchanged."""
         return _unpack(self).with_tolerances(dict(self.tolerances))
 
 
 @lru_cache(maxsize=4)
-def _unpack(shipped: ShippedRobot) -> Robot:
+def _unpack(portable: PortableRobot) -> Robot:
     packaged = packaged_robots()
-    for there in (shipped.name if shipped.name in packaged else None, Path(shipped.folder)):
-        if there is None or (isinstance(there, Path) and not is_folder(there)):
-            continue
-        robot = load_robot(there)
-        if robot.sha256 == shipped.sha256:
+    folder = Path(portable.folder)
+    sources: list[str | Path] = [portable.name] if portable.name in packaged else []
+    sources += [folder] if is_folder(folder) else []
+    for source in sources:
+        robot = load_robot(source)
+        if robot.sha256 == portable.sha256:
             return robot
     with tempfile.TemporaryDirectory() as above:
-        folder = Path(above) / shipped.name
+        folder = Path(above) / portable.name
         folder.mkdir()
-        (folder / f"{shipped.name}.urdf").write_bytes(shipped.urdf)
-        (folder / f"{shipped.name}.yaml").write_bytes(shipped.description)
+        (folder / f"{portable.name}.urdf").write_bytes(portable.urdf)
+        (folder / f"{portable.name}.yaml").write_bytes(portable.description)
         return load_robot(folder)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ShippedSession:
-    """A session without its robot, and that robot's files."""
+class PortableSession:
+    """A session, with the files of its robot in place of the robot."""
 
-    robot: ShippedRobot
-    rest: Session
+    robot: PortableRobot
+    session: Session
+    """Without its robot."""
 
     @classmethod
-    def of(cls, session: Session) -> ShippedSession:
+    def of(cls, session: Session) -> PortableSession:
         """A session of a nominal robot."""
-        bare: Any = None  # put back by `unpack`
-        return cls(ShippedRobot.of(session.robot), replace(session, robot=bare, parts=()))
+        no_robot: Any = None  # `unpack` restores it
+        return cls(PortableRobot.of(session.robot), replace(session, robot=no_robot, parts=()))
 
     def unpack(self) -> Session:
         """The session, with its robot."""
-        return replace(self.rest, robot=self.robot.unpack())
+        return replace(self.session, robot=self.robot.unpack())
 
     @property
     def record(self) -> dict[str, Any]:
-        """What it is, as plain data: what was measured by what it is, not by where it lies."""
+        """The session as plain data, without the locations of its files."""
         session = self.unpack()
         document = session_document(session)
         document["robot"] = self.robot.name

@@ -81,7 +81,7 @@ def test_strings_in_lists_of_a_json_are_looked_at_too(session):
     text = path.read_text(encoding="utf-8")
     assert '"told": [\n   "x_slide.offset"' in text
     path.write_text(text.replace('"told": [\n   "x_', '"told": [\n   "\\u001b[31mx_'))
-    with pytest.raises(OrthocalError, match="a text holds a control character"):
+    with pytest.raises(OrthocalError, match="a text contains a control character"):
         load_calibration(session)
 
 
@@ -114,7 +114,7 @@ def test_a_name_is_one_name_in_every_form_of_its_accents(session):
 
     twice = text.replace(f"  {apart}:", f"  {composed}: {{tcp_mm: [1, 2, 3]}}\n  {apart}:", 1)
     described.write_text(twice, encoding="utf-8")
-    with pytest.raises(OrthocalError, match="the key 'max_é' stands twice"):
+    with pytest.raises(OrthocalError, match="the key 'max_é' occurs twice"):
         load_session(session)
 
 

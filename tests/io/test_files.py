@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import random
+import re
+import shutil
 import signal
 import stat
 import subprocess
@@ -13,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from orthocal import load_calibration, load_robot, load_session
-from orthocal.errors import OrthocalError, OutputError, SessionError
+from orthocal import import_readings, load_calibration, load_plan, load_robot, load_session
+from orthocal.errors import OrthocalError, OutputError, RobotError, SessionError
 from orthocal.io.files import (
     read_file,
     require_writable,
@@ -193,7 +195,7 @@ def test_what_a_killed_run_left_is_cleaned_up_by_the_next(tmp_path):
 
 def test_all_or_none_where_one_cannot_be(tmp_path):
     (tmp_path / "b").mkdir()
-    with pytest.raises(OrthocalError, match="is a folder"):
+    with pytest.raises(OrthocalError, match="is a directory"):
         write_files(tmp_path, {"a": "new", "b": "new"})
     assert not (tmp_path / "a").exists()
     assert leftovers(tmp_path) == []
@@ -282,3 +284,53 @@ def test_killed_between_two_renames_there_is_one_generation(steps, left, tmp_pat
     subprocess.run([sys.executable, "-c", STOP, str(tmp_path), str(steps)], check=False)
     found = {p.name: p.read_text() for p in tmp_path.iterdir() if not p.name.startswith(".")}
     assert found == left
+
+
+# ---- files that a document names
+
+
+SECRET = "the combination is 17-42-23"
+
+
+@pytest.fixture
+def secret(tmp_path):
+    """A file outside the session."""
+    path = tmp_path / "elsewhere" / "secret.txt"
+    path.parent.mkdir()
+    path.write_text(f"{SECRET}\n" * 3)
+    return path
+
+
+@pytest.mark.parametrize("place", ["absolute", "parent", "link", "inside"])
+@pytest.mark.parametrize("head", ["", "setup,posture,reading_mm\n", "setup;posture;mm\n"])
+def test_content_of_a_table_is_quoted_only_inside_the_session(place, head, root, secret, tmp_path):
+    folder = tmp_path / "session"
+    shutil.copytree(root / "examples/table1/experiment-2", folder)
+    table = (folder / "readings.csv").rename(tmp_path / "table.csv")
+    secret.write_text(head + secret.read_text())
+    name = {"absolute": str(secret), "parent": "../elsewhere/secret.txt"}.get(place, "inside.csv")
+    if place == "inside":
+        shutil.copy(secret, folder / name)
+    elif place == "link":
+        (folder / name).symlink_to(secret)
+    file = folder / "session.yaml"
+    file.write_text(file.read_text().replace("readings.csv", name))
+    for act in (load_session, load_plan, lambda path: import_readings(table, path)):
+        with pytest.raises(OrthocalError) as caught:
+            act(folder)
+        assert ("combination" in str(caught.value)) == (place == "inside" and not head)
+        assert re.fullmatch(f"{re.escape(str(folder / name))}:[12]", caught.value.where)
+
+
+@pytest.mark.parametrize("kind", ["yaml", "urdf"])
+def test_content_of_a_robot_file_behind_a_link_is_not_quoted(kind, root, secret, tmp_path):
+    folder = tmp_path / "orthoglide"
+    shutil.copytree(root / "robots/orthoglide", folder)
+    file = folder / f"orthoglide.{kind}"
+    file.unlink()
+    secret.write_text(f"{SECRET}: 1\n")
+    file.symlink_to(secret)
+    with pytest.raises(RobotError) as caught:
+        load_robot(folder)
+    assert "combination" not in str(caught.value)
+    assert caught.value.where.startswith(str(file))

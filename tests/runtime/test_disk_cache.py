@@ -29,10 +29,10 @@ def only_file(folder):
 
 
 def test_what_is_kept_comes_back_and_nobody_else_may_write_it(folder):
-    assert cache.recall(KEY) is None
-    cache.keep(KEY, b"content")
-    assert cache.recall(KEY) == b"content"
-    assert cache.recall(KEY + " of another") is None
+    assert cache.load(KEY) is None
+    cache.store(KEY, b"content")
+    assert cache.load(KEY) == b"content"
+    assert cache.load(KEY + " of another") is None
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert stat.S_IMODE(only_file(folder).stat().st_mode) == 0o600
 
@@ -41,9 +41,9 @@ def test_what_is_kept_comes_back_and_nobody_else_may_write_it(folder):
 def test_it_can_be_switched_off(monkeypatch, tmp_path, value):
     monkeypatch.setenv(cache.VARIABLE, value)
     monkeypatch.chdir(tmp_path)
-    cache.keep(KEY, b"content")
+    cache.store(KEY, b"content")
     assert cache.cache_folder() is None
-    assert cache.recall(KEY) is None
+    assert cache.load(KEY) is None
     assert not list(tmp_path.iterdir())
 
 
@@ -58,103 +58,103 @@ def test_it_is_where_the_desktop_says(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("mode", [0o770, 0o702])
 def test_a_folder_that_others_can_write_to_is_not_used(folder, mode):
-    cache.keep(KEY, b"content")
+    cache.store(KEY, b"content")
     folder.chmod(mode)
-    assert cache.recall(KEY) is None
-    cache.keep("another", b"content")
+    assert cache.load(KEY) is None
+    cache.store("another", b"content")
     assert len(list(folder.iterdir())) == 1
 
 
 def test_a_folder_of_another_user_is_not_used(folder, monkeypatch):
-    cache.keep(KEY, b"content")
+    cache.store(KEY, b"content")
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
-    assert cache.recall(KEY) is None
+    assert cache.load(KEY) is None
 
 
 def test_a_link_to_a_folder_is_not_used(folder, tmp_path):
-    cache.keep(KEY, b"content")
+    cache.store(KEY, b"content")
     elsewhere = tmp_path / "elsewhere"
     folder.rename(elsewhere)
     folder.symlink_to(elsewhere)
-    assert cache.recall(KEY) is None
-    cache.keep("another", b"content")
+    assert cache.load(KEY) is None
+    cache.store("another", b"content")
     assert len(list(elsewhere.iterdir())) == 1
 
 
 def test_a_link_to_a_file_and_one_that_others_can_write_to_are_not_used(folder, tmp_path):
-    cache.keep(KEY, b"content")
+    cache.store(KEY, b"content")
     path = only_file(folder)
     path.chmod(0o620)
-    assert cache.recall(KEY) is None
+    assert cache.load(KEY) is None
     path.chmod(0o600)
-    assert cache.recall(KEY) == b"content"
+    assert cache.load(KEY) == b"content"
     path.rename(tmp_path / "elsewhere")
     path.symlink_to(tmp_path / "elsewhere")
-    assert cache.recall(KEY) is None
+    assert cache.load(KEY) is None
 
 
 def test_a_pipe_is_not_waited_for(folder):
-    cache.keep(KEY, b"content")
+    cache.store(KEY, b"content")
     path = only_file(folder)
     path.unlink()
     os.mkfifo(path, 0o600)
-    assert cache.recall(KEY) is None
+    assert cache.load(KEY) is None
 
 
 @pytest.mark.parametrize("spoil", [lambda b: b[:-1], lambda b: b + b"!", lambda b: b"", None])
 def test_a_spoiled_file_is_not_trusted_and_is_made_anew(folder, spoil):
-    cache.keep(KEY, b"content")
+    cache.store(KEY, b"content")
     path = only_file(folder)
     whole = path.read_bytes()
     if spoil is not None:
         path.write_bytes(spoil(whole))
-        assert cache.recall(KEY) is None
+        assert cache.load(KEY) is None
     for place in range(len(whole)):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-        assert cache.recall(KEY) is None
-    cache.keep(KEY, b"content")
-    assert cache.recall(KEY) == b"content"
+        assert cache.load(KEY) is None
+    cache.store(KEY, b"content")
+    assert cache.load(KEY) == b"content"
 
 
 def test_a_file_of_another_key_is_not_trusted(folder):
-    cache.keep("another", b"of another")
+    cache.store("another", b"of another")
     only_file(folder).rename(folder / cache._name(KEY))
-    assert cache.recall(KEY) is None
+    assert cache.load(KEY) is None
 
 
 def test_its_size_is_bounded_and_the_oldest_go_first(folder, monkeypatch):
     monkeypatch.setattr(cache, "LARGEST_TOTAL", 1000)
     for i in range(10):
-        cache.keep(f"key {i}", bytes(200))
+        cache.store(f"key {i}", bytes(200))
         os.utime(folder / cache._name(f"key {i}"), (i, i))
     assert sum(p.stat().st_size for p in folder.iterdir()) <= 1000
-    assert cache.recall("key 9") is not None
-    assert cache.recall("key 0") is None
+    assert cache.load("key 9") is not None
+    assert cache.load("key 0") is None
     monkeypatch.setattr(cache, "MOST_ENTRIES", 2)
-    cache.keep("key 10", b"")
+    cache.store("key 10", b"")
     assert len(list(folder.iterdir())) == 2
     monkeypatch.setattr(cache, "LARGEST_ENTRY", 10)
-    cache.keep("key 11", bytes(11))
-    assert cache.recall("key 11") is None
+    cache.store("key 11", bytes(11))
+    assert cache.load("key 11") is None
 
 
 def test_a_file_is_never_half_written(folder, monkeypatch):
-    cache.keep(KEY, b"old")
+    cache.store(KEY, b"old")
 
     def full(*args, **kwargs):
         raise OSError("disk full")
 
     monkeypatch.setattr(os, "rename", full)
-    cache.keep(KEY, b"new")
-    assert cache.recall(KEY) == b"old"
+    cache.store(KEY, b"new")
+    assert cache.load(KEY) == b"old"
     assert len(list(folder.iterdir())) == 1
 
 
 def test_a_folder_that_cannot_be_made_stops_nothing(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file/kept"))
-    cache.keep(KEY, b"content")
-    assert cache.recall(KEY) is None
+    cache.store(KEY, b"content")
+    assert cache.load(KEY) is None
     assert load_afresh("orthoglide").name == "orthoglide"
 
 

@@ -115,7 +115,7 @@ def test_a_folder_that_no_document_can_name_is_refused_before_the_work(name, fol
     )
     err = done.stderr.decode("ascii")
     assert done.returncode == 2
-    assert "which no document can name; rename the file or folder" in err
+    assert "which documents cannot contain; rename the file or directory" in err
     assert err.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
@@ -125,7 +125,7 @@ def test_a_robots_folder_that_no_document_can_name_is_refused(root, tmp_path):
 
     odd = tmp_path / "a\x1b[31mb"
     shutil.copytree(root / "tests/robots/biglide", odd / "biglide")
-    with pytest.raises(OrthocalError, match=r"holds '\\x1b', which no document can name"):
+    with pytest.raises(OrthocalError, match=r"contains '\\x1b', which documents cannot contain"):
         load_robot(odd / "biglide")
 
 

@@ -1,0 +1,129 @@
+"""Many machines at once, as the studies use them: readings, Jacobians, tool positions.
+
+The only place where the studies call the batch interface of `estimation` and `kinematics`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.errors import ClosureError, SolverError
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
+from orthocal.estimation.solvers.machine_readings import Fleet
+from orthocal.kinematics.machine_batch import Machines
+from orthocal.robot.model import Robot
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+def predict_batch(
+    problem: CalibrationProblem, theta: Array, *, retry: bool = False
+) -> tuple[Array, Flags]:
+    """Readings of many machines, gauge zeros at 0.
+
+    Args:
+        problem: The problem.
+        theta: Scaled free parameters of each machine, shape (n_sets, n_free).
+        retry: Whether to close the loops of failed machines again, one by one.
+
+    Returns:
+        Readings, shape (n_sets, n_entries), [m of the first gauge], and whether the loops of each
+        machine close, shape (n_sets,).
+    """
+    machines = Fleet(problem, theta)
+    closed = machines.close()
+    for i in np.flatnonzero(~closed) if retry else ():
+        with suppress(ClosureError):
+            machines.passive[i] = problem.close(theta[i] * problem.theta_scale)
+            closed[i] = True
+    return machines.predict(), closed
+
+
+def linearise_batch(problem: CalibrationProblem, theta: Array) -> tuple[Array, Array, Flags]:
+    """Readings and Jacobians of many machines.
+
+    Args:
+        problem: The problem.
+        theta: Scaled free parameters of each machine, shape (n_sets, n_free).
+
+    Returns:
+        Of the machines whose loops close: readings, shape (n_closed, n_entries), and Jacobians by
+        scaled parameters, shape (n_closed, n_entries, n_free). Then whether the loops of each
+        machine close, shape (n_sets,).
+    """
+    machines = Fleet(problem, theta)
+    closed = machines.close()
+    if not closed.any():
+        shape = (0, problem.observations.size)
+        return np.zeros(shape), np.zeros((*shape, problem.n_free)), closed
+    slopes = FleetSlopes(problem, machines.theta[closed], machines.passive[closed])
+    return slopes.reading, slopes.jacobian(), closed
+
+
+def tool_positions(
+    robot: Robot, errors: Array, drives: Array, passive: Array
+) -> tuple[Array, Flags]:
+    """Tool positions of many machines, shape (n_postures, 3, n_sets), [m].
+
+    Args:
+        robot: The nominal robot.
+        errors: All elementary errors of each machine, shape (n_sets, n_errors), [SI].
+        drives: Commanded drive coordinates, shape (n_postures, n_drives), [m, rad].
+        passive: Passive coordinates of the nominal robot, shape (n_postures, n_passive).
+
+    Returns:
+        The positions, and whether the loops of each machine close, shape (n_sets,).
+    """
+    machines = Machines(robot, errors, drives, passive)
+    closed = machines.close()
+    return np.moveaxis(machines.tool(), 0, -1), closed
+
+
+def estimate_batch(
+    program: BatchProgram, problem: CalibrationProblem, values: Array, sigma: float
+) -> tuple[Array, Flags]:
+    """Estimates of many machines, and whether each calibration converges.
+
+    Args:
+        program: Solver, with the data that all machines share.
+        problem: Its problem.
+        values: Readings, shape (n_sets, n_entries), [m of the first gauge].
+        sigma: Standard deviation of one reading, [m].
+
+    Returns:
+        Free parameters, shape (n_sets, n_free), [SI], NaN where the calibration fails.
+    """
+    converged = np.ones(len(values), dtype=np.bool_)
+    try:
+        return program.solve(values, sigma=sigma).theta, converged
+    except (SolverError, ClosureError):  # one by one, to find the machines that fail
+        theta = np.full((len(values), problem.n_free), np.nan)
+        for i in range(len(values)):
+            try:
+                theta[i] = BatchProgram(problem).solve(values[i : i + 1], sigma=sigma).theta[0]
+            except (SolverError, ClosureError):
+                converged[i] = False
+        return theta, converged
+
+
+def columns_in_edge_units(
+    prefix: str, problem: CalibrationProblem, values: Array
+) -> dict[str, Sequence[float]]:
+    """Table columns of machine parameters, named with the unit that users read.
+
+    Args:
+        prefix: Start of each column's name.
+        problem: The problem.
+        values: Shape (n_sets, n_machine), [SI].
+    """
+    return {
+        f"{prefix}{p.name}_{p.edge_unit}": list(values[:, i] * p.edge_factor)
+        for i, p in enumerate(problem.machine_selection.parameters)
+    }

@@ -1,0 +1,79 @@
+"""YAML: invalid documents raise the stated errors, and nothing but plain data is built."""
+
+from __future__ import annotations
+
+import importlib
+import random
+
+import pytest
+import yaml
+from fuzzing import DIAL, ERRORS, PLAN, SESSION
+
+from orthocal.io import strict_yaml
+
+FOREIGN = 'title: "a \\u00e9 – 机器"\nkeys: [~, yes, 1e3]\n'
+
+DOCUMENTS = (SESSION, SESSION + PLAN, ERRORS, DIAL, FOREIGN)
+
+LETTERS = "abc:-?,[]{}#&*!|>'\"%@` \n\t\\~0123\x85\u2028\xa0\ufeff\x07\x00é机\r"
+
+STRANGE = (*LETTERS, "\ud800", ": ", "<<")
+
+
+@pytest.fixture(params=["libyaml", "python"])
+def load(request, monkeypatch):
+    """`load_yaml` on each of PyYAML's parsers."""
+    if request.param == "python":
+        monkeypatch.delattr(yaml, "CSafeLoader", raising=False)
+    elif not yaml.__with_libyaml__:
+        pytest.skip("PyYAML was built without libyaml")
+    yield importlib.reload(strict_yaml).load_yaml
+    monkeypatch.undo()
+    importlib.reload(strict_yaml)
+
+
+def mutate(rng, text):
+    """One to three characters changed, inserted or deleted."""
+    letters = list(text)
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        at = rng.randrange(len(letters))
+        letters[at : at + rng.randrange(2)] = rng.choice(([], [rng.choice(STRANGE)]))
+    return "".join(letters)
+
+
+def test_both_parsers_read_the_same(load):
+    for text in DOCUMENTS:
+        assert load(text) == yaml.load(text, Loader=yaml.SafeLoader)
+
+
+def test_mutated_documents(load):
+    rng, good = random.Random(3), 0
+    for _ in range(600):
+        text = mutate(rng, rng.choice(DOCUMENTS))
+        try:
+            good += isinstance(load(text), dict)
+        except (yaml.YAMLError, ValueError, OverflowError):
+            continue
+        except Exception as e:
+            pytest.fail(f"{text!r}: {e!r}")
+    assert 200 < good < 500
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("a: 1\na: 2", "the key 'a' occurs twice"),
+        ("{e\u0301: 1, \u00e9: 2}", "occurs twice"),
+        ("a: &b 1\nc: *b", "aliases"),
+        ("? [1]\n: 2", "a key is a list or a mapping"),
+        ("a: !!python/object:os.system 1", "tag"),
+        ('a: "\\x07"', "control character"),
+        (f"a: {'[' * 30}{']' * 30}", "nested more than 20 deep"),
+        (f"a: {'9' * 101}", "does not fit its tag !!int"),
+    ],
+)
+def test_refused_documents(load, text, problem):
+    with pytest.raises(yaml.MarkedYAMLError) as caught:
+        load(text)
+    assert problem in caught.value.problem
+    assert caught.value.problem_mark is not None
