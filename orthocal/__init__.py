@@ -32,7 +32,7 @@ _HOMES = {
     "LiveScene": "orthocal.viewer.live",
     "Loss": "orthocal.estimation.loss",
     "Machine": "orthocal.calibration.machine",
-    "Means": "orthocal.planning.equipment",
+    "Equipment": "orthocal.planning.equipment",
     "MeasuringPlan": "orthocal.planning.plan",
     "NonlinearProgram": "orthocal.estimation.solvers.ipopt",
     "NotIdentifiableError": "orthocal.errors",
@@ -48,7 +48,7 @@ _HOMES = {
     "Session": "orthocal.session.session",
     "SessionError": "orthocal.errors",
     "Setup": "orthocal.session.session",
-    "Sizes": "orthocal.robot.builder.dimensions",
+    "Dimensions": "orthocal.robot.builder.machine_file",
     "SolverError": "orthocal.errors",
     "SolverOptions": "orthocal.estimation.options",
     "Study": "orthocal.study.study",
@@ -105,6 +105,8 @@ __all__ = [
     "ClosureError",
     "Comparison",
     "Decision",
+    "Dimensions",
+    "Equipment",
     "ExportError",
     "ExportOptions",
     "Finding",
@@ -113,7 +115,6 @@ __all__ = [
     "LiveScene",
     "Loss",
     "Machine",
-    "Means",
     "MeasuringPlan",
     "NonlinearProgram",
     "NotIdentifiableError",
@@ -129,7 +130,6 @@ __all__ = [
     "Session",
     "SessionError",
     "Setup",
-    "Sizes",
     "SolverError",
     "SolverOptions",
     "Study",
@@ -229,10 +229,10 @@ if TYPE_CHECKING:
     from orthocal.output.report.page import write_report
     from orthocal.output.scene.drawing import draw_scene
     from orthocal.output.text.summary import summarize
-    from orthocal.planning.equipment import Means
+    from orthocal.planning.equipment import Equipment
     from orthocal.planning.plan import MeasuringPlan, plan_readings
     from orthocal.robot.builder.build import make_robot
-    from orthocal.robot.builder.dimensions import Sizes
+    from orthocal.robot.builder.machine_file import Dimensions
     from orthocal.robot.loading import load_robot
     from orthocal.robot.model import Robot
     from orthocal.sensors.protocol import Sensor

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orthocal.cli.options import Json, Tolerances, app, require_cube, split_globs
+from orthocal.cli.options import Json, Tolerances, app, read_workspace, split_globs
 from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.progress import told
 from orthocal.errors import ParameterError
@@ -127,7 +127,7 @@ def accuracy(
     read_tolerances(tolerance or [], parameters, where="--tolerance")
     tolerances = _quantities(tolerance)
     if half_side_mm is not None:
-        require_cube(session.robot, half_side_mm)
+        read_workspace(f"{half_side_mm:g}", session.robot, where="--half-side-mm")
     study = build_accuracy_study(
         session,
         Choice(model, free=split_globs(free), tolerances=tolerances),
@@ -373,12 +373,14 @@ def _subject(subject: str, leg_mm: float | None) -> Iterator[Robot | Session]:
         return
     if not isinstance(found, Robot) or found.name != "orthoglide":
         raise ParameterError("is of the robot orthoglide; this is another", where="--leg-mm")
-    from orthocal.robot.builder.build import Sizes, make_robot
+    from orthocal.robot.builder.build import Dimensions, make_robot
 
-    pattern, leg = Sizes(), leg_mm * MM
+    pattern, leg = Dimensions(), leg_mm * MM
     longer = leg / pattern.leg
-    sizes = Sizes(leg, longer * pattern.lower, longer * pattern.upper)
-    sizes.require_machine("--leg-mm")
+    sizes = Dimensions(leg, longer * pattern.lower, longer * pattern.upper)
+    problem = sizes.find_problem()
+    if problem:
+        raise ParameterError(problem[1], where="--leg-mm")
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         yield make_robot(sizes, folder / "orthoglide")

@@ -25,7 +25,7 @@ from orthocal.estimation.solvers.batch import BatchProgram
 from orthocal.estimation.solvers.machine_readings import Fleet
 from orthocal.kinematics.loop_closure import Assembly
 from orthocal.kinematics.machine_batch import Machines
-from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace, gauss_cube
+from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace, gauss_box
 from orthocal.observation.simulate import limits_of, show_readings
 from orthocal.planning.expected_error import (
     Expected,
@@ -75,8 +75,8 @@ class AccuracyStudy(Study):
     """Errors that all machines have, [SI]."""
     machines: int
     seed: int
-    half_side: float
-    """Of the cube in which the tool's error counts, [m]."""
+    box: tuple[tuple[float, float], ...]
+    """Box over which the tool's error is computed, relative to the mechanical zero, [m]."""
 
     @property
     def record(self) -> dict[str, Any]:
@@ -88,7 +88,7 @@ class AccuracyStudy(Study):
             "given": dict(self.given),
             "machines": self.machines,
             "seed": self.seed,
-            "half_side": self.half_side,
+            "box": self.box,
         }
 
     @property
@@ -168,7 +168,7 @@ class _Prepared:
         session = study.session.unpack()
         robot = session.robot
         problem = weigh_readings(CalibrationProblem(session, study.choice.select(robot.parameters)))
-        workspace = gauss_cube(robot, half_side=study.half_side)
+        workspace = gauss_box(robot, study.box)
         assembly = Assembly(robot)
         nominal = assembly.inverse(workspace.points)
         drives = nominal - session.active_offsets

@@ -8,7 +8,8 @@ import numpy as np
 
 from orthocal.errors import SessionError
 from orthocal.estimation.choice import Choice, choose
-from orthocal.planning.expected_error import default_workspace
+from orthocal.kinematics.workspace import cube_limits, find_workspace
+from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ParameterSet
 from orthocal.session.session import Session
 from orthocal.study.accuracy import AccuracyStudy
@@ -36,8 +37,8 @@ def build_accuracy_study(
         given: Errors that all machines have, [SI].
         machines: How many.
         seed: Of errors, gauges and noise.
-        half_side: Of the cube in which the tool's error counts, [m]; by default as large as the
-            machine reaches, at most ±60 mm.
+        half_side: Half the side of a cube around the mechanical zero over which the tool's error
+            is computed, [m]; by default the workspace of the robot.
 
     Raises:
         ParameterError: If a name or number makes no sense.
@@ -72,8 +73,14 @@ def build_accuracy_study(
         given=given,
         machines=machines,
         seed=seed,
-        half_side=default_workspace(robot).half_side or 0.0 if half_side is None else half_side,
+        box=_find_box(robot, half_side),
     )
+
+
+def _find_box(robot: Robot, half_side: float | None) -> tuple[tuple[float, float], ...]:
+    """Box over which the tool's error is computed, [m]."""
+    box = find_workspace(robot).limits if half_side is None else cube_limits(robot, half_side)
+    return tuple((float(low), float(high)) for low, high in box)
 
 
 def _without_sums(names: Sequence[str], parameters: ParameterSet) -> tuple[str, ...]:

@@ -38,7 +38,7 @@ from orthocal.estimation.problem import build_problem
 from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
 from orthocal.kinematics.orthoglide import inverse
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.kinematics.workspace import Workspace, cube, largest_cube, tool_at_zero
+from orthocal.kinematics.workspace import Workspace, cube, find_workspace, tool_at_zero
 from orthocal.observation.simulate import load_errors
 from orthocal.statistics.information import decompose
 from orthocal.statistics.zeros import project_out_zeros
@@ -195,15 +195,15 @@ def test_the_cube_is_around_the_mechanical_zero_and_within_reach(tmp_path):
     """A machine whose drives end 20 mm beyond their zero, and one whose zero is not the origin."""
     robot = load_robot(write_orthoglide(tmp_path / "short", 0.25, travel=(0.1, 0.27)))
     nominal = nominal_assembly(robot)
-    found = largest_cube(robot, nominal.inverse)
+    found = find_workspace(robot, nominal.inverse)
     assert found.half_side == pytest.approx(0.020)  # p + √(L² − …) ≤ 0.27 on the axis
-    assert found.words == "a cube of ±20 mm around the zero"
+    assert found.words == "the workspace ±20 mm"
     text = (tmp_path / "short/machine.yaml").read_text().replace("zero_mm: 250", "zero_mm: 240")
     (tmp_path / "short/machine.yaml").write_text(text)
     moved = load_robot(tmp_path / "short")
     middle = nominal_assembly(moved).forward(np.full(3, 0.24))
     assert tool_at_zero(moved) == pytest.approx(middle, abs=1e-12)
-    found = largest_cube(moved, nominal_assembly(moved).inverse)
+    found = find_workspace(moved, nominal_assembly(moved).inverse)
     assert found.weights @ found.points == pytest.approx(middle, abs=1e-12)
     assert 0.028 < found.half_side < 0.032
 
@@ -220,10 +220,10 @@ def test_a_machine_that_does_not_reach_60_mm_has_results_at_the_tool(tmp_path):
     # drives end 30 mm beyond the zero, and some µm of offsets belong into the controller
     assert found.workspace.half_side == pytest.approx(0.029)
     text = " ".join(summarize(result, details=True).split())
-    assert "Over a cube of ±29 mm around the zero." in text
+    assert "Over the workspace ±29 mm." in text
     assert "missing" not in text
     compared = compare_models(session, models=["offsets", "lengths"])
-    assert "a cube of ±29 mm" in " ".join(f.text for f in decide_comparison(compared).findings)
+    assert "the workspace ±29 mm" in " ".join(f.text for f in decide_comparison(compared).findings)
     assert all(r.tool is not None for r in compared.results)
 
 

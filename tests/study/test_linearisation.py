@@ -13,7 +13,7 @@ from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.kinematics import orthoglide as closed_forms
-from orthocal.robot.builder.build import Sizes, make_robot
+from orthocal.robot.builder.build import Dimensions, make_robot
 from orthocal.session.session import Gauge
 from orthocal.study.linearisation import METHODS, build_linearisation_study
 from orthocal.study.linearisation_summary import summarise_linearisation
@@ -163,7 +163,9 @@ def test_what_is_missed_grows_with_the_square_and_each_step_squares_it(summary):
 
 def test_where_undamped_steps_come_to_nothing_is_told(tmp_path):
     """A machine of short legs, 60 mm off."""
-    robot = make_robot(Sizes(leg=0.15, lower=0.06, upper=0.24, attachment=0.02), tmp_path / "m")
+    robot = make_robot(
+        Dimensions(leg=0.15, lower=0.06, upper=0.24, attachment=0.02), tmp_path / "m"
+    )
     from orthocal.study.paper import Displacements
 
     study = build_linearisation_study(
@@ -175,7 +177,7 @@ def test_where_undamped_steps_come_to_nothing_is_told(tmp_path):
 
 
 def test_longer_legs_bend_less(tmp_path, orthoglide):
-    longer = make_robot(Sizes(leg=0.6205, lower=0.43, upper=0.7), tmp_path / "long")
+    longer = make_robot(Dimensions(leg=0.6205, lower=0.43, upper=0.7), tmp_path / "long")
     errors = [
         run_task(build_linearisation_study(r, sizes=[2.0], along=ALONG), 0)["first_order"][0]
         for r in (orthoglide, longer)

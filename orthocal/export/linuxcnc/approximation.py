@@ -24,8 +24,8 @@ from orthocal.export.linuxcnc.polynomial import (
 from orthocal.export.linuxcnc.words import region_words, rounded_up
 from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.loop_closure import find_beyond_travel
-from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.units import MM, UM
+from orthocal.kinematics.workspace import cube_limits, describe_box, tool_at_zero
+from orthocal.units import UM
 
 Array = NDArray[np.float64]
 
@@ -99,8 +99,8 @@ def approximate(
         calibration: The calibration.
         within: Largest distance of the tip from where it belongs, [m].
         tool: The tip in the frame of the robot's tool centre point, shape (3,), [m].
-        half_side: Half the side of the region around the zero, [m]; by default the largest that
-            the machine reaches, of 60 mm at most.
+        half_side: Half the side of a cube around the mechanical zero, [m]; by default the region
+            is the workspace.
 
     Raises:
         ExportError: If no degree does, naming what is reached; if the machine has no tool, or
@@ -108,8 +108,8 @@ def approximate(
     """
     tip = ToolTip(calibration, tool)
     robot = calibration.robot
-    middle = tool_at_zero(robot)
-    half = np.full(middle.size, _half_side(calibration, half_side))
+    box = _find_box(calibration, half_side)
+    middle, half = tool_at_zero(robot) + 0.5 * box.sum(axis=1), 0.5 * (box[:, 1] - box[:, 0])
     most = MOST_DEGREE[middle.size]
     fitted = chebyshev_lattice(middle.size, most + SPARE)
     checked = check_points(middle.size)
@@ -121,7 +121,7 @@ def approximate(
         belong, passive = tip.reach(middle + half * checked)
     except ClosureError as e:
         raise ExportError(
-            f"the machine does not reach ±{half[0] / MM:g} mm ({e.reason}); "
+            f"the machine does not reach {describe_box(box)} ({e.reason}); "
             "give a smaller --half-side-mm"
         ) from None
     form = find_nominal_form(robot, middle, half)
@@ -148,7 +148,7 @@ def approximate(
             )
     raise ExportError(
         f"no polynomial of a degree up to {most} keeps the tool within {within / UM:g} µm "
-        f"over ±{half[0] / MM:g} mm; the best of them reaches {rounded_up(best / UM)} µm"
+        f"over {describe_box(box)}; the best of them reaches {rounded_up(best / UM)} µm"
     )
 
 
@@ -171,13 +171,14 @@ def corners(n: int) -> Array:
     return np.stack(np.meshgrid(*[[-1.0, 1.0]] * n, indexing="ij"), axis=-1).reshape(-1, n)
 
 
-def _half_side(calibration: Calibration, given: float | None) -> float:
-    if given is not None:
-        return given
+def _find_box(calibration: Calibration, half_side: float | None) -> Array:
+    """Region relative to the mechanical zero, shape (n_coordinates, 2), [m]."""
+    if half_side is not None:
+        return cube_limits(calibration.robot, half_side)
     tool = find_tool(calibration)
-    if tool is None or tool.workspace.half_side is None:
+    if tool is None:
         raise ExportError("the machine has no tool that its drives command over a region")
-    return tool.workspace.half_side
+    return tool.workspace.limits
 
 
 def _estimate(found: CorrectedInverse, points: Array, drives: Array) -> float:

@@ -10,7 +10,6 @@ from orthocal.assessment.tool_error import ToolAccuracy, assess_remaining, asses
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
 from orthocal.output.text.layout import um
-from orthocal.units import MM
 from orthocal.viewer.scene import LegendEntry, Scene, round_scale
 from orthocal.viewer.shapes import Colour, css, draw_arrow, material
 from orthocal.viewer.stage import Stage
@@ -54,7 +53,7 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
     except (ClosureError, RobotError) as e:
         scene.facts.append(f"Errors of the tool: none are shown. {e}.")
         return ""
-    region = f"±{(found.workspace.half_side or 0.0) / MM:.3g} mm"
+    region = found.workspace.words
     fields = found.align(found.deviation), found.align(found.error_after_offsets)
     now, left = (float(np.linalg.norm(d, axis=1).max()) for d in fields)
     # in space, as in all tables: the axes of an ellipsoid are shorter

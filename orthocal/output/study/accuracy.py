@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from orthocal.kinematics.workspace import describe_box
 from orthocal.output.study.numbers import MOST_ROWS, sized, um_of
 from orthocal.output.text.layout import add_row, counted, section, table_of
 from orthocal.study.accuracy import AccuracyStudy
 from orthocal.study.accuracy_summary import AccuracySummary
 from orthocal.study.runner import StudyTable
-from orthocal.units import MM, UM
+from orthocal.units import UM
 
 Array = NDArray[np.float64]
 
@@ -32,12 +33,12 @@ def answer_accuracy(table: StudyTable, s: AccuracySummary) -> str:
     if not s.machines:
         reasons = ", ".join(f"{n}: {reason}" for reason, n in s.failed.items())
         return f"None of the machines could be calibrated ({reasons})."
-    half = study.half_side / MM if isinstance(study, AccuracyStudy) else math.nan
+    region = describe_box(np.array(study.box)) if isinstance(study, AccuracyStudy) else "unknown"
     text = (
         f"{um_of(s.after)} ± {um_of(s.doubt)} µm are left at the tool of "
-        f"{counted(s.machines, 'machine')} ({um_of(s.before)} µm before; r.m.s. over a cube of "
-        f"±{half:.3g} mm, shift and rotation taken out), in a controller that knows all "
-        f"that was identified; 95 % of them stay below {um_of(s.most)} µm."
+        f"{counted(s.machines, 'machine')} ({um_of(s.before)} µm before; r.m.s. over the workspace "
+        f"{region}, shift and rotation taken out), in a controller that knows all that was "
+        f"identified; 95 % of them stay below {um_of(s.most)} µm."
     )
     if s.foretold is None:
         return text
