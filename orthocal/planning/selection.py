@@ -291,6 +291,8 @@ class Gains:
     """B C R, shape (n_seen, p)."""
     total: float | None
     """tr(T C); None where T depends on C."""
+    averaged: bool
+    """Whether setups are ranked with the alignment averaged over all postures."""
     computed: dict[tuple[int, int | None, bool], SetupGain] = field(default_factory=dict)
     """Gains so far, by candidate setup, first reading, and whether alignment is averaged."""
 
@@ -302,7 +304,8 @@ class Gains:
         constant = search.weigh(covariance) is root
         total = float(np.vdot(root, covariance @ root)) if constant else None
         known = search.basis @ covariance
-        return Gains(search, known @ search.basis.T, known @ root, total)
+        averaged = search.candidates.count > FEW
+        return Gains(search, known @ search.basis.T, known @ root, total, averaged)
 
     def setup(self, which: int, first: int | None = None) -> SetupGain:
         """Gain of a candidate setup, begun with one of its readings."""
@@ -320,7 +323,7 @@ class Gains:
         That takes half the time.
         """
         own = self.search.reduced[which]
-        if not own.aligned or self.search.candidates.count <= FEW:
+        if not (own.aligned and self.averaged):
             return self.setup(which)
         key = which, None, True
         if key not in self.computed:

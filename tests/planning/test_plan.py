@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import gc
+import json
+import weakref
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from models import JOINTS
 
-from orthocal import Choice, calibrate, draw_errors, load_plan, load_session, simulate_session
+from orthocal import (
+    Choice,
+    calibrate,
+    draw_errors,
+    load_plan,
+    load_session,
+    simulate_session,
+    summarize,
+)
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchProgram
@@ -17,7 +28,9 @@ from orthocal.kinematics.loop_closure import Assembly
 from orthocal.kinematics.workspace import cube, find_workspace
 from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
+from orthocal.output.text.plan import OUT_OF_RANGE, plan_json
 from orthocal.planning.candidates import list_candidates, measure_candidates
+from orthocal.planning.cost_curve import compute_curve, find_enough
 from orthocal.planning.equipment import Equipment, choose_box, find_box
 from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.plan import plan_readings
@@ -247,3 +260,45 @@ def test_the_cube_keeps_clear_of_where_a_machine_just_gets_to(tmp_path, leg):
     assert (drives <= sizes.upper).all()
     forecast = ToolForecast(robot, Choice("full").select(robot.parameters))
     assert forecast.before.headline.largest < 0.5 * space.half_side
+
+
+def test_the_memory_of_a_plan_is_released_with_it(orthoglide):
+    """Candidates, their matrices and pairs: none of them is kept by a cache."""
+    equipment = Equipment(along=3, across=0.0, sections=(0.5,))
+    forecast = ToolForecast(orthoglide, Choice("full").select(orthoglide.parameters))
+    session = list_candidates(orthoglide, equipment)
+    candidates = measure_candidates(session, forecast.problem(session), spare_range=3.0)
+    n = len(candidates.state)
+    search = SetupSearch.of(candidates, np.eye(n), forecast.weigh("aligned", n))
+    plan = search.choose([3] * 3, starts=2)
+    list(search.grow([3] * 3))
+    arrays = [s.reachable for s in candidates.setups] + [p.flat for p in search.pairs.values()]
+    kept = [weakref.ref(array) for array in arrays]
+    del arrays, candidates, search, plan, session
+    gc.collect()
+    assert [ref for ref in kept if ref() is not None] == []
+
+
+def test_usual_plans_that_the_dial_cannot_read_have_no_expected_error(orthoglide):
+    """The paper's readings differ by more than ±0.4 mm; they were listed as the better plan."""
+    equipment = Equipment(gauge=Gauge(5e-6, 10e-6, (-4e-4, 4e-4)), sections=(0.5,), across=0.0)
+    choice = Choice("full", tolerances={"*.offset_mm": 0.2})
+    plan = plan_readings(orthoglide, choice, equipment=equipment, starts=1)
+    assert [(a.name, a.expected) for a in plan.compared] == [("the paper's", None), ("even", None)]
+    assert summarize(plan).count(OUT_OF_RANGE) == 2
+    compared = json.loads(plan_json(plan))["compared"]
+    assert [(a["in_range"], a["aligned_um"]) for a in compared] == [(False, None)] * 2
+
+
+def test_enough_does_not_depend_on_the_number_of_setups_of_the_plan(orthoglide):
+    """With `--setups 6` it was 9 setups, with `--setups 9` more."""
+    equipment = Equipment(along=5, across=0.0, sections=(0.5,))
+    forecast = ToolForecast(orthoglide, Choice("full").select(orthoglide.parameters))
+    session = list_candidates(orthoglide, equipment)
+    candidates = measure_candidates(session, forecast.problem(session), spare_range=3.0)
+    n = len(candidates.state)
+    search = SetupSearch.of(candidates, np.eye(n), forecast.weigh("aligned", n))
+    curves = [compute_curve(search, 3, planned, equipment) for planned in (1, 9)]
+    few, many = (find_enough(curve) for curve in curves)
+    assert few == many is not None
+    assert len(curves[1]) > len(curves[0]) > few.setups
