@@ -10,7 +10,7 @@ import numpy as np
 from orthocal.errors import OrthocalError
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.joining import join_sessions
-from orthocal.planning.candidates import Candidates, CandidateSetup, measure_candidates
+from orthocal.planning.candidates import Candidates, CandidateSetup
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import Expected, ToolForecast
 from orthocal.sensors.leg_indicator import LegIndicator
@@ -61,10 +61,14 @@ class Comparison:
         each = [total // count + (i < total % count) for i in range(count)]
         lines = [self._line(setup) for setup in chosen]
         found = []
-        for name, select in (("the paper's", _ends_and_middle), ("even", _evenly)):
-            rows = [select(line, n) for line, n in zip(lines, each, strict=True)]
+        for name, select in (("the paper's", _ends_and_zero), ("even", _evenly)):
+            rows = [select(*line, n) for line, n in zip(lines, each, strict=True)]
             if any(rows):
-                found.append(self._assess(name, self._session(chosen, rows)))
+                in_range = all(map(_is_in_range, chosen, rows))
+                session = self._session(
+                    chosen, [[self.candidates.session.readings[i] for i in own] for own in rows]
+                )
+                found.append(self._assess(name, session, in_range=in_range))
         return tuple(found)
 
     def list_alternatives(self) -> tuple[Alternative, ...]:
@@ -81,20 +85,13 @@ class Comparison:
                 found.append(self._assess(name, change(self.plan)))
             except OrthocalError:
                 continue  # a gauge that cannot be mounted is no alternative
-        return tuple(a for a in found if a.expected is not None)
+        return tuple(found)
 
-    def _assess(self, name: str, session: Session) -> Alternative:
+    def _assess(self, name: str, session: Session, *, in_range: bool = True) -> Alternative:
         whole = session if self.measured is None else join_sessions([self.measured, session])
         minutes = self.equipment.minutes(len(session.setups), len(session.readings))
-        expected = self.forecast.after(whole) if self._is_in_range(session) else None
+        expected = self.forecast.after(whole) if in_range else None
         return Alternative(name, len(session.setups), len(session.readings), minutes, expected)
-
-    def _is_in_range(self, session: Session) -> bool:
-        """Whether each gauge has all readings of its setup in its range, as for candidates."""
-        found = measure_candidates(
-            session, self.forecast.problem(session), spare_range=self.equipment.spare_range
-        )
-        return all(setup.reachable[0].all() for setup in found.setups)
 
     def _middle_setups(self) -> list[CandidateSetup]:
         """Setups at mid-leg, with the tip on the rod in the mechanical zero."""
@@ -111,8 +108,12 @@ class Comparison:
                 best[key] = (distance, setup)
         return [setup for _, setup in best.values()]
 
-    def _line(self, setup: CandidateSetup) -> list[Reading]:
-        """Readings of a setup with the tool on the leg's direction through the zero, in order."""
+    def _line(self, setup: CandidateSetup) -> tuple[list[int], int]:
+        """Readings of a setup on the line along the leg through the mechanical zero.
+
+        Returns:
+            Rows in the order of the line, and the index of the one nearest to the zero.
+        """
         session = self.candidates.session
         readings = [session.readings[i] for i in setup.rows]
         points = np.array([session.postures[r.posture].values for r in readings])
@@ -120,7 +121,9 @@ class Comparison:
         along = int(np.ptp(points, axis=0).argmax())
         across = np.delete(np.abs(points), along, axis=1).max(axis=1, initial=0.0)
         on = np.flatnonzero(across < 1e-9)
-        return [readings[i] for i in on[np.argsort(points[on, along])]]
+        on = on[np.argsort(points[on, along])]
+        nearest = int(np.abs(points[on, along]).argmin()) if on.size else 0
+        return setup.rows[on].tolist(), nearest
 
     def _session(
         self, chosen: Sequence[CandidateSetup], rows: Sequence[Sequence[Reading]]
@@ -141,21 +144,27 @@ class Comparison:
         return replace(source, setups=setups, readings=tuple(readings), postures=postures)
 
 
-def _ends_and_middle(line: Sequence[Reading], count: int) -> list[Reading]:
+def _is_in_range(setup: CandidateSetup, rows: Sequence[int]) -> bool:
+    """Whether the gauge has all readings in its range, with the first one in its middle."""
+    at = np.searchsorted(setup.rows, rows)
+    return bool(setup.reachable[at[:1], at].all())
+
+
+def _ends_and_zero(line: Sequence[int], zero: int, count: int) -> list[int]:
     """Zero, last and first posture of a line, repeated."""
     if not line:
         return []
-    zero = min(range(len(line)), key=lambda i: (line[i].posture != "zero", abs(2 * i - len(line))))
     three = [line[zero], line[-1], line[0]]
     return [three[i % 3] for i in range(count)]
 
 
-def _evenly(line: Sequence[Reading], count: int) -> list[Reading]:
-    """Evenly spaced postures of a line; the middle one first, where the dial is set to zero."""
+def _evenly(line: Sequence[int], zero: int, count: int) -> list[int]:
+    """Evenly spaced postures of a line, beginning with the one nearest to the zero."""
     if not line:
         return []
-    places = np.linspace(0, len(line) - 1, count).round().astype(int).tolist()
-    return [line[i] for i in sorted(places, key=lambda i: i != places[count // 2])]
+    places = np.linspace(0, len(line) - 1, count).round().astype(int)
+    first = int(np.abs(places - zero).argmin())
+    return [line[i] for i in [places[first], *np.delete(places, first)]]
 
 
 def _with_finer_dial(session: Session) -> Session:
