@@ -93,7 +93,7 @@ def new(
         Path | None,
         typer.Option(help="dial.yaml, data of the gauge; by default ±5 mm, 10 µm, ball of 3 mm."),
     ] = None,
-    model: Annotated[str, typer.Option(help="Model to identify.")] = "full",
+    model: Annotated[str | None, typer.Option(help="Model to identify; full by default.")] = None,
     tolerance: Tolerances = None,
     again: Annotated[
         bool,
@@ -238,17 +238,18 @@ def _plan(
     *,
     paper: bool,
     hours: float | None,
-    model: str,
+    model: str | None,
     given: list[str] | None,
 ) -> tuple[MeasuringPlan | None, Session]:
     """Plan, and its session with no active offsets; no plan for the paper's readings."""
     from orthocal.estimation.choice import Choice
     from orthocal.estimation.selection import read_tolerances
     from orthocal.planning.first_plan import first_equipment, paper_plan
-    from orthocal.planning.plan import plan_readings
+    from orthocal.planning.plan import MODEL, plan_readings
     from orthocal.session.session import Purpose
 
     tolerances = read_tolerances(given or [], robot.parameters, where="--tolerance")
+    model = model or MODEL
     choice = Choice(model, tolerances=tolerances)
     choice.select(robot.parameters)
     zeros = [0.0] * len(robot.drives)

@@ -184,14 +184,28 @@ def plan_readings(
     planned = _simplify(candidates, planned, search)
     plan = build_session(candidates, planned.setups, measured)
     plan = replace(plan, purpose=Purpose(chosen.model, tuple(chosen.free)))
-    whole = plan if measured is None else join_sessions([measured, plan])
-    each = round(sum(counts) / len(counts))
-    comparison = Comparison(candidates, plan, equipment, forecast, measured)
     say("comparing the plan with others")
+    comparison = Comparison(candidates, plan, equipment, forecast, measured)
+    return _evaluate(search, planned, comparison, criterion, workers)
+
+
+def _evaluate(
+    search: SetupSearch,
+    planned: PlannedSetups,
+    comparison: Comparison,
+    criterion: Criterion,
+    workers: int,
+) -> MeasuringPlan:
+    """Plan with its expected errors, and those of others."""
+    plan, measured, forecast = comparison.plan, comparison.measured, comparison.forecast
+    whole = plan if measured is None else join_sessions([measured, plan])
+    setups, readings = len(planned.setups), sum(len(s.chosen) for s in planned.setups)
+    minutes = comparison.equipment.minutes(setups, len(plan.readings))
+    each = round(readings / setups)
     with lent(workers):
         curve, helps, compared, expected, first_round, nominal, known = call_on_cores(
             (
-                lambda: compute_curve(search, each, len(counts), equipment),
+                lambda: compute_curve(search, each, setups, comparison.equipment),
                 comparison.list_alternatives,
                 comparison.list_usual_plans,
                 lambda: forecast.after(whole),
@@ -201,15 +215,13 @@ def plan_readings(
             ),
             killed=KILLED,
         )
-    own = Stage(
-        len(counts), sum(counts), equipment.minutes(len(counts), len(plan.readings)), planned.error
-    )
+    own = Stage(setups, readings, minutes, planned.error)
     factor, rest = _scale(own, expected, nominal, criterion)
     return MeasuringPlan(
         session=plan,
         forecast=forecast,
         criterion=criterion,
-        minutes=own.minutes,
+        minutes=minutes,
         known=known,
         expected=expected,
         first_round=first_round,
@@ -217,8 +229,8 @@ def plan_readings(
         helps=helps,
         stage=scale_curve([own], factor, rest)[0],
         curve=scale_curve(curve, factor, rest),
-        equipment=equipment,
-        candidates=len(candidates.session.readings),
+        equipment=comparison.equipment,
+        candidates=len(comparison.candidates.session.readings),
     )
 
 

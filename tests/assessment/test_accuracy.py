@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import itertools
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -35,11 +37,18 @@ from orthocal.assessment.tool_error import (
 )
 from orthocal.errors import RobotError
 from orthocal.estimation.problem import build_problem
+from orthocal.export.corrections import export_corrections
+from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
 from orthocal.kinematics.orthoglide import inverse
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, cube, find_workspace, tool_at_zero
 from orthocal.observation.simulate import load_errors
+from orthocal.output.text.accuracy import accuracy_json
+from orthocal.planning.equipment import Equipment
+from orthocal.planning.first_plan import paper_plan
+from orthocal.robot.builder.build import make_robot
+from orthocal.robot.builder.machine_file import Dimensions
 from orthocal.statistics.information import decompose
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -383,3 +392,23 @@ def test_machines_that_are_worse_than_their_tolerances_are_found_to_be(root, tim
     # of one machine the square scatters by 0.84 of its mean: a few combinations of errors decide
     three_sigma = 3.0 * 0.84 / 2.0 / np.sqrt(count)
     assert np.sqrt(np.mean(np.square(found))) == pytest.approx(times, rel=three_sigma)
+
+
+def test_every_figure_at_the_tool_is_for_the_stated_workspace(tmp_path):
+    """Tool error, correction table and LinuxCNC module of a machine with a box of its own."""
+    box = np.array([[-0.05, 0.06], [-0.06, 0.05], [-0.07, 0.04]])
+    robot = make_robot(Dimensions(workspace=tuple(map(tuple, box))), tmp_path / "mine")
+    session = simulate_session(paper_plan(robot, Equipment()), {"x_slide.offset": 1e-3}, seed=1)
+    result = calibrate(session.session, "offsets")
+    found = assess_tool(result)
+    assert found.workspace.limits == pytest.approx(box)
+    assert json.loads(accuracy_json(result, found))["box"] == pytest.approx(box)
+    text = " ".join(summarize(result, details=True).split())
+    assert "over the workspace x −50…60, y −60…50, z −70…40 mm" in text
+    table = np.loadtxt(
+        io.StringIO(export_corrections(result)["corrections.csv"]), delimiter=",", skiprows=1
+    )
+    assert table[:, :3].min(axis=0) == pytest.approx(box[:, 0] * 1e3)
+    assert table[:, :3].max(axis=0) == pytest.approx(box[:, 1] * 1e3)
+    module = approximate(result, within=1e-5)
+    assert (module.lower, module.upper) == (pytest.approx(box[:, 0]), pytest.approx(box[:, 1]))
