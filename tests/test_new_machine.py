@@ -67,7 +67,7 @@ def copied(made, tmp_path):
     return tmp_path / "mill"
 
 
-def test_a_folder_has_all_that_is_needed(made):
+def test_a_new_directory_has_all_files(made):
     assert {p.name for p in made.iterdir()} == {"machine.yaml", "mill.yaml", "mill.urdf", "first"}
     assert {p.name for p in (made / "first").iterdir()} == {
         *("session.yaml", "readings.csv", "sheet.html"),
@@ -101,7 +101,7 @@ def test_what_is_read_on_it_calibrates_it(made, capsys, tmp_path):
     assert code == 0
 
 
-def test_it_is_made_again_after_a_change(copied, capsys):
+def test_a_machine_is_made_again_after_a_change(copied, capsys):
     file = copied / "machine.yaml"
     file.write_text(file.read_text().replace("leg_mm: 250", "leg_mm: 260"))
     code, out, _ = run(capsys, "new", copied, "--again")
@@ -114,7 +114,7 @@ def test_it_is_made_again_after_a_change(copied, capsys):
     assert load_plan(copied / "first").purpose == Purpose("full")
 
 
-def test_readings_are_not_written_over(copied, capsys):
+def test_readings_are_not_overwritten(copied, capsys):
     file = copied / "first/readings.csv"
     head, *rows = file.read_text().splitlines()
     file.write_text("\n".join([head, *(f"{row}0.12" for row in rows)]) + "\n")
@@ -171,7 +171,7 @@ def test_a_workspace_out_of_reach_is_refused_and_nothing_is_written(copied, caps
     assert {p: p.read_bytes() for p in copied.rglob("*") if p.is_file()} == before
 
 
-def test_a_folder_that_was_named_otherwise_says_so(copied, capsys):
+def test_a_renamed_directory_is_named(copied, capsys):
     renamed = copied.rename(copied.with_name("lathe"))
     code, _, err = run(capsys, "new", renamed, "--again")
     assert (code, err) == (
@@ -181,7 +181,7 @@ def test_a_folder_that_was_named_otherwise_says_so(copied, capsys):
     )
 
 
-def test_what_joints_that_count_down_must_show_is_said(made, capsys, tmp_path):
+def test_entries_of_joints_that_count_down_are_described(made, capsys, tmp_path):
     words = ["--out", tmp_path / "try", "--error", "y_slide.offset_mm=1.5"]
     code, _, err = run(capsys, "simulate", made / "first", *words)
     assert code == 0, err
@@ -190,7 +190,7 @@ def test_what_joints_that_count_down_must_show_is_said(made, capsys, tmp_path):
     assert "y_slide counts down in the controller: there its joint must show so much less" in said
 
 
-def test_readings_belong_to_the_sizes_of_their_day(copied, capsys):
+def test_sheets_with_readings_stay_unchanged(copied, capsys):
     csv = copied / "first/readings.csv"
     csv.write_text(csv.read_text().replace("yx,zero,1,", "yx,zero,1,0.12"))
     before = (copied / "first/sheet.html").read_text()
@@ -201,7 +201,7 @@ def test_readings_belong_to_the_sizes_of_their_day(copied, capsys):
     assert (copied / "first/sheet.html").read_text() == before
 
 
-def test_a_plan_that_is_out_of_reach_now_is_told(copied, capsys):
+def test_a_plan_out_of_reach_is_old(copied, capsys):
     file = copied / "machine.yaml"
     file.write_text(file.read_text().replace("[100, 320]", "[200, 320]"))
     code, _, err = run(capsys, "new", copied, "--again")
@@ -236,7 +236,7 @@ def test_a_plan_that_is_out_of_reach_now_is_told(copied, capsys):
         ({"travel_mm": "245:300"}, "expected 10 mm to either side of the mechanical zero"),
     ],
 )
-def test_what_makes_no_machine_is_refused(capsys, tmp_path, changed, message):
+def test_impossible_machines_are_refused(capsys, tmp_path, changed, message):
     given = ["new", tmp_path / "mill", "--paper", *options(**changed)]
     code, out, err = run(capsys, *given)
     assert (code, out) == (2, "")
@@ -245,7 +245,7 @@ def test_what_makes_no_machine_is_refused(capsys, tmp_path, changed, message):
     assert not (tmp_path / "mill").exists()
 
 
-def test_what_is_there_is_not_written_over(copied, capsys):
+def test_existing_files_are_not_overwritten(copied, capsys):
     before = (copied / "mill.urdf").read_text()
     given = ["new", copied, *options(leg_mm="260"), "--paper"]
     code, _, err = run(capsys, *given)
@@ -266,7 +266,7 @@ def test_what_is_there_is_not_written_over(copied, capsys):
         (["mill", "--again", "--leg-mm", "260"], "--leg-mm: found with --again, which reads mach"),
     ],
 )
-def test_other_mistakes_are_told(capsys, tmp_path, words, message):
+def test_other_mistakes_are_refused(capsys, tmp_path, words, message):
     code, _, err = run(capsys, "new", tmp_path / words[0], *words[1:])
     assert code == 2
     assert message in err
@@ -294,7 +294,7 @@ def talk(command, answers, cwd):
     return process.wait(timeout=300), said.decode(errors="replace").replace("\r\n", "\n")
 
 
-def test_at_a_terminal_it_asks_and_asks_back(root, tmp_path):
+def test_invalid_answers_are_asked_for_again(root, tmp_path):
     answers = ["250000\n", "\n", "250\n", "10:600\n", "100:320\n", "30\n", "60\n", "40\n", "4\n"]
     answers += ["sideways\n", "up,down,up\n", "0\n", "90\n", "40:30\n", "-50:60,-50:60,-40:40\n"]
     answers += ["0\n", "1.5\n"]
@@ -318,7 +318,7 @@ def test_at_a_terminal_it_asks_and_asks_back(root, tmp_path):
     assert session.robot.parameters.stated == {"*.offset_mm": 1.5}
 
 
-def test_nothing_is_made_where_answers_end(root, tmp_path):
+def test_nothing_is_written_when_the_input_ends(root, tmp_path):
     command = [sys.executable, "-m", "orthocal", "new", str(tmp_path / "mill"), "--paper"]
     code, said = talk(command, ["250\n", "\x04"], root)
     assert code == 2
@@ -344,7 +344,7 @@ def test_options_are_not_asked_for(monkeypatch):
 
 
 @pytest.mark.slow
-def test_without_the_papers_plan_one_is_chosen(capsys, tmp_path):
+def test_without_paper_a_plan_is_chosen(capsys, tmp_path):
     given = [*options(), "--tolerance", "*.offset_mm=2"]
     code, out, _ = run(capsys, "new", tmp_path / "mill", *given)
     assert code == 0

@@ -58,7 +58,7 @@ def export(
         typer.Option(
             metavar="MM",
             help="linuxcnc: half the side of a module's region around the zero; by default the "
-            "largest that the machine reaches, of 60 mm at most.",
+            "workspace.",
         ),
     ] = None,
     module: Annotated[

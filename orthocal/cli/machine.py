@@ -36,8 +36,8 @@ def accuracy(
         typer.Option(
             min=0.001,
             max=1e5,
-            help="Half the side of the cube, without points; else the largest that the machine "
-            "reaches, of 60 mm at most.",
+            help="Half the side of a cube around the mechanical zero, without points; by default "
+            "the workspace.",
         ),
     ] = None,
     json: Json = False,

@@ -1,6 +1,6 @@
 """Candidate readings of a plan: every possible setup in every posture in which it can be read.
 
-Candidates are a session like any other, whatever the sensors are: contacts, predicted readings and
+Candidates are a session like any other, for all sensors: contacts, predicted readings and
 Jacobians come from the same functions.
 """
 

@@ -13,7 +13,7 @@ from orthocal.planning.equipment import Equipment
 from orthocal.planning.selection import SetupSearch
 
 ENOUGH = 0.05
-"""Relative reduction of the error by another hour below which it is not worth it."""
+"""Relative reduction of the error by another hour below which a plan has enough readings."""
 
 HOUR = 60.0
 

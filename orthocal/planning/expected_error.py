@@ -116,11 +116,11 @@ class ToolForecast:
         self.workspace = find_workspace(robot) if workspace is None else workspace
         parameters = robot.parameters
         free = selection.names
-        taken = {parameters[n].terms[0][0] for n in (*free, *selection.fixed)}
+        determined = {parameters[n].terms[0][0] for n in (*free, *selection.fixed)}
         self.others = tuple(
             n
             for n in (machine_errors(robot) if others is None else others)
-            if not taken & {term for term, _ in parameters[n].terms}
+            if not determined & {term for term, _ in parameters[n].terms}
         )
         self.names = (*free, *self.others)
         own = {**(others or {}), **{p.name: p.tolerance for p in selection.parameters}}
@@ -175,7 +175,7 @@ class ToolForecast:
             ClosureError: If no machine allows enough readings.
         """
         problem = self.problem(session)
-        others = self._slopes_of_others(session)
+        others = self._jacobian_of_others(session)
         noise = noise_of(session) if sigma is None else sigma
         drawn = list(self._draw(problem, entered=entered)) if machines is None else machines
         fleet = Fleet(problem, np.array(drawn) / problem.theta_scale)
@@ -200,14 +200,14 @@ class ToolForecast:
     def about_nominal(self, session: Session, *, sigma: float | None = None) -> Expected:
         """Expected tool error to first order about the nominal machine, as in the search."""
         problem = self.problem(session)
-        others = self._slopes_of_others(session)
+        others = self._jacobian_of_others(session)
         noise = noise_of(session) if sigma is None else sigma
         covariance, _ = self._posterior(problem, others, problem.reference, noise)
         if covariance is None:
             raise ClosureError("cannot be read", posture="the planned ones")
         return self._expected(covariance)
 
-    def _slopes_of_others(self, session: Session) -> Array | None:
+    def _jacobian_of_others(self, session: Session) -> Array | None:
         """Change of a session's readings by one tolerance of what is not identified, [m]."""
         if not self.others:
             return None
@@ -265,9 +265,9 @@ class ToolForecast:
             return known, lost
         other = project_out_zeros(others[good], part)
         leak = (inverse @ (slopes.T @ other) / weight**2)[:n] * scale[:, None]
-        left = np.diag(self.tolerances[n:] ** 2)
-        taken = leak * self.tolerances[n:]
-        return np.block([[known + leak @ leak.T, -taken], [-taken.T, left]]), lost
+        variance = np.diag(self.tolerances[n:] ** 2)
+        across = leak * self.tolerances[n:]
+        return np.block([[known + leak @ leak.T, -across], [-across.T, variance]]), lost
 
     def _expected(self, covariance: Array) -> Expected:
         tool = measure_uncertainty(self.jacobian, covariance, self.workspace, self.positions)

@@ -238,13 +238,13 @@ def _reporter(say: Callable[[str], None], criterion: Criterion) -> Callable[[int
     """Report of the starts that improve the plan."""
     in_metres, least = criterion not in ("A", "D", "E"), math.inf
 
-    def tell(start: int, error: float) -> None:
+    def report_start(start: int, error: float) -> None:
         nonlocal least
         if error < (1.0 - REPORTED) * least:
             least = error
             say(f"start {start}: " + (f"{error / UM:.4g} µm" if in_metres else f"{error:.4g}"))
 
-    return tell
+    return report_start
 
 
 def _scale(
@@ -276,7 +276,7 @@ def build_session(
     and ends with the first posture.
     """
     source = candidates.session
-    taken = set() if measured is None else set(measured.setups)
+    used_names = set() if measured is None else set(measured.setups)
     setups: dict[str, Setup] = {}
     readings: list[Reading] = []
     used: dict[str, Posture] = {}
@@ -289,7 +289,7 @@ def build_session(
 
     for own in sorted(planned, key=place):
         candidate = candidates.setups[own.candidate]
-        name = _setup_name(candidate.name, {*taken, *setups})
+        name = _setup_name(candidate.name, {*used_names, *setups})
         rows = [source.readings[i] for i in candidate.rows[list(own.chosen)]]
         points = np.array([source.postures[r.posture].values for r in rows])
         setups[name] = replace(source.setups[candidate.name], name=name)
@@ -337,12 +337,14 @@ def order_postures(points: Array) -> list[int]:
     return order
 
 
-def _setup_name(candidate: str, taken: set[str]) -> str:
+def _setup_name(candidate: str, used_names: set[str]) -> str:
     """Short name of a setup: direction and leg, with a number where there are several."""
     short = candidate.partition("_")[0]
-    if short not in taken:
+    if short not in used_names:
         return short
-    return next(f"{short}_{i}" for i in range(2, len(taken) + 3) if f"{short}_{i}" not in taken)
+    return next(
+        f"{short}_{i}" for i in range(2, len(used_names) + 3) if f"{short}_{i}" not in used_names
+    )
 
 
 def _prior(candidates: Candidates, forecast: ToolForecast, measured: Session | None) -> Array:

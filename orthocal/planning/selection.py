@@ -24,7 +24,7 @@ from orthocal.units import MM
 
 Array = NDArray[np.float64]
 
-WORTH = 1e-3
+LEAST_IMPROVEMENT = 1e-3
 """Relative improvement by one round of exchanges that justifies another round."""
 
 MOST_ROUNDS = 8
@@ -202,7 +202,7 @@ class SetupSearch:
                 before = found.error
                 for k in range(len(found.setups)):
                     found = self._exchange(found, k)
-                if found.error > before * (1.0 - WORTH):
+                if found.error > before * (1.0 - LEAST_IMPROVEMENT):
                     break
             return found
 

@@ -1,4 +1,4 @@
-"""A first plan for a machine of any size: clear of hinges, within reach, in range of the dial."""
+"""First plan of any machine: clear of hinges, within reach, in the range of the dial."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from orthocal.sensors.rod_indicator import RodByBlade
 from orthocal.sensors.tips import Tip
 
 
-def test_on_the_papers_machine_it_is_the_papers_plan(orthoglide, root):
+def test_the_first_plan_of_the_orthoglide_is_the_paper_plan(orthoglide, root):
     """The seven postures of the workshop example, and its setups; the zero again at the end."""
     plan, workshop = paper_plan(orthoglide, Equipment()), load_plan(root / "examples/workshop")
     assert {n: p.values.tolist() for n, p in plan.postures.items()} == {
@@ -46,7 +46,7 @@ def test_on_the_papers_machine_it_is_the_papers_plan(orthoglide, root):
         Dimensions(leg=0.6, lower=0.3, upper=0.9),
     ],
 )
-def test_a_machine_of_another_size_is_read_within_its_reach(tmp_path, sizes):
+def test_the_paper_plan_of_other_dimensions_is_within_reach(tmp_path, sizes):
     robot = make_robot(sizes, tmp_path / "mine")
     plan = paper_plan(robot, Equipment())
     check_contacts(plan)
@@ -61,7 +61,7 @@ def test_a_machine_of_another_size_is_read_within_its_reach(tmp_path, sizes):
     assert 1 <= len(equipment.sections) <= 3
 
 
-def test_it_is_read_with_what_one_has(orthoglide):
+def test_the_paper_plan_uses_the_given_equipment(orthoglide):
     blade = Equipment(tip=Tip("blade", 0.0, 0.02), rods=("b",))
     sensors = [s.sensor for s in paper_plan(orthoglide, blade).setups.values()]
     assert {(type(s), s.rod) for s in sensors} == {(RodByBlade, "b")}

@@ -1,4 +1,4 @@
-"""What readings take off what others leave: against posteriors of all that is said."""
+"""Gains of readings, against posterior covariances."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def drawn(request):
     return kind, information, root, taking
 
 
-def test_a_gain_is_what_readings_take_off(drawn):
+def test_a_gain_is_the_reduction_of_the_error(drawn):
     kind, information, root, taking = drawn
     for rows in ([2], [0, 3], [1, 4, 6, 2]):
         taken = left(kind, information, root, []) - left(kind, information, root, rows)
         assert taking.gain(rows) == pytest.approx(taken, rel=1e-9)
 
 
-def test_one_more_reading_takes_what_is_said(drawn):
+def test_the_gain_of_one_further_reading(drawn):
     kind, information, root, taking = drawn
     rows = [5, 1]
     gains = taking.further_gains(rows)
@@ -75,7 +75,7 @@ def test_readings_are_completed_greedily(drawn, count):
 
 
 @pytest.mark.parametrize("count", [2, 4, 6])
-def test_the_best_pairs_differ_most_and_share_no_reading(drawn, count):
+def test_best_pairs_have_the_largest_gains_and_share_no_reading(drawn, count):
     """Two readings beside a zero of which nothing is known are worth their difference."""
     kind, _, _, taking = drawn
 
@@ -100,7 +100,7 @@ def test_the_best_pairs_differ_most_and_share_no_reading(drawn, count):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_pairs_are_worth_what_they_are_with_the_gauge_set_in_the_first(seed):
+def test_gains_with_the_gauge_aligned_in_the_first_posture(seed):
     """What a hand sets by the machine is elsewhere with each beginning: low rank against anew."""
     kind, information, root = draw(seed)
     rng = np.random.default_rng(seed)

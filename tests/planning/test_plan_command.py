@@ -1,4 +1,4 @@
-"""orthocal plan: what it prints and writes, and what it refuses."""
+"""orthocal plan: output, files and refusals."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_plan_is_written_ready_to_measure(monkeypatch, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("much", [["--setups", "4"], ["--hours", "1"]])
-def test_one_process_plans_what_two_do(monkeypatch, capsys, tmp_path, much):
+def test_one_process_gives_the_plan_of_two(monkeypatch, capsys, tmp_path, much):
     monkeypatch.setattr(cores, "can_fork", lambda: True)
     found = []
     for workers in (1, 2):
@@ -84,7 +84,7 @@ def test_one_process_plans_what_two_do(monkeypatch, capsys, tmp_path, much):
     assert found[0] == found[1]
 
 
-def test_what_a_process_of_a_plan_finds_wrong_is_told(monkeypatch, capsys):
+def test_an_error_in_a_worker_process_is_reported(monkeypatch, capsys):
     monkeypatch.setattr(cores, "can_fork", lambda: True)
     words = ["orthoglide", *QUICK[:-1], 2, "--tolerance", "*.offset_mm=40", "--workers", 2]
     code, out, err = run(monkeypatch, capsys, "plan", *words)
@@ -113,7 +113,7 @@ def test_a_plan_that_is_stopped_leaves_no_process(tmp_path):
     assert not out.exists()
 
 
-def test_a_dial_without_a_tip_is_told(monkeypatch, capsys, tmp_path):
+def test_a_dial_without_a_tip_is_named(monkeypatch, capsys, tmp_path):
     dial = tmp_path / "dial.yaml"
     dial.write_text("sigma_mm: 0.005\nrange_mm: [-5, 5]\n")
     code, _, err = run(monkeypatch, capsys, "plan", "orthoglide", *QUICK, "--gauge", dial)
@@ -130,7 +130,7 @@ def test_further_setups_of_a_session_are_planned(monkeypatch, capsys, root):
     assert found["expected"]["aligned_um"] < found["before"]["aligned_um"]
 
 
-def test_in_python_it_is_the_same(orthoglide):
+def test_the_same_seed_gives_the_same_plan_in_python(orthoglide):
     equipment = Equipment(along=3, across=0.0, sections=(0.5,))
     plan = plan_readings(orthoglide, "full", equipment=equipment, starts=1, seed=3)
     again = plan_readings(orthoglide, "full", equipment=equipment, starts=1, seed=3)
@@ -152,7 +152,7 @@ def for_the_headline(orthoglide):
     return plan_for(orthoglide, "aligned")
 
 
-def test_what_gains_nothing_is_no_help(for_the_headline):
+def test_other_gauges_without_a_gain_are_not_listed(for_the_headline):
     """As much as the plan itself leaves, or a trifle less, or more."""
     plan = for_the_headline
     assert len(plan.helps) >= 2
@@ -229,7 +229,7 @@ def test_each_criterion_is_better_met_by_its_own_plan(orthoglide, for_the_headli
         ),
     ],
 )
-def test_what_makes_no_sense_is_refused(monkeypatch, capsys, words, message):
+def test_invalid_options_are_refused(monkeypatch, capsys, words, message):
     code, out, err = run(monkeypatch, capsys, "plan", *words)
     assert (code, out) == (2, "")
     assert message in err.splitlines()[-1]
@@ -244,7 +244,7 @@ def test_what_makes_no_sense_is_refused(monkeypatch, capsys, words, message):
         ("- 1\n", "dial.yaml: "),
     ],
 )
-def test_a_dial_that_makes_no_sense_is_refused(monkeypatch, capsys, tmp_path, text, message):
+def test_an_invalid_dial_is_refused(monkeypatch, capsys, tmp_path, text, message):
     dial = tmp_path / "dial.yaml"
     dial.write_text(text)
     code, _, err = run(monkeypatch, capsys, "plan", "orthoglide", "--gauge", dial)

@@ -95,7 +95,7 @@ def test_a_plan_is_nearly_the_best_of_all(seed, hands):
     )
 
 
-def test_every_setup_keeps_what_the_gauge_reaches():
+def test_every_setup_stays_in_the_range_of_the_gauge():
     rng = np.random.default_rng(3)
     candidates, _ = draw_candidates(rng, kinds=4, readings=8)
     root = rng.normal(size=(STATE, STATE))
@@ -152,7 +152,7 @@ class Always:
         return self.root
 
 
-def test_what_is_left_is_found_roughly_only_where_it_can_be():
+def test_the_rough_error_needs_a_constant_weight():
     """The error of the worst point, say, is another one for each covariance."""
     rng = np.random.default_rng(2)
     candidates, _ = draw_candidates(rng, kinds=3, readings=6)
@@ -169,7 +169,7 @@ def test_what_is_left_is_found_roughly_only_where_it_can_be():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_way_through_postures_is_hardly_longer_than_the_shortest(seed):
+def test_the_path_through_postures_is_nearly_the_shortest(seed):
     points = np.random.default_rng(seed).normal(size=(7, 3))
     way = order_postures(points)
     assert way[0] == 0

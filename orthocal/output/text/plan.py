@@ -138,7 +138,7 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
             "setups": s.setups,
             "readings": s.readings,
             "minutes": s.minutes,
-            "left": s.error / _unit(plan),
+            "error": s.error / _unit(plan),
         }
 
     read, closing = _counts(plan)
