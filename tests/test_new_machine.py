@@ -346,8 +346,10 @@ def test_options_are_not_asked_for(monkeypatch):
 @pytest.mark.slow
 def test_without_paper_a_plan_is_chosen(capsys, tmp_path):
     given = [*options(), "--tolerance", "*.offset_mm=2"]
-    code, out, _ = run(capsys, "new", tmp_path / "mill", *given)
+    code, out, err = run(capsys, "new", tmp_path / "mill", *given)
     assert code == 0
+    steps = [line.split()[1] for line in err.splitlines()]
+    assert list(dict.fromkeys(steps)) == ["computing", "choosing", "start", "comparing", "drawing"]
     assert "Plan: 24 readings in 6 setups, about 72 min." in out
     assert re.search(r"Expected tool error: [\d.]+ µm \(now \d+ µm\), workspace ±60 mm, workp", out)
     first = tmp_path / "mill/first"

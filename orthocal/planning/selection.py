@@ -119,7 +119,8 @@ class SetupSearch:
         jacobians = [
             s for k in candidates.setups for s in (k.jacobian, *(a.jacobian for a in k.aligned))
         ]
-        _, sizes, directions = np.linalg.svd(np.vstack(jacobians), full_matrices=False)
+        triangle = np.linalg.qr(np.vstack(jacobians), mode="r")  # half the time of a single SVD
+        _, sizes, directions = np.linalg.svd(triangle, full_matrices=False)
         basis = directions[sizes > UNSEEN * sizes.max(initial=0.0)]
         reduced = tuple(
             replace(
