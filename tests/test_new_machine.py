@@ -197,7 +197,7 @@ def test_sheets_with_readings_stay_unchanged(copied, capsys):
     code, out, err = run(capsys, "new", copied, "--again")
     assert code == 0
     assert f"orthocal: {copied}/first: has readings, which belong to the dimensions of their" in err
-    assert "sheet" not in out
+    assert "sheet.html" not in out
     assert (copied / "first/sheet.html").read_text() == before
 
 
