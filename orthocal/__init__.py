@@ -76,11 +76,11 @@ if TYPE_CHECKING:  # the public names; each is imported when it is first used
     from orthocal.output.report.page import write_report as write_report
     from orthocal.output.scene.drawing import draw_scene as draw_scene
     from orthocal.output.text.summary import summarize as summarize
-    from orthocal.planning.equipment import Means as Means
+    from orthocal.planning.equipment import Equipment as Equipment
     from orthocal.planning.plan import MeasuringPlan as MeasuringPlan
     from orthocal.planning.plan import plan_readings as plan_readings
     from orthocal.robot.builder.build import make_robot as make_robot
-    from orthocal.robot.builder.dimensions import Sizes as Sizes
+    from orthocal.robot.builder.machine_file import Dimensions as Dimensions
     from orthocal.robot.loading import load_robot as load_robot
     from orthocal.robot.model import Robot as Robot
     from orthocal.sensors.protocol import Sensor as Sensor

@@ -140,7 +140,7 @@ KINDS = {
 
 def lay_out(folder: Path) -> None:
     """Good files of every kind."""
-    from orthocal import Sizes, calibrate, load_session, make_robot
+    from orthocal import Dimensions, calibrate, load_session, make_robot
     from orthocal.measurement.files.session_file import load_plan
     from orthocal.measurement.files.write_session import write_session
     from orthocal.observation.simulate import simulate_session
@@ -165,7 +165,7 @@ def lay_out(folder: Path) -> None:
     write_calibration(calibrate(load_session(folder), "full"), folder / "calibration.json")
     (folder / "part.ngc").write_text(PROGRAM, encoding="utf-8")
     (folder / "dial.yaml").write_text(DIAL, encoding="utf-8")
-    make_robot(Sizes(), folder / "made")
+    make_robot(Dimensions(), folder / "made")
     lay_out_journals(folder)
 
 
@@ -553,8 +553,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     from orthocal.output.scene.drawing import draw_scene
     from orthocal.output.text.accuracy import format_points
     from orthocal.output.text.import_report import format_import, format_import_json
-    from orthocal.planning.equipment import Means
-    from orthocal.planning.gauge_range import load_dial
+    from orthocal.planning.equipment import Equipment, load_dial
     from orthocal.study.runner import open_results
 
     deep = rng.random() < thorough
@@ -596,7 +595,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     elif kind == "machine":
         use_machine(folder / "made", deep=deep)
     elif kind == "dial":
-        load_dial(folder / "dial.yaml", Means())
+        load_dial(folder / "dial.yaml", Equipment())
     elif kind == "journal":
         with restored(folder / "recorded"), open_recording(folder / "recorded") as recording:
             assert recording.rows

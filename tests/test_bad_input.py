@@ -461,14 +461,15 @@ SESSION_FILE_CASES = [
     ),
     Case(
         "plan-cube-not-reached",
-        "--half-side-mm: the machine does not reach a cube of ±500 mm (cannot be reached: the "
-        "loops stay open by # mm, #% of the way from the mechanical zero)",
-        command="plan orthoglide --half-side-mm 500",
+        "--workspace-mm: the machine does not reach the workspace ±500 mm (cannot be reached: the "
+        "loops stay open by # mm, #% of the way from the mechanical zero); it reaches ±79 mm",
+        command="plan orthoglide --workspace-mm 500",
     ),
     Case(
         "plan-cube-below-zero",
-        "--half-side-mm: found -5; expected 0.1 mm to 10 m",
-        command="plan orthoglide --half-side-mm -5",
+        "--workspace-mm: found '-5'; expected half the side of a cube, such as 80, or LOW:HIGH of "
+        "x,y,z, such as -80:80,-80:80,-80:80, in mm",
+        command="plan orthoglide --workspace-mm -5",
     ),
     Case(
         "session-folder-above",

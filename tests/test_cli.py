@@ -249,7 +249,7 @@ def test_compare_gives_its_verdict_as_exit_code(orthocal, experiment, root):
 def test_accuracy_over_a_cube_and_at_points(orthocal, calibrated, tmp_path):
     code, out, _ = orthocal("accuracy", calibrated, "--half-side-mm", 40)
     assert code == 0
-    assert "Over a cube of ±40 mm around the zero" in out
+    assert "Over the workspace ±40 mm" in out
     points = tmp_path / "points.csv"
     points.write_text("x_mm,y_mm,z_mm\n0,0,0\n10,20,-30.5\n")
     code, out, _ = orthocal("accuracy", calibrated, points)

@@ -143,7 +143,7 @@ CALIBRATE = f"calibrate {EXPERIMENT}"
         ("docs/results.md", "Verdict", f"compare {EXPERIMENT}"),
         (
             "docs/planning.md",
-            "at the tool are to be expected",
+            "Expected tool error",
             "plan orthoglide --tolerance '*.offset_mm=2' --out out/monday",
         ),
         (

@@ -13,7 +13,7 @@ from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.kinematics.workspace import Workspace, largest_cube
+from orthocal.kinematics.workspace import Workspace, find_workspace
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
@@ -50,7 +50,7 @@ class CalibratedTool:
 
 
 def find_tool(calibration: Calibration) -> CalibratedTool | None:
-    """The tool over the largest cube around the zero that it reaches, of ±60 mm at most.
+    """The tool over the workspace, or over the largest box of its shape that the machine reaches.
 
     That is within all limits and reached by the nominal and the calibrated machine, with the
     offsets that were active while measuring and with the identified ones.
@@ -74,8 +74,11 @@ def _find_tool(calibration: Calibration) -> CalibratedTool | None:
             _require_travel(robot, drives - offsets)
             sensitivity.assembly.forward(drives - offsets, start=passive)
 
-    space = largest_cube(robot, reach)
-    return None if space is None else _place(calibration, space, sensitivity, None)
+    try:
+        space = find_workspace(robot, reach)
+    except ClosureError:
+        return None
+    return _place(calibration, space, sensitivity, None)
 
 
 def place_tool(

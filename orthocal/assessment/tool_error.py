@@ -27,9 +27,9 @@ from orthocal.assessment.calibrated_tool import (
 )
 from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.calibration.calibration import Calibration
-from orthocal.errors import ClosureError, RobotError
+from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
-from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
+from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace, require_commanded_tool
 from orthocal.statistics.distributions import chi_square_tail
 
 Array = NDArray[np.float64]
@@ -193,8 +193,7 @@ def assess_tool(
 
     Args:
         calibration: The calibration.
-        workspace: Tool positions that are commanded; by default the largest cube around the zero
-            that the machine reaches, of ±60 mm at most.
+        workspace: Tool positions that are commanded; by default the workspace.
         names: What to call the points in messages.
 
     Raises:
@@ -203,24 +202,16 @@ def assess_tool(
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     if workspace is None:
-        return calibration.remember("accuracy", lambda: _assess_largest_cube(calibration))
+        return calibration.remember("accuracy", lambda: _assess_workspace(calibration))
     return _assess(calibration, place_tool(calibration, workspace, names=names), names)
 
 
-def _assess_largest_cube(calibration: Calibration) -> ToolAccuracy:
+def _assess_workspace(calibration: Calibration) -> ToolAccuracy:
     tool = find_tool(calibration)
-    robot = calibration.robot
-    if robot.tcp is None:
-        raise RobotError("has no tool centre point; add orthocal.tcp", where=str(robot.yaml))
-    if len(robot.tcp.coordinates) != len(robot.drives):
-        raise RobotError(
-            f"orthocal.tcp.coordinates names {len(robot.tcp.coordinates)} coordinates for "
-            f"{len(robot.drives)} drives: they do not command it",
-            where=str(robot.yaml),
-        )
+    require_commanded_tool(calibration.robot)
     if tool is None:
         raise ClosureError(
-            "cannot be reached: there is no cube around it, not even of a millimetre, that the "
+            "cannot be reached: there is no region around it, not even of a millimetre, that the "
             "machine reaches within its limits",
             posture="mechanical zero",
         )

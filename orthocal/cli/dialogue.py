@@ -1,45 +1,50 @@
-"""What a machine is like: from options, or asked for at a terminal."""
+"""Dimensions of a machine, from options or from answers at a terminal."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, TypeVar
 
 from orthocal.cli.printing import put_note
 from orthocal.errors import ParameterError
 from orthocal.io.documents import parse_number
-from orthocal.robot.builder.dimensions import Counting, Sizes, find_counting_problem, in_mm
+from orthocal.robot.builder.machine_file import Counting, Dimensions, find_counting_problem, in_mm
 from orthocal.units import MM
 
 AXES = "xyz"
 
-USUALLY_OFF = "2"
-"""mm"""
+Box = tuple[tuple[float, float], ...]
+Answer = TypeVar("Answer")
 
-MOST_OFF = 50.0
-"""mm"""
+USUAL_OFFSET = "2"
+"""Tolerance of the home switches that is proposed, [mm]."""
+
+MOST_OFFSET = 50.0
+"""[mm]"""
 
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """What is known of a machine so far; sizes that nobody has said yet are harmless ones."""
+    """Answers so far; dimensions without an answer have values that cause no error message."""
 
-    sizes: Sizes
+    dimensions: Dimensions
     counting: tuple[Counting, Counting, Counting]
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Something that a machine's files need."""
+    """Question about a machine, with the option that answers it."""
 
     option: str
     words: Callable[[Answers], str]
-    """What is asked at a terminal."""
+    """Text at the terminal."""
     answer: Callable[[Answers, str, str], Answers]
-    """What is known with an answer; takes the option's name for messages."""
+    """Answers so far, the new text and the option's name, to the answers with it."""
     field: str
-    """What `Sizes.find_problem` calls it."""
+    """Name of the dimension, as in `Dimensions.find_problem`."""
 
 
 def _number(text: str, option: str) -> float:
@@ -48,7 +53,7 @@ def _number(text: str, option: str) -> float:
 
 def _leg(known: Answers, text: str, option: str) -> Answers:
     leg = _number(text, option)
-    harmless = Sizes(
+    proportional = Dimensions(
         leg=leg,
         lower=0.9 * leg,
         upper=1.1 * leg,
@@ -56,7 +61,7 @@ def _leg(known: Answers, text: str, option: str) -> Answers:
         rods_apart=0.3 * leg,
         rod_radius=0.01 * leg,
     )
-    return replace(known, sizes=harmless)
+    return replace(known, dimensions=proportional)
 
 
 def _travel(known: Answers, text: str, option: str) -> Answers:
@@ -65,25 +70,30 @@ def _travel(known: Answers, text: str, option: str) -> Answers:
         raise ParameterError(
             f"found '{text}'; expected LEAST:LARGEST, in mm, such as 100:320", where=option
         )
-    ends = {"lower": _number(low, option), "upper": _number(high, option)}
-    return replace(known, sizes=replace(known.sizes, **ends))
+    ends: dict[str, Any] = {"lower": _number(low, option), "upper": _number(high, option)}
+    return replace(known, dimensions=replace(known.dimensions, **ends))
 
 
 def _size(name: str) -> Callable[[Answers, str, str], Answers]:
     def answer(known: Answers, text: str, option: str) -> Answers:
-        return replace(known, sizes=replace(known.sizes, **{name: _number(text, option)}))
+        change: dict[str, Any] = {name: _number(text, option)}
+        return replace(known, dimensions=replace(known.dimensions, **change))
 
     return answer
 
 
 def _rods_apart(known: Answers, text: str, option: str) -> Answers:
     apart = _number(text, option)
-    thin = min(known.sizes.rod_radius, 0.4 * apart) if apart > 0.0 else known.sizes.rod_radius
-    return replace(known, sizes=replace(known.sizes, rods_apart=apart, rod_radius=thin))
+    thin = (
+        min(known.dimensions.rod_radius, 0.4 * apart)
+        if apart > 0.0
+        else known.dimensions.rod_radius
+    )
+    return replace(known, dimensions=replace(known.dimensions, rods_apart=apart, rod_radius=thin))
 
 
 def _each(text: str, option: str) -> list[str]:
-    """One for all, or one for each of x, y, z."""
+    """Parts of an answer: one for all of x, y, z, or one for each."""
     parts = [part.strip() for part in text.split(",")]
     if len(parts) == 1:
         return parts * len(AXES)
@@ -122,8 +132,8 @@ QUESTIONS = (
         "--travel-mm",
         lambda known: (
             "Travel of a slider, LEAST:LARGEST, mm. Count "
-            f"{in_mm(known.sizes.leg)} (the leg) where the legs are parallel to their axes, and "
-            "more further out"
+            f"{in_mm(known.dimensions.leg)} (the leg) where the legs are parallel to their axes, "
+            "and more further out"
         ),
         _travel,
         "travel",
@@ -161,93 +171,116 @@ QUESTIONS = (
     ),
 )
 
-NOTHING_KNOWN = Answers(Sizes(), (Counting(), Counting(), Counting()))
+NO_ANSWERS = Answers(Dimensions(), (Counting(), Counting(), Counting()))
 
 
 def find_answers(given: Mapping[str, str | None]) -> Answers:
-    """What a machine is like: what was given, all else asked for where somebody can answer.
+    """Dimensions of a machine from its options; missing ones are asked for at a terminal.
 
     Args:
-        given: Option to what was given with it.
+        given: Option to its value; None where it is missing.
 
     Raises:
-        ParameterError: If an option makes no sense, makes no machine with the others, or is
-            missing where nobody can be asked.
+        ParameterError: If an option is invalid, contradicts the others, or is missing without a
+            terminal.
     """
     asked = sys.stdin is not None and sys.stdin.isatty()
     missing = [q.option for q in QUESTIONS if given.get(q.option) is None]
     if missing and not asked:
         raise ParameterError(
-            "missing, and nobody can be asked: this is no terminal"
-            if len(missing) > 1
-            else "is missing, and nobody can be asked: this is no terminal",
+            f"{'are' if len(missing) > 1 else 'is'} missing; without a terminal every dimension "
+            "must be an option",
             where=", ".join(missing),
         )
-    known = NOTHING_KNOWN
+    known = NO_ANSWERS
     for question in QUESTIONS:
         text = given.get(question.option)
-        known = _ask(question, known) if text is None else _take(question, known, text)
+        if text is None:
+            known = _ask_until_valid(
+                question.words(known), question.option, partial(_require, question, known)
+            )
+        else:
+            known = _add(question, known, text)
     return known
 
 
+def _require(question: Question, known: Answers, text: str) -> Answers:
+    if not text:
+        raise ParameterError("found nothing; expected an answer")
+    return _add(question, known, text)
+
+
 def ask_tolerance() -> list[str]:
-    """How far zeros of joints may be off, as the option --tolerance says it.
+    """Tolerance of the drives' offsets, as values of --tolerance.
+
+    Raises:
+        ParameterError: If the input ends.
+    """
+
+    def read(text: str) -> list[str]:
+        size = _number(text, "--tolerance") / MM
+        if not 0.0 < size <= MOST_OFFSET:
+            raise ParameterError(
+                f"found {size:g} mm; expected more than 0, and at most {MOST_OFFSET:g} mm"
+            )
+        return [f"*.offset_mm={size:g}"]
+
+    return _ask_until_valid(
+        "How far may the zeros of the joints be off, one standard deviation, mm? Enter alone: "
+        f"{USUAL_OFFSET}, usual for home switches that were never measured",
+        "--tolerance",
+        lambda text: read(text or USUAL_OFFSET),
+    )
+
+
+def ask_workspace(usual: str, read: Callable[[str], Box]) -> Box | None:
+    """Workspace of a machine; None for the usual one.
+
+    Args:
+        usual: The usual one in words.
+        read: Box of a text; raises ParameterError for an invalid one.
+
+    Raises:
+        ParameterError: If the input ends.
+    """
+    return _ask_until_valid(
+        "Workspace around the mechanical zero, mm: half side of a cube, such as 80, or ranges of "
+        f"x,y,z, such as -80:80,-80:80,-100:60. Enter alone: {usual}",
+        "--workspace-mm",
+        lambda text: read(text) if text else None,
+    )
+
+
+def _ask_until_valid(question: str, option: str, read: Callable[[str], Answer]) -> Answer:
+    """Ask until there is a valid answer.
 
     Raises:
         ParameterError: If the input ends.
     """
     while True:
-        sys.stderr.write(
-            "How far may the joints' zeros be off, one standard deviation, mm? Enter alone: "
-            f"{USUALLY_OFF}, of home switches that nobody has measured: "
-        )
+        sys.stderr.write(f"{question}: ")
         sys.stderr.flush()
         text = sys.stdin.readline()
         if not text:
             put_note("")
-            raise ParameterError("was not answered: the input ended", where="--tolerance")
+            raise ParameterError("was not answered: the input ended", where=option)
         try:
-            size = _number(text.strip() or USUALLY_OFF, "--tolerance") / MM
+            return read(text.strip())
         except ParameterError as e:
             put_note(f"  {e.problem}")
-            continue
-        if 0.0 < size <= MOST_OFF:
-            return [f"*.offset_mm={size:g}"]
-        put_note(f"  found {size:g} mm; expected more than 0, and at most {MOST_OFF:g} mm")
 
 
-def _take(question: Question, known: Answers, text: str) -> Answers:
-    """What is known with an answer.
+def _add(question: Question, known: Answers, text: str) -> Answers:
+    """Answers with one more.
 
     Raises:
-        ParameterError: If the answer makes no sense, or no machine with what is known before.
+        ParameterError: If the answer is invalid, or contradicts earlier ones.
     """
     found = question.answer(known, text, question.option)
-    problem = found.sizes.find_problem()
+    problem = found.dimensions.find_problem()
     if problem:
         hint = ""
-        if question.field == "leg" and 0.0 < found.sizes.leg < 0.005:
+        if question.field == "leg" and 0.0 < found.dimensions.leg < 0.005:
             hint = ": mm, not m"
         raise ParameterError(problem[1] + hint, where=question.option)
     return found
-
-
-def _ask(question: Question, known: Answers) -> Answers:
-    """Ask until there is an answer that makes sense.
-
-    Raises:
-        ParameterError: If there is none, for the input ends.
-    """
-    while True:
-        sys.stderr.write(f"{question.words(known)}: ")
-        sys.stderr.flush()
-        text = sys.stdin.readline()
-        if not text:
-            put_note("")
-            raise ParameterError("was not answered: the input ended", where=question.option)
-        if not text.strip():
-            continue
-        try:
-            return _take(question, known, text.strip())
-        except ParameterError as e:
-            put_note(f"  {e.problem}")

@@ -55,8 +55,8 @@ def export(
         float | None,
         typer.Option(
             metavar="MM",
-            help="linuxcnc: half the side of a module's region around the mechanical zero; default "
-            "the largest that the machine reaches, at most 60 mm.",
+            help="linuxcnc: half the side of a module's region around the zero; by default the "
+            "workspace.",
         ),
     ] = None,
     module: Annotated[

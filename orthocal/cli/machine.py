@@ -36,8 +36,8 @@ def accuracy(
         typer.Option(
             min=0.001,
             max=1e5,
-            help="Half the side of the cube, without points; else the largest that the machine "
-            "reaches, of 60 mm at most.",
+            help="Half the side of a cube around the mechanical zero, without points; by default "
+            "the workspace.",
         ),
     ] = None,
     json: Json = False,
@@ -50,7 +50,7 @@ def accuracy(
     from orthocal.assessment.tool_error import MOST_POINTS, assess_tool
     from orthocal.assessment.tool_tables import accuracy_rows
     from orthocal.calibration.file import load_calibration
-    from orthocal.kinematics.workspace import Workspace, cube
+    from orthocal.kinematics.workspace import Workspace, cube, describe_box
     from orthocal.measurement.files.coordinate_tables import read_points
     from orthocal.output.text.accuracy import (
         POINT_COLUMNS,
@@ -80,8 +80,7 @@ def accuracy(
     except ClosureError as e:
         if half_side_mm is None:
             raise SessionError(e.reason, where=e.posture) from None
-        largest = assess_tool(result).workspace.half_side
-        known = "" if largest is None else f"; without this it is ±{largest / MM:.3g} mm"
+        known = f"; without this it is {describe_box(assess_tool(result).workspace.limits)}"
         raise SessionError(
             f"the machine does not reach a cube of ±{half_side_mm:g} mm{known} ({e.reason})",
             where="--half-side-mm",

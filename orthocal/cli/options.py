@@ -8,16 +8,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orthocal.errors import ClosureError, ParameterError, SessionError
+from orthocal.errors import ParameterError, SessionError
 from orthocal.units import MM
 
 if TYPE_CHECKING:
-    from orthocal.kinematics.workspace import Workspace
+    import numpy as np
+    from numpy.typing import NDArray
+
     from orthocal.robot.model import Robot
     from orthocal.session.session import Session
 
+    Array = NDArray[np.float64]
+
 SIMULATED = "Simulated"
 """What the source of a session begins with that was not measured."""
+
+MOST_MM = 1e4
+"""Largest coordinate of a box, [mm]."""
 
 FEWEST_DIFFERENT = 4
 """Numbers that differ from each other in sessions that can be told to be the same."""
@@ -117,29 +124,57 @@ def require_no_readings(folder: Path) -> None:
         )
 
 
-def require_cube(robot: Robot, half_side_mm: float) -> Workspace:
-    """The cube of --half-side-mm, which the nominal machine must reach.
+def read_box(text: str, letters: str, *, where: str) -> Array:
+    """Box of an option, shape (n, 2), [m].
+
+    Args:
+        text: Half the side of a cube, such as 80, or LOW:HIGH for each coordinate or all of them,
+            with commas between, in mm.
+        letters: Names of the coordinates.
+        where: The option, for messages.
 
     Raises:
-        ParameterError: If it is none, or not reached.
+        ParameterError: If the text is no box.
     """
-    from orthocal.kinematics.loop_closure import nominal_assembly
-    from orthocal.kinematics.workspace import cube
-    from orthocal.units import MM
+    import numpy as np
 
-    if not 0.1 <= half_side_mm <= 1e4:
+    from orthocal.io.documents import parse_number
+
+    def number(part: str) -> float:
+        return parse_number(part.strip(), where=where, name="it", error=ParameterError)
+
+    rows = []
+    for part in text.split(","):
+        low, colon, high = part.partition(":")
+        ends = (number(low), number(high)) if colon else (-number(low), number(low))
+        if not -MOST_MM <= ends[0] < ends[1] <= MOST_MM or (not colon and "," in text):
+            raise ParameterError(
+                f"found '{part}'; expected half the side of a cube, such as 80, or LOW:HIGH of "
+                f"{','.join(letters)}, such as {','.join(['-80:80'] * len(letters))}, in mm",
+                where=where,
+            )
+        rows.append(ends)
+    if len(rows) not in (1, len(letters)):
         raise ParameterError(
-            f"found {half_side_mm:g}; expected 0.1 mm to 10 m", where="--half-side-mm"
+            f"has {len(rows)} ranges; expected one for all, or one for each of {','.join(letters)}",
+            where=where,
         )
-    found = cube(robot, half_side=half_side_mm * MM)
-    try:
-        nominal_assembly(robot).inverse(found.points)
-    except ClosureError as e:
-        raise ParameterError(
-            f"the machine does not reach a cube of ±{half_side_mm:g} mm ({e.reason})",
-            where="--half-side-mm",
-        ) from None
-    return found
+    return np.array(rows * (len(letters) if len(rows) == 1 else 1)) * MM
+
+
+def read_workspace(text: str, robot: Robot, *, where: str = "--workspace-mm") -> Array:
+    """Workspace of an option, which the nominal machine must reach, shape (n, 2), [m].
+
+    Raises:
+        ParameterError: If the text is no box, or the machine does not reach it.
+    """
+    from orthocal.kinematics.workspace import coordinate_letters, find_unreached
+
+    box = read_box(text, coordinate_letters(robot), where=where)
+    problem = find_unreached(robot, box)
+    if problem:
+        raise ParameterError(problem, where=where)
+    return box
 
 
 def read_numbers(text: str, option: str, names: Sequence[str]) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""What to measure: plan."""
+"""Measuring plan: plan."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from orthocal.cli.options import (
     Json,
     Tolerances,
     app,
-    require_cube,
+    read_box,
+    read_workspace,
     require_no_readings,
     split_globs,
 )
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from orthocal.planning.equipment import Means
+    from orthocal.planning.equipment import Equipment
     from orthocal.robot.model import Robot
     from orthocal.session.session import Session
 
@@ -38,81 +39,98 @@ def plan(
         str,
         typer.Argument(
             metavar="ROBOT|SESSION",
-            help="A robot; or a session that was measured, for readings on top of it.",
+            help="A robot, or a measured session that the plan complements.",
         ),
     ],
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for session.yaml, an empty readings.csv and a sheet."),
+        typer.Option(help="Directory for session.yaml, an empty readings.csv and a sheet."),
     ] = None,
     model: Annotated[
         str | None,
-        typer.Option(help="What will be identified: full, or what the session is for."),
+        typer.Option(help="Model to identify; by default full, or that of the session."),
     ] = None,
-    setups: Annotated[int | None, typer.Option(min=1, help="How many; 6 by default.")] = None,
+    setups: Annotated[
+        int | None, typer.Option(min=1, help="Number of setups; 6 by default.")
+    ] = None,
     readings: Annotated[
-        int | None, typer.Option(min=2, help="In all setups together; 3 a setup by default.")
+        int | None,
+        typer.Option(min=2, help="Number of readings in all setups; 3 per setup by default."),
     ] = None,
     hours: Annotated[
-        float | None, typer.Option(help="How long there is, instead of both numbers.")
+        float | None, typer.Option(help="Available time, instead of both numbers.")
     ] = None,
     add: Annotated[
-        int | None, typer.Option(min=1, help="How many further setups, of a session.")
+        int | None, typer.Option(min=1, help="Number of further setups for a session.")
     ] = None,
     gauge: Annotated[
         Path | None,
-        typer.Option(help="dial.yaml: what the dial is like; else ±5 mm, 10 µm, a ball of 3 mm."),
+        typer.Option(help="dial.yaml, data of the gauge; by default ±5 mm, 10 µm, ball of 3 mm."),
     ] = None,
     touches: Annotated[
-        str | None, typer.Option(metavar="RODS", help="That can be touched, with commas between.")
+        str | None,
+        typer.Option(metavar="RODS", help="Rods that the gauge can touch, with commas between."),
     ] = None,
     sections: Annotated[
         str | None,
-        typer.Option(metavar="PARTS", help="Of a leg's length, from its root: 0.25,0.5,0.75."),
+        typer.Option(
+            metavar="FRACTIONS",
+            help="Sections as fractions of a leg's length from its root; 0.25,0.5,0.75 by default.",
+        ),
     ] = None,
     box: Annotated[
         str | None,
         typer.Option(
             metavar="LOW:HIGH,...",
-            help="Where the tool may go, mm for each coordinate; by default up to 100 mm.",
+            help="Region of the postures, mm, one range for all coordinates or one for each; up "
+            "to 100 mm from the mechanical zero by default.",
         ),
     ] = None,
-    along: Annotated[int, typer.Option(min=2, max=50, help="Places on a leg's own way.")] = 9,
+    along: Annotated[
+        int, typer.Option(min=2, max=50, help="Number of positions along a leg's direction.")
+    ] = 9,
     across_mm: Annotated[
-        float, typer.Option("--across-mm", help="How far beside that way, mm to either side.")
+        float,
+        typer.Option("--across-mm", help="Displacement across that direction, to either side."),
     ] = 20.0,
-    minutes_a_setup: Annotated[float, typer.Option(help="That a setup takes.")] = 10.0,
-    minutes_a_reading: Annotated[float, typer.Option(help="That a reading takes.")] = 0.5,
-    half_side_mm: Annotated[
-        float | None,
-        typer.Option("--half-side-mm", help="Half the side of the cube that counts."),
+    minutes_a_setup: Annotated[float, typer.Option(help="Duration of a setup.")] = 10.0,
+    minutes_a_reading: Annotated[float, typer.Option(help="Duration of a reading.")] = 0.5,
+    workspace_mm: Annotated[
+        str | None,
+        typer.Option(
+            "--workspace-mm",
+            metavar="HALF|LOW:HIGH,...",
+            help="Workspace instead of the robot's: half the side of a cube around the mechanical "
+            "zero, or a range for each coordinate.",
+        ),
     ] = None,
     criterion: Annotated[
         str,
         typer.Option(
-            metavar="aligned|relative|absolute|worst|A|D|E", help="What is to become small."
+            metavar="aligned|relative|absolute|worst|A|D|E", help="Criterion to minimise."
         ),
     ] = "aligned",
     tolerance: Tolerances = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the search's random starts.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the search's random starts.")] = 0,
     starts: Annotated[
-        int | None, typer.Option(min=1, max=100, help="How often the search begins anew.")
+        int | None, typer.Option(min=1, max=100, help="Number of starts of the search.")
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=1024, help="Processes; by default all cores.")
+        int | None, typer.Option(min=1, max=1024, help="Number of processes; all cores by default.")
     ] = None,
     json: Json = False,
     details: Annotated[
-        bool, typer.Option("--details", help="Say what it still cannot tell apart, too.")
+        bool, typer.Option("--details", help="List the largest remaining errors, too.")
     ] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Write over a session that is there.")
+        bool, typer.Option("--force", help="Overwrite a session without readings.")
     ] = False,
 ) -> None:
-    """Which setups and readings tell most, and what they will be worth, before any is taken."""
+    """Choose setups and readings for the smallest expected tool error, before measuring."""
     from orthocal.estimation.choice import Choice
     from orthocal.estimation.selection import read_tolerances
     from orthocal.io.files import exists, require_writable
+    from orthocal.kinematics.workspace import box_workspace
     from orthocal.measurement.files.write_session import write_session
     from orthocal.output.text.plan import draw_plan, plan_json
     from orthocal.output.text.summary import print_summary
@@ -129,27 +147,27 @@ def plan(
         require_writable(out)
         for name in FILES:
             if exists(out / name) and not force:
-                raise SessionError(
-                    "is there already; --force writes over it", where=str(out / name)
-                )
+                raise SessionError("exists already; --force overwrites it", where=str(out / name))
         require_no_readings(out)
     robot, measured, reference = _load(subject)
     if add is not None and measured is None:
-        raise ParameterError("is of a session; this is a robot", where="--add")
+        raise ParameterError("needs a session; found a robot", where="--add")
     if add is not None and setups is not None:
         raise ParameterError("found with --setups; expected one", where="--add")
-    means = _means(
+    equipment = _equipment(
         gauge,
         measured,
         rods=tuple(split_globs([touches] if touches else None)),
         sections=_numbers(sections, "--sections"),
-        box=_box(box, robot),
+        box=_region(box, robot),
         along=along,
         across=across_mm * MM,
         minutes=(minutes_a_setup, minutes_a_reading),
     )
     tolerances = read_tolerances(tolerance or [], robot.parameters, where="--tolerance")
-    workspace = None if half_side_mm is None else require_cube(robot, half_side_mm)
+    workspace = None
+    if workspace_mm is not None:
+        workspace = box_workspace(robot, read_workspace(workspace_mm, robot))
     count = workers or available_cores()
     found = plan_readings(
         robot,
@@ -157,7 +175,7 @@ def plan(
         setups=setups if add is None else add,
         readings=readings,
         hours=hours,
-        means=means,
+        equipment=equipment,
         measured=measured,
         workspace=workspace,
         criterion=criterion,
@@ -172,18 +190,18 @@ def plan(
         put_out(document.rstrip("\n"))
     else:
         print_summary(found, details=details)
-    if gauge is not None and means.tip is None:
+    if gauge is not None and equipment.tip is None:
         put_note(
-            f"orthocal: {gauge} names no tip: readings are planned of the line between the rods, "
-            "which no dial touches; with tip: {ball: {radius_mm: 1.5}} of what it touches"
+            f"orthocal: {gauge} states no tip: the plan is for the line between the rods, which "
+            "no dial touches; for a ball add tip: {ball: {radius_mm: 1.5}}"
         )
     if out is not None:
         comment = (
-            "A plan: here `orthocal record .` leads through it, or fill in readings.csv; then\n"
+            "A plan: run `orthocal record .` in this directory, or fill in readings.csv; then\n"
             "orthocal calibrate .\n"
-            "State the offsets that are active in the controller meanwhile, such as\n"
-            "controller: {offsets_mm: [0, 0, 0]}, one number a drive.\n"
-            "Approach every posture from the same side; the last reading of a setup is its first\n"
+            "State the offsets that are active in the controller during the measurement, such as\n"
+            "controller: {offsets_mm: [0, 0, 0]}, one number for each drive.\n"
+            "Approach every posture from the same side. The last reading of a setup is its first\n"
             "posture again."
         )
         calls = [lambda: sheet_or_problem(found.session), lambda: draw_plan(found)]
@@ -194,11 +212,11 @@ def plan(
         extra = {"plan.json": document, "plan.svg": picture} | sheet
         path = write_session(found.session, out, comment=comment, extra=extra, blank=True)
         paper = ", sheet.html and its programs" if "sheet.html" in extra else ""
-        put_note(f"Wrote {path}, readings.csv to fill in, plan.json, plan.svg{paper}")
+        put_note(f"Wrote {path}, an empty readings.csv, plan.json, plan.svg{paper}")
 
 
 def _load(subject: str) -> tuple[Robot, Session | None, str]:
-    """A robot, the session that was measured on it, and how a session names the robot."""
+    """Robot, measured session, and the name of the robot in a session."""
     from orthocal.output.text.subject import load_subject
     from orthocal.robot.model import Robot
     from orthocal.session.session import Session
@@ -214,7 +232,7 @@ def _load(subject: str) -> tuple[Robot, Session | None, str]:
     raise ParameterError("is a calibration; expected a robot or a session", where=subject)
 
 
-def _means(
+def _equipment(
     gauge: Path | None,
     measured: Session | None,
     *,
@@ -224,16 +242,15 @@ def _means(
     along: int,
     across: float,
     minutes: tuple[float, float],
-) -> Means:
-    from orthocal.planning.equipment import SECTIONS, Means
-    from orthocal.planning.gauge_range import load_dial, means_of
+) -> Equipment:
+    from orthocal.planning.equipment import SECTIONS, Equipment, equipment_of, load_dial
 
     for name, value in (("--minutes-a-setup", minutes[0]), ("--minutes-a-reading", minutes[1])):
         if not 0.0 < value < 1e4:
             raise ParameterError(f"found {value:g}; expected a number above 0", where=name)
     if not 0.0 <= across < 1.0:
         raise ParameterError("expected 0 or more, and less than 1000 mm", where="--across-mm")
-    own = Means(
+    own = Equipment(
         rods=rods,
         sections=sections or SECTIONS,
         box=box,
@@ -244,7 +261,7 @@ def _means(
     )
     if gauge is not None:
         return load_dial(gauge, own)
-    return own if measured is None else means_of(measured, own)
+    return own if measured is None else equipment_of(measured, own)
 
 
 def _numbers(text: str | None, option: str) -> tuple[float, ...] | None:
@@ -262,32 +279,10 @@ def _numbers(text: str | None, option: str) -> tuple[float, ...] | None:
     return values
 
 
-def _box(text: str | None, robot: Robot) -> NDArray[np.float64] | None:
-    """Least and largest tool coordinates, [m]."""
+def _region(text: str | None, robot: Robot) -> NDArray[np.float64] | None:
+    """Region of the postures: limits of the tool's coordinates, shape (n_coordinates, 2), [m]."""
     if text is None:
         return None
-    import numpy as np
+    from orthocal.kinematics.workspace import coordinate_letters
 
-    from orthocal.io.documents import parse_number
-    from orthocal.units import MM
-
-    count = 0 if robot.tcp is None else len(robot.tcp.coordinates)
-    rows = []
-    for part in text.split(","):
-        low, colon, high = part.partition(":")
-        if not colon:
-            raise ParameterError(f"found '{part}'; expected LOW:HIGH, in mm", where="--box")
-        ends = [
-            parse_number(v.strip(), where="--box", name="end", error=ParameterError) * MM
-            for v in (low, high)
-        ]
-        if not ends[0] < ends[1]:
-            raise ParameterError(f"found '{part}'; expected LOW:HIGH, in mm", where="--box")
-        rows.append(ends)
-    if len(rows) == 1:
-        rows *= count
-    if len(rows) != count:
-        raise ParameterError(
-            f"has {len(rows)} coordinates; expected 1 for all, or {count}", where="--box"
-        )
-    return np.array(rows)
+    return read_box(text, coordinate_letters(robot), where="--box")

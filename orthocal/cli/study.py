@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orthocal.cli.options import Json, Tolerances, app, require_cube, split_globs
+from orthocal.cli.options import Json, Tolerances, app, read_workspace, split_globs
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import ParameterError
 
@@ -128,7 +128,7 @@ def accuracy(
         fixed = collect_errors(session.robot, file=errors, single=error or [])
     tolerances = _tolerances(tolerance, session.robot)
     if half_side_mm is not None:
-        require_cube(session.robot, half_side_mm)
+        read_workspace(f"{half_side_mm:g}", session.robot, where="--half-side-mm")
     study = build_accuracy_study(
         session,
         Choice(model, free=split_globs(free), tolerances=tolerances),
@@ -392,7 +392,8 @@ def _duration(seconds: float) -> str:
 def _robot_or_session(subject: str, leg_mm: float | None) -> Iterator[Robot | Session]:
     """The robot, if asked for with legs of another length, or the session to study."""
     from orthocal.output.text.subject import load_subject
-    from orthocal.robot.builder.build import Sizes, make_robot
+    from orthocal.robot.builder.build import make_robot
+    from orthocal.robot.builder.machine_file import Dimensions
     from orthocal.robot.model import Robot
     from orthocal.session.session import Session
     from orthocal.units import MM
@@ -405,12 +406,14 @@ def _robot_or_session(subject: str, leg_mm: float | None) -> Iterator[Robot | Se
         return
     if not isinstance(source, Robot) or source.name != "orthoglide":
         raise ParameterError("applies to the robot orthoglide alone", where="--leg-mm")
-    usual, leg = Sizes(), leg_mm * MM
+    usual, leg = Dimensions(), leg_mm * MM
     scale = leg / usual.leg
-    sizes = Sizes(leg, scale * usual.lower, scale * usual.upper)
-    sizes.require_machine("--leg-mm")
+    dimensions = Dimensions(leg, scale * usual.lower, scale * usual.upper)
+    problem = dimensions.find_problem()
+    if problem:
+        raise ParameterError(problem[1], where="--leg-mm")
     with tempfile.TemporaryDirectory() as directory:
-        yield make_robot(sizes, Path(directory) / "orthoglide")
+        yield make_robot(dimensions, Path(directory) / "orthoglide")
 
 
 def _parameter_globs(texts: list[str] | None, robot: Robot) -> tuple[str, ...] | None:

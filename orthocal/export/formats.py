@@ -59,8 +59,7 @@ def export_corrections(calibration: Calibration) -> dict[str, str]:
     tool, robot = find_tool(calibration), calibration.robot
     if tool is None or robot.tcp is None:
         raise ExportError("the machine has no tool that its drives command over a region")
-    half_side = tool.workspace.half_side or 0.0  # find_tool has a cube
-    points = even_grid(robot, half_side=half_side, points_a_side=POINTS_A_SIDE)
+    points = even_grid(robot, tool.workspace.limits, points_a_side=POINTS_A_SIDE)
     coordinates = list(robot.tcp.coordinates)
     try:
         drives = calibration.machine.inverse(points) + entered_offsets(calibration)

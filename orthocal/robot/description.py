@@ -31,6 +31,8 @@ ClosureKind = Annotated[Literal["3d", "6d"], BeforeValidator(_in_small_letters)]
 THICKEST_ROD_MM = 500.0
 """No rod that a gauge touches is thicker: it is a wrong unit."""
 
+LARGEST_WORKSPACE_MM = 1e4
+
 MOST_PARTS = 100
 """Legs, closures and named sums of a robot, of each."""
 
@@ -100,6 +102,33 @@ class TcpKeys(_Keys):
     commanded by the tool."""
 
 
+def _require_ascending(limits: list[float]) -> list[float]:
+    low, high = limits
+    if not -LARGEST_WORKSPACE_MM <= low < high <= LARGEST_WORKSPACE_MM:
+        raise ValueError(
+            f"found [{low:g}, {high:g}]; expected [least, largest], in mm, within "
+            f"±{LARGEST_WORKSPACE_MM:g}"
+        )
+    return limits
+
+
+WorkspaceBox = Annotated[
+    list[
+        Annotated[
+            list[Number], Field(min_length=2, max_length=2), AfterValidator(_require_ascending)
+        ]
+    ],
+    Field(min_length=1, max_length=3),
+]
+"""Limits of each coordinate of the tool, relative to the mechanical zero, [mm]."""
+
+
+class WorkspaceKeys(_Keys):
+    """Workspace: the region over which errors at the tool are reported."""
+
+    box_mm: WorkspaceBox
+
+
 class ToleranceKeys(_Keys):
     """One standard deviation of each kind of error, and of single parameters."""
 
@@ -122,6 +151,7 @@ class OrthocalKeys(_Keys):
     closed; 0 where absent."""
     legs: Annotated[dict[Name, LegKeys], Field(max_length=MOST_PARTS)] = {}
     tcp: TcpKeys | None = None
+    workspace: WorkspaceKeys | None = None
     parameters: Annotated[
         dict[Name, Annotated[list[Name], Field(min_length=1)]], Field(max_length=MOST_PARTS)
     ] = {}

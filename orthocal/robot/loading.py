@@ -130,6 +130,7 @@ def _build_robot(
         closures=closures,
         legs={},
         tcp=_build_tcp(model, keys, where),
+        workspace=_read_workspace(keys, where),
         parameters=parameters,
         drive_index=np.array(drive_index, dtype=np.int64),
         passive_index=np.array(passive_index, dtype=np.int64),
@@ -253,6 +254,21 @@ def _build_tcp(model: pin.Model, keys: RobotKeys, where: str) -> Tcp | None:
         return None
     find_frame(model, tcp.frame, where=f"{where}: orthocal.tcp.frame")
     return Tcp(tcp.frame, tuple(sorted("xyz".index(c) for c in set(tcp.coordinates))))
+
+
+def _read_workspace(keys: RobotKeys, where: str) -> NDArray[np.float64] | None:
+    """Box of the workspace, shape (n_coordinates, 2), [m]."""
+    tcp, workspace = keys.orthocal.tcp, keys.orthocal.workspace
+    if workspace is None:
+        return None
+    names = sorted(set(tcp.coordinates)) if tcp else []
+    if len(workspace.box_mm) != len(names):
+        raise RobotError(
+            f"has {len(workspace.box_mm)} ranges; expected one for each coordinate of "
+            f"orthocal.tcp: {', '.join(names) or 'none'}",
+            where=f"{where}: orthocal.workspace.box_mm",
+        )
+    return read_only(np.array(workspace.box_mm) * MM)
 
 
 def _build_parameter_set(

@@ -142,6 +142,9 @@ class Robot:
     closures: tuple[Closure, ...]
     legs: Mapping[str, Leg]
     tcp: Tcp | None
+    workspace: Array | None
+    """Box over which errors at the tool are reported, relative to the mechanical zero, shape
+    (n_coordinates, 2), [m]; None where the YAML states none."""
     parameters: ParameterSet
     drive_index: NDArray[np.int64]
     """Indices of the actuated coordinates, shape (n_drives,)."""

@@ -23,12 +23,17 @@ from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.solvers.batch import BatchProgram
 from orthocal.kinematics.loop_closure import Assembly
-from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace, gauss_cube
+from orthocal.kinematics.workspace import (
+    FEWEST_ALIGNED,
+    Workspace,
+    cube_limits,
+    find_workspace,
+    gauss_box,
+)
 from orthocal.observation.simulate import limits_of, show_readings
 from orthocal.planning.expected_error import (
     Expected,
     ToolForecast,
-    default_workspace,
     noise_of,
     weigh_readings,
 )
@@ -81,8 +86,8 @@ class AccuracyStudy(Study):
     """Errors that all machines have, [SI]."""
     machines: int
     seed: int
-    half_side: float
-    """Half side of the cube in which the tool error is evaluated, [m]."""
+    box: tuple[tuple[float, float], ...]
+    """Box over which the tool's error is computed, relative to the mechanical zero, [m]."""
 
     @property
     def record(self) -> dict[str, Any]:
@@ -94,7 +99,7 @@ class AccuracyStudy(Study):
             "fixed": dict(self.fixed),
             "machines": self.machines,
             "seed": self.seed,
-            "half_side": self.half_side,
+            "box": self.box,
         }
 
     @property
@@ -200,7 +205,7 @@ class _Prepared:
         session = study.session.unpack()
         robot = session.robot
         problem = weigh_readings(CalibrationProblem(session, study.choice.select(robot.parameters)))
-        workspace = gauss_cube(robot, half_side=study.half_side)
+        workspace = gauss_box(robot, study.box)
         assembly = Assembly(robot)
         nominal = assembly.inverse(workspace.points)
         drives = nominal - session.active_offsets
@@ -322,8 +327,8 @@ def build_accuracy_study(
         fixed: Errors that all machines have, [SI].
         machines: Number of machines.
         seed: Seed of errors, gauges and noise.
-        half_side: Half side of the cube in which the tool error is evaluated, [m]; default: the
-            largest reachable cube of at most ±60 mm.
+        half_side: Half the side of a cube around the mechanical zero over which the tool error is
+            computed, [m]; by default the workspace of the robot.
 
     Raises:
         ParameterError: If a name or a number is invalid.
@@ -349,8 +354,7 @@ def build_accuracy_study(
                 "is missing: the study needs the noise of the gauge",
                 where=key if session.path is None else f"{session.path}: {key}",
             )
-    if half_side is None:
-        half_side = default_workspace(robot).half_side or 0.0
+    box = find_workspace(robot).limits if half_side is None else cube_limits(robot, half_side)
     return AccuracyStudy(
         session=PortableSession.of(session.with_values(np.zeros(len(session.readings)))),
         choice=chosen,
@@ -359,7 +363,7 @@ def build_accuracy_study(
         fixed=fixed,
         machines=machines,
         seed=seed,
-        half_side=half_side,
+        box=tuple((float(low), float(high)) for low, high in box),
     )
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import itertools
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +15,7 @@ from folders import session_folder
 from gauges import exact
 from machines import place, write_orthoglide
 from models import JOINTS
+from orthocal.export.corrections import export_corrections
 
 from orthocal import (
     Choice,
@@ -35,11 +38,17 @@ from orthocal.assessment.tool_error import (
 )
 from orthocal.errors import RobotError
 from orthocal.estimation.problem import build_problem
+from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
 from orthocal.kinematics.orthoglide import inverse
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.kinematics.workspace import Workspace, cube, largest_cube, tool_at_zero
+from orthocal.kinematics.workspace import Workspace, cube, find_workspace, tool_at_zero
 from orthocal.observation.simulate import load_errors
+from orthocal.output.text.accuracy import accuracy_json
+from orthocal.planning.equipment import Equipment
+from orthocal.planning.first_plan import paper_plan
+from orthocal.robot.builder.build import make_robot
+from orthocal.robot.builder.machine_file import Dimensions
 from orthocal.statistics.information import decompose
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -195,15 +204,15 @@ def test_the_cube_is_around_the_mechanical_zero_and_within_reach(tmp_path):
     """A machine whose drives end 20 mm beyond their zero, and one whose zero is not the origin."""
     robot = load_robot(write_orthoglide(tmp_path / "short", 0.25, travel=(0.1, 0.27)))
     nominal = nominal_assembly(robot)
-    found = largest_cube(robot, nominal.inverse)
+    found = find_workspace(robot, nominal.inverse)
     assert found.half_side == pytest.approx(0.020)  # p + √(L² − …) ≤ 0.27 on the axis
-    assert found.words == "a cube of ±20 mm around the zero"
+    assert found.words == "the workspace ±20 mm"
     text = (tmp_path / "short/machine.yaml").read_text().replace("zero_mm: 250", "zero_mm: 240")
     (tmp_path / "short/machine.yaml").write_text(text)
     moved = load_robot(tmp_path / "short")
     middle = nominal_assembly(moved).forward(np.full(3, 0.24))
     assert tool_at_zero(moved) == pytest.approx(middle, abs=1e-12)
-    found = largest_cube(moved, nominal_assembly(moved).inverse)
+    found = find_workspace(moved, nominal_assembly(moved).inverse)
     assert found.weights @ found.points == pytest.approx(middle, abs=1e-12)
     assert 0.028 < found.half_side < 0.032
 
@@ -220,10 +229,10 @@ def test_a_machine_that_does_not_reach_60_mm_has_results_at_the_tool(tmp_path):
     # drives end 30 mm beyond the zero, and some µm of offsets belong into the controller
     assert found.workspace.half_side == pytest.approx(0.029)
     text = " ".join(summarize(result, details=True).split())
-    assert "Over a cube of ±29 mm around the zero." in text
+    assert "Over the workspace ±29 mm." in text
     assert "missing" not in text
     compared = compare_models(session, models=["offsets", "lengths"])
-    assert "a cube of ±29 mm" in " ".join(f.text for f in decide_comparison(compared).findings)
+    assert "the workspace ±29 mm" in " ".join(f.text for f in decide_comparison(compared).findings)
     assert all(r.tool is not None for r in compared.results)
 
 
@@ -383,3 +392,23 @@ def test_machines_that_are_worse_than_their_tolerances_are_found_to_be(root, tim
     # of one machine the square scatters by 0.84 of its mean: a few combinations of errors decide
     three_sigma = 3.0 * 0.84 / 2.0 / np.sqrt(count)
     assert np.sqrt(np.mean(np.square(found))) == pytest.approx(times, rel=three_sigma)
+
+
+def test_every_figure_at_the_tool_is_for_the_stated_workspace(tmp_path):
+    """Tool error, correction table and LinuxCNC module of a machine with a box of its own."""
+    box = np.array([[-0.05, 0.06], [-0.06, 0.05], [-0.07, 0.04]])
+    robot = make_robot(Dimensions(workspace=tuple(map(tuple, box))), tmp_path / "mine")
+    session = simulate_session(paper_plan(robot, Equipment()), {"x_slide.offset": 1e-3}, seed=1)
+    result = calibrate(session.session, "offsets")
+    found = assess_tool(result)
+    assert found.workspace.limits == pytest.approx(box)
+    assert json.loads(accuracy_json(result, found))["box"] == pytest.approx(box)
+    text = " ".join(summarize(result, details=True).split())
+    assert "over the workspace x −50…60, y −60…50, z −70…40 mm" in text
+    table = np.loadtxt(
+        io.StringIO(export_corrections(result)["corrections.csv"]), delimiter=",", skiprows=1
+    )
+    assert table[:, :3].min(axis=0) == pytest.approx(box[:, 0] * 1e3)
+    assert table[:, :3].max(axis=0) == pytest.approx(box[:, 1] * 1e3)
+    module = approximate(result, within=1e-5)
+    assert (module.lower, module.upper) == (pytest.approx(box[:, 0]), pytest.approx(box[:, 1]))

@@ -28,9 +28,9 @@ from orthocal.kinematics.compiled import compiled_robot
 from orthocal.observation.observations import build_observations
 from orthocal.observation.sensor_frames import predict_entries
 from orthocal.planning.candidates import list_candidates, measure_candidates
-from orthocal.planning.equipment import Means
+from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import ToolForecast
-from orthocal.planning.selection import choose_setups, error_left
+from orthocal.planning.selection import SetupSearch
 from orthocal.study.accuracy import build_accuracy_study
 from orthocal.study.linearisation import build_linearisation_study
 from orthocal.study.study import run_task
@@ -313,20 +313,21 @@ def test_a_plan_is_chosen_faster_than_by_trying(orthoglide, record):
     """
     choice = Choice("full", tolerances={"*.offset_mm": 2.0})
     forecast = ToolForecast(orthoglide, choice.select(orthoglide.parameters))
-    session = list_candidates(orthoglide, Means())
+    session = list_candidates(orthoglide, Equipment())
     candidates = measure_candidates(session, forecast.problem(session), spare_range=3.0)
-    size = sum(len(k.rows) for k in candidates.kinds)
+    size = sum(len(k.rows) for k in candidates.setups)
     assert size > 5_000
     prior, weigh = np.eye(len(candidates.state)), forecast.weigh("aligned", len(candidates.state))
     counts = [9] * 4 + [8] * 8
     began = time.perf_counter()
-    choose_setups(candidates, counts, prior=prior, weigh=weigh)
+    search = SetupSearch.of(candidates, prior, weigh)
+    search.choose(counts)
     ours = time.perf_counter() - began
     began = time.perf_counter()
     trials = 100
     for i in range(trials):
-        row = candidates.kinds[0].slopes[i % len(candidates.kinds[0].rows)]
-        error_left(prior + np.outer(row, row) / candidates.sigma**2, weigh)
+        row = candidates.setups[0].jacobian[i % len(candidates.setups[0].rows)]
+        search.error_of(prior + np.outer(row, row) / candidates.sigma**2)
     peer = (time.perf_counter() - began) / trials * size * sum(counts)
     record(f"plan of {sum(counts)} readings out of {size}: {ours:.1f} s, peer / ours", peer / ours)
     assert peer / ours > PLANNED

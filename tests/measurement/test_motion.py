@@ -24,14 +24,16 @@ from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.measurement.motion.motion import APPROACH, plan_motion, shown_joints
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
 from orthocal.robot.builder.build import make_robot
-from orthocal.robot.builder.dimensions import Counting, Sizes
+from orthocal.robot.builder.machine_file import Counting, Dimensions
 from orthocal.units import MM
 
 ROUNDED = 1e-4
 """Rounding of coordinates and joints in a program, [mm]. Half a unit in each of three
 joints moves the tool by less."""
 
-SMALL = Sizes(leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004)
+SMALL = Dimensions(
+    leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004
+)
 COUNTING = (Counting(True, 0.0), Counting(False, 0.005), Counting(False, None))
 
 PLAN = """robot: mine

@@ -13,7 +13,7 @@ from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.kinematics import orthoglide as closed_forms
-from orthocal.robot.builder.build import Sizes, make_robot
+from orthocal.robot.builder.build import Dimensions, make_robot
 from orthocal.session.session import Gauge
 from orthocal.study.batch import predict_batch
 from orthocal.study.linearisation import (
@@ -161,7 +161,9 @@ def test_order_of_convergence(summary):
 
 def test_gauss_newton_diverges_on_short_legs(tmp_path):
     """A machine of short legs, 60 mm off."""
-    robot = make_robot(Sizes(leg=0.15, lower=0.06, upper=0.24, attachment=0.02), tmp_path / "m")
+    robot = make_robot(
+        Dimensions(leg=0.15, lower=0.06, upper=0.24, attachment=0.02), tmp_path / "m"
+    )
     from orthocal.study.paper_plan import Displacements
 
     study = build_linearisation_study(
@@ -173,7 +175,7 @@ def test_gauss_newton_diverges_on_short_legs(tmp_path):
 
 
 def test_longer_legs_are_less_nonlinear(tmp_path, orthoglide):
-    longer = make_robot(Sizes(leg=0.6205, lower=0.43, upper=0.7), tmp_path / "long")
+    longer = make_robot(Dimensions(leg=0.6205, lower=0.43, upper=0.7), tmp_path / "long")
     errors = [
         run_task(build_linearisation_study(r, sizes=[2.0], along=ALONG), 0)["first_order"][0]
         for r in (orthoglide, longer)

@@ -144,7 +144,7 @@ def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
         "robot": calibration.robot_record.name,
         "model": calibration.model,
         "points": len(accuracy.workspace.points),
-        "half_side": accuracy.workspace.half_side,
+        "box": None if accuracy.workspace.box is None else accuracy.workspace.box.tolist(),
         "deviation": all_sizes(accuracy.measure(accuracy.deviation)),
         "offsets_entered": all_sizes(accuracy.measure(accuracy.error_after_offsets)),
         "uncertainty_before": all_sizes(accuracy.before.sizes),

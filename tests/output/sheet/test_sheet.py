@@ -19,7 +19,7 @@ from orthocal import load_plan
 from orthocal.cli.run import main
 from orthocal.output.sheet.page import sheet_files
 from orthocal.robot.builder.build import make_robot
-from orthocal.robot.builder.dimensions import Counting, Sizes
+from orthocal.robot.builder.machine_file import Counting, Dimensions
 from orthocal.units import MM
 
 ROUNDED = 1e-3
@@ -28,7 +28,9 @@ ROUNDED = 1e-3
 ROUNDED_PLACE = 0.06
 """Places are shown with one decimal, [mm]."""
 
-SMALL = Sizes(leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004)
+SMALL = Dimensions(
+    leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004
+)
 COUNTING = (Counting(True, 0.0), Counting(False, 0.005), Counting(False, None))
 
 PLAN = """robot: mine

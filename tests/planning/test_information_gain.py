@@ -1,4 +1,4 @@
-"""What readings take off what others leave: against posteriors of all that is said."""
+"""Gains of readings, against posterior covariances."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from orthocal.planning.candidates import HandSet, Kind
-from orthocal.planning.information_gain import Taking
+from orthocal.planning.candidates import AlignedParameter, CandidateSetup
+from orthocal.planning.information_gain import Pairs, SetupGain
 
 SIGMA, STATE, READINGS = 0.5, 5, 7
 
@@ -21,7 +21,7 @@ def draw(seed):
     h = rng.uniform(0.0, 3.0, READINGS)
     together = np.abs(h[:, None] - h[None]) < 1.2
     spread = own @ own.T + 1.0
-    kind = Kind("k", np.arange(READINGS), slopes, spread, together)
+    kind = CandidateSetup("k", np.arange(READINGS), slopes, spread, together)
     says = rng.normal(size=(STATE, STATE))
     return kind, says @ says.T + np.eye(STATE), rng.normal(size=(STATE, 2))
 
@@ -29,8 +29,8 @@ def draw(seed):
 def left(kind, information, root, rows):
     """tr(T C) with these readings, by the inverse of all that is said."""
     rows = list(rows)
-    spread = kind.own[np.ix_(rows, rows)] + SIGMA**2 * np.eye(len(rows))
-    slopes = kind.slopes[rows]
+    spread = kind.covariance[np.ix_(rows, rows)] + SIGMA**2 * np.eye(len(rows))
+    slopes = kind.jacobian[rows]
     whole = information + slopes.T @ np.linalg.inv(spread) @ slopes
     return np.trace(root.T @ np.linalg.inv(whole) @ root)
 
@@ -38,23 +38,23 @@ def left(kind, information, root, rows):
 @pytest.fixture(params=range(6))
 def drawn(request):
     kind, information, root = draw(request.param)
-    taking = Taking.beside(
+    taking = SetupGain.of(
         kind, np.linalg.inv(information), np.linalg.inv(information) @ root, SIGMA
     )
     return kind, information, root, taking
 
 
-def test_a_gain_is_what_readings_take_off(drawn):
+def test_a_gain_is_the_reduction_of_the_error(drawn):
     kind, information, root, taking = drawn
     for rows in ([2], [0, 3], [1, 4, 6, 2]):
         taken = left(kind, information, root, []) - left(kind, information, root, rows)
         assert taking.gain(rows) == pytest.approx(taken, rel=1e-9)
 
 
-def test_one_more_reading_takes_what_is_said(drawn):
+def test_the_gain_of_one_further_reading(drawn):
     kind, information, root, taking = drawn
     rows = [5, 1]
-    gains = taking.gains_beside(rows)
+    gains = taking.further_gains(rows)
     for more in set(range(READINGS)) - set(rows):
         taken = left(kind, information, root, rows) - left(kind, information, root, [*rows, more])
         assert gains[more] == pytest.approx(taken, rel=1e-9)
@@ -63,11 +63,11 @@ def test_one_more_reading_takes_what_is_said(drawn):
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_readings_are_completed_greedily(drawn, count):
     kind, information, root, taking = drawn
-    for _, pair in taking.pairs(count, 3):
+    for _, pair in taking.best_pairs(Pairs.of(kind, count), 3):
         gain, chosen = taking.complete(pair, count)
         expected = list(pair)
         while len(expected) < count:
-            rest = [r for r in np.flatnonzero(kind.together[pair[0]]) if r not in expected]
+            rest = [r for r in np.flatnonzero(kind.reachable[pair[0]]) if r not in expected]
             expected.append(min(rest, key=lambda r: left(kind, information, root, [*expected, r])))
         assert list(chosen) == expected
         taken = left(kind, information, root, []) - left(kind, information, root, chosen)
@@ -75,7 +75,7 @@ def test_readings_are_completed_greedily(drawn, count):
 
 
 @pytest.mark.parametrize("count", [2, 4, 6])
-def test_the_best_pairs_differ_most_and_share_no_reading(drawn, count):
+def test_best_pairs_have_the_largest_gains_and_share_no_reading(drawn, count):
     """Two readings beside a zero of which nothing is known are worth their difference."""
     kind, _, _, taking = drawn
 
@@ -89,9 +89,9 @@ def test_the_best_pairs_differ_most_and_share_no_reading(drawn, count):
     left = [
         p
         for p in permutations(range(READINGS), 2)
-        if kind.together[p] and kind.together[p[0]].sum() >= count
+        if kind.reachable[p] and kind.reachable[p[0]].sum() >= count
     ]
-    found = taking.pairs(count, 3)
+    found = taking.best_pairs(Pairs.of(kind, count), 3)
     for gain, pair in found:
         assert gain == pytest.approx(max(map(worth, left)), rel=1e-12)
         assert pair in left
@@ -100,19 +100,22 @@ def test_the_best_pairs_differ_most_and_share_no_reading(drawn, count):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_pairs_are_worth_what_they_are_with_the_gauge_set_in_the_first(seed):
+def test_gains_with_the_gauge_aligned_in_the_first_posture(seed):
     """What a hand sets by the machine is elsewhere with each beginning: low rank against anew."""
     kind, information, root = draw(seed)
     rng = np.random.default_rng(seed)
     by_hand = tuple(
-        HandSet(rng.normal(size=READINGS), rng.normal(size=(READINGS, STATE))) for _ in range(2)
+        AlignedParameter(rng.normal(size=READINGS), rng.normal(size=(READINGS, STATE)))
+        for _ in range(2)
     )
-    kind, covariance = replace(kind, by_hand=by_hand), np.linalg.inv(information)
-    found = Taking.beside(kind, covariance, covariance @ root, SIGMA).pairs(3, 3)
+    kind, covariance = replace(kind, aligned=by_hand), np.linalg.inv(information)
+    found = SetupGain.of(kind, covariance, covariance @ root, SIGMA).best_pairs(
+        Pairs.of(kind, 3), 3
+    )
     assert len({first for _, (first, _) in found}) == len(found) > 0
     for gain, (first, second) in found:
-        begun = Taking.beside(kind.begun(first), covariance, covariance @ root, SIGMA)
-        again = Taking.beside(kind, covariance, covariance @ root, SIGMA).begun(first)
+        begun = SetupGain.of(kind.begun(first), covariance, covariance @ root, SIGMA)
+        again = SetupGain.of(kind, covariance, covariance @ root, SIGMA).begun(first)
         assert again.spread == pytest.approx(begun.spread, abs=1e-10)
         assert again.effect == pytest.approx(begun.effect, abs=1e-10)
         assert again.variance == pytest.approx(begun.variance, abs=1e-10)
@@ -122,9 +125,11 @@ def test_pairs_are_worth_what_they_are_with_the_gauge_set_in_the_first(seed):
         assert gain == pytest.approx(float(across @ across) / scatter, rel=1e-10)
         for rows in ([first, second], [first, (second + 1) % READINGS, second]):
             exact = begun.gain(rows)
-            (whole,) = Taking.beside(kind, covariance, covariance @ root, SIGMA).gains(
+            (whole,) = SetupGain.of(kind, covariance, covariance @ root, SIGMA).gains(
                 np.array([rows])
             )
             assert whole == pytest.approx(exact, rel=1e-10)
         alone = kind.only([first, second]).begun(0)
-        assert alone.slopes == pytest.approx(kind.begun(first).slopes[[first, second]], abs=1e-14)
+        assert alone.jacobian == pytest.approx(
+            kind.begun(first).jacobian[[first, second]], abs=1e-14
+        )

@@ -1,4 +1,4 @@
-"""A first plan for a machine of any size: clear of hinges, within reach, in range of the dial."""
+"""First plan of any machine: clear of hinges, within reach, in the range of the dial."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import pytest
 from orthocal import load_plan
 from orthocal.errors import RobotError
 from orthocal.measurement.files.session_file import check_contacts
-from orthocal.planning.equipment import Means, reachable
-from orthocal.planning.first_plan import CLEAR, first_means, paper_plan
+from orthocal.planning.equipment import Equipment, reachable
+from orthocal.planning.first_plan import CLEAR, first_equipment, paper_plan
 from orthocal.robot.builder.build import make_robot
-from orthocal.robot.builder.dimensions import Sizes
+from orthocal.robot.builder.machine_file import Dimensions
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.rod_indicator import RodByBlade
 from orthocal.sensors.tips import Tip
 
 
-def test_on_the_papers_machine_it_is_the_papers_plan(orthoglide, root):
+def test_the_first_plan_of_the_orthoglide_is_the_paper_plan(orthoglide, root):
     """The seven postures of the workshop example, and its setups; the zero again at the end."""
-    plan, workshop = paper_plan(orthoglide, Means()), load_plan(root / "examples/workshop")
+    plan, workshop = paper_plan(orthoglide, Equipment()), load_plan(root / "examples/workshop")
     assert {n: p.values.tolist() for n, p in plan.postures.items()} == {
         n: p.values.tolist() for n, p in workshop.postures.items()
     }
@@ -39,28 +39,30 @@ def test_on_the_papers_machine_it_is_the_papers_plan(orthoglide, root):
 @pytest.mark.parametrize(
     "sizes",
     [
-        Sizes(leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004),
-        Sizes(leg=0.15, lower=0.06, upper=0.24, attachment=0.02),
-        Sizes(leg=0.6, lower=0.3, upper=0.9),
+        Dimensions(
+            leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004
+        ),
+        Dimensions(leg=0.15, lower=0.06, upper=0.24, attachment=0.02),
+        Dimensions(leg=0.6, lower=0.3, upper=0.9),
     ],
 )
-def test_a_machine_of_another_size_is_read_within_its_reach(tmp_path, sizes):
+def test_the_paper_plan_of_other_dimensions_is_within_reach(tmp_path, sizes):
     robot = make_robot(sizes, tmp_path / "mine")
-    plan = paper_plan(robot, Means())
+    plan = paper_plan(robot, Equipment())
     check_contacts(plan)
     points = np.array([p.values for p in plan.postures.values()])
     assert reachable(robot, points).all()
     assert np.abs(points).max() <= 0.1
-    means = first_means(robot, Means())
+    equipment = first_equipment(robot, Equipment())
     clear = min(CLEAR, 0.2 * sizes.leg)
-    for section in means.sections:  # from a hinge, wherever the leg goes
-        assert section * sizes.leg + means.box.max() <= sizes.leg - clear + 1e-9
-        assert section * sizes.leg + means.box.min() >= clear - 1e-9
-    assert 1 <= len(means.sections) <= 3
+    for section in equipment.sections:  # from a hinge, wherever the leg goes
+        assert section * sizes.leg + equipment.box.max() <= sizes.leg - clear + 1e-9
+        assert section * sizes.leg + equipment.box.min() >= clear - 1e-9
+    assert 1 <= len(equipment.sections) <= 3
 
 
-def test_it_is_read_with_what_one_has(orthoglide):
-    blade = Means(tip=Tip("blade", 0.0, 0.02), rods=("b",))
+def test_the_paper_plan_uses_the_given_equipment(orthoglide):
+    blade = Equipment(tip=Tip("blade", 0.0, 0.02), rods=("b",))
     sensors = [s.sensor for s in paper_plan(orthoglide, blade).setups.values()]
     assert {(type(s), s.rod) for s in sensors} == {(RodByBlade, "b")}
     none = paper_plan(orthoglide, replace(blade, tip=None))
@@ -68,6 +70,6 @@ def test_it_is_read_with_what_one_has(orthoglide):
 
 
 def test_a_machine_that_hardly_moves_is_refused(tmp_path):
-    robot = make_robot(Sizes(leg=0.25, lower=0.245, upper=0.3), tmp_path / "mine")
+    robot = make_robot(Dimensions(leg=0.25, lower=0.245, upper=0.3), tmp_path / "mine")
     with pytest.raises(RobotError, match="expected 10 mm to either side of the mechanical zero"):
-        paper_plan(robot, Means())
+        paper_plan(robot, Equipment())

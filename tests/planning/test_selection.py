@@ -1,4 +1,4 @@
-"""The choice among candidates: against enumeration, and what it says against least squares."""
+"""Search among candidates: against enumeration, and its errors against least squares."""
 
 from __future__ import annotations
 
@@ -8,15 +8,9 @@ from itertools import combinations, permutations
 import numpy as np
 import pytest
 
-from orthocal.planning.candidates import Candidates, HandSet, Kind
-from orthocal.planning.ordering import order_postures
-from orthocal.planning.selection import (
-    Opened,
-    _Beside,
-    choose_setups,
-    error_left,
-    information_of,
-)
+from orthocal.planning.candidates import AlignedParameter, Candidates, CandidateSetup
+from orthocal.planning.plan import order_postures
+from orthocal.planning.selection import Gains, PlannedSetup, SetupSearch
 from orthocal.runtime import worker_pool as cores
 
 SIGMA = 0.5
@@ -37,10 +31,12 @@ def draw_candidates(rng, *, kinds=3, readings=4, own=1, hands=0):
         together = np.abs(h[:, None] - h[None]) < 2.0
         spread = mine @ mine.T + ZERO**2
         by_hand = tuple(
-            HandSet(rng.normal(size=readings), rng.normal(size=(readings, STATE)))
+            AlignedParameter(rng.normal(size=readings), rng.normal(size=(readings, STATE)))
             for _ in range(hands)
         )
-        found.append(Kind(f"k{k}", np.arange(readings), slopes, spread, together, by_hand))
+        found.append(
+            CandidateSetup(f"k{k}", np.arange(readings), slopes, spread, together, by_hand)
+        )
         unknowns.append(mine)
     return Candidates(None, None, tuple(found), SIGMA, tuple("abcd"), 0.0), unknowns
 
@@ -51,14 +47,14 @@ def posterior(candidates, unknowns, setups, prior):
     width = unknowns[0].shape[1] + 1
     rows = []
     for place, s in enumerate(setups):
-        kind = candidates.kinds[s.kind]
+        kind = candidates.setups[s.candidate]
         for i in s.chosen:
             row = np.zeros(STATE + count * width)
-            row[:STATE] = kind.slopes[i]
-            for hand in kind.by_hand:
-                row[:STATE] += hand.answers[i] * hand.slopes[s.chosen[0]]
+            row[:STATE] = kind.jacobian[i]
+            for hand in kind.aligned:
+                row[:STATE] += hand.sensitivity[i] * hand.jacobian[s.chosen[0]]
             own = STATE + place * width
-            row[own : own + width] = [*unknowns[s.kind][i], 1.0]
+            row[own : own + width] = [*unknowns[s.candidate][i], 1.0]
             rows.append(row / SIGMA)
     whole = np.array(rows)
     known = np.zeros(STATE + count * width)
@@ -71,11 +67,11 @@ def posterior(candidates, unknowns, setups, prior):
 
 def every_setup(candidates, count):
     """All setups that can take so many readings, by their first and their others."""
-    for k, kind in enumerate(candidates.kinds):
+    for k, kind in enumerate(candidates.setups):
         for first in range(len(kind.rows)):
-            others = [i for i in np.flatnonzero(kind.together[first]) if i != first]
+            others = [i for i in np.flatnonzero(kind.reachable[first]) if i != first]
             for rest in combinations(others, count - 1):
-                yield Opened(k, (first, *(int(i) for i in rest)))
+                yield PlannedSetup(k, (first, *(int(i) for i in rest)))
 
 
 @pytest.mark.parametrize("hands", [0, 1, 2])
@@ -84,29 +80,30 @@ def test_a_plan_is_nearly_the_best_of_all(seed, hands):
     rng = np.random.default_rng(seed)
     candidates, unknowns = draw_candidates(rng, hands=hands)
     root, prior = rng.normal(size=(STATE, 2)), np.eye(STATE)
-    found = choose_setups(candidates, [3, 2], prior=prior, weigh=lambda _: root, seed=0)
+    found = SetupSearch.of(candidates, prior, lambda _: root).choose([3, 2], seed=0)
     best = min(
         np.sqrt(np.trace(root.T @ posterior(candidates, unknowns, pair, prior) @ root))
         for pair in ((a, b) for a in every_setup(candidates, 3) for b in every_setup(candidates, 2))
     )
-    assert best * (1.0 - 1e-9) <= found.left < 1.01 * best
+    assert best * (1.0 - 1e-9) <= found.error < 1.01 * best
     # and what it says of itself is what least squares say
     own = posterior(candidates, unknowns, found.setups, prior)
-    assert found.left == pytest.approx(np.sqrt(np.trace(root.T @ own @ root)), rel=1e-4)
-    assert np.linalg.inv(prior + information_of(candidates, found.setups)) == pytest.approx(
+    assert found.error == pytest.approx(np.sqrt(np.trace(root.T @ own @ root)), rel=1e-4)
+    search = SetupSearch.of(candidates, prior, lambda _: root)
+    assert np.linalg.inv(prior + search.information_of(*found.setups)) == pytest.approx(
         own, rel=1e-3, abs=1e-6
     )
 
 
-def test_every_setup_keeps_what_the_gauge_reaches():
+def test_every_setup_stays_in_the_range_of_the_gauge():
     rng = np.random.default_rng(3)
     candidates, _ = draw_candidates(rng, kinds=4, readings=8)
     root = rng.normal(size=(STATE, STATE))
-    found = choose_setups(candidates, [4, 3, 3], prior=np.eye(STATE), weigh=lambda _: root)
+    found = SetupSearch.of(candidates, np.eye(STATE), lambda _: root).choose([4, 3, 3])
     for s in found.setups:
-        kind = candidates.kinds[s.kind]
+        kind = candidates.setups[s.candidate]
         assert len(set(s.chosen)) == len(s.chosen)
-        assert kind.together[s.chosen[0], list(s.chosen)].all()
+        assert kind.reachable[s.chosen[0], list(s.chosen)].all()
 
 
 def test_the_same_seed_gives_the_same_plan():
@@ -114,7 +111,7 @@ def test_the_same_seed_gives_the_same_plan():
     candidates, _ = draw_candidates(rng, kinds=6, readings=8)
     root = rng.normal(size=(STATE, STATE))
     first, second = (
-        choose_setups(candidates, [3, 3], prior=np.eye(STATE), weigh=lambda _: root, seed=7)
+        SetupSearch.of(candidates, np.eye(STATE), lambda _: root).choose([3, 3], seed=7)
         for _ in range(2)
     )
     assert first.setups == second.setups
@@ -129,11 +126,8 @@ def test_any_number_of_processes_chooses_the_same_to_the_last_bit(monkeypatch, f
 
     def choose(workers):
         told[workers] = []
-        return choose_setups(
-            candidates,
+        return SetupSearch.of(candidates, np.eye(STATE), Always(root)).choose(
             [3, 3],
-            prior=np.eye(STATE),
-            weigh=Always(root),
             seed=7,
             starts=5,
             workers=workers,
@@ -142,7 +136,7 @@ def test_any_number_of_processes_chooses_the_same_to_the_last_bit(monkeypatch, f
 
     alone, together = choose(1), choose(2)
     assert together.setups == alone.setups
-    assert together.left == alone.left
+    assert together.error == alone.error
     assert together.information.tobytes() == alone.information.tobytes()
     assert [start for start, _ in told[1]] == [1, 2, 3, 4, 5]
     assert told[2] == told[1]
@@ -158,21 +152,24 @@ class Always:
         return self.root
 
 
-def test_what_is_left_is_found_roughly_only_where_it_can_be():
+def test_the_rough_error_needs_a_constant_weight():
     """The error of the worst point, say, is another one for each covariance."""
     rng = np.random.default_rng(2)
     candidates, _ = draw_candidates(rng, kinds=3, readings=6)
     root, prior = rng.normal(size=(STATE, 2)), np.eye(STATE)
-    steady = _Beside.of(candidates, prior, Always(root))
-    changing = _Beside.of(candidates, prior, lambda covariance: covariance @ root)
+    search = SetupSearch.of(candidates, prior, Always(root))
+    steady = Gains.of(search, prior)
+    changing = Gains.of(
+        SetupSearch.of(candidates, prior, lambda covariance: covariance @ root), prior
+    )
     for opened in every_setup(candidates, 3):
-        left = error_left(prior + information_of(candidates, [opened]), Always(root))
-        assert steady.left_roughly(opened) == pytest.approx(left, rel=1e-9)
-        assert changing.left_roughly(opened) == 0.0
+        left = search.error_of(prior + search.information_of(opened))
+        assert steady.rough_error(opened) == pytest.approx(left, rel=1e-9)
+        assert changing.rough_error(opened) == 0.0
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_way_through_postures_is_hardly_longer_than_the_shortest(seed):
+def test_the_path_through_postures_is_nearly_the_shortest(seed):
     points = np.random.default_rng(seed).normal(size=(7, 3))
     way = order_postures(points)
     assert way[0] == 0
