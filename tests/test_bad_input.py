@@ -215,7 +215,8 @@ SESSION_KEY_CASES = [
         "xy: {leg:",
         "xy: {legs:",
         ": setups.xy.legs: unknown key; known keys: sensor, gauge, postures, "
-        "direction_tolerance_mrad, section_tolerance_mm, lateral_tolerance_mm, scale_tolerance, "
+        "aligned_at, direction_tolerance_mrad, section_tolerance_mm, lateral_tolerance_mm, "
+        "scale_tolerance, "
         "stand, square_tolerance_mrad, leg, direction, section, touches, tip, "
         "beside_mm",
     ),
@@ -2071,12 +2072,12 @@ VIEW_CASES = [
     mesh(
         "outside",
         "../../etc/part.stl",
-        ":24: the mesh '../../etc/part.stl' lies outside of the robot's folder",
+        ":24: the mesh '../../etc/part.stl' lies outside of the robot's directory",
     ),
     mesh(
         "absolute",
         "/etc/part.stl",
-        ":24: the mesh '/etc/part.stl' lies outside of the robot's folder",
+        ":24: the mesh '/etc/part.stl' lies outside of the robot's directory",
     ),
     mesh("kind", "session.yaml", ":24: the mesh 'session.yaml' is none of .stl, .obj, .dae, .ply"),
     mesh(
@@ -2097,7 +2098,7 @@ PROGRAM_CASES = [
     program(
         "no-feed",
         "G0 X0 Y0 Z0\nG1 X1\n",
-        ":2: found G1, and no feed is known; expected F before it, and again after another unit",
+        ":2: found G1 without a feed; expected F before it, and again after a change of unit",
     ),
     program(
         "too-far",
@@ -2114,8 +2115,8 @@ PROGRAM_CASES = [
     program(
         "long-line",
         PROGRAM + "(" + "a" * 300 + ")\n",
-        ":3: has 302 bytes once it is corrected; expected at most 252, as LinuxCNC reads: shorten "
-        "what stands beside its words",
+        ":3: has 302 bytes after correction; expected at most 252, as LinuxCNC reads: shorten "
+        "its comments",
     ),
     program(
         "longer-line",
@@ -2145,7 +2146,7 @@ PROGRAM_CASES = [
     program(
         "system-twice",
         PROGRAM,
-        "--work-offset-mm: G54 stands twice",
+        "--work-offset-mm: found G54 twice",
         " --work-offset-mm 0,0,0 --work-offset-mm G54=0,0,0",
     ),
     Case(

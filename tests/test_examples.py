@@ -148,7 +148,7 @@ CALIBRATE = f"calibrate {EXPERIMENT}"
         ),
         (
             "docs/planning.md",
-            "The paper's six equations",
+            "The error of the paper's six equations",
             "study linearisation orthoglide --out out/linearisation",
         ),
     ],
