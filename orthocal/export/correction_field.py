@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError
 from orthocal.export.tool_tip import ToolTip
-from orthocal.kinematics.continuation import Failures
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import Failures, nominal_assembly
 from orthocal.robot.model import Robot, Tcp
 
 Array = NDArray[np.float64]

@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError
-from orthocal.kinematics.compiled import compiled_robot, zero_poses
-from orthocal.kinematics.continuation import Failures
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import Assembly, Failures
+from orthocal.kinematics.robot_functions import reference_poses, robot_functions
 
 Array = NDArray[np.float64]
 
@@ -41,8 +40,8 @@ class ToolTip:
         self.chosen = list(robot.tcp.coordinates)
         self.tool = np.array(tool, dtype=np.float64)
         self._assembly = Assembly(robot, fixed=calibration.errors)
-        self._pose = compiled_robot(robot).pose(robot.tcp.frame)
-        (zero,) = zero_poses(robot, [robot.tcp.frame])
+        self._pose = robot_functions(robot).pose(robot.tcp.frame)
+        (zero,) = reference_poses(robot, [robot.tcp.frame])
         self.level = np.array(zero[:3, :3])
         """Rotation of the nominal platform in its zero, shape (3, 3)."""
 
@@ -98,7 +97,7 @@ class ToolTip:
         raise ExportError("the platform turns too much for such a tool; give one nearer to it")
 
     def _poses(self, drives: Array, start: Array | None) -> Array:
-        machine = self._assembly.machine()
+        machine = self._assembly.geometry()
         passive = self._assembly.close(drives, start=start)
         (poses,) = self._pose(machine.drives(drives), passive, machine.placements)
         return np.asarray(poses)

@@ -32,11 +32,18 @@ class Observations:
     zero_setup: tuple[str, ...]
     """Setup of each zero."""
     zero_real: tuple[bool, ...]
-    """Whether a zero is that of a gauge, not one that stands for differences."""
+    """True for the zero of a gauge, False for one that replaces differences."""
+    zero_known: NDArray[np.bool_]
+    """Mask of the zeros that are known to be 0, shape (n_zeros,)."""
     plus: Indices
     """Entry of each row of the session, shape (n_rows,)."""
     minus: Indices
     """Entry taken off, or -1, shape (n_rows,)."""
+
+    @property
+    def n_free_zeros(self) -> int:
+        """Number of zeros that are estimated."""
+        return self.n_zeros - int(self.zero_known.sum())
 
     @property
     def size(self) -> int:
@@ -147,6 +154,13 @@ def build_observations(session: Session) -> Observations:
         n_zeros=len(zeros),
         zero_setup=tuple(zero_setup),
         zero_real=tuple(zero_real),
+        zero_known=np.array(
+            [
+                r and session.setups[s].zero == "known"
+                for s, r in zip(zero_setup, zero_real, strict=True)
+            ],
+            dtype=np.bool_,
+        ),
         plus=np.array(plus, dtype=np.int64),
         minus=np.array(minus, dtype=np.int64),
     )

@@ -16,9 +16,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from orthocal.arguments import require_kind, require_names, require_numbers, require_seed
 from orthocal.errors import ParameterError, SessionError
 from orthocal.io.documents import Number, parse_number, read_yaml, validate
+from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import Observations, build_observations
-from orthocal.observation.sensor_frames import predict_entries
-from orthocal.observation.sensor_groups import sensor_unknowns
+from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.robot.model import Robot
 from orthocal.session.session import Reading, Session
 from orthocal.units import MM, to_mm
@@ -110,13 +110,13 @@ def simulate_session(
         raise ValueError(f"sigma: found {sigma!r}; expected a number of at least 0")
     rng = np.random.default_rng(seed)
     observations = build_observations(plan)
-    unknown = sensor_unknowns(plan).parameters
+    unknown = nuisance_parameters(plan).parameters
     drawn = np.zeros(len(unknown))
     if unknown and not exact:
         # their own, so that noise is the same whatever is not known of the gauges
         own = np.random.default_rng((seed, 1)).normal(size=len(unknown))
         drawn = own * [p.tolerance for p in unknown]
-    entries = predict_entries(plan, observations, errors, unknowns=drawn)
+    entries = predict_readings(plan, errors, observations=observations, nuisance=drawn)
     entries, zeros = show_readings(plan, observations, entries, rng=rng, sigma=sigma, exact=exact)
     rows = observations.rows(entries)
     for reading, value in zip(plan.readings, rows, strict=True):
@@ -315,7 +315,7 @@ def truth_document(simulated: SimulatedSession) -> str:
         "zeros_mm": {name: to_mm(value) for name, value in simulated.zeros.items()},
     }
     if simulated.unknowns:
-        of_sensors = {p.name: p for p in sensor_unknowns(simulated.session).parameters}
+        of_sensors = {p.name: p for p in nuisance_parameters(simulated.session).parameters}
         document["sensors"] = {
             f"{name}_{of_sensors[name].edge_unit}": float(
                 f"{value * of_sensors[name].edge_factor:.9g}"

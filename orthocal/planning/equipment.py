@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError, ParameterError
 from orthocal.io.fields import read_only
-from orthocal.kinematics.function_cache import once_a_robot
+from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.robot.model import Robot
@@ -78,7 +78,7 @@ class Means:
         return setups * self.minutes_a_setup + readings * self.minutes_a_reading
 
 
-@once_a_robot(maxsize=8)
+@cached_per_robot(maxsize=8)
 def find_box(robot: Robot) -> Array:
     """How far the tool gets from the mechanical zero along each coordinate, at most 100 mm.
 

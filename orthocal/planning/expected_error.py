@@ -25,9 +25,8 @@ from orthocal.errors import ClosureError, RobotError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.selection import Selection
-from orthocal.estimation.solvers.machine_readings import Fleet
 from orthocal.estimation.weighting import split_by_gauge
-from orthocal.kinematics.function_cache import once_a_robot
+from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import (
@@ -186,11 +185,10 @@ class ToolForecast:
         others = self._slopes_of_others(session)
         noise = noise_of(session) if sigma is None else sigma
         drawn = list(self._draw(problem, entered=entered)) if machines is None else machines
-        fleet = Fleet(problem, np.array(drawn) / problem.theta_scale)
-        closed = fleet.close()
+        _, closed, reached = problem.simulate(np.array(drawn))
 
         def posteriors(part: Iterable[int]) -> list[tuple[Array | None, float]]:
-            passive = [fleet.passive[i] if closed[i] else None for i in range(len(drawn))]
+            passive = [closed[i] if reached[i] else None for i in range(len(drawn))]
             return [
                 self._posterior(problem, others, drawn[i], noise, weight, passive[i]) for i in part
             ]
@@ -393,7 +391,7 @@ def state_noise(session: Session) -> Session:
     return replace(session, gauges=gauges)
 
 
-@once_a_robot(maxsize=8)
+@cached_per_robot(maxsize=8)
 def default_workspace(robot: Robot) -> Workspace:
     """The largest cube around the zero that the nominal machine reaches, of ±60 mm at most.
 

@@ -15,7 +15,6 @@ from orthocal.assessment.remaining_errors import RemainingError, rank_errors
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, choose
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.kinematics.backend.lanes import expect_many
 from orthocal.kinematics.workspace import Workspace
 from orthocal.measurement.joining import join_sessions
 from orthocal.planning.candidates import (
@@ -159,7 +158,6 @@ def plan_readings(
         RobotError: If the drives do not command a tool.
         SessionError: If nothing tells the noise of the readings that there are.
     """
-    expect_many()
     measured = None if measured is None else state_noise(measured)
     means = means or Means()
     chosen = choose(choice, measured, usual="full")

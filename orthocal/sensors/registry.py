@@ -23,6 +23,11 @@ def register_sensor(kind: type[Sensor]) -> None:
     _KINDS[kind.kind] = kind.keys, kind.from_keys
 
 
+def unregister_sensor(kind: str) -> None:
+    """Forget a registered kind of sensor."""
+    _KINDS.pop(kind, None)
+
+
 def sensor_kinds() -> tuple[str, ...]:
     """Names of the kinds that are known."""
     return tuple(_KINDS)

@@ -70,6 +70,8 @@ class Setup:
     active: Array | None = None
     """Offsets that were active in the controller while it stood, shape (n_drives,), [m, rad]; those
     of the session where not given."""
+    zero: Literal["free", "known"] = "free"
+    """Gauge zero: estimated from the setup's readings, or known to be 0 (absolute readings)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,6 +89,8 @@ class Reading:
     """Line in the CSV, for messages."""
     file: Path | None = None
     """The CSV; that of the session where not given."""
+    zero: Literal["free", "known"] = "free"
+    """Gauge zero: estimated from the setup's readings, or known to be 0 (absolute readings)."""
 
     @property
     def label(self) -> str:

@@ -22,9 +22,7 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.estimation.solvers.machine_readings import Fleet
-from orthocal.kinematics.loop_closure import Assembly
-from orthocal.kinematics.machine_batch import Machines
+from orthocal.kinematics.loop_closure import Failures, LoopClosure
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace, gauss_cube
 from orthocal.observation.simulate import limits_of, show_readings
 from orthocal.planning.expected_error import (
@@ -129,7 +127,7 @@ class AccuracyStudy(Study):
         """What a machine's parameters and gauges really are, as far as they are identified."""
         truth = prepared.truth
         drawn, _ = self.draw(prepared, number)
-        errors = truth.assembly.errors(
+        errors = truth.closure.errors(
             truth.theta_scale[: truth.n_machine] * drawn[: truth.n_machine]
         )
         own = drawn[truth.n_machine :] * truth.theta_scale[truth.n_machine :]
@@ -146,7 +144,6 @@ class _Prepared:
     truth: CalibrationProblem
     """Of all that machines have wrong."""
     program: BatchProgram
-    """With what all machines share."""
     workspace: Workspace
     drives: Array
     """Commanded for the points of the workspace, shape (K, n_drives)."""
@@ -169,7 +166,7 @@ class _Prepared:
         robot = session.robot
         problem = weigh_readings(CalibrationProblem(session, study.choice.select(robot.parameters)))
         workspace = gauss_cube(robot, half_side=study.half_side)
-        assembly = Assembly(robot)
+        assembly = LoopClosure(robot)
         nominal = assembly.inverse(workspace.points)
         drives = nominal - session.active_offsets
         passive = assembly.close(drives)
@@ -186,32 +183,24 @@ class _Prepared:
             limits=np.array(limits).T,
             sigma=noise_of(session),
         )
-        found = replace(found, sigma=_weight(study, found))
-        good = np.zeros((0, problem.observations.size))
-        if found.program.takes_values:
-            read = found.read(study, range(min(MACHINES_A_TASK, study.machines)))
-            good = read.values[read.status == GOOD]
-            if not len(good):
-                return found
-        program = found.program.fixed_by(good, sigma=found.sigma, count=study.machines)
-        return replace(found, program=program)
+        return replace(found, sigma=_weight(study, found))
 
     def read(self, study: AccuracyStudy, numbers: Sequence[int]) -> _Read:
         """Machines, and what dials show of them."""
         drawn, generators = zip(*(study.draw(self, n) for n in numbers), strict=True)
-        fleet, o = Fleet(self.truth, np.array(drawn)), self.problem.observations
-        status = np.where(fleet.close(), GOOD, NO_MACHINE).astype(object)
-        entries = fleet.predict() * self.problem.noise
+        truth, o = self.truth, self.problem.observations
+        readings, _, reached = truth.simulate(np.array(drawn) * truth.theta_scale)
+        status = np.where(reached, GOOD, NO_MACHINE).astype(object)
+        entries = readings * self.problem.noise
         for i, rng in enumerate(generators):
             entries[i], _ = show_readings(self.session, o, entries[i], rng=rng)
         _mark(status, np.asarray(~np.isfinite(entries).all(axis=1)), NO_CONTACT)
         rows = np.array([o.rows(v) for v in entries])
         beyond = (rows < self.limits[0]) | (rows > self.limits[1])
         _mark(status, np.asarray(beyond.any(axis=1)), OUT_OF_RANGE)
-        truth = self.truth
         machines = np.array(drawn)[:, : truth.n_machine]
         return _Read(
-            truth.assembly.errors() + machines @ truth.columns.T,
+            truth.closure.errors() + machines @ truth.columns.T,
             entries / self.problem.noise,
             rows,
             status,
@@ -225,7 +214,7 @@ class _Prepared:
         Args:
             errors: All elementary errors, shape (n_sets, n_errors), [SI].
         """
-        columns = self.problem.compiled.errors.columns(self.problem.machine_selection.names)
+        columns = self.problem.functions.errors.columns(self.problem.machine_selection.names)
         return np.asarray(errors @ (columns / (columns**2).sum(axis=0)))
 
     def align(self, field: Array) -> Array:
@@ -269,16 +258,20 @@ class _Calibrated:
         status, true = read.status, read.errors
         theta = _identify(p, read.values, status)
         names = p.problem.machine_selection.names
-        n, columns = len(names), p.problem.compiled.errors.columns(names)
-        errors = p.problem.assembly.errors() + theta[:, :n] @ columns.T
+        n, columns = len(names), p.problem.functions.errors.columns(names)
+        errors = p.problem.closure.errors() + theta[:, :n] @ columns.T
         good = np.flatnonzero(status == GOOD)
         tools = np.full((2, *p.positions.shape, len(status)), np.nan)
         for tool, machines in zip(tools, (true, errors), strict=True):
             if not good.size:
                 break
-            own = Machines(p.robot, machines[good], p.drives, p.passive)
-            _mark(status, np.isin(np.arange(len(status)), good[~own.close()]), NO_MACHINE)
-            tool[..., good] = np.moveaxis(own.tool(), 0, -1)
+            closure = LoopClosure(p.robot)
+            lost: Failures = {}
+            q = closure.close(p.drives, errors=machines[good], start=p.passive, failures=lost)
+            failed = good[sorted({i // len(p.drives) for i in lost})]
+            _mark(status, np.isin(np.arange(len(status)), failed), NO_MACHINE)
+            points = closure.tcp(p.drives, q, errors=machines[good])
+            tool[..., good] = np.moveaxis(points, 0, -1)
         bad = status != GOOD
         before, after = tools[0] - p.positions[..., None], tools[0] - tools[1]
         for values in (before, after):
@@ -334,7 +327,7 @@ def _weight(study: AccuracyStudy, p: _Prepared) -> float:
     What is stated of the gauge, unless machines have errors that are not identified: then, as in
     a calibration, what remains of the readings tells it, of a few machines in the middle.
     """
-    columns = p.problem.compiled.errors.columns(p.problem.machine_selection.names)
+    columns = p.problem.functions.errors.columns(p.problem.machine_selection.names)
     known = columns @ np.linalg.pinv(columns)
     if np.allclose(known @ p.truth.columns, p.truth.columns, atol=1e-12):
         return p.sigma

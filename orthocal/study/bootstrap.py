@@ -7,7 +7,7 @@ prior that is what the readings' noise does to estimates, not all that is unknow
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -99,14 +99,13 @@ class _Prepared:
     cycles: tuple[tuple[NDArray[np.int64], ...], ...]
     """Entries of each cycle of each setup, those of a setup in the same order of postures."""
     program: BatchProgram
-    """With what all draws share."""
 
     @classmethod
     def of(cls, study: BootstrapStudy) -> _Prepared:
         session = study.session.unpack()
         fit = fit_session(session, study.choice)
         cycles = find_cycles(session, fit.problem.observations) if study.how == "cycles" else ()
-        found = cls(
+        return cls(
             fit=fit,
             values=fit.problem.values,
             fitted=fit.prediction,
@@ -114,11 +113,6 @@ class _Prepared:
             cycles=cycles,
             program=BatchProgram(fit.problem, options=fit.program.options),
         )
-        numbers = range(min(DRAWS_A_TASK, study.draws))
-        program = found.program.fixed_by(
-            found.draw_each(study, numbers), sigma=fit.sigma, count=study.draws
-        )
-        return replace(found, program=program)
 
     def draw_each(self, study: BootstrapStudy, numbers: Sequence[int]) -> Array:
         """Readings of these draws, shape (n_draws, n_entries)."""

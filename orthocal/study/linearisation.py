@@ -28,9 +28,7 @@ from orthocal.estimation.linear import (
 )
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
-from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
-from orthocal.estimation.solvers.machine_readings import Fleet
-from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.robot.model import Robot
 from orthocal.sensors.mounting import EXACT
 from orthocal.session.session import Gauge, Session
@@ -146,7 +144,7 @@ class _Prepared:
 
     problem: CalibrationProblem
     linearisation: Linearisation
-    program: EliminatedProgram
+    program: VariableProjection
     matrices: Mapping[int, Array] | None
     """The paper's, by their number of rows."""
     rows: Array | None
@@ -178,7 +176,7 @@ class _Prepared:
                 for n in (6, 12)
             }
             rows = _differences(session)
-        return cls(problem, linearisation, EliminatedProgram(problem), matrices, rows)
+        return cls(problem, linearisation, VariableProjection(problem), matrices, rows)
 
     def identify(self, errors: Array) -> dict[str, list[Any]]:
         """What each way misses of machines with these errors, shape (n_sets, n_free), [SI]."""
@@ -223,13 +221,8 @@ class _Prepared:
     def _read(self, errors: Array) -> tuple[Array, NDArray[np.bool_]]:
         """What machines show, shape (n_sets, n_entries), [m], and which can be assembled."""
         problem = self.problem
-        fleet = Fleet(problem, errors / problem.theta_scale)
-        good = fleet.close()
-        for i in np.flatnonzero(~good):
-            with suppress(ClosureError):
-                fleet.passive[i] = problem.close(errors[i])
-                good[i] = True
-        return fleet.predict(), good
+        readings, _, reached = problem.simulate(errors)
+        return readings, reached
 
     def _iterate(
         self, read: Array, first: Array, errors: Array, good: NDArray[np.bool_]
@@ -263,16 +256,15 @@ class _Prepared:
     def _step(self, read: Array, theta: Array) -> tuple[Array, NDArray[np.bool_]]:
         """One step of each machine, and which can be assembled before it."""
         problem = self.problem
-        fleet = Fleet(problem, theta / problem.theta_scale)
-        alive = fleet.close()
+        _, passive, alive = problem.simulate(theta)
         found = np.full_like(theta, np.nan)
         if alive.any():
-            about = FleetSlopes(problem, fleet.theta[alive], fleet.passive[alive])
-            jacobian = np.moveaxis(about.jacobian(), 0, -1)
+            reading, jacobian = problem.linearise(theta[alive], passive[alive])
+            jacobian = np.moveaxis(jacobian, 0, -1)
             shape = jacobian.shape
             flat = project_out_zeros(jacobian.reshape(shape[0], -1), problem.observations)
             slopes = np.moveaxis(flat.reshape(shape), -1, 0)
-            left = project_out_zeros((read[alive] - about.reading).T, problem.observations).T
+            left = project_out_zeros((read[alive] - reading).T, problem.observations).T
             inverse = np.linalg.pinv(slopes)
             step = (inverse @ left[..., None])[..., 0]
             found[alive] = theta[alive] + step * problem.theta_scale

@@ -7,10 +7,8 @@ import pytest
 from gauges import exact
 from tolerances import THREE_DECIMALS_MM
 
-from orthocal import Choice, load_plan
+from orthocal import load_plan
 from orthocal.errors import NotIdentifiableError, ParameterError
-from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.kinematics import orthoglide as closed_forms
 from orthocal.robot.builder.build import Sizes, make_robot
@@ -133,19 +131,6 @@ def test_a_step_is_gauss_newtons(study):
         left = project_out_zeros(y - reading, problem.observations)
         expected = at + np.linalg.lstsq(slopes, left)[0] * problem.theta_scale
         assert np.abs(step - expected).max() < 1e-12
-
-
-def test_slopes_of_many_machines_are_each_ones_own(root):
-    """All errors, what is not known of gauges among them."""
-    plan = load_plan(root / "examples/workshop/plan.yaml")
-    choice = Choice("full")
-    problem = CalibrationProblem(plan, choice.select(plan.robot.parameters))
-    theta = 0.5 * np.random.default_rng(0).normal(size=(2, problem.n_free))
-    passive = np.array([problem.close(t * problem.theta_scale) for t in theta])
-    found = FleetSlopes(problem, theta, passive).jacobian()
-    for own, t in zip(found, theta, strict=True):
-        _, expected = problem.linearise(t * problem.theta_scale)
-        assert np.abs(own - expected).max() < 1e-12
 
 
 def test_what_is_missed_grows_with_the_square_and_each_step_squares_it(summary):

@@ -11,9 +11,9 @@ def build_program(problem: CalibrationProblem, options: SolverOptions | None = N
     """A problem made ready for the solver that is chosen; Ipopt by default."""
     chosen = options or SolverOptions()
     if chosen.solver == "eliminated":
-        from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+        from orthocal.estimation.solvers.variable_projection import VariableProjection
 
-        return EliminatedProgram(problem, options=chosen)
+        return VariableProjection(problem, options=chosen)
     if chosen.solver == "linearised":
         from orthocal.estimation.solvers.linearised import LinearisedProgram
 

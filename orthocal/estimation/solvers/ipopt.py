@@ -228,14 +228,15 @@ class NonlinearProgram:
         y = problem.values if values is None else values
         residual = (y - problem.predict(at, closed)) / sigma
         wide = replace(loss, width=loss.width * widening)
-        follows = problem.setting.follows
+        aligned = problem.model.alignment.aligned
         zeros = sigma * wide.centres(residual, o.zero, o.n_zeros, weights=np.ones(o.size))
         return np.concatenate(
             [
                 at / problem.theta_scale,
                 zeros / LENGTH_SCALE,
                 (closed / problem.passive_scale).reshape(-1),
-                problem.standing(at)[follows] / problem.theta_scale[problem.n_machine :][follows],
+                problem.nuisance_values(at)[aligned]
+                / problem.theta_scale[problem.n_machine :][aligned],
             ]
         )
 
@@ -318,7 +319,7 @@ class NonlinearProgram:
         """Bounds of all variables, scaled: only parameters have any."""
         problem = self.problem
         k = problem.n_postures * self._n_passive + self._n_zeros
-        k += int(problem.setting.follows.sum())
+        k += int(problem.model.alignment.aligned.sum())
         own = getattr(problem.selection, side) / problem.theta_scale
         for i, value in held.items():
             own[i] = value / problem.theta_scale[i]

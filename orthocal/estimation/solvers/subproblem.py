@@ -1,7 +1,7 @@
-"""A calibration problem in its free parameters alone: where it is, and its step to first order.
+"""The problem in its free parameters alone, for one set of readings, and its Gauss-Newton step.
 
-The passive coordinates follow the parameters by the implicit function theorem, ∂q/∂θ = −g_q⁻¹ g_θ;
-a gauge's zero is where it leaves least. What remains is small and dense.
+The passive coordinates follow the parameters by the implicit function theorem, ∂q/∂θ = −g_q⁻¹ g_θ.
+Free gauge zeros have their optimal values. The remaining problem is small and dense.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from orthocal.errors import SolverError
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.program import LEFT_OUT
-from orthocal.observation.expansion import Expansion
+from orthocal.observation.model import Linearisation
 
 Array = NDArray[np.float64]
 
@@ -91,10 +91,10 @@ class Task:
         self, state: State, jacobian: Array, held: Mapping[int, float] | None
     ) -> NDArray[np.int8]:
         """-1 where a lower bound holds a parameter, 1 where an upper one does, shape (n_free,)."""
-        pull = self.slope(state, jacobian)
+        gradient = self.slope(state, jacobian)
         result = np.zeros(state.theta.size, dtype=np.int8)
-        result[(state.theta <= self.low) & (pull > 0.0)] = -1
-        result[(state.theta >= self.high) & (pull < 0.0)] = 1
+        result[(state.theta <= self.low) & (gradient > 0.0)] = -1
+        result[(state.theta >= self.high) & (gradient < 0.0)] = 1
         result[list(held or {})] = 0
         return result
 
@@ -109,7 +109,7 @@ class Task:
         closed = problem.close(si, start=passive)
         return self._state(theta, closed, (self.values - problem.predict(si, closed)) / self.sigma)
 
-    def begin(self, theta: ArrayLike | None, passive: Array | None) -> tuple[State, Expansion]:
+    def begin(self, theta: ArrayLike | None, passive: Array | None) -> tuple[State, Linearisation]:
         """The problem where a solver begins; arguments as for `Program.solve`.
 
         Raises:
@@ -123,23 +123,23 @@ class Task:
                 passive = problem.close(at * problem.theta_scale, start=passive)
         else:
             passive = problem.close(at * problem.theta_scale, start=passive)
-        expansion = self.expand(at, passive)
-        if not np.isfinite(expansion.jacobian).all():
+        linear = self.linearise(at, passive)
+        if not np.isfinite(linear.jacobian).all():
             raise SolverError(
                 "cannot begin: on the machine that the readings lead to a tip passes what it "
                 "touched, or a sensor shows nothing; look for a wrong sign, row or setup",
                 status="Invalid_Number_Detected",
                 iterations=0,
             )
-        return self.near(at, passive, expansion), expansion
+        return self.near(at, passive, linear), linear
 
-    def expand(self, theta: Array, passive: Array) -> Expansion:
+    def linearise(self, theta: Array, passive: Array) -> Linearisation:
         """Readings to first order about some θ̂ and passive coordinates near closed loops."""
-        return self.problem.expand(theta * self.problem.theta_scale, passive)
+        return self.problem.linearisation(theta * self.problem.theta_scale, passive)
 
-    def near(self, theta: Array, passive: Array, expansion: Expansion) -> State:
+    def near(self, theta: Array, passive: Array, linear: Linearisation) -> State:
         """The problem at some θ̂, its loops closed to first order."""
-        predicted = expansion.reading + expansion.opening
+        predicted = linear.reading + linear.opening
         return self._state(theta, passive, (self.values - predicted) / self.sigma)
 
     def moved(self, state: State, jacobian: Array, change: Array) -> State:

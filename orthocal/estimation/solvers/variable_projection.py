@@ -1,10 +1,10 @@
-"""The exact identification with passive joints and gauge zeros eliminated: Gauss-Newton on θ alone.
+"""Variable projection: the exact identification by Gauss-Newton on θ alone.
 
-About the present θ the problem is linear but for a robust loss: that subproblem is solved to its
-end, within the bounds. The passive joints follow the step to first order, and where that leaves the
-loops nearly closed and the whole better, what is left open is a correction to the next step.
-Elsewhere the loops are closed, and the step is taken as far as it makes the whole better. The
-optimum is that of the whole program which Ipopt solves.
+Passive joints and gauge zeros are eliminated. About the present θ the problem is linear except for
+a robust loss; this subproblem is solved completely, within the bounds. The passive joints follow
+the step to first order. If the loops stay nearly closed and the objective decreases, their opening
+is corrected in the next step. Otherwise the loops are closed and the step is halved until the
+objective decreases. The optimum is that of the complete program, which Ipopt solves.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.solvers.program import Solution, no_convergence
 from orthocal.estimation.solvers.subproblem import State, Task
-from orthocal.observation.expansion import Expansion
+from orthocal.observation.model import Linearisation
 
 Array = NDArray[np.float64]
 
@@ -39,8 +39,8 @@ ROUNDING = 1e-12
 """Relative growth of the objective that is none."""
 
 
-class EliminatedProgram:
-    """A calibration problem with nothing left but its free parameters.
+class VariableProjection:
+    """A calibration problem reduced to its free parameters.
 
     Args:
         problem: The problem.
@@ -53,9 +53,9 @@ class EliminatedProgram:
         self.problem = problem
         self.options = options or SolverOptions(solver="eliminated")
 
-    def with_problem(self, problem: CalibrationProblem) -> EliminatedProgram:
+    def with_problem(self, problem: CalibrationProblem) -> VariableProjection:
         """The same for another problem: nothing is built."""
-        return EliminatedProgram(problem, options=self.options)
+        return VariableProjection(problem, options=self.options)
 
     def solve(
         self,
@@ -103,7 +103,7 @@ class EliminatedProgram:
         )
 
     def _descend(
-        self, task: Task, begin: tuple[State, Expansion], *, follow: bool
+        self, task: Task, begin: tuple[State, Linearisation], *, follow: bool
     ) -> tuple[State, Array, int]:
         """The optimum, the Jacobian by which it was found, and iterations.
 
@@ -118,25 +118,25 @@ class EliminatedProgram:
         """
         most = self.options.max_iterations
         sizes: list[float] = []
-        state, expansion = begin
+        state, linear = begin
         for iterations in range(1, most + 1):
-            jacobian = expansion.jacobian
-            jacobian /= task.sigma  # in its place: it may be large, and is of no more use as it was
+            jacobian = linear.jacobian
+            jacobian /= task.sigma  # in place: it may be large, and is not used again
             step = task.step(state, jacobian)
             sizes.append(float(np.abs(step).max(initial=0.0)))
             if follow and _settled(sizes):
                 theta = np.clip(state.theta + step, task.low, task.high)
-                passive = state.passive + expansion.follow(theta - state.theta)
+                passive = state.passive + linear.follow(theta - state.theta)
                 return task.at(theta, passive), jacobian, iterations
-            followed = self._follow(task, state, expansion, step) if follow else None
+            followed = self._follow(task, state, linear, step) if follow else None
             if followed is not None:
-                state, expansion = followed
+                state, linear = followed
                 continue
             state, taken = self._move(task, state, step)
             sizes[-1] = float(np.abs(taken).max(initial=0.0))
             if _settled(sizes):
                 return state, jacobian, iterations
-            expansion = task.expand(state.theta, state.passive)
+            linear = task.linearise(state.theta, state.passive)
         raise SolverError(
             f"did not converge: the step is still {sizes[-1]:.2g} tolerances after {most} "
             f"iterations; {no_convergence(self.options)}",
@@ -145,20 +145,20 @@ class EliminatedProgram:
         )
 
     def _follow(
-        self, task: Task, state: State, expansion: Expansion, step: Array
-    ) -> tuple[State, Expansion] | None:
+        self, task: Task, state: State, linear: Linearisation, step: Array
+    ) -> tuple[State, Linearisation] | None:
         """A whole step with passive joints that follow it; None where that is not good enough."""
         theta = np.clip(state.theta + step, task.low, task.high)
-        passive = state.passive + expansion.follow(theta - state.theta)
+        passive = state.passive + linear.follow(theta - state.theta)
         try:
-            found = task.expand(theta, passive)
+            following = task.linearise(theta, passive)
         except np.linalg.LinAlgError:
             return None
-        turned = np.abs(found.correction / task.problem.passive_scale).max(initial=0.0)
-        if not turned * LENGTH_SCALE < NEARLY_CLOSED * task.problem.robot.characteristic_length:
+        motion = np.abs(following.correction / task.problem.passive_scale).max(initial=0.0)
+        if not motion * LENGTH_SCALE < NEARLY_CLOSED * task.problem.robot.characteristic_length:
             return None
-        after = task.near(theta, passive, found)
-        return (after, found) if after.objective <= _no_more_than(state) else None
+        after = task.near(theta, passive, following)
+        return (after, following) if after.objective <= _no_more_than(state) else None
 
     def _move(self, task: Task, state: State, step: Array) -> tuple[State, Array]:
         """Take a step as far as it makes the objective smaller, loops closed.

@@ -24,7 +24,7 @@ from orthocal.measurement.files.readings_checks import check_readings
 from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
 from orthocal.measurement.files.session_robot import build_offsets, require_given_zero
-from orthocal.observation.sensor_frames import locate_contacts
+from orthocal.observation.contacts import locate_contacts
 from orthocal.robot.loading import load_robot
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Sensor, SetupKeys, Unknown

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.observations import drive_table
-from orthocal.observation.sensor_frames import locate_contacts
 from orthocal.sensors.protocol import Contact
 from orthocal.session.session import Session
 

@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.errors import ClosureError, SessionError
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_assembly
 from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.observation.contacts import locate_contacts
+from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_frames import locate_contacts, predict_entries
 from orthocal.robot.model import Robot
 from orthocal.session.session import Posture, Reading, Session
 from orthocal.units import DEG, MM
@@ -247,7 +248,7 @@ def _touch(session: Session, setup: str, stops: list[Stop], ways: Sequence[_Gone
         readings=tuple(Reading(setup, n, None, 1, 0.0, None) for n in names),
     )
     observations = build_observations(along)
-    shown = observations.rows(predict_entries(along, observations, passive=passive))
+    shown = observations.rows(predict_readings(along, observations=observations, passive=passive))
     _, contact = locate_contacts(along)[setup]
     ends = np.cumsum([len(way) for way, _, _ in ways])
     zero = shown[ends[0] - 1]

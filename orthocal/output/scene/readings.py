@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.kinematics.compiled import zero_poses
+from orthocal.kinematics.robot_functions import reference_poses
 from orthocal.output.scene.deviations import (
     Deviation,
     Measurement,
@@ -211,7 +211,7 @@ def _named_setups(
 def _find_contact(stage: Stage, setup: Setup, poses: Mapping[str, Array]) -> Contact:
     """Where a sensor touches what is drawn in the first frame."""
     frames = setup.sensor.frames(stage.robot)
-    at_zero = zero_poses(stage.robot, frames.at_zero)
+    at_zero = reference_poses(stage.robot, frames.at_zero)
     return setup.sensor.contact([poses[f][:1] for f in frames.in_posture], at_zero, stage.robot)
 
 

@@ -11,7 +11,7 @@ from orthocal.io.html import escape, heading, paragraph, table
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.measurement.motion.motion import SetupMotion, Stop, plan_motion
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
-from orthocal.observation.sensor_frames import locate_contacts
+from orthocal.observation.contacts import locate_contacts
 from orthocal.output.sheet.drawing import draw_cut, draw_machine
 from orthocal.output.sheet.gauge_position import Standing, direction_words, find_standing, tip_words
 from orthocal.output.sheet.words import (
