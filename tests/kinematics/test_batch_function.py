@@ -95,8 +95,8 @@ def test_a_function_with_an_unknown_instruction_is_left_to_casadi():
 
 @pytest.mark.parametrize("installed", [True, False])
 def test_the_backend_depends_on_the_call_alone(orthoglide, monkeypatch, installed):
-    batch = robot_functions(orthoglide).closure_by_passive
-    enough = int(np.ceil(batch_function.MIN_OPERATIONS / batch.function.n_instructions()))
+    batch, enough = robot_functions(orthoglide).closure_by_passive, batch_function.MIN_POINTS
+    assert batch.function.n_instructions() * enough > batch_function.MIN_OPERATIONS
     used = []
     monkeypatch.setattr(llvm, "is_installed", lambda: installed)
     monkeypatch.setattr(llvm, "run", lambda *_: used.append("llvm"))

@@ -8,7 +8,7 @@ build it does not grow with the session. The functions are cached in memory and 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import casadi as ca
@@ -157,34 +157,11 @@ class ProgramFunctions:
 
         Local variables are (θ̂, ν̂, ẑ, q̂) in the order of x.
         """
-        problem, o = self.problem, self.problem.observations
         count, n_t = one.entries.size, one.theta_index.size
-        postures = o.posture[one.entries]
-        variables = np.hstack(
-            [
-                np.tile(one.theta_index, (count, 1)),
-                self._value_of[one.nuisance_index],
-                (self._n_theta + o.zero[one.entries])[:, None],
-                self._passive_variables(postures, one.passive_index),
-            ]
-        )
-        local, n_u = variables[:, n_t:], one.nuisance_index.shape[1]
-        tolerances = ca.DM(problem.theta_scale[one.nuisance_index].T)
-        separate = [
-            ca.reshape(x[local[:, :n_u].reshape(-1).tolist()], n_u, count),
-            ca.MX(tolerances),
-            x[local[:, n_u].tolist()].T,
-            ca.reshape(x[local[:, n_u + 1 :].reshape(-1).tolist()], -1, count),
-            p[one.entries.tolist()].T,
-            p[(o.size + one.entries).tolist()].T,
-            p[(2 * o.size + one.entries).tolist()].T,
-            ca.MX(ca.DM(problem.drives[postures].T)),
-            ca.MX(ca.DM(problem.session.zero_drives[one.setups].T)),
-            ca.MX(ca.DM(one.table.T)),
-        ]
-        common = [p[3 * o.size], p[3 * o.size + 2], *shared]
-        arguments = [*separate, *common]
-        masks = [*(False for _ in separate), *(True for _ in common)]
+        theta = np.tile(one.theta_index, (count, 1))
+        variables = np.hstack([theta, self._local_variables(one)])
+        local = variables[:, n_t:]
+        arguments, masks = self._reading_arguments(one, local, x, p, shared)
         functions = self._reading_functions(one)
 
         total = functions["objective"].map(count, masks, [True])(*arguments)
@@ -203,6 +180,76 @@ class ProgramFunctions:
         hessian.add(*upper, lam_f * ca.vec(rest))
         return total
 
+    def _local_variables(self, one: ReadingExpressions) -> Indices:
+        """Positions in x of the (ν̂, ẑ, q̂) of a sensor group's entries, shape (n, n_local)."""
+        o = self.problem.observations
+        return np.hstack(
+            [
+                self._value_of[one.nuisance_index],
+                (self._n_theta + o.zero[one.entries])[:, None],
+                self._passive_variables(o.posture[one.entries], one.passive_index),
+            ]
+        )
+
+    def predict(self, x: ca.MX, p: ca.MX) -> ca.MX:
+        """Predicted readings of all entries, gauge zeros at 0, shape (n_entries,).
+
+        Args:
+            x: Variables of the program.
+            p: Parameters of the program.
+
+        Returns:
+            In metres of the first gauge.
+        """
+        shared = self._shared_call(x[: self.problem.n_machine])
+        values, entries = [], []
+        for one in self._symbolic.readings:
+            local = self._local_variables(one)
+            arguments, masks = self._reading_arguments(one, local, x, p, shared)
+            function = self._reading_functions(one)["reading"]
+            values.append(ca.vec(function.map(one.entries.size, masks, [False])(*arguments)))
+            entries.append(one.entries)
+        order = np.argsort(np.concatenate(entries)) if entries else np.empty(0, dtype=np.int64)
+        return ca.vertcat(ca.MX(0, 1), *values)[order.tolist()]
+
+    def _reading_arguments(
+        self,
+        one: ReadingExpressions,
+        local: Indices,
+        x: ca.MX,
+        p: ca.MX,
+        shared: Sequence[ca.MX],
+    ) -> tuple[list[ca.MX], list[bool]]:
+        """Arguments of the mapped functions of a sensor group, and a mask of the common ones.
+
+        Args:
+            one: The reading.
+            local: Positions in x of its (ν̂, ẑ, q̂), shape (n, n_local).
+            x: Variables of the program.
+            p: Parameters of the program.
+            shared: Functions of θ̂ alone.
+        """
+        problem, o = self.problem, self.problem.observations
+        count, n_u = one.nuisance_index.shape
+        postures = o.posture[one.entries]
+        tolerances = ca.DM(problem.theta_scale[one.nuisance_index].T)
+        separate = [
+            ca.reshape(x[local[:, :n_u].reshape(-1).tolist()], n_u, count),
+            ca.MX(tolerances),
+            x[local[:, n_u].tolist()].T,
+            ca.reshape(x[local[:, n_u + 1 :].reshape(-1).tolist()], -1, count),
+            p[one.entries.tolist()].T,
+            p[(o.size + one.entries).tolist()].T,
+            p[(2 * o.size + one.entries).tolist()].T,
+            ca.MX(ca.DM(problem.drives[postures].T)),
+            ca.MX(ca.DM(problem.session.zero_drives[one.setups].T)),
+            ca.MX(ca.DM(one.table.T)),
+        ]
+        common = [p[3 * o.size], p[3 * o.size + 2], *shared]
+        arguments = [*separate, *common]
+        masks = [*(False for _ in separate), *(True for _ in common)]
+        return arguments, masks
+
     def _cached(self, name: str, build: Callable[[], ca.Function]) -> ca.Function:
         """A cached function of one posture or one reading; its constants are part of the key."""
         problem = self.problem
@@ -212,7 +259,7 @@ class ProgramFunctions:
         return cached_function(problem.robot, f"program {digest}", build)
 
     def _reading_functions(self, one: ReadingExpressions) -> dict[str, ca.Function]:
-        """Objective, gradient (by θ̂; by others) and Hessian (θ̂ with θ̂; others) of one reading."""
+        """Value, objective, gradient (θ̂; others) and Hessian (θ̂ with θ̂; others) of a reading."""
         sensor = self.problem.model.groups[one.group].reading.name
         built: dict[str, ca.Function] = {}
 
@@ -223,7 +270,7 @@ class ProgramFunctions:
 
         return {
             name: self._cached(f"{name} of {sensor}", partial(build, name))
-            for name in ("objective", "gradient", "hessian")
+            for name in ("reading", "objective", "gradient", "hessian")
         }
 
     def _build_reading(self, one: ReadingExpressions) -> dict[str, ca.Function]:
@@ -258,6 +305,7 @@ class ProgramFunctions:
 
         triangle = _triangle(n_t), _rest_of_triangle(row.numel(), n_t)
         outputs = {
+            "reading": [one.reading / noise],
             "objective": [weight * loss.cost(residual, width)],
             "gradient": [gradient[:n_t], gradient[n_t:]],
             "hessian": [pick(*triangle[0]), pick(*triangle[1])],

@@ -20,9 +20,9 @@ Backend = Literal["casadi", "llvm"]
 BLOCK_SIZES = (32, 8, 1)
 """Points of one call of a mapped CasADi function, largest first."""
 
-MIN_OPERATIONS = 2e5
-"""Instructions times points of a call from which the LLVM backend is used. CasADi takes 0.7 ms for
-them and LLVM a tenth of that; starting LLVM takes 0.1 s once."""
+MIN_POINTS, MIN_OPERATIONS = 16, 2e4
+"""Points of a call, and instructions times points, from which the LLVM backend is used. It takes a
+tenth of CasADi's time, but 0.1 s once to start: sessions of a few postures do not start it."""
 
 
 class BatchFunction:
@@ -75,7 +75,8 @@ class BatchFunction:
             keep their one column; sparse outputs have shape (K, nnz).
         """
         count = self._count(inputs)
-        fast = self._n_instructions * count >= MIN_OPERATIONS and llvm.is_installed()
+        large = count >= MIN_POINTS and self._n_instructions * count >= MIN_OPERATIONS
+        fast = large and llvm.is_installed()
         return self.evaluate(*inputs, backend="llvm" if fast else "casadi")
 
     def evaluate(self, *inputs: ArrayLike, backend: Backend) -> tuple[Array, ...]:
