@@ -335,6 +335,7 @@ def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
             gauge=s.gauge,
             active=None if s.active is None else tuple(s.active.tolist()),
             zero=zeros.get(s.name),
+            zero_kind=s.zero,
         )
         for s in fit.problem.session.setups.values()
     )

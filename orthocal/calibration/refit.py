@@ -134,7 +134,11 @@ def restore_session(calibration: Calibration) -> Session:
         },
         setups={
             s.name: Setup(
-                s.name, s.sensor, s.gauge, None if s.active is None else np.array(s.active)
+                s.name,
+                s.sensor,
+                s.gauge,
+                None if s.active is None else np.array(s.active),
+                s.zero_kind,
             )
             for s in calibration.setups
         },

@@ -176,7 +176,9 @@ def show_readings(
     deviation = np.array([_noise_of(plan, s.gauge, sigma, exact) for s in plan.setups.values()])
     # the dial is set where its setup begins
     zeros = dict.fromkeys(plan.setups, 0.0)
-    for i, name in enumerate(zeros):
+    for i, (name, setup) in enumerate(plan.setups.items()):
+        if setup.zero == "known":
+            continue
         zeros[name] = -float(entries[observations.setup == i][:1].sum())
         if not exact:
             zeros[name] += round(float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO)), 6)

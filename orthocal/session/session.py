@@ -18,7 +18,7 @@ from orthocal.arguments import require_array
 from orthocal.io.fields import read_only
 from orthocal.io.html import paragraph, table
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import Sensor
+from orthocal.sensors.protocol import GaugeZero, Sensor
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
@@ -70,7 +70,7 @@ class Setup:
     active: Array | None = None
     """Offsets that were active in the controller while it stood, shape (n_drives,), [m, rad]; those
     of the session where not given."""
-    zero: Literal["free", "known"] = "free"
+    zero: GaugeZero = "free"
     """Gauge zero: estimated from the setup's readings, or known to be 0 (absolute readings)."""
 
 
@@ -89,7 +89,7 @@ class Reading:
     """Line in the CSV, for messages."""
     file: Path | None = None
     """The CSV; that of the session where not given."""
-    zero: Literal["free", "known"] = "free"
+    zero: GaugeZero = "free"
     """Gauge zero: estimated from the setup's readings, or known to be 0 (absolute readings)."""
 
     @property

@@ -187,6 +187,7 @@ class Task:
     def _state(self, theta: Array, passive: Array, deviation: Array) -> State:
         o, off = self.problem.observations, self._off(theta)
         zeros = self.loss.centres(deviation, o.zero, o.n_zeros, weights=self.weights)
+        zeros[o.zero_known] = 0.0
         own = 0.5 * float(off @ (self.problem.prior_precision * off))
         cost = float(self.weights @ self.loss.value(deviation - zeros[o.zero]))
         return State(theta, passive, deviation, zeros, cost + own)
@@ -228,11 +229,12 @@ class Task:
         return np.asarray(theta - self.problem.prior_mean / self.problem.theta_scale)
 
     def _square(self, jacobian: Array, weights: Array) -> Array:
-        """Jᵀ W J, rows less the weighted mean of those that share their zero, some zeros at a time.
+        """Jᵀ W J of rows minus the weighted mean of those with the same free zero.
 
-        A large Jacobian is read once, and never copied as a whole.
+        Works on some zeros at a time: a large Jacobian is read once and never copied completely.
         """
-        zero = self.problem.observations.zero
+        o = self.problem.observations
+        zero = o.zero
         order = np.argsort(zero, kind="stable")
         starts = np.flatnonzero(np.diff(zero[order], prepend=-1))
         ends = np.append(starts[1:], zero.size)
@@ -243,13 +245,16 @@ class Task:
             rows, own = order[starts[first] : ends[last - 1]], starts[first:last] - starts[first]
             counts = ends[first:last] - starts[first:last]
             part, weight = jacobian[rows], weights[rows]
+            known = o.zero_known[zero[order[starts[first:last]]]]
             if (weight != 1.0).any():
                 means = np.add.reduceat(part * weight[:, None], own, axis=0)
                 means /= np.add.reduceat(weight, own)[:, None]
+                means[known] = 0.0
                 part -= np.repeat(means, counts, axis=0)
                 part *= np.sqrt(weight)[:, None]
             else:
                 means = np.add.reduceat(part, own, axis=0) / counts[:, None]
+                means[known] = 0.0
                 part -= np.repeat(means, counts, axis=0)
             result += part.T @ part
             first = last

@@ -27,7 +27,7 @@ from orthocal.measurement.files.session_robot import build_offsets, require_give
 from orthocal.observation.contacts import locate_contacts
 from orthocal.robot.loading import load_robot
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import Sensor, SetupKeys, Unknown
+from orthocal.sensors.protocol import Sensor, SetupKeys, Unknown, default_zero
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge, Posture, Purpose, Reading, Session, Setup
 from orthocal.units import DRIVE_UNITS, MM
@@ -263,7 +263,8 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
     for name, (setup, sensor) in read.items():
         where = f"{file}: setups.{name}"
         sensor.require_fit(robot, where=where)
-        setups[name] = Setup(name, sensor, _gauge_of(setup, gauges, where))
+        gauge, zero = _gauge_of(setup, gauges, where), setup.zero or default_zero(sensor)
+        setups[name] = Setup(name, sensor, gauge, zero=zero)
     _check_shared(setups, str(file))
     _check_planned_postures(file, keys, read)
     return Session(
