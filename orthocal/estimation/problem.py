@@ -195,10 +195,25 @@ class CalibrationProblem:
             (S,). The others have NaN.
         """
         failures: Failures = {}
-        passive = self.close(theta, failures=failures)
+        passive = self.close(theta, start=self._first_order_passive(theta), failures=failures)
         reached = np.ones(len(theta), dtype=np.bool_)
         reached[[i // max(self.n_postures, 1) for i in failures]] = False
         return self.predict(theta, passive), passive, reached
+
+    def _first_order_passive(self, theta: Array) -> Array | None:
+        """Passive coordinates of a batch to first order, to start from; None if that fails."""
+        if self._near_reference is None:
+            return None
+        try:
+            linear = self._reference_linearisation
+        except np.linalg.LinAlgError:
+            return None
+        change = (theta - self.reference) / self.theta_scale
+        return np.asarray(self._near_reference + linear.follow(change))
+
+    @cached_property
+    def _reference_linearisation(self) -> Linearisation:
+        return self.linearisation(self.reference, self.reference_passive, dense=False)
 
     @cached_property
     def _near_reference(self) -> Array | None:

@@ -162,14 +162,17 @@ class ErrorMap:
         """Scale errors of the drives, shape (..., n_drives)."""
         return self._of_drives(np.asarray(errors, dtype=np.float64), self._scale)
 
-    def jacobian(self, errors: ArrayLike, columns: Array) -> ErrorJacobian:
+    def jacobian(
+        self, errors: ArrayLike, columns: Array, *, right: Array | None = None
+    ) -> ErrorJacobian:
         """Derivatives of placements and drives by parameters.
 
         Args:
             errors: Point of differentiation, shape (..., n_errors), [SI].
             columns: Elementary errors of one unit of each parameter, shape (n_errors, n).
+            right: `right_jacobians` there, if known.
         """
-        right = self.right_jacobians(errors)
+        right = self.right_jacobians(errors) if right is None else right
         n = columns.shape[1]
         twists = right @ self.twists_of(columns.T).T.reshape(len(self.moved), 6, n)
         twists = twists.reshape(*twists.shape[:-3], 6 * len(self.moved), n)

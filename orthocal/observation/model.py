@@ -13,7 +13,8 @@ and studies all use this module.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -315,16 +316,20 @@ class Linearisation:
         self._by_errors = alignment @ free.columns
         map_ = model.functions.errors
         self._geometry = map_.geometry(errors)
-        self._right = map_.right_jacobians(errors)
         self._pattern = _ClosurePattern.of(model.functions, free.columns)
+        moved = len(map_.moved) if self._pattern.used.size else 0
+        self._right = (
+            map_.right_jacobians(errors) if moved else np.zeros((1, len(map_.moved), 6, 6))
+        )
         n_sets, n = len(errors), model.observations.size
         n_machine, n_nuisance = free.columns.shape[1], free.nuisance_scale.size
         reading, opening = np.empty((n_sets, n)), np.empty((n_sets, n))
         correction = np.zeros_like(passive, dtype=np.float64)
         jacobian = np.empty((n_sets, n, n_machine + n_nuisance)) if dense else np.empty((0, 0, 0))
-        chain = (
-            _Chain(map_.jacobian(errors, free.columns), self._pattern.used, n) if dense else None
-        )
+        chain = None
+        if dense:
+            by_errors = map_.jacobian(errors, free.columns, right=self._right)
+            chain = _Chain(by_errors, self._pattern.used, n)
         self._blocks: list[tuple[_Block, _Closures, _Readings | None]] = []
         for block in model._single_blocks if n_sets == 1 else model.blocks(n_sets):
             closures = self._evaluate_closures(block, passive)
@@ -539,9 +544,11 @@ class _ClosurePattern:
 
     def times(self, nonzeros: Array, twists: Array, n_rows: int) -> Array:
         """∂g · ξ, shape (S, k, n_rows), of nonzeros, (S, k, nnz), and twists, (S, n_twists)."""
-        weights = np.zeros((len(twists), self.rows.size, n_rows))
-        weights[:, np.arange(self.rows.size), self.rows] = twists[:, self.columns]
-        return np.asarray(nonzeros @ weights)
+        n_sets = max(len(twists), len(nonzeros))
+        result = np.zeros((n_sets, nonzeros.shape[1], n_rows))
+        for row, part in self._row_parts(n_rows):
+            result[..., row] = (nonzeros[..., part] @ twists[:, self.columns[part], None])[..., 0]
+        return result
 
     def subtract(self, twists: Array, nonzeros: Array, forces: Array) -> None:
         """Subtract λ · ∂g, summed over postures, from (S, n_twists), in place.
@@ -551,11 +558,16 @@ class _ClosurePattern:
             nonzeros: Shape (S, k, nnz).
             forces: λ, shape (S, k, n_rows).
         """
-        starts = np.searchsorted(self.rows, np.arange(forces.shape[2] + 1))
-        for row in np.flatnonzero(np.diff(starts)).tolist():
-            part = slice(starts[row], starts[row + 1])
+        for row, part in self._row_parts(forces.shape[2]):
             product = forces[:, None, :, row] @ nonzeros[:, :, part]
             twists[:, self.columns[part]] -= product[:, 0]  # no column twice in a row
+
+    def _row_parts(self, n_rows: int) -> Iterator[tuple[int, slice]]:
+        """Rows that have nonzeros, and the slice of each."""
+        starts = np.searchsorted(self.rows, np.arange(n_rows + 1)).tolist()
+        for row, (first, end) in enumerate(itertools.pairwise(starts)):
+            if end > first:
+                yield row, slice(first, end)
 
 
 class _Chain:

@@ -28,6 +28,9 @@ MAX_STEPS = 30
 MAX_STEP_SIZE = 100.0
 """Longer steps mark a set that is solved alone, [tolerances]."""
 
+LARGEST_INVERSE = 1e12
+"""Entry of inverse normal equations from which they count as singular, [tolerances²]."""
+
 MAX_NUMBERS = 2**21
 """Numbers in the Jacobians of the sets that are solved together."""
 
@@ -139,7 +142,7 @@ class BatchProgram:
             gradient = shared.with_prior(theta[active], gradient)
             if first or shared.loss.robust:
                 normal = shared.normal_matrices(residual, jacobian[active])
-                inverses = np.asarray(np.linalg.pinv(normal, rcond=1e-13, hermitian=True))
+                inverses = _inverse(normal)
             if previous is not None:
                 _update_inverses(inverses, previous[0], previous[1] - gradient)
             step = (inverses @ gradient[..., None])[..., 0]
@@ -243,6 +246,17 @@ def _settled(sizes: Array) -> NDArray[np.bool_]:
 def _parts(count: int, size: int) -> Iterator[slice]:
     for first in range(0, count, size):
         yield slice(first, first + size)
+
+
+def _inverse(matrices: Array) -> Array:
+    """Inverses of symmetric matrices; pseudo-inverses if one of them is singular."""
+    try:
+        inverses = np.asarray(np.linalg.inv(matrices))
+    except np.linalg.LinAlgError:
+        inverses = np.full_like(matrices, np.inf)
+    if np.abs(inverses).max(initial=0.0) < LARGEST_INVERSE:
+        return inverses
+    return np.asarray(np.linalg.pinv(matrices, rcond=1e-13, hermitian=True))
 
 
 def _update_inverses(inverses: Array, step: Array, change: Array) -> None:
