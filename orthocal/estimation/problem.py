@@ -310,7 +310,7 @@ class CalibrationProblem:
             self.errors(theta),
             passive,
             self._nuisance(theta),
-            free=FreeParameters(self.columns, self.theta_scale[self.n_machine :]),
+            free=self._free_parameters,
             noise=self.noise,
             dense=dense,
         )
@@ -336,6 +336,10 @@ class CalibrationProblem:
     def functions(self) -> RobotFunctions:
         """The functions of the robot."""
         return self.model.functions
+
+    @cached_property
+    def _free_parameters(self) -> FreeParameters:
+        return self.model.parametrise(self.columns, self.theta_scale[self.n_machine :])
 
     @cached_property
     def columns(self) -> Array:

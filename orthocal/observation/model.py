@@ -56,6 +56,8 @@ class FreeParameters:
     """Elementary errors of one unit of each machine parameter, (n_errors, n_machine), [SI]."""
     nuisance_scale: Array
     """One unit of each nuisance parameter, shape (n_nuisance,), [SI]."""
+    pattern: _ClosurePattern
+    """Nonzeros of ∂g by the twists that the machine parameters move."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,6 +98,65 @@ class _Readings:
     by_nuisance: Array
     by_twists: tuple[tuple[Indices, Indices, Array], ...]
     """Of each sensor group: positions, (n,), columns, (nnz,), and nonzeros, (S, n, nnz)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ClosurePattern:
+    """Nonzeros of ∂g by the twists that free parameters move, sorted by rows of g."""
+
+    used: Indices
+    """Columns of the twists that free parameters move."""
+    place: Indices
+    """Position of each twist column among the used ones, -1 for others, shape (n_twists,)."""
+    chosen: Indices
+    """Their positions among all nonzeros."""
+    rows: Indices
+    columns: Indices
+    """Row and column of each, shape (nnz,)."""
+
+    @staticmethod
+    def of(functions: RobotFunctions, columns: Array) -> _ClosurePattern:
+        moved = functions.errors.twists_of(columns.T).any(axis=0).reshape(-1, 6).any(axis=1)
+        used = np.flatnonzero(np.repeat(moved, 6))
+        place = np.full(functions.n_twists, -1)
+        place[used] = np.arange(used.size)
+        rows, twists = functions.twist_pattern
+        chosen = np.flatnonzero(place[twists] >= 0)
+        chosen = chosen[np.argsort(rows[chosen], kind="stable")]
+        return _ClosurePattern(used, place, chosen, rows[chosen], twists[chosen])
+
+    def dense(self, nonzeros: Array, n_rows: int) -> Array:
+        """Matrices of nonzeros, shape (S, k, n_rows, n_used) of (S, k, nnz)."""
+        result: Array = np.zeros((*nonzeros.shape[:2], n_rows * self.used.size))
+        result[:, :, self.rows * self.used.size + self.place[self.columns]] = nonzeros
+        return result.reshape(*nonzeros.shape[:2], n_rows, self.used.size)
+
+    def times(self, nonzeros: Array, twists: Array, n_rows: int) -> Array:
+        """∂g · ξ, shape (S, k, n_rows), of nonzeros, (S, k, nnz), and twists, (S, n_twists)."""
+        n_sets = max(len(twists), len(nonzeros))
+        result = np.zeros((n_sets, nonzeros.shape[1], n_rows))
+        for row, part in self._row_parts(n_rows):
+            result[..., row] = (nonzeros[..., part] @ twists[:, self.columns[part], None])[..., 0]
+        return result
+
+    def subtract(self, twists: Array, nonzeros: Array, forces: Array) -> None:
+        """Subtract λ · ∂g, summed over postures, from (S, n_twists), in place.
+
+        Args:
+            twists: Shape (S, n_twists).
+            nonzeros: Shape (S, k, nnz).
+            forces: λ, shape (S, k, n_rows).
+        """
+        for row, part in self._row_parts(forces.shape[2]):
+            product = forces[:, None, :, row] @ nonzeros[:, :, part]
+            twists[:, self.columns[part]] -= product[:, 0]  # no column twice in a row
+
+    def _row_parts(self, n_rows: int) -> Iterator[tuple[int, slice]]:
+        """Rows that have nonzeros, and the slice of each."""
+        starts = np.searchsorted(self.rows, np.arange(n_rows + 1)).tolist()
+        for row, (first, end) in enumerate(itertools.pairwise(starts)):
+            if end > first:
+                yield row, slice(first, end)
 
 
 class ObservationModel:
@@ -142,6 +203,11 @@ class ObservationModel:
             slopes[index] = by_errors
             start[index] = -((by_errors @ offsets) * active).sum(axis=1)
         return ManualAlignment(slopes, start)
+
+    def parametrise(self, columns: Array, nuisance_scale: Array) -> FreeParameters:
+        """Free parameters for `linearise`; arguments as the fields of `FreeParameters`."""
+        pattern = _ClosurePattern.of(self.functions, columns)
+        return FreeParameters(columns, nuisance_scale, pattern)
 
     def predict(
         self,
@@ -316,7 +382,7 @@ class Linearisation:
         self._by_errors = alignment @ free.columns
         map_ = model.functions.errors
         self._geometry = map_.geometry(errors)
-        self._pattern = _ClosurePattern.of(model.functions, free.columns)
+        self._pattern = free.pattern
         moved = len(map_.moved) if self._pattern.used.size else 0
         self._right = (
             map_.right_jacobians(errors) if moved else np.zeros((1, len(map_.moved), 6, 6))
@@ -511,65 +577,6 @@ class Linearisation:
         return values if self._batch else values[0]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _ClosurePattern:
-    """Nonzeros of ∂g by the twists that free parameters move, sorted by rows of g."""
-
-    used: Indices
-    """Columns of the twists that free parameters move."""
-    place: Indices
-    """Position of each twist column among the used ones, -1 for others, shape (n_twists,)."""
-    chosen: Indices
-    """Their positions among all nonzeros."""
-    rows: Indices
-    columns: Indices
-    """Row and column of each, shape (nnz,)."""
-
-    @staticmethod
-    def of(functions: RobotFunctions, columns: Array) -> _ClosurePattern:
-        moved = functions.errors.twists_of(columns.T).any(axis=0).reshape(-1, 6).any(axis=1)
-        used = np.flatnonzero(np.repeat(moved, 6))
-        place = np.full(functions.n_twists, -1)
-        place[used] = np.arange(used.size)
-        rows, twists = functions.twist_pattern
-        chosen = np.flatnonzero(place[twists] >= 0)
-        chosen = chosen[np.argsort(rows[chosen], kind="stable")]
-        return _ClosurePattern(used, place, chosen, rows[chosen], twists[chosen])
-
-    def dense(self, nonzeros: Array, n_rows: int) -> Array:
-        """Matrices of nonzeros, shape (S, k, n_rows, n_used) of (S, k, nnz)."""
-        result: Array = np.zeros((*nonzeros.shape[:2], n_rows * self.used.size))
-        result[:, :, self.rows * self.used.size + self.place[self.columns]] = nonzeros
-        return result.reshape(*nonzeros.shape[:2], n_rows, self.used.size)
-
-    def times(self, nonzeros: Array, twists: Array, n_rows: int) -> Array:
-        """∂g · ξ, shape (S, k, n_rows), of nonzeros, (S, k, nnz), and twists, (S, n_twists)."""
-        n_sets = max(len(twists), len(nonzeros))
-        result = np.zeros((n_sets, nonzeros.shape[1], n_rows))
-        for row, part in self._row_parts(n_rows):
-            result[..., row] = (nonzeros[..., part] @ twists[:, self.columns[part], None])[..., 0]
-        return result
-
-    def subtract(self, twists: Array, nonzeros: Array, forces: Array) -> None:
-        """Subtract λ · ∂g, summed over postures, from (S, n_twists), in place.
-
-        Args:
-            twists: Shape (S, n_twists).
-            nonzeros: Shape (S, k, nnz).
-            forces: λ, shape (S, k, n_rows).
-        """
-        for row, part in self._row_parts(forces.shape[2]):
-            product = forces[:, None, :, row] @ nonzeros[:, :, part]
-            twists[:, self.columns[part]] -= product[:, 0]  # no column twice in a row
-
-    def _row_parts(self, n_rows: int) -> Iterator[tuple[int, slice]]:
-        """Rows that have nonzeros, and the slice of each."""
-        starts = np.searchsorted(self.rows, np.arange(n_rows + 1)).tolist()
-        for row, (first, end) in enumerate(itertools.pairwise(starts)):
-            if end > first:
-                yield row, slice(first, end)
-
-
 class _Chain:
     """Product of rows by twists with ∂ξ/∂θ̂, sparse where there are many rows of one machine."""
 
@@ -630,7 +637,7 @@ def nominal_sensitivity(session: Session) -> Array:
     """
     model, closure = ObservationModel(session), LoopClosure(session.robot)
     n = len(model.functions.errors.names)
-    free = FreeParameters(np.eye(n), np.ones(len(model.nuisance.parameters)))
+    free = model.parametrise(np.eye(n), np.ones(len(model.nuisance.parameters)))
     passive = closure.close(model.drives, names=list(session.postures))
     linear = model.linearise(closure.errors(), passive, free=free, aligned=False)
     return linear.jacobian[:, :n]

@@ -56,11 +56,12 @@ to 5 were measured for 3,030 readings."""
 BACKENDS = 3.0
 """Closures of many postures by CasADi over the same by LLVM. 11 to 15 were measured."""
 
-AT_ONCE = 100.0
-"""Calibrations of three offsets a second, all at once over one by one. 440 to 700 were measured."""
+AT_ONCE = 8.0
+"""Calibrations of three offsets a second, all at once over one by one. 20 to 24 were measured: 0.4 ms
+a set, of which the closures of its seven postures are most."""
 
-FULL_AT_ONCE = 1.5
-"""The same of all errors. 2.2 to 3.8 were measured in lanes, 2.0 to 2.2 without."""
+FULL_AT_ONCE = 1.4
+"""The same of all errors. 1.9 to 2.3 were measured."""
 
 PLANNED = 30.0
 """Adding readings one by one, each tried by an inverse of its own, over the whole search of a plan

@@ -55,13 +55,16 @@ class BatchFunction:
         ]
         self._matrices = frozenset(function.index_out(name) for name in matrices)
         self._key = key
+        self._patterns: dict[str, tuple[Indices, Indices]] = {}
         self._local = threading.local()
 
     def pattern(self, name: str) -> tuple[Indices, Indices]:
         """Rows and columns of the nonzeros of a sparse output, shape (nnz,) each."""
-        sparsity = self.function.sparsity_out(self.function.index_out(name))
-        rows, columns = (np.array(v, dtype=np.int64) for v in sparsity.get_triplet())
-        return rows, columns
+        if name not in self._patterns:
+            sparsity = self.function.sparsity_out(self.function.index_out(name))
+            rows, columns = (np.array(v, dtype=np.int64) for v in sparsity.get_triplet())
+            self._patterns[name] = rows, columns
+        return self._patterns[name]
 
     def __call__(self, *inputs: ArrayLike) -> tuple[Array, ...]:
         """Evaluate the function at K points.
