@@ -637,8 +637,8 @@ class LoopClosure:
         solve: Callable[[], Array],
     ) -> Array:
         """The solution for the same arguments, held from a recent call or computed now."""
-        given = [*arrays, np.asarray(start, dtype=np.float64)] if start is not None else arrays
-        key = (*name, *(a.tobytes() for a in given))
+        arguments = [*arrays, np.asarray(start, dtype=np.float64)] if start is not None else arrays
+        key = (*name, *(a.tobytes() for a in arguments))
         if key in self._solutions:
             return np.array(self._solutions[key])
         solution = solve()
@@ -760,7 +760,7 @@ def _joint_names(robot: Robot, index: NDArray[np.int64]) -> tuple[str, ...]:
     return tuple(owner[int(i)] for i in index)
 
 
-def as_rows(values: ArrayLike, n: int, what: str) -> tuple[Array, bool]:
+def as_rows(values: ArrayLike, n: int, noun: str) -> tuple[Array, bool]:
     """Numbers as an array of shape (K, n), and whether they were a single row.
 
     Raises:
@@ -769,7 +769,7 @@ def as_rows(values: ArrayLike, n: int, what: str) -> tuple[Array, bool]:
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"found {type(values).__name__}; expected {n} {what} a row") from None
+        raise ValueError(f"found {type(values).__name__}; expected {n} {noun} a row") from None
     if array.ndim not in (1, 2) or array.shape[-1] != n:
-        raise ValueError(f"found the shape {array.shape}; expected {n} {what} a row, (K, {n})")
+        raise ValueError(f"found the shape {array.shape}; expected {n} {noun} a row, (K, {n})")
     return np.atleast_2d(array), array.ndim == 1

@@ -70,9 +70,9 @@ def exp6(twist: Operand) -> tuple[Operand, Operand]:
         return ca.SX.eye(3), v
     a, b, c = _coefficients(m, m.transpose(w) @ w, 3)
     hat = m.skew(w)
-    turned = hat @ v
+    cross = hat @ v
     rotation = np.eye(3) + a * hat + b * (hat @ hat)
-    position = v + b * turned + c * (hat @ turned)
+    position = v + b * cross + c * (hat @ cross)
     return (rotation, position) if m is _CASADI else (rotation, position[..., 0])
 
 
@@ -106,8 +106,8 @@ def log6(rotation: Operand, position: Operand) -> Operand:
     far = 1.0 / angle**2 - (1.0 + safe_cosine) / (2.0 * angle * sine)
     beta = m.where(near, _polynomial(m.transpose(w) @ w, _BERNOULLI), far)
     hat = m.skew(w)
-    turned = hat @ p
-    v = p - 0.5 * turned + beta * (hat @ turned)
+    cross = hat @ p
+    v = p - 0.5 * cross + beta * (hat @ cross)
     if m is _CASADI:
         return ca.vertcat(v, w)
     return np.concatenate([v, w], axis=-2)[..., 0]

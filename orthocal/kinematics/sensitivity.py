@@ -75,24 +75,24 @@ class ToolSensitivity:
         _, p_a, p_q, p_t = self._functions.tool_jacobian(*arguments)
         _, g_a, g_q, nonzeros = self._functions.closure_jacobian(*arguments)
         if g_q.shape[1] == g_q.shape[2]:
-            pull = np.swapaxes(
+            multiplier = np.swapaxes(
                 np.linalg.solve(np.swapaxes(g_q, 1, 2), np.swapaxes(p_q, 1, 2)), 1, 2
             )
         else:
-            pull = p_q @ np.linalg.pinv(g_q, rcond=1e-10)
-        twists = p_t - self._times_twists(pull, nonzeros)
-        drives = p_a - pull @ g_a
+            multiplier = p_q @ np.linalg.pinv(g_q, rcond=1e-10)
+        twists = p_t - self._times_twists(multiplier, nonzeros)
+        drives = p_a - multiplier @ g_a
         commanded = drives * d[:, None, :]
         return np.asarray(
             twists @ by_errors.twists + drives @ by_errors.offsets + commanded @ by_errors.gains
         )
 
-    def _times_twists(self, pull: Array, nonzeros: Array) -> Array:
+    def _times_twists(self, multiplier: Array, nonzeros: Array) -> Array:
         """Rows times ∂g by twists, shape (K, 3, n_twists) of (K, 3, n_rows) and (K, nnz)."""
         rows, columns = self._functions.twist_pattern
-        result = np.zeros((*pull.shape[:2], self._functions.n_twists))
+        result = np.zeros((*multiplier.shape[:2], self._functions.n_twists))
         if columns.size:
             used, starts = np.unique(columns, return_index=True)
-            products = pull[:, :, rows] * nonzeros[:, None, :]
+            products = multiplier[:, :, rows] * nonzeros[:, None, :]
             result[:, :, used] = np.add.reduceat(products, starts, axis=2)
         return result

@@ -1,9 +1,9 @@
-"""Symbolic kinematics (CasADi) of any Pinocchio model, with errors on every placement.
+"""Symbolic kinematics (CasADi) of a Pinocchio model, with errors on every placement.
 
     oM_i = oM_parent · placement_i · exp6(δ_i) · M_i(q)
 
 A pose is a pair (R, p): rotation 3×3 and position 3, as CasADi expressions. All functions are safe
-to differentiate at zero errors and at closed loops: near the identity they take series.
+to differentiate at zero errors and at closed loops (see `se3`).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from orthocal.robot.model import Closure, Robot, joint_axis
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """A rigid-body pose: maps coordinates of its own frame into the parent's."""
+    """A rigid-body pose: maps coordinates of its frame into the parent's."""
 
     rotation: ca.SX
     """Shape (3, 3)."""
@@ -93,10 +93,10 @@ class SymbolicTree:
     Args:
         model: The nominal model.
         coordinates: Joint coordinates, shape (nv,): one an unbounded revolute joint.
-        joint_placements: Joint to its placement in its parent's moving frame, where that is not
-            the model's own.
+        joint_placements: Joint to its placement in its parent's moving frame; the model's by
+            default.
         frame_placements: Index of a frame to its placement in the frame that it hangs on (see
-            `hangs_on`), where that is not the model's own.
+            `hangs_on`); the model's by default.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class SymbolicTree:
         self._frames: dict[int, Pose] = {}
 
     def joint_base(self, joint: int) -> Pose:
-        """Pose of a joint's frame in the world before its own motion: where its errors act."""
+        """Pose of a joint's frame in the world before its motion, in which its errors act."""
         if joint not in self._bases:
             m = self.model
             placement = self._joint_placements.get(joint)
@@ -149,11 +149,11 @@ class SymbolicTree:
 
     def joints_to(self, frame: int) -> list[int]:
         """Joints that move a frame, from it to the base."""
-        joint, found = int(self.model.frames[frame].parentJoint), []
+        joint, joints = int(self.model.frames[frame].parentJoint), []
         while joint > 0:
-            found.append(joint)
+            joints.append(joint)
             joint = int(self.model.parents[joint])
-        return found
+        return joints
 
 
 def nominal_frame_placement(model: pin.Model, frame: int) -> pin.SE3:
@@ -165,7 +165,7 @@ def nominal_frame_placement(model: pin.Model, frame: int) -> pin.SE3:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorExpressions:
-    """Errors of a robot as expressions: twists of placements, and what drives add."""
+    """Errors of a robot as expressions: twists of placements, offsets and gains of drives."""
 
     joint_twists: Mapping[int, ca.SX]
     """Joint to its placement twist δ, shape (6,)."""
@@ -212,8 +212,7 @@ class SymbolicRobot:
         drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
         passive: Passive coordinates, shape (n_passive,), [m, rad].
         errors: Parameter name to expression or number, [unit of the parameter].
-        placements: Placements of joints and of frames (by index) to take instead of those that
-            the errors' twists make.
+        placements: Placements of joints and of frames by index; those of the errors by default.
     """
 
     def __init__(
@@ -228,7 +227,7 @@ class SymbolicRobot:
         self.robot = robot
         expressions = express_errors(robot, errors)
         self.actuated = expressions.gain * drives + expressions.offset
-        """Where the drives really are, shape (n_drives,), [m, rad]."""
+        """Actual drive coordinates, shape (n_drives,), [m, rad]."""
         coordinates = ca.SX(robot.model.nv, 1)
         for i, k in enumerate(robot.drive_index):
             coordinates[int(k)] = self.actuated[i]
@@ -244,7 +243,7 @@ class SymbolicRobot:
         return self.tree.frame_pose(self.robot.frame_id(name))
 
     def closure_error(self, closure: Closure) -> ca.SX:
-        """Pose error of one closure, rows that count: position of b in a, or log6, [m, rad]."""
+        """Constrained rows of a closure's pose error: position of b in a, or log6, [m, rad]."""
         a, b = self.frame_pose(closure.frame_a), self.frame_pose(closure.frame_b)
         relative = a.relative(b)
         error = (

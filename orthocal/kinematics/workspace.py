@@ -1,7 +1,7 @@
-"""Regions of the tool: points that stand for a volume, and what of an error a workpiece sees.
+"""Regions of the tool: quadrature points of a volume, and the errors that a workpiece shows.
 
-A field of position errors over a region is told three ways: absolute; with the shift that is
-common to the region taken out; and with shift and rotation taken out. The last is what matters: a
+A field of position errors over a region is reported three ways: absolute; with the mean translation
+removed; and with translation and rotation removed. The last is what matters: a
 workpiece is aligned on the machine, and nothing in readings of its legs knows the world's axes.
 """
 
@@ -34,7 +34,7 @@ CELLS_A_SIDE = 12
 """Of a cube, where parts of it that are alike are asked for."""
 
 FEWEST_ALIGNED = 4
-"""Points below which a rigid motion leaves nothing of their errors, whatever they are."""
+"""Points below which a rigid motion can remove all of their errors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

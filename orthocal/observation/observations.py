@@ -1,4 +1,4 @@
-"""A session's readings as single ones with unknown zeros, and what a machine shows of them."""
+"""Entries of a session: its readings as single ones with gauge zeros."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """Readings as the gauge showed them, one an entry; differences taken apart.
+    """Readings as the gauge showed them, one an entry; differences are split.
 
-    Differences of one setup and cycle that share postures are the same as readings with one
-    unknown zero: their covariance, σ² [[2, 1], [1, 2]] for two differences from one posture, comes
-    out of eliminating it. So every reading here is a single one with standard deviation σ.
+    Differences of one setup and cycle that share postures are equivalent to readings with one free
+    zero: eliminating it gives their covariance, σ² [[2, 1], [1, 2]] for two differences from one
+    posture. So every entry is a single reading with standard deviation σ.
     """
 
     setup: Indices
@@ -27,7 +27,7 @@ class Observations:
     posture: Indices
     """Index of the posture, shape (n,)."""
     zero: Indices
-    """Index of the unknown zero, shape (n,)."""
+    """Index of the gauge zero, shape (n,)."""
     n_zeros: int
     zero_setup: tuple[str, ...]
     """Setup of each zero."""
@@ -51,7 +51,7 @@ class Observations:
         return self.setup.size
 
     def only(self, chosen: NDArray[np.bool_]) -> Observations:
-        """Some of the entries: which setup, posture and zero they have; no rows."""
+        """Some of the entries, without rows."""
         none = np.empty(0, dtype=np.int64)
         return replace(
             self,
@@ -63,7 +63,7 @@ class Observations:
         )
 
     def sum_by_zero(self, values: Array, weights: Array) -> Array:
-        """Weighted sums of those with the same zero, shape (n_zeros, m) of (n, m)."""
+        """Weighted sums of the values with the same zero, shape (n_zeros, m) of (n, m)."""
         order = np.argsort(self.zero, kind="stable")
         starts = np.searchsorted(self.zero[order], np.arange(self.n_zeros))
         result = np.zeros((self.n_zeros, values.shape[1]))
@@ -110,7 +110,7 @@ class Observations:
 
 
 def build_observations(session: Session) -> Observations:
-    """Take a session's readings apart into single ones with unknown zeros."""
+    """Split a session's readings into single ones with gauge zeros."""
     setups = {name: i for i, name in enumerate(session.setups)}
     postures = {name: i for i, name in enumerate(session.postures)}
     entries: list[tuple[int, int, int]] = []
@@ -167,7 +167,7 @@ def build_observations(session: Session) -> Observations:
 
 
 def _difference_groups(session: Session) -> dict[tuple[str, int, str], str]:
-    """Posture of a setup and cycle to a name for all postures that differences join it with."""
+    """Posture of a setup and cycle to a name of its group of differences."""
     leader: dict[tuple[str, int, str], tuple[str, int, str]] = {}
 
     def find(node: tuple[str, int, str]) -> tuple[str, int, str]:

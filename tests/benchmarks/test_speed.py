@@ -57,8 +57,8 @@ BACKENDS = 3.0
 """Closures of many postures by CasADi over the same by LLVM. 11 to 15 were measured."""
 
 AT_ONCE = 8.0
-"""Calibrations of three offsets a second, all at once over one by one. 20 to 24 were measured: 0.4 ms
-a set, of which the closures of its seven postures are most."""
+"""Calibrations of three offsets a second, all at once over one by one. 20 to 24 were measured:
+0.4 ms a set, of which the closures of its seven postures are most."""
 
 FULL_AT_ONCE = 1.4
 """The same of all errors. 1.9 to 2.3 were measured."""

@@ -399,7 +399,7 @@ def _require_accepted(options: Mapping[str, OptionValue]) -> None:
 
 
 def _weighting(sigma: float) -> tuple[float, float]:
-    """Standard deviation that readings are weighted by, and the scale of the whole objective."""
+    """Standard deviation by which readings are weighted, and the scale of the objective."""
     weighted = max(sigma, FINEST_WEIGHT)
     return weighted, (sigma / weighted) ** 2
 

@@ -21,27 +21,27 @@ from orthocal.observation.model import Linearisation
 Array = NDArray[np.float64]
 
 SETTLED_WITHIN = 1e-11
-"""Last step towards the optimum of a subproblem with a robust loss, in tolerances."""
+"""Last step of a subproblem with a robust loss, [tolerances]."""
 
 MOST_STEPS_WITHIN = 100
 
 ROWS_AT_ONCE = 2048
-"""Of the Jacobian, while they are squared: what stays near the processor."""
+"""Rows of the Jacobian that are multiplied at once: they stay in the processor's cache."""
 
 FEW = 50
-"""Unknowns up to which an elimination takes less than SciPy's triangular one takes to import."""
+"""Size of systems that NumPy solves faster than SciPy's triangular solver is imported."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """The problem at some θ, or to first order near one."""
+    """The problem at some θ̂, or to first order near it."""
 
     theta: Array
     """θ̂, shape (n_free,)."""
     passive: Array
-    """Passive coordinates of every posture where it is no approximation, [m, rad]."""
+    """Passive coordinates of every posture, not updated by first-order changes, [m, rad]."""
     deviation: Array
-    """Readings less predictions, zeros still in them, shape (n_entries,), [σ]."""
+    """Readings minus predictions, with gauge zeros, shape (n_entries,), [σ]."""
     zeros: Array
     """Shape (n_zeros,), [σ]."""
     objective: float
@@ -70,7 +70,7 @@ class Task:
         left_out: ArrayLike | None,
         held: Mapping[int, float] | None,
     ) -> Task:
-        """What a solver is asked for; arguments as for `Program.solve`."""
+        """Task of a solver; arguments as for `Program.solve`."""
         lower, upper = problem.selection.lower.copy(), problem.selection.upper.copy()
         for i, value in (held or {}).items():
             lower[i] = upper[i] = value
@@ -84,13 +84,13 @@ class Task:
     def start(self, theta: ArrayLike | None) -> Array:
         """θ̂ to start from, within the bounds, shape (n_free,)."""
         problem = self.problem
-        given = np.array(problem.reference if theta is None else theta, dtype=np.float64)
-        return np.clip(given / problem.theta_scale, self.low, self.high)
+        start = np.array(problem.reference if theta is None else theta, dtype=np.float64)
+        return np.clip(start / problem.theta_scale, self.low, self.high)
 
     def held_by_bounds(
         self, state: State, jacobian: Array, held: Mapping[int, float] | None
     ) -> NDArray[np.int8]:
-        """-1 where a lower bound holds a parameter, 1 where an upper one does, shape (n_free,)."""
+        """-1 for a parameter held by its lower bound, 1 by its upper bound, shape (n_free,)."""
         gradient = self.slope(state, jacobian)
         result = np.zeros(state.theta.size, dtype=np.int8)
         result[(state.theta <= self.low) & (gradient > 0.0)] = -1
@@ -110,11 +110,11 @@ class Task:
         return self._state(theta, closed, (self.values - problem.predict(si, closed)) / self.sigma)
 
     def begin(self, theta: ArrayLike | None, passive: Array | None) -> tuple[State, Linearisation]:
-        """The problem where a solver begins; arguments as for `Program.solve`.
+        """The problem at the start of a solver; arguments as for `Program.solve`.
 
         Raises:
             ClosureError: If the machine cannot reach a posture there.
-            SolverError: If a sensor shows nothing there.
+            SolverError: If a sensor has no reading there.
         """
         problem, at = self.problem, self.start(theta)
         if passive is None:
@@ -138,7 +138,7 @@ class Task:
         return self.problem.linearisation(theta * self.problem.theta_scale, passive)
 
     def near(self, theta: Array, passive: Array, linear: Linearisation) -> State:
-        """The problem at some θ̂, its loops closed to first order."""
+        """The problem at some θ̂, with loops closed to first order."""
         predicted = linear.reading + linear.opening
         return self._state(theta, passive, (self.values - predicted) / self.sigma)
 
@@ -147,13 +147,13 @@ class Task:
         return self._state(state.theta + change, state.passive, state.deviation - jacobian @ change)
 
     def step(self, state: State, jacobian: Array) -> Array:
-        """Change of θ̂ that solves the problem, its readings taken to first order, (n_free,).
+        """Change of θ̂ that solves the problem with readings to first order, shape (n_free,).
 
-        Squares: one solve. A robust loss: Newton's method, whose weights are ρ''; where that does
-        not make it better, by the secant ρ'/r, which always does.
+        Least squares take one solve. A robust loss takes Newton's method with weights ρ''; where
+        that does not decrease the objective, with the secant ρ'/r, which always does.
 
         Args:
-            state: Where.
+            state: The point of linearisation.
             jacobian: dh/dθ̂ there, shape (n_entries, n_free), [σ per tolerance].
         """
         at = state
@@ -163,17 +163,17 @@ class Task:
             residual = at.deviation - at.zeros[self.problem.observations.zero]
             for weights in (self.loss.bend(residual), self.loss.weight(residual)):
                 change = self._change(at, jacobian, self.weights * weights)
-                found = self.moved(at, jacobian, change)
-                if found.objective <= at.objective:
+                trial = self.moved(at, jacobian, change)
+                if trial.objective <= at.objective:
                     break
             settled = float(np.abs(change).max(initial=0.0)) < SETTLED_WITHIN
-            if settled or found.objective > at.objective:
+            if settled or trial.objective > at.objective:
                 break
-            at = found
+            at = trial
         return np.asarray(at.theta - state.theta)
 
     def _change(self, at: State, jacobian: Array, weights: Array) -> Array:
-        """Newton's step with given weights, within the bounds, shape (n_free,)."""
+        """Newton step with weights of the entries, within the bounds, shape (n_free,)."""
         square = self._square(jacobian, weights)
         square[np.diag_indices_from(square)] += self.problem.prior_precision
         return self._solve(square, -self.slope(at, jacobian), at.theta)
@@ -181,8 +181,8 @@ class Task:
     def slope(self, state: State, jacobian: Array) -> Array:
         """Derivative of the objective by θ̂, shape (n_free,)."""
         residual = state.deviation - state.zeros[self.problem.observations.zero]
-        own = self.problem.prior_precision * self._off(state.theta)
-        return np.asarray(own - jacobian.T @ (self.weights * self.loss.influence(residual)))
+        prior = self.problem.prior_precision * self._off(state.theta)
+        return np.asarray(prior - jacobian.T @ (self.weights * self.loss.influence(residual)))
 
     def _state(self, theta: Array, passive: Array, deviation: Array) -> State:
         o, off = self.problem.observations, self._off(theta)
@@ -192,7 +192,7 @@ class Task:
         cost = float(self.weights @ self.loss.value(deviation - zeros[o.zero]))
         return State(theta, passive, deviation, zeros, cost + own)
 
-    def _solve(self, square: Array, pull: Array, theta: Array) -> Array:
+    def _solve(self, square: Array, gradient: Array, theta: Array) -> Array:
         """The s that minimises ½ sᵀ A s − bᵀ s within the bounds, shape (n_free,).
 
         Parameters with a bound come last in the triangular factor, so that its last rows are a
@@ -204,28 +204,28 @@ class Task:
         n_open = int((~bounded).sum())
         scale = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
         scaled = (square * np.outer(scale, scale))[np.ix_(order, order)]
-        target = (pull * scale)[order]
+        target = (gradient * scale)[order]
         step = np.empty_like(theta)
         try:
             factor: Array = np.asarray(np.linalg.cholesky(scaled).T, dtype=np.float64)
-        except np.linalg.LinAlgError:  # not told by anything: the least change
+        except np.linalg.LinAlgError:  # undetermined parameters: the smallest change
             values, vectors = np.linalg.eigh(scaled)
-            kept = values > 1e-13 * values.max(initial=0.0)
-            step[order] = vectors[:, kept] @ ((vectors[:, kept].T @ target) / values[kept])
+            large = values > 1e-13 * values.max(initial=0.0)
+            step[order] = vectors[:, large] @ ((vectors[:, large].T @ target) / values[large])
             return np.asarray(np.clip(step * scale, low, high))
         target = _solve_triangular(factor, target, transposed=True)
         last = slice(n_open, None)
         limits = ((side / scale)[order][last] for side in (low, high))
-        found = np.empty_like(target)
-        found[last] = _bounded(factor[last, last], target[last], *limits)
-        found[:n_open] = _solve_triangular(
-            factor[:n_open, :n_open], target[:n_open] - factor[:n_open, last] @ found[last]
+        solution = np.empty_like(target)
+        solution[last] = _bounded(factor[last, last], target[last], *limits)
+        solution[:n_open] = _solve_triangular(
+            factor[:n_open, :n_open], target[:n_open] - factor[:n_open, last] @ solution[last]
         )
-        step[order] = found
+        step[order] = solution
         return np.asarray(np.clip(step * scale, low, high))
 
     def _off(self, theta: Array) -> Array:
-        """How far θ̂ is from its prior's mean, shape (n_free,)."""
+        """Deviation of θ̂ from the mean of its prior, shape (n_free,)."""
         return np.asarray(theta - self.problem.prior_mean / self.problem.theta_scale)
 
     def _square(self, jacobian: Array, weights: Array) -> Array:
@@ -242,18 +242,18 @@ class Task:
         first = 0
         while first < starts.size:
             last = max(first + 1, int(np.searchsorted(ends, starts[first] + ROWS_AT_ONCE, "right")))
-            rows, own = order[starts[first] : ends[last - 1]], starts[first:last] - starts[first]
+            rows, groups = order[starts[first] : ends[last - 1]], starts[first:last] - starts[first]
             counts = ends[first:last] - starts[first:last]
             part, weight = jacobian[rows], weights[rows]
             known = o.zero_known[zero[order[starts[first:last]]]]
             if (weight != 1.0).any():
-                means = np.add.reduceat(part * weight[:, None], own, axis=0)
-                means /= np.add.reduceat(weight, own)[:, None]
+                means = np.add.reduceat(part * weight[:, None], groups, axis=0)
+                means /= np.add.reduceat(weight, groups)[:, None]
                 means[known] = 0.0
                 part -= np.repeat(means, counts, axis=0)
                 part *= np.sqrt(weight)[:, None]
             else:
-                means = np.add.reduceat(part, own, axis=0) / counts[:, None]
+                means = np.add.reduceat(part, groups, axis=0) / counts[:, None]
                 means[known] = 0.0
                 part -= np.repeat(means, counts, axis=0)
             result += part.T @ part
@@ -279,8 +279,8 @@ def _bounded(factor: Array, target: Array, low: Array, high: Array) -> Array:
 
     movable = high > low
     result = np.where(movable, 0.0, low)
-    left = target - factor @ result
+    remainder = target - factor @ result
     limits = low[movable], high[movable]
-    found = lsq_linear(factor[:, movable], left, bounds=limits, method="bvls", tol=1e-15)
-    result[movable] = found.x
+    solution = lsq_linear(factor[:, movable], remainder, bounds=limits, method="bvls", tol=1e-15)
+    result[movable] = solution.x
     return np.asarray(result)

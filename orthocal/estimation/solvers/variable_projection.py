@@ -26,8 +26,8 @@ from orthocal.observation.model import Linearisation
 Array = NDArray[np.float64]
 
 SETTLED = 1e-8
-"""Largest change of θ̂ that the next step would make, in tolerances, by how the last ones shrank:
-each is smaller than the one before by what errors change of the derivatives."""
+"""Estimated next step at which the solver has converged, extrapolated from the ratio of the last
+steps, [tolerances]."""
 
 NEARLY_CLOSED = 1e-3
 """Largest correction of a passive coordinate that readings are taken to follow to first order,
@@ -36,7 +36,7 @@ NEARLY_CLOSED = 1e-3
 MOST_HALVINGS = 12
 
 ROUNDING = 1e-12
-"""Relative growth of the objective that is none."""
+"""Relative growth of the objective that counts as rounding."""
 
 
 class VariableProjection:
@@ -44,7 +44,7 @@ class VariableProjection:
 
     Args:
         problem: The problem.
-        options: Iterations and loss; the rest is Ipopt's.
+        options: Iterations and loss; other options do not apply.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class VariableProjection:
         self.options = options or SolverOptions(solver="eliminated")
 
     def with_problem(self, problem: CalibrationProblem) -> VariableProjection:
-        """The same for another problem: nothing is built."""
+        """The same solver for another problem; nothing is built."""
         return VariableProjection(problem, options=self.options)
 
     def solve(
@@ -84,10 +84,10 @@ class VariableProjection:
         )
         begin = task.begin(start, start_passive)
         try:
-            found = self._descend(task, begin, follow=True)
-        except (ClosureError, SolverError):  # on the way the loops were not looked at
-            found = self._descend(task, task.begin(start, start_passive), follow=False)
-        state, jacobian, iterations = found
+            optimum = self._descend(task, begin, follow=True)
+        except (ClosureError, SolverError):  # with open loops; now close them in every step
+            optimum = self._descend(task, task.begin(start, start_passive), follow=False)
+        state, jacobian, iterations = optimum
         return Solution(
             theta=state.theta * self.problem.theta_scale,
             zeros=state.zeros * sigma,
@@ -105,16 +105,16 @@ class VariableProjection:
     def _descend(
         self, task: Task, begin: tuple[State, Linearisation], *, follow: bool
     ) -> tuple[State, Array, int]:
-        """The optimum, the Jacobian by which it was found, and iterations.
+        """Gauss-Newton iterations: the optimum, the last Jacobian and the number of iterations.
 
         Args:
-            task: What is asked for.
-            begin: Where to begin, loops closed.
-            follow: Whether passive joints may follow a step to first order.
+            task: The task.
+            begin: The start, with closed loops.
+            follow: Let passive joints follow a step to first order.
 
         Raises:
             SolverError: If it does not converge.
-            ClosureError: If the machine found cannot reach a posture.
+            ClosureError: If the solution cannot reach a posture.
         """
         most = self.options.max_iterations
         sizes: list[float] = []
@@ -132,8 +132,8 @@ class VariableProjection:
             if followed is not None:
                 state, linear = followed
                 continue
-            state, taken = self._move(task, state, step)
-            sizes[-1] = float(np.abs(taken).max(initial=0.0))
+            state, step = self._move(task, state, step)
+            sizes[-1] = float(np.abs(step).max(initial=0.0))
             if _settled(sizes):
                 return state, jacobian, iterations
             linear = task.linearise(state.theta, state.passive)
@@ -147,7 +147,7 @@ class VariableProjection:
     def _follow(
         self, task: Task, state: State, linear: Linearisation, step: Array
     ) -> tuple[State, Linearisation] | None:
-        """A whole step with passive joints that follow it; None where that is not good enough."""
+        """A full step with passive joints that follow it; None if the loops open too far."""
         theta = np.clip(state.theta + step, task.low, task.high)
         passive = state.passive + linear.follow(theta - state.theta)
         try:
@@ -161,19 +161,19 @@ class VariableProjection:
         return (after, following) if after.objective <= _no_more_than(state) else None
 
     def _move(self, task: Task, state: State, step: Array) -> tuple[State, Array]:
-        """Take a step as far as it makes the objective smaller, loops closed.
+        """Halve a step until the objective decreases, with closed loops.
 
         Raises:
-            SolverError: If no part of it does.
+            SolverError: If it never does.
         """
         for halving in range(MOST_HALVINGS):
             part = step * 0.5**halving
             try:
-                found = task.at(np.clip(state.theta + part, task.low, task.high), state.passive)
-            except ClosureError:  # there the machine cannot be assembled
+                trial = task.at(np.clip(state.theta + part, task.low, task.high), state.passive)
+            except ClosureError:  # the machine cannot reach a posture there
                 continue
-            if found.objective <= _no_more_than(state):
-                return found, part
+            if trial.objective <= _no_more_than(state):
+                return trial, part
             if np.abs(part).max(initial=0.0) < SETTLED:
                 return state, np.zeros_like(step)
         raise SolverError(
@@ -184,7 +184,7 @@ class VariableProjection:
 
 
 def _settled(sizes: list[float]) -> bool:
-    """Whether the next step would change nothing, shrinking as the last two did, or slower."""
+    """True if the next step is negligible, extrapolated from the last three."""
     last = sizes[-3:]
     if last[-1] <= SETTLED:
         return True
