@@ -27,7 +27,8 @@ def observations(setup, posture, zero):
     s, p, z = (np.array(v, dtype=np.int64) for v in (setup, posture, zero))
     n = int(z.max()) + 1
     rows = np.arange(len(s))
-    return Observations(s, p, z, n, ("s",) * n, (True,) * n, rows, np.full(len(s), -1))
+    known = np.zeros(n, dtype=np.bool_)
+    return Observations(s, p, z, n, ("s",) * n, (True,) * n, known, rows, np.full(len(s), -1))
 
 
 def test_covariance_of_a_line_solved_by_hand():
