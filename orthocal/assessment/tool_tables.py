@@ -15,8 +15,13 @@ from orthocal.assessment.calibrated_tool import error_covariance
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
-from orthocal.kinematics.continuation import Failures, as_rows
-from orthocal.kinematics.loop_closure import Assembly, find_beyond_travel, nominal_assembly
+from orthocal.kinematics.loop_closure import (
+    Assembly,
+    Failures,
+    as_rows,
+    find_beyond_travel,
+    nominal_assembly,
+)
 from orthocal.kinematics.sensitivity import ToolSensitivity
 
 Array = NDArray[np.float64]

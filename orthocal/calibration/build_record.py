@@ -337,6 +337,7 @@ def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
             active=None if s.active is None else tuple(s.active.tolist()),
             zero=zeros.get(s.name),
             aligned_at=aligned_at[s.name],
+            zero_kind=s.zero,
         )
         for s in fit.problem.session.setups.values()
     )

@@ -19,7 +19,7 @@ from orthocal.estimation.linear import linearise_at_reference
 from orthocal.estimation.loss import Loss, LossKind
 from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.kinematics.continuation import as_rows
+from orthocal.kinematics.loop_closure import as_rows
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.statistics.identifiability import (
     find_base_parameters,

@@ -16,7 +16,7 @@ from orthocal.hypotheses.reversed_setup import TurnedSetup
 from orthocal.hypotheses.sessions.change_records import Changes
 from orthocal.io.documents import Count, Number, PositiveInSI, PositiveNumber
 from orthocal.io.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN, Sizes
-from orthocal.sensors.protocol import Sensor
+from orthocal.sensors.protocol import GaugeZero, Sensor
 from orthocal.sensors.registry import RECORDED
 from orthocal.statistics.identifiability import Identifiability
 from orthocal.statistics.noise import Noise
@@ -185,9 +185,11 @@ class SetupRecord:
     active: Many[Number] | None
     """Offsets active in the controller, [m, rad], where they were not those of the session."""
     zero: Number | None
-    """Estimated zero of the gauge, [m]; None where only differences were given."""
+    """Zero of the gauge, [m]; None where only differences were given."""
     aligned_at: str
     """Posture in which the operator aligned the gauge."""
+    zero_kind: GaugeZero = "free"
+    """Whether the zero was estimated or known to be 0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

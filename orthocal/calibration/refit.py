@@ -139,6 +139,7 @@ def restore_session(calibration: Calibration) -> Session:
                 s.gauge,
                 None if s.active is None else np.array(s.active),
                 s.aligned_at,
+                s.zero_kind,
             )
             for s in calibration.setups
         },

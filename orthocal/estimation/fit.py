@@ -112,7 +112,7 @@ class Fit:
         """Independent readings: repeated ones once, less gauge zeros."""
         o = self.problem.observations
         _, repeated = estimate_repeatability(self.problem.values, o)
-        return o.size - o.n_zeros - repeated
+        return o.size - o.n_free_zeros - repeated
 
     @property
     def held(self) -> NDArray[np.bool_]:
@@ -322,7 +322,7 @@ def _few_are_free(linearisation: Linearisation, sigma: float) -> bool:
     used = linearisation.information.effective_parameters(
         sigma=sigma, precision=problem.prior_precision
     )
-    return o.size - o.n_zeros - used < SMALL_DOF
+    return o.size - o.n_free_zeros - used < SMALL_DOF
 
 
 def first_sigma(session: Session, repeatability: tuple[float, int]) -> float:
@@ -369,7 +369,7 @@ def _noise(
     used = information.effective_parameters(
         sigma=sigma, precision=problem.prior_precision, held=held
     )
-    dof = problem.observations.size - problem.observations.n_zeros - used
+    dof = problem.observations.size - problem.observations.n_free_zeros - used
     return estimate_noise(
         # cycles with a wrong reading among them would say that all scatter
         repeatability=(math.nan, 0) if loss.robust and dof > 1.0 else repeatability,

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from orthocal.errors import OrthocalError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import CalibrationProblem, build_problem
-from orthocal.estimation.solvers.machine_readings import Fleet
 from orthocal.measurement.recording.anomalies import Oddity, name_slip, noise_of_row
 from orthocal.measurement.recording.recording import Row
 from orthocal.session.session import Gauge, Reading, Session
@@ -186,9 +185,8 @@ def build_foresight(session: Session) -> Foresight | None:
 def _not_of_first_order(problem: CalibrationProblem, nominal: Array, jacobian: Array) -> Array:
     """A root of the second moments of what readings have beyond first order, (n_entries, DRAWN)."""
     drawn = np.random.default_rng(0).normal(size=(DRAWN, problem.n_free))
-    fleet = Fleet(problem, problem.reference / problem.theta_scale + drawn)
-    closed = fleet.close()
-    rest = (fleet.predict() - nominal - drawn @ jacobian.T)[closed].T
+    readings, _, reached = problem.simulate(problem.reference + drawn * problem.theta_scale)
+    rest = (readings - nominal - drawn @ jacobian.T)[reached].T
     there = np.isfinite(rest)
     count = np.maximum(there.sum(axis=1, keepdims=True), 1)
     return np.asarray(np.where(there, rest, 0.0) / np.sqrt(count))

@@ -1,65 +1,86 @@
-"""All errors of a robot as one vector, and the placements that they make: numbers, nothing built.
+"""Placements and drive gains of a machine as functions of its error parameters.
 
 A placement with errors is placement · exp6(δ). Its derivative by δ is a twist in its own frame,
-
-    d exp6(δ) = exp6(δ) T(δ) dδ,  T(δ) = Σ (−ad δ)^k/(k + 1)!
-
-(Chirikjian, Stochastic Models, Information Theory, and Lie Groups, volume 2, 2012, section 10.8).
-Everything that errors do to a machine goes through these twists and through where its drives are.
+exp6(δ) [T(δ) dδ], with T the right Jacobian of SE(3). All effects of errors on the kinematics pass
+through these twists and through the drives' offsets and gains. `ErrorMap` computes them for NumPy
+arrays with any leading batch dimensions, `SymbolicErrorMap` as CasADi expressions.
 """
 
 from __future__ import annotations
 
-import math
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.io.fields import read_only
-from orthocal.kinematics.symbolic import SERIES_BELOW, nominal_frame_placement
+from orthocal.kinematics.se3 import exp6, right_jacobian
+from orthocal.kinematics.symbolic import Pose, nominal_frame_placement
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-SERIES_TERMS = 40
-"""Terms of the series of T, at most: enough for a turn by π."""
-
 
 @dataclass(frozen=True, slots=True)
 class MovedPlacement:
-    """A joint or frame whose placement errors can move."""
+    """A joint or frame whose placement has error parameters."""
 
     index: int
-    """Of the joint, or of the frame."""
+    """Index of the joint or frame in the model."""
     of_frame: bool
 
 
+class MachineGeometry(NamedTuple):
+    """Geometry of one machine or of a batch of machines with errors."""
+
+    placements: Array
+    """Moved placements, shape (..., 12 n_moved), [1, m]."""
+    offset: Array
+    """Drive offsets, shape (..., n_drives), [m, rad]."""
+    gain: Array
+    """Drive gains, shape (..., n_drives)."""
+
+    def drives(self, commanded: Array) -> Array:
+        """Actual drive coordinates.
+
+        Args:
+            commanded: Shape (K, n_drives), or (n_drives,), [m, rad].
+
+        Returns:
+            Shape (..., K, n_drives): the machines' batch dimensions come first.
+        """
+        if commanded.ndim == 1 or self.gain.ndim == 1:
+            return np.asarray(self.gain * commanded + self.offset)
+        return np.asarray(self.gain[..., None, :] * commanded + self.offset[..., None, :])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Slopes:
-    """What errors do to placements and drives to first order, for a choice of n parameters."""
+class ErrorJacobian:
+    """Derivatives of placements and drives by n parameters."""
 
     twists: Array
-    """∂ξ of every moved placement in its own frame, shape (6 n_moved, n), [m, rad]."""
+    """∂ξ of every moved placement in its own frame, shape (..., 6 n_moved, n), [m, rad]."""
     offsets: Array
-    """∂ of where the drives are, shape (n_drives, n), [m, rad]."""
+    """Derivative of the drives' offsets, shape (n_drives, n), [m, rad]."""
     gains: Array
-    """The same as a multiple of the commanded coordinates, shape (n_drives, n)."""
+    """Derivative of the drives' gains, shape (n_drives, n)."""
 
 
 class ErrorMap:
-    """The elementary errors of a robot in a fixed order, shape (n_errors,), [m, rad, 1].
+    """The elementary errors of a robot in a fixed order, shape (..., n_errors), [m, rad, 1].
 
     Args:
         robot: The nominal robot.
 
     Attributes:
-        names: Of the errors.
-        moved: Placements that they move.
+        names: Names of the errors.
+        moved: Placements that have errors.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -91,7 +112,7 @@ class ErrorMap:
         self._positions = np.array([p.translation for p in nominal]).reshape(-1, 3)
 
     def expand(self, values: Mapping[str, float]) -> Array:
-        """The vector of named parameters, which may be sums, shape (n_errors,), [SI].
+        """Elementary errors of named parameters, which may be sums, shape (n_errors,), [SI].
 
         Raises:
             ParameterError: If a name is unknown.
@@ -102,12 +123,16 @@ class ErrorMap:
         return result
 
     def columns(self, names: Sequence[str]) -> Array:
-        """What one unit of each named parameter adds to the vector, shape (n_errors, n)."""
+        """Elementary errors of one unit of each named parameter, shape (n_errors, n)."""
         result = np.zeros((len(self.names), len(names)))
         for column, name in enumerate(names):
             for term, coefficient in self.robot.parameters[name].terms:
                 result[self._index[term], column] += coefficient
         return result
+
+    def geometry(self, errors: ArrayLike) -> MachineGeometry:
+        """Placements and drives of machines with errors, shape (..., n_errors), [SI]."""
+        return MachineGeometry(self.placements(errors), self.offsets(errors), self.gains(errors))
 
     def placements(self, errors: ArrayLike) -> Array:
         """Moved placements: rotation by columns, then position.
@@ -118,47 +143,44 @@ class ErrorMap:
         Returns:
             Shape (..., 12 n_moved), [1, m].
         """
-        twists = self._twists(np.asarray(errors, dtype=np.float64))
-        turn, shift = exp6(twists)
-        rotations = self._rotations @ turn
-        positions = (self._rotations @ shift[..., None])[..., 0] + self._positions
+        rotation, position = exp6(self._twists(np.asarray(errors, dtype=np.float64)))
+        rotations = self._rotations @ rotation
+        positions = (self._rotations @ position[..., None])[..., 0] + self._positions
         columns = np.swapaxes(rotations, -1, -2).reshape(*rotations.shape[:-2], 9)
         values = np.concatenate([columns, positions], axis=-1)
         return values.reshape(*values.shape[:-2], -1)
-
-    def drives(self, errors: ArrayLike, commanded: ArrayLike) -> Array:
-        """Where the drives really are, gain · commanded + offset, shape (..., n_drives), [m, rad].
-
-        Args:
-            errors: Shape (n_errors,) or (..., n_errors), [SI].
-            commanded: Shape (..., n_drives), [m, rad].
-        """
-        offset, gain = self.offsets(errors), self.gains(errors)
-        return np.asarray(gain * np.asarray(commanded, dtype=np.float64) + offset)
 
     def offsets(self, errors: ArrayLike) -> Array:
         """Offsets of the drives, shape (..., n_drives), [m, rad]."""
         return self._of_drives(np.asarray(errors, dtype=np.float64), self._offset)
 
     def gains(self, errors: ArrayLike) -> Array:
-        """1 + scale error of the drives, shape (..., n_drives)."""
+        """Gains of the drives, 1 + scale error, shape (..., n_drives)."""
         return np.asarray(self.robot.drive_gain + self.scales(errors))
 
     def scales(self, errors: ArrayLike) -> Array:
         """Scale errors of the drives, shape (..., n_drives)."""
         return self._of_drives(np.asarray(errors, dtype=np.float64), self._scale)
 
-    def slopes(self, errors: ArrayLike, columns: Array) -> Slopes:
+    def jacobian(
+        self, errors: ArrayLike, columns: Array, *, right: Array | None = None
+    ) -> ErrorJacobian:
         """Derivatives of placements and drives by parameters.
 
         Args:
-            errors: Where, shape (n_errors,), [SI].
-            columns: What one unit of each parameter adds to them, shape (n_errors, n).
+            errors: Point of differentiation, shape (..., n_errors), [SI].
+            columns: Elementary errors of one unit of each parameter, shape (n_errors, n).
+            right: `right_jacobians` there, if known.
         """
-        at = right_jacobian(self._twists(np.asarray(errors, dtype=np.float64)))
+        right = self.right_jacobians(errors) if right is None else right
         n = columns.shape[1]
-        twists = at @ self.twists_of(columns.T).T.reshape(len(self.moved), 6, n)
-        return Slopes(twists.reshape(-1, n), self.offsets(columns.T).T, self.scales(columns.T).T)
+        twists = right @ self.twists_of(columns.T).T.reshape(len(self.moved), 6, n)
+        twists = twists.reshape(*twists.shape[:-3], 6 * len(self.moved), n)
+        return ErrorJacobian(twists, self.offsets(columns.T).T, self.scales(columns.T).T)
+
+    def right_jacobians(self, errors: ArrayLike) -> Array:
+        """Right Jacobian T(δ) of every moved placement, shape (..., n_moved, 6, 6)."""
+        return right_jacobian(self._twists(np.asarray(errors, dtype=np.float64)))
 
     @property
     def nominal(self) -> Array:
@@ -168,10 +190,10 @@ class ErrorMap:
 
     def twists_of(self, errors: ArrayLike) -> Array:
         """Twists δ of the moved placements, shape (..., 6 n_moved), [m, rad]."""
-        given = np.asarray(errors, dtype=np.float64)
-        result = np.zeros((*given.shape[:-1], 6 * len(self.moved)))
+        values = np.asarray(errors, dtype=np.float64)
+        result = np.zeros((*values.shape[:-1], 6 * len(self.moved)))
         chosen = self._twist >= 0
-        result[..., self._twist[chosen]] = given[..., chosen]
+        result[..., self._twist[chosen]] = values[..., chosen]
         return result
 
     def _twists(self, errors: Array) -> Array:
@@ -186,7 +208,7 @@ class ErrorMap:
 
 @lru_cache(maxsize=8)
 def error_map(robot: Robot) -> ErrorMap:
-    """The error map of a robot, made once."""
+    """The error map of a robot, built once."""
     return ErrorMap(robot)
 
 
@@ -196,69 +218,89 @@ def _placement_of(robot: Robot, error: ElementaryError) -> MovedPlacement:
     return MovedPlacement(int(robot.model.getJointId(error.owner)), False)
 
 
-def exp6(twists: Array) -> tuple[Array, Array]:
-    """Exponentials of twists (translation v, rotation ω), as Pinocchio's exp6.
+class SymbolicErrorMap:
+    """Placements and drives of a machine as expressions of scaled parameters θ̂.
+
+    The choice of free parameters is a matrix of constants; the CasADi function of one placement is
+    mapped over all of them.
 
     Args:
-        twists: Shape (..., 6), [m, rad].
+        errors: The robot's error map.
+        fixed: Elementary errors at θ̂ = 0, shape (n_errors,), [SI].
+        columns: Elementary errors of one unit of each θ̂, shape (n_errors, n_free).
 
-    Returns:
-        Rotations, shape (..., 3, 3), and positions, shape (..., 3), [m].
+    Attributes:
+        placements: Symbol of the moved placements, shape (12 n_moved,).
+        symbols: θ̂, placements and the nonzeros of ∂ξ/∂θ̂: the inputs of posture and reading
+            functions.
+        function: θ̂ to the values of the symbols.
+        digest: Digest of the numbers that are constants here.
     """
-    v, w = twists[..., :3], twists[..., 3:]
-    square = (w * w).sum(axis=-1)[..., None]
-    near = square < SERIES_BELOW
-    safe = np.where(near, 1.0, square)
-    angle = np.sqrt(safe)
-    sine, cosine = np.sin(angle), np.cos(angle)
-    a, b, c = (
-        np.where(near, _alternating(square, first), far)
-        for first, far in (
-            (1, sine / angle),
-            (2, (1.0 - cosine) / safe),
-            (3, (angle - sine) / (safe * angle)),
+
+    def __init__(self, errors: ErrorMap, *, fixed: Array, columns: Array) -> None:
+        n_moved, n_free = len(errors.moved), columns.shape[1]
+        self.digest = hashlib.sha256(fixed.tobytes() + columns.tobytes()).hexdigest()
+        inner, base = errors.twists_of(columns.T).T, errors.twists_of(fixed)
+        theta = ca.SX.sym("theta", n_free)
+        twist_jacobian = ca.SX.sym("twist_jacobian", _twist_pattern(inner))
+        self.placements = ca.SX.sym("placements", 12 * n_moved)
+        self.symbols = (theta, self.placements, twist_jacobian.nz[:])
+        self._twist_jacobian = twist_jacobian
+        self._by_offset, self._by_gain = (
+            ca.sparsify(ca.SX(m.T)) for m in (errors.offsets(columns.T), errors.scales(columns.T))
         )
-    )
-    hat = _hat(w)
-    rotations = np.eye(3) + a[..., None] * hat + b[..., None] * (hat @ hat)
-    turned = hat @ v[..., None]
-    return rotations, v + b * turned[..., 0] + c * (hat @ turned)[..., 0]
+        self._offset = ca.SX(errors.offsets(fixed)) + self._by_offset @ theta
+        self._gain = ca.SX(errors.gains(fixed)) + self._by_gain @ theta
+
+        at = ca.MX.sym("theta", n_free)
+        twists = ca.DM(base) + ca.MX(ca.sparsify(ca.DM(inner))) @ at
+        values, right = ca.MX(12, 0), ca.MX(36, 0)
+        if n_moved:
+            mapped = _moved_placement().map(n_moved)
+            values, right = mapped(ca.reshape(twists, 6, n_moved), ca.DM(errors.nominal.T))
+        nonzeros = _twist_nonzeros(inner, twist_jacobian.sparsity()) @ ca.vec(right)
+        self.function = ca.Function(
+            "error_map", [at], [at, ca.densify(ca.vec(values)), ca.densify(nonzeros)]
+        )
+
+    def actuated(self, commanded: ca.SX) -> ca.SX:
+        """Actual drive coordinates, shape (n_drives,) of commanded ones, [m, rad]."""
+        return self._gain * commanded + self._offset
+
+    def chain(self, by_twists: ca.SX, by_actuated: ca.SX, commanded: ca.SX) -> ca.SX:
+        """Derivative by θ̂ of rows with known derivatives by twists and actuated coordinates."""
+        by_drives = self._by_offset + ca.diag(commanded) @ self._by_gain
+        return by_twists @ self._twist_jacobian + by_actuated @ by_drives
 
 
-def _alternating(square: Array, first: int) -> Array:
-    """Σ (−θ²)^k / (first + 2k)!, enough terms for double precision below SERIES_BELOW."""
-    total = np.zeros_like(square)
-    for k in reversed(range(7)):
-        total = total * -square + 1.0 / math.factorial(first + 2 * k)
-    return total
+def _twist_pattern(inner: Array) -> ca.Sparsity:
+    """Pattern of ∂ξ/∂θ̂: T maps a translation to a translation, a rotation to both."""
+    sizes = np.abs(inner).reshape(-1, 2, 3, inner.shape[1]).sum(axis=2)  # (moved, kind, n)
+    rotates, any_motion = sizes[:, 1] > 0.0, sizes.sum(axis=1) > 0.0
+    pattern = np.repeat(np.stack([any_motion, rotates], axis=1), 3, axis=1).reshape(inner.shape)
+    columns, rows = np.nonzero(pattern.T)
+    n_rows, n_columns = inner.shape
+    return ca.Sparsity.triplet(n_rows, n_columns, rows.tolist(), columns.tolist())
 
 
-def right_jacobian(twists: Array) -> Array:
-    """T with exp6(δ + dδ) = exp6(δ) exp6(T dδ) to first order, shape (..., 6, 6) of (..., 6)."""
-    ad = _small_adjoint(twists)
-    term = np.broadcast_to(np.eye(6), ad.shape)
-    total = np.array(term)
-    for k in range(1, SERIES_TERMS):
-        term = -(term @ ad) / (k + 1)
-        total += term
-        if not term.any() or np.abs(term).max() < 1e-18:
-            break
-    return read_only(total)
+def _twist_nonzeros(inner: Array, pattern: ca.Sparsity) -> ca.MX:
+    """Linear map from all T, stacked, to the nonzeros of T · inner."""
+    rows, columns = (np.array(v, dtype=np.int64) for v in pattern.get_triplet())
+    block, row = rows // 6, rows % 6
+    weights = inner.reshape(-1, 6, inner.shape[1])[block, :, columns]  # (nnz, 6)
+    place = 36 * block[:, None] + 6 * np.arange(6)[None, :] + row[:, None]
+    nonzero, axis = np.nonzero(weights)
+    target = place[nonzero, axis]
+    order = np.lexsort((nonzero, target))  # compressed columns
+    triplet = ca.Sparsity.triplet(rows.size, 6 * inner.shape[0], nonzero.tolist(), target.tolist())
+    return ca.MX(ca.DM(triplet, weights[nonzero, axis][order].tolist()))
 
 
-def _small_adjoint(twists: Array) -> Array:
-    """Ad of twists (v, ω): [[ω, v], [0, ω]] of their cross products, shape (..., 6, 6)."""
-    result = np.zeros((*twists.shape, 6))
-    hat_v, hat_w = _hat(twists[..., :3]), _hat(twists[..., 3:])
-    result[..., :3, :3] = result[..., 3:, 3:] = hat_w
-    result[..., :3, 3:] = hat_v
-    return result
-
-
-def _hat(vectors: Array) -> Array:
-    result = np.zeros((*vectors.shape, 3))
-    x, y, z = (vectors[..., i] for i in range(3))
-    result[..., 0, 1], result[..., 0, 2] = -z, y
-    result[..., 1, 0], result[..., 1, 2] = z, -x
-    result[..., 2, 0], result[..., 2, 1] = -y, x
-    return result
+@lru_cache(maxsize=1)
+def _moved_placement() -> ca.Function:
+    """(twist, nominal placement) to placement · exp6(twist) and T, both by columns."""
+    twist, nominal = ca.SX.sym("twist", 6), ca.SX.sym("nominal", 12)
+    pose = Pose(ca.reshape(nominal[:9], 3, 3), nominal[9:]) * Pose(*exp6(twist))
+    values = ca.vertcat(ca.vec(pose.rotation), pose.position)
+    right = ca.densify(ca.vec(right_jacobian(twist)))
+    return ca.Function("moved_placement", [twist, nominal], [values, right])

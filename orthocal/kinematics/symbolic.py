@@ -1,9 +1,9 @@
-"""Symbolic kinematics (CasADi) of any Pinocchio model, with errors on every placement.
+"""Symbolic kinematics (CasADi) of a Pinocchio model, with errors on every placement.
 
     oM_i = oM_parent · placement_i · exp6(δ_i) · M_i(q)
 
 A pose is a pair (R, p): rotation 3×3 and position 3, as CasADi expressions. All functions are safe
-to differentiate at zero errors and at closed loops: near the identity they take series.
+to differentiate at zero errors and at closed loops (see `se3`).
 """
 
 from __future__ import annotations
@@ -17,19 +17,14 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from orthocal.errors import RobotError
+from orthocal.kinematics.se3 import exp6, log6
 from orthocal.robot.frames import hangs_on
 from orthocal.robot.model import Closure, Robot, joint_axis
-
-SERIES_BELOW = 0.04
-"""Squared angle below which exponential coefficients come from their series, [rad²]."""
-
-SERIES_COSINE = 0.999
-"""Cosine above which logarithm coefficients come from their series."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """A rigid-body pose: maps coordinates of its own frame into the parent's."""
+    """A rigid-body pose: maps coordinates of its frame into the parent's."""
 
     rotation: ca.SX
     """Shape (3, 3)."""
@@ -52,78 +47,6 @@ def constant_pose(placement: pin.SE3) -> Pose:
     rotation[np.abs(rotation) < 1e-15] = 0.0
     position[np.abs(position) < 1e-15] = 0.0
     return Pose(ca.sparsify(ca.SX(rotation)), ca.sparsify(ca.SX(position)))
-
-
-def exp6(twist: ca.SX) -> Pose:
-    """Exponential of a twist (translation v, rotation ω), as Pinocchio's exp6.
-
-        R = I + a [ω] + b [ω]²,  p = v + b ω × v + c ω × (ω × v)
-        a = sin θ/θ,  b = (1 − cos θ)/θ²,  c = (θ − sin θ)/θ³,  θ = |ω|
-
-    Args:
-        twist: Shape (6,), [m, rad].
-    """
-    v, w = twist[:3], twist[3:]
-    if w.is_zero():
-        return Pose(ca.SX.eye(3), v)
-    square = ca.dot(w, w)
-    near = square < SERIES_BELOW
-    safe = ca.if_else(near, 1.0, square)
-    angle = ca.sqrt(safe)
-    # 1/1!, 1/3!, ... ; 1/2!, 1/4!, ... ; 1/3!, 1/5!, ... with alternating signs
-    a = ca.if_else(near, _alternating(square, 1), ca.sin(angle) / angle)
-    b = ca.if_else(near, _alternating(square, 2), (1.0 - ca.cos(angle)) / safe)
-    c = ca.if_else(near, _alternating(square, 3), (angle - ca.sin(angle)) / (safe * angle))
-    hat = ca.skew(w)
-    rotation = ca.SX.eye(3) + a * hat + b * (hat @ hat)
-    if v.is_zero():
-        return Pose(rotation, ca.SX(3, 1))
-    turned = ca.cross(w, v)
-    return Pose(rotation, v + b * turned + c * ca.cross(w, turned))
-
-
-def _alternating(square: ca.SX, first: int) -> ca.SX:
-    """Σ (−θ²)^k / (first + 2k)!, enough terms for double precision below SERIES_BELOW."""
-    from math import factorial
-
-    total = ca.SX(0.0)
-    for k in reversed(range(7)):
-        total = total * -square + 1.0 / factorial(first + 2 * k)
-    return total
-
-
-def log6(pose: Pose) -> ca.SX:
-    """Logarithm of a pose, as Pinocchio's log6: (translation, rotation), shape (6,).
-
-    ω = (θ/sin θ) ½ vee(R − Rᵀ)
-    v = p − ½ ω × p + (1/θ² − (1 + cos θ)/(2 θ sin θ)) ω × (ω × p)
-    """
-    rotation, p = pose.rotation, pose.position
-    half = 0.5 * ca.inv_skew(rotation - rotation.T)
-    cosine = 0.5 * (ca.trace(rotation) - 1.0)
-    sine2 = ca.dot(half, half)
-    near = cosine > SERIES_COSINE
-    safe_sine = ca.sqrt(ca.if_else(near, 1.0, sine2))
-    safe_cosine = ca.if_else(near, 0.0, cosine)
-    angle = ca.atan2(safe_sine, safe_cosine)
-    asin_series = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
-    w = ca.if_else(near, _horner(sine2, asin_series), angle / safe_sine) * half
-    square = ca.dot(w, w)
-    beta_series = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
-    beta = ca.if_else(
-        near,
-        _horner(square, beta_series),
-        1.0 / angle**2 - (1.0 + safe_cosine) / (2.0 * angle * safe_sine),
-    )
-    turned = ca.cross(w, p)
-    return ca.vertcat(p - 0.5 * turned + beta * ca.cross(w, turned), w)
-
-
-def _horner(x: ca.SX, coefficients: tuple[float, ...]) -> ca.SX:
-    total = ca.SX(0.0)
-    for coefficient in reversed(coefficients):
-        total = total * x + coefficient
-    return total
 
 
 def joint_motion(model: pin.Model, joint: int, coordinates: ca.SX) -> Pose:
@@ -170,10 +93,10 @@ class SymbolicTree:
     Args:
         model: The nominal model.
         coordinates: Joint coordinates, shape (nv,): one an unbounded revolute joint.
-        joint_placements: Joint to its placement in its parent's moving frame, where that is not
-            the model's own.
+        joint_placements: Joint to its placement in its parent's moving frame; the model's by
+            default.
         frame_placements: Index of a frame to its placement in the frame that it hangs on (see
-            `hangs_on`), where that is not the model's own.
+            `hangs_on`); the model's by default.
     """
 
     def __init__(
@@ -193,7 +116,7 @@ class SymbolicTree:
         self._frames: dict[int, Pose] = {}
 
     def joint_base(self, joint: int) -> Pose:
-        """Pose of a joint's frame in the world before its own motion: where its errors act."""
+        """Pose of a joint's frame in the world before its motion, in which its errors act."""
         if joint not in self._bases:
             m = self.model
             placement = self._joint_placements.get(joint)
@@ -226,11 +149,11 @@ class SymbolicTree:
 
     def joints_to(self, frame: int) -> list[int]:
         """Joints that move a frame, from it to the base."""
-        joint, found = int(self.model.frames[frame].parentJoint), []
+        joint, joints = int(self.model.frames[frame].parentJoint), []
         while joint > 0:
-            found.append(joint)
+            joints.append(joint)
             joint = int(self.model.parents[joint])
-        return found
+        return joints
 
 
 def nominal_frame_placement(model: pin.Model, frame: int) -> pin.SE3:
@@ -242,7 +165,7 @@ def nominal_frame_placement(model: pin.Model, frame: int) -> pin.SE3:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorExpressions:
-    """Errors of a robot as expressions: twists of placements, and what drives add."""
+    """Errors of a robot as expressions: twists of placements, offsets and gains of drives."""
 
     joint_twists: Mapping[int, ca.SX]
     """Joint to its placement twist δ, shape (6,)."""
@@ -289,8 +212,7 @@ class SymbolicRobot:
         drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
         passive: Passive coordinates, shape (n_passive,), [m, rad].
         errors: Parameter name to expression or number, [unit of the parameter].
-        placements: Placements of joints and of frames (by index) to take instead of those that
-            the errors' twists make.
+        placements: Placements of joints and of frames by index; those of the errors by default.
     """
 
     def __init__(
@@ -305,7 +227,7 @@ class SymbolicRobot:
         self.robot = robot
         expressions = express_errors(robot, errors)
         self.actuated = expressions.gain * drives + expressions.offset
-        """Where the drives really are, shape (n_drives,), [m, rad]."""
+        """Actual drive coordinates, shape (n_drives,), [m, rad]."""
         coordinates = ca.SX(robot.model.nv, 1)
         for i, k in enumerate(robot.drive_index):
             coordinates[int(k)] = self.actuated[i]
@@ -321,10 +243,14 @@ class SymbolicRobot:
         return self.tree.frame_pose(self.robot.frame_id(name))
 
     def closure_error(self, closure: Closure) -> ca.SX:
-        """Pose error of one closure, rows that count: position of b in a, or log6, [m, rad]."""
+        """Constrained rows of a closure's pose error: position of b in a, or log6, [m, rad]."""
         a, b = self.frame_pose(closure.frame_a), self.frame_pose(closure.frame_b)
         relative = a.relative(b)
-        error = relative.position if closure.kind == "3d" else log6(relative)
+        error = (
+            relative.position
+            if closure.kind == "3d"
+            else log6(relative.rotation, relative.position)
+        )
         return error[list(closure.rows)]
 
     def closure_residual(self) -> ca.SX:
@@ -337,11 +263,11 @@ def erroneous_placements(
 ) -> tuple[dict[int, Pose], dict[int, Pose]]:
     """Placement · exp6(δ) of every joint and frame that has an error."""
     joints = {
-        i: constant_pose(model.jointPlacements[i]) * exp6(twist)
+        i: constant_pose(model.jointPlacements[i]) * Pose(*exp6(twist))
         for i, twist in expressions.joint_twists.items()
     }
     frames = {
-        i: constant_pose(nominal_frame_placement(model, i)) * exp6(twist)
+        i: constant_pose(nominal_frame_placement(model, i)) * Pose(*exp6(twist))
         for i, twist in expressions.frame_twists.items()
     }
     return joints, frames

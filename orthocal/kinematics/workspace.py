@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError, RobotError
 from orthocal.io.fields import read_only
-from orthocal.kinematics.function_cache import once_a_robot
+from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.robot.model import Robot
@@ -263,7 +263,7 @@ def find_workspace(robot: Robot, reach: Callable[[Array], object] | None = None)
     return box_workspace(robot, robot.workspace)
 
 
-@once_a_robot(maxsize=8)
+@cached_per_robot(maxsize=8)
 def _default_workspace(robot: Robot) -> Workspace:
     """Largest cube of at most ±60 mm that the nominal machine reaches with room to spare."""
     middle, reach = tool_at_zero(robot), nominal_reach(robot)

@@ -1,4 +1,4 @@
-"""A session's readings as single ones with unknown zeros, and what a machine shows of them."""
+"""Entries of a session: its readings as single ones with gauge zeros."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """Readings as the gauge showed them, one an entry; differences taken apart.
+    """Readings as the gauge showed them, one an entry; differences are split.
 
-    Differences of one setup and cycle that share postures are the same as readings with one
-    unknown zero: their covariance, σ² [[2, 1], [1, 2]] for two differences from one posture, comes
-    out of eliminating it. So every reading here is a single one with standard deviation σ.
+    Differences of one setup and cycle that share postures are equivalent to readings with one free
+    zero: eliminating it gives their covariance, σ² [[2, 1], [1, 2]] for two differences from one
+    posture. So every entry is a single reading with standard deviation σ.
     """
 
     setup: Indices
@@ -27,16 +27,23 @@ class Observations:
     posture: Indices
     """Index of the posture, shape (n,)."""
     zero: Indices
-    """Index of the unknown zero, shape (n,)."""
+    """Index of the gauge zero, shape (n,)."""
     n_zeros: int
     zero_setup: tuple[str, ...]
     """Setup of each zero."""
     zero_real: tuple[bool, ...]
-    """Whether a zero is that of a gauge, not one that stands for differences."""
+    """True for the zero of a gauge, False for one that replaces differences."""
+    zero_known: NDArray[np.bool_]
+    """Mask of the zeros that are known to be 0, shape (n_zeros,)."""
     plus: Indices
     """Entry of each row of the session, shape (n_rows,)."""
     minus: Indices
     """Entry taken off, or -1, shape (n_rows,)."""
+
+    @property
+    def n_free_zeros(self) -> int:
+        """Number of zeros that are estimated."""
+        return self.n_zeros - int(self.zero_known.sum())
 
     @property
     def size(self) -> int:
@@ -44,7 +51,7 @@ class Observations:
         return self.setup.size
 
     def only(self, chosen: NDArray[np.bool_]) -> Observations:
-        """Some of the entries: which setup, posture and zero they have; no rows."""
+        """Some of the entries, without rows."""
         none = np.empty(0, dtype=np.int64)
         return replace(
             self,
@@ -56,7 +63,7 @@ class Observations:
         )
 
     def sum_by_zero(self, values: Array, weights: Array) -> Array:
-        """Weighted sums of those with the same zero, shape (n_zeros, m) of (n, m)."""
+        """Weighted sums of the values with the same zero, shape (n_zeros, m) of (n, m)."""
         order = np.argsort(self.zero, kind="stable")
         starts = np.searchsorted(self.zero[order], np.arange(self.n_zeros))
         result = np.zeros((self.n_zeros, values.shape[1]))
@@ -103,7 +110,7 @@ class Observations:
 
 
 def build_observations(session: Session) -> Observations:
-    """Take a session's readings apart into single ones with unknown zeros."""
+    """Split a session's readings into single ones with gauge zeros."""
     setups = {name: i for i, name in enumerate(session.setups)}
     postures = {name: i for i, name in enumerate(session.postures)}
     entries: list[tuple[int, int, int]] = []
@@ -147,13 +154,20 @@ def build_observations(session: Session) -> Observations:
         n_zeros=len(zeros),
         zero_setup=tuple(zero_setup),
         zero_real=tuple(zero_real),
+        zero_known=np.array(
+            [
+                r and session.setups[s].zero == "known"
+                for s, r in zip(zero_setup, zero_real, strict=True)
+            ],
+            dtype=np.bool_,
+        ),
         plus=np.array(plus, dtype=np.int64),
         minus=np.array(minus, dtype=np.int64),
     )
 
 
 def _difference_groups(session: Session) -> dict[tuple[str, int, str], str]:
-    """Posture of a setup and cycle to a name for all postures that differences join it with."""
+    """Posture of a setup and cycle to a name of its group of differences."""
     leader: dict[tuple[str, int, str], tuple[str, int, str]] = {}
 
     def find(node: tuple[str, int, str]) -> tuple[str, int, str]:

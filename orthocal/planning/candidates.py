@@ -17,9 +17,9 @@ from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.observation.manual_alignment import slopes_by_errors
+from orthocal.observation.contacts import locate_contacts
+from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_frames import locate_contacts
 from orthocal.planning.equipment import Equipment, choose_box, reachable
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.leg_indicator import Direction, LegIndicator, Section
@@ -240,7 +240,7 @@ def _list_aligned(
     for unknown, setups in aligned.items():
         readings = tuple(r for r in session.readings if r.setup in setups)
         views = replace(session, setups=setups, readings=readings)
-        jacobian = slopes_by_errors(views) @ problem.columns
+        jacobian = nominal_sensitivity(views) @ problem.columns
         setup_of = build_observations(views).setup
         for k, name in enumerate(setups):
             index = problem.free.index(f"setup.{name}.{unknown}")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from orthocal.errors import ClosureError, SessionError
 from orthocal.io.documents import read_yaml, validate
 from orthocal.io.fields import read_only
-from orthocal.kinematics.function_cache import once_a_robot
+from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.workspace import require_commanded_tool, tool_at_zero
 from orthocal.measurement.files.schema import GaugeKeys
@@ -88,7 +88,7 @@ class Equipment:
         return setups * self.minutes_a_setup + readings * self.minutes_a_reading
 
 
-@once_a_robot(maxsize=8)
+@cached_per_robot(maxsize=8)
 def find_box(robot: Robot) -> Array:
     """Reach of the tool along each coordinate through the mechanical zero, at most 100 mm.
 

@@ -24,7 +24,6 @@ from orthocal.errors import ClosureError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.selection import Selection
-from orthocal.estimation.solvers.machine_readings import Fleet
 from orthocal.estimation.weighting import split_by_gauge
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity
@@ -178,11 +177,10 @@ class ToolForecast:
         others = self._jacobian_of_others(session)
         noise = noise_of(session) if sigma is None else sigma
         drawn = list(self._draw(problem, entered=entered)) if machines is None else machines
-        fleet = Fleet(problem, np.array(drawn) / problem.theta_scale)
-        closed = fleet.close()
+        _, closed, reached = problem.simulate(np.array(drawn))
 
         def posteriors(part: Iterable[int]) -> list[tuple[Array | None, float]]:
-            passive = [fleet.passive[i] if closed[i] else None for i in range(len(drawn))]
+            passive = [closed[i] if reached[i] else None for i in range(len(drawn))]
             return [
                 self._posterior(problem, others, drawn[i], noise, weight, passive[i]) for i in part
             ]

@@ -16,7 +16,6 @@ from orthocal.assessment.remaining_errors import RemainingError, rank_errors
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, choose
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.kinematics.backend.lanes import expect_many
 from orthocal.kinematics.workspace import Workspace
 from orthocal.measurement.joining import join_sessions
 from orthocal.planning.candidates import (
@@ -157,7 +156,6 @@ def plan_readings(
         SessionError: If the repeatability of the existing readings is unknown.
     """
     say = report or (lambda text: None)
-    expect_many()
     measured = None if measured is None else state_noise(measured)
     equipment = equipment or Equipment()
     chosen = choose(choice, measured, usual=MODEL)

@@ -1,8 +1,7 @@
-"""Readings of sensors as functions: built once for each kind of sensor and the frames it looks at.
+"""Compiled functions of a sensor's reading, one build for each kind of sensor and its frames.
 
-The derivatives by the poses of the frames are those of the sensor's own expression; those of the
-poses follow the geometry of the machine: a frame on which the reading pulls with force f and moment
-m is moved by whatever carries it.
+The derivatives by the poses of the frames are those of the sensor's expression. They act on a frame
+like a force f and a moment m; the derivatives of the poses follow the geometry of the machine.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ from numpy.typing import NDArray
 
 from orthocal.errors import OrthocalError
 from orthocal.kinematics.backend.batch_function import BatchFunction
-from orthocal.kinematics.compiled import compiled_robot
-from orthocal.kinematics.function_cache import identify, kept_function
+from orthocal.kinematics.function_cache import cached_function, function_key, identify
+from orthocal.kinematics.robot_functions import RobotFunctions, robot_functions
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Frames, Sensor, View
@@ -33,43 +32,43 @@ INPUTS = ["actuated", "passive", "placements", "zero", "constants", "unknowns"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompiledReading:
-    """What a kind of sensor shows, and what moves it.
+    """Functions of the reading of one kind of sensor.
 
-    All functions take: actuated and passive coordinates, placements, the drives in the zero
-    posture, constants and unknowns.
+    Their inputs: actuated and passive coordinates, placements, drives in the reference posture,
+    constants and nuisance parameters.
     """
 
     value: BatchFunction
     """h, [m]."""
-    slopes: BatchFunction
-    """h; ∂h by actuated, passive, twists, zero drives and unknowns, each of one row; of that by
-    twists the nonzeros alone."""
+    jacobian: BatchFunction
+    """h; ∂h by actuated, passive, twists, reference drives and nuisance parameters, one row each;
+    the one by twists as nonzeros."""
     expression: ca.Function
-    """The same with sparse rows, to be put into other expressions."""
-    words: str
-    """What distinguishes it from other readings of the robot."""
+    """The same with sparse rows, for use in other expressions."""
+    name: str
+    """Distinguishes it from other readings of the robot."""
     probe: float | None
-    """The expression of a sensor that is not orthocal's own, at some values."""
+    """Value of the expression of a sensor from outside orthocal, at some arguments."""
 
 
 def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
-    """The functions of a sensor; one build for all of its kind that look at the same frames.
+    """The functions of a sensor; one build for all of its kind with the same frames.
 
     Raises:
-        OrthocalError: If its expression is not that of another one of its kind.
+        OrthocalError: If its expression differs from that of another one of its kind.
     """
     pattern = _Pattern(robot, sensor, sensor.frames(robot))
-    found = _compile(pattern)
-    if found.probe is not None and _probe(pattern) != found.probe:
+    reading = _compile(pattern)
+    if reading.probe is not None and _probe(pattern) != reading.probe:
         raise OrthocalError(
             f"the expression of a sensor '{sensor.kind}' depends on more than its frames, "
             "constants and unknowns: what differs between setups belongs into `constants`"
         )
-    return found
+    return reading
 
 
 class _Pattern:
-    """Equal for sensors that have one expression."""
+    """A sensor's expression; equal for sensors with the same one."""
 
     def __init__(self, robot: Robot, sensor: Sensor, frames: Frames) -> None:
         self.robot, self.sensor, self.frames = robot, sensor, frames
@@ -85,8 +84,8 @@ class _Pattern:
         )
 
     @property
-    def words(self) -> str:
-        """What distinguishes it from other patterns of the robot."""
+    def name(self) -> str:
+        """Distinguishes it from other patterns of the robot."""
         return repr(self._key[2:])
 
     @cached_property
@@ -103,9 +102,9 @@ class _Pattern:
 
 @lru_cache(maxsize=64)
 def _source(kind: type[Sensor]) -> str:
-    """A digest of the code of a kind that is not orthocal's own: with it its functions change.
+    """Digest of the code of a sensor from outside orthocal: its functions change with it.
 
-    One whose code is in no file, as in a notebook, has functions of this process alone.
+    A class without a file, as in a notebook, has functions of this process alone.
     """
     if kind.__module__.startswith("orthocal."):
         return ""
@@ -119,16 +118,22 @@ def _source(kind: type[Sensor]) -> str:
 
 @lru_cache(maxsize=256)
 def _compile(pattern: _Pattern) -> CompiledReading:
-    value, slopes = (
-        kept_function(pattern.robot, f"{name} {pattern.words}", partial(build, pattern))
-        for name, build in (("reading", _build_value), ("reading slopes", _build_slopes))
+    value, jacobian = (
+        cached_function(pattern.robot, f"{name} {pattern.name}", partial(build, pattern))
+        for name, build in (("reading", _build_value), ("reading jacobian", _build_jacobian))
     )
-    rows = [name for name in slopes.name_out() if name not in ("h", "by_twists")]
+    rows = [name for name in jacobian.name_out() if name not in ("h", "by_twists")]
+
+    def key(name: str) -> str:
+        return function_key(pattern.robot, f"{name} {pattern.name}")
+
     return CompiledReading(
-        value=BatchFunction(value, shared=["placements"]),
-        slopes=BatchFunction(slopes, shared=["placements"], matrices=rows, sparse=["by_twists"]),
-        expression=slopes,
-        words=pattern.words,
+        value=BatchFunction(value, key=key("reading")),
+        jacobian=BatchFunction(
+            jacobian, matrices=rows, sparse=["by_twists"], key=key("reading jacobian")
+        ),
+        expression=jacobian,
+        name=pattern.name,
         probe=_probe(pattern) if _source(type(pattern.sensor)) else None,
     )
 
@@ -138,40 +143,38 @@ def _build_value(pattern: _Pattern) -> ca.Function:
     return ca.Function("h", inputs, [ca.densify(outputs[0])], INPUTS, ["h"])
 
 
-def _build_slopes(pattern: _Pattern) -> ca.Function:
+def _build_jacobian(pattern: _Pattern) -> ca.Function:
     inputs, outputs = pattern.expressions
     labels = ["h", *(f"by_{n}" for n in ("actuated", "passive", "twists", "zero", "unknowns"))]
-    return ca.Function("slopes", inputs, outputs, INPUTS, labels)
+    return ca.Function("jacobian", inputs, outputs, INPUTS, labels)
 
 
 def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
-    """Inputs and outputs: h; ∂h by actuated, passive, twists, zero drives and unknowns."""
+    """Inputs and outputs: h; ∂h by actuated, passive, twists, reference drives and nuisance."""
     robot, sensor = pattern.robot, pattern.sensor
-    here = compiled_robot(robot)
-    there = here.at_zero
+    here: RobotFunctions = robot_functions(robot)
+    there = here.reference
     constants = ca.SX.sym("constants", pattern.n_constants)
     unknowns = ca.SX.sym("unknowns", len(sensor.unknowns))
     trees = [
         *((here, robot.frame_id(f)) for f in pattern.frames.in_posture),
         *((there, robot.frame_id(f)) for f in pattern.frames.at_zero),
     ]
-    poses, h = _own_expression(pattern, constants, unknowns)
-    pulls = [_pull(h, pose) for pose in poses]
+    poses, h = _sensor_expression(pattern, constants, unknowns)
+    wrenches = [_wrench(h, pose) for pose in poses]
     local = ca.Function(
         "sensor",
         [*(s for pose in poses for s in (pose.rotation, pose.position)), constants, unknowns],
-        [h, *(v for pull in pulls for v in pull), ca.jacobian(h, unknowns)],
+        [h, *(v for wrench in wrenches for v in wrench), ca.jacobian(h, unknowns)],
     )
-    seen = [machine.tree.frame_pose(frame) for machine, frame in trees]
-    found = local(
-        *(s for pose in seen for s in (pose.rotation, pose.position)), constants, unknowns
-    )
-    value, by_unknowns = found[0], found[-1]
+    at = [machine.tree.frame_pose(frame) for machine, frame in trees]
+    values = local(*(s for pose in at for s in (pose.rotation, pose.position)), constants, unknowns)
+    value, by_unknowns = values[0], values[-1]
     n_d, n_p = here.actuated.numel(), here.passive.numel()
     by_actuated, by_passive = ca.SX(1, n_d), ca.SX(1, n_p)
     by_zero, by_twists = ca.SX(1, n_d), ca.SX(1, here.n_twists)
     for i, (machine, frame) in enumerate(trees):
-        force, moment = found[1 + 2 * i], found[2 + 2 * i]
+        force, moment = values[1 + 2 * i], values[2 + 2 * i]
         joints, twists = machine.wrench_row(frame, force=force, moment=moment)
         actuated, passive = machine.split(joints)
         by_twists += twists
@@ -183,10 +186,10 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
     return inputs, [value, by_actuated, by_passive, by_twists, by_zero, by_unknowns]
 
 
-def _own_expression(
+def _sensor_expression(
     pattern: _Pattern, constants: ca.SX, unknowns: ca.SX
 ) -> tuple[list[Pose], ca.SX]:
-    """Symbols of the frames that a sensor looks at, and what it shows of them."""
+    """Symbols of a sensor's frames, and its reading as an expression of them."""
     count = len(pattern.frames.in_posture)
     poses = [
         Pose(ca.SX.sym("rotation", 3, 3), ca.SX.sym("position", 3))
@@ -197,18 +200,18 @@ def _own_expression(
 
 
 def _probe(pattern: _Pattern) -> float:
-    """What a sensor shows for some values: two with one expression show the same."""
+    """Reading of a sensor at fixed arguments: equal for equal expressions."""
     constants = ca.SX.sym("constants", pattern.n_constants)
     unknowns = ca.SX.sym("unknowns", len(pattern.sensor.unknowns))
-    poses, h = _own_expression(pattern, constants, unknowns)
+    poses, h = _sensor_expression(pattern, constants, unknowns)
     symbols = [*(s for pose in poses for s in (pose.rotation, pose.position)), constants, unknowns]
     rng = np.random.default_rng(0)
     values = [ca.DM(rng.uniform(0.1, 1.0, s.shape)) for s in symbols]
     return float(ca.Function("probe", symbols, [h])(*values))
 
 
-def _pull(h: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
-    """Force and moment, in the world, by which a pose moves a reading."""
+def _wrench(h: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
+    """Derivatives of a reading by a pose as force and moment, in the world."""
     force = ca.jacobian(h, pose.position).T
     by_rotation = ca.reshape(ca.jacobian(h, ca.vec(pose.rotation)), 3, 3)
     moment = [ca.dot(by_rotation, ca.skew(ca.SX(np.eye(3)[i])) @ pose.rotation) for i in range(3)]

@@ -1,8 +1,16 @@
-"""The kinds of sensor that a session may name: each is known from here on by its protocol."""
+"""Kinds of sensor that a session may name: packaged, registered, or from installed packages.
+
+A package offers a kind by an entry point of the group `orthocal.sensors`. Its name is the kind, and
+its object is the class:
+
+    [project.entry-points."orthocal.sensors"]
+    tool = "my_package.tool:ToolIndicator"
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from importlib.metadata import entry_points
 from typing import Any
 
 from orthocal.errors import OrthocalError
@@ -14,18 +22,55 @@ from orthocal.sensors.rod_indicator import RodKeys, read_leg
 
 DEFAULT = LegIndicator.kind
 
+GROUP = "orthocal.sensors"
+"""Group of the entry points by which installed packages offer kinds of sensor."""
+
 _KINDS: dict[str, tuple[type[SetupKeys], Callable[[Any], Sensor]]] = {DEFAULT: (RodKeys, read_leg)}
-"""What a document may say of each kind, and what makes a sensor of it."""
+"""Kind to its keys and to the function that builds a sensor from them."""
 
 
 def register_sensor(kind: type[Sensor]) -> None:
-    """Make a kind of sensor known by its name; one that is known already is replaced."""
+    """Register a kind of sensor; it replaces one of the same name."""
     _KINDS[kind.kind] = kind.keys, kind.from_keys
 
 
+def unregister_sensor(kind: str) -> None:
+    """Forget a registered kind of sensor."""
+    _KINDS.pop(kind, None)
+
+
 def sensor_kinds() -> tuple[str, ...]:
-    """Names of the kinds that are known."""
-    return tuple(_KINDS)
+    """Names of all kinds, with those of installed packages."""
+    return tuple(dict.fromkeys([*_KINDS, *(e.name for e in entry_points(group=GROUP))]))
+
+
+def _find_kind(
+    name: object, *, where: str, error: type[OrthocalError]
+) -> tuple[type[SetupKeys], Callable[[Any], Sensor]]:
+    """Keys and builder of a kind; one of an installed package is loaded here.
+
+    Raises:
+        OrthocalError: If the kind is unknown, or its package cannot be loaded.
+    """
+    if isinstance(name, str) and name in _KINDS:
+        return _KINDS[name]
+    offered = [e for e in entry_points(group=GROUP) if e.name == name]
+    if not offered:
+        kinds = ", ".join(sensor_kinds())
+        raise error(f"found {name!r}; expected one of {kinds}", where=where)
+    point = offered[0]
+    package = "" if point.dist is None else f" of package {point.dist.name}"
+    try:
+        kind = point.load()
+        found = kind.keys, kind.from_keys
+        if kind.kind != name or not issubclass(kind.keys, SetupKeys):
+            raise TypeError(f"{point.value} is not a sensor with kind = '{name}' and keys")
+    except Exception as e:  # whatever foreign code raises is this one problem
+        reason = f"{type(e).__name__}: {e}"
+        raise error(
+            f"the sensor '{name}'{package} cannot be loaded: {reason}", where=where
+        ) from None
+    return found
 
 
 def read_setup(
@@ -36,25 +81,20 @@ def read_setup(
     error: type[OrthocalError],
     gauge: Mapping[str, Any] | None = None,
 ) -> tuple[SetupKeys, Sensor]:
-    """What a document says of a setup, and the sensor that stands there.
+    """Keys of a setup and its sensor, from a document.
 
     Args:
         data: Keys and values of the setup.
         where: File, for messages.
         under: Key of the setup in it.
         error: Kind of error.
-        gauge: What its gauge says for all its setups, where a kind of sensor wants to know.
+        gauge: Keys that its gauge states for all its setups.
 
     Raises:
         OrthocalError: Of that kind, naming the key that does not fit.
     """
     name = data.get("sensor", DEFAULT)
-    if not isinstance(name, str) or name not in _KINDS:
-        raise error(
-            f"found {name!r}; expected one of {', '.join(_KINDS)}",
-            where=f"{where}: {under}.sensor",
-        )
-    schema, build = _KINDS[name]
+    schema, build = _find_kind(name, where=f"{where}: {under}.sensor", error=error)
     known = {k: v for k, v in (gauge or {}).items() if k in schema.model_fields}
     data = {**known, **data}
     keys = validate(schema, data, where=where, error=error, under=under)

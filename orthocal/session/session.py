@@ -18,7 +18,7 @@ from orthocal.arguments import require_array
 from orthocal.io.fields import read_only
 from orthocal.io.html import paragraph, table
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import Sensor
+from orthocal.sensors.protocol import GaugeZero, Sensor
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
@@ -76,6 +76,8 @@ class Setup:
     aligned_at: str | None = None
     """Posture in which the operator aligned the gauge; None for the rule of
     `Session.alignment_postures`."""
+    zero: GaugeZero = "free"
+    """Gauge zero: estimated from the setup's readings, or known to be 0 (absolute readings)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,6 +95,8 @@ class Reading:
     """Line in the CSV, for messages."""
     file: Path | None = None
     """The CSV; that of the session where not given."""
+    zero: GaugeZero = "free"
+    """Gauge zero: estimated from the setup's readings, or known to be 0 (absolute readings)."""
 
     @property
     def label(self) -> str:

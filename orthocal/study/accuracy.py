@@ -22,7 +22,7 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import (
     FEWEST_ALIGNED,
     Workspace,
@@ -43,7 +43,6 @@ from orthocal.session.session import Session
 from orthocal.study.batch import (
     columns_in_edge_units,
     estimate_batch,
-    predict_batch,
     tool_positions,
 )
 from orthocal.study.portable_session import PortableSession
@@ -169,7 +168,7 @@ class AccuracyStudy(Study):
         truth, n = prepared.truth, prepared.truth.n_machine
         drawn, _ = self.draw(prepared, number)
         scaled = drawn * truth.theta_scale
-        errors = truth.assembly.errors(scaled[:n])
+        errors = truth.closure.errors(scaled[:n])
         return np.append(prepared.identified_part(errors[None])[0], scaled[n:])
 
 
@@ -206,8 +205,8 @@ class _Prepared:
         robot = session.robot
         problem = weigh_readings(CalibrationProblem(session, study.choice.select(robot.parameters)))
         workspace = gauss_box(robot, study.box)
-        assembly = Assembly(robot)
-        nominal = assembly.inverse(workspace.points)
+        closure = LoopClosure(robot)
+        nominal = closure.inverse(workspace.points)
         drives = nominal - session.active_offsets
         limits = [limits_of(session, r) or (-np.inf, np.inf) for r in session.readings]
         prepared = cls(
@@ -217,27 +216,18 @@ class _Prepared:
             program=BatchProgram(problem),
             workspace=workspace,
             drives=drives,
-            passive=assembly.close(drives),
-            positions=assembly.tcp(nominal, assembly.close(nominal)),
+            passive=closure.close(drives),
+            positions=closure.tcp(nominal, closure.close(nominal)),
             limits=np.array(limits).T,
             sigma=noise_of(session),
         )
-        prepared = replace(prepared, sigma=_weighting_sigma(study, prepared))
-        sample = np.zeros((0, problem.observations.size))
-        if prepared.program.takes_values:
-            numbers = range(min(study.cases_per_task, study.machines))
-            measured = prepared.measure(study, numbers)
-            sample = measured.values[measured.status == CALIBRATED]
-            if not len(sample):
-                return prepared
-        program = prepared.program.fixed_by(sample, sigma=prepared.sigma, count=study.machines)
-        return replace(prepared, program=program)
+        return replace(prepared, sigma=_weighting_sigma(study, prepared))
 
     def measure(self, study: AccuracyStudy, numbers: Sequence[int]) -> _Measured:
         """Random machines and their readings."""
         draws, generators = zip(*(study.draw(self, n) for n in numbers), strict=True)
         theta, o, truth = np.array(draws), self.problem.observations, self.truth
-        predicted, closed = predict_batch(truth, theta)
+        predicted, _, closed = truth.simulate(theta * truth.theta_scale)
         status = np.where(closed, CALIBRATED, NOT_ASSEMBLED).astype(object)
         entries = predicted * self.problem.noise
         for i, rng in enumerate(generators):
@@ -246,7 +236,7 @@ class _Prepared:
         rows = np.array([o.rows(v) for v in entries])
         beyond = (rows < self.limits[0]) | (rows > self.limits[1])
         _set_reason(status, np.asarray(beyond.any(axis=1)), OUT_OF_RANGE)
-        errors = truth.assembly.errors() + theta[:, : truth.n_machine] @ truth.columns.T
+        errors = truth.closure.errors() + theta[:, : truth.n_machine] @ truth.columns.T
         return _Measured(errors, entries / self.problem.noise, rows, status)
 
     def tool_errors(
@@ -260,8 +250,8 @@ class _Prepared:
             status: Changed where the loops of a machine do not close.
         """
         names = self.problem.machine_selection.names
-        columns = self.problem.compiled.errors.columns(names)
-        estimated = self.problem.assembly.errors() + theta[:, : len(names)] @ columns.T
+        columns = self.problem.functions.errors.columns(names)
+        estimated = self.problem.closure.errors() + theta[:, : len(names)] @ columns.T
         good = np.flatnonzero(status == CALIBRATED)
         tools = np.full((2, *self.positions.shape, len(status)), np.nan)
         for tool, errors in zip(tools, (true, estimated), strict=True):
@@ -282,7 +272,7 @@ class _Prepared:
         Args:
             errors: All elementary errors, shape (n_sets, n_errors), [SI].
         """
-        columns = self.problem.compiled.errors.columns(self.problem.machine_selection.names)
+        columns = self.problem.functions.errors.columns(self.problem.machine_selection.names)
         return np.asarray(errors @ (columns / (columns**2).sum(axis=0)))
 
     def align(self, field: Array) -> Array:
@@ -399,7 +389,7 @@ def _weighting_sigma(study: AccuracyStudy, p: _Prepared) -> float:
     It is the stated noise, unless machines have errors that are not identified. Then the residuals
     give it, as in a calibration: the median of a few pilot machines.
     """
-    columns = p.problem.compiled.errors.columns(p.problem.machine_selection.names)
+    columns = p.problem.functions.errors.columns(p.problem.machine_selection.names)
     projector = columns @ np.linalg.pinv(columns)
     if np.allclose(projector @ p.truth.columns, p.truth.columns, atol=1e-12):
         return p.sigma

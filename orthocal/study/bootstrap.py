@@ -8,7 +8,7 @@ not their total uncertainty.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -100,7 +100,7 @@ class _Prepared:
         session = study.session.unpack()
         problem = CalibrationProblem(session, study.choice.select(session.robot.parameters))
         fit = fit_problem(problem, options=SolverOptions(solver="eliminated"))
-        prepared = cls(
+        return cls(
             fit=fit,
             values=problem.values,
             fitted=fit.prediction,
@@ -108,9 +108,6 @@ class _Prepared:
             cycles=find_cycles(session, problem.observations) if study.by == "cycles" else (),
             program=BatchProgram(problem, options=fit.program.options),
         )
-        sample = prepared.draw_each(study, study.case_numbers(0))
-        program = prepared.program.fixed_by(sample, sigma=fit.sigma, count=study.draws)
-        return replace(prepared, program=program)
 
     def draw_each(self, study: BootstrapStudy, numbers: Sequence[int]) -> Array:
         """Readings of these draws, shape (n_draws, n_entries), [m of the first gauge]."""

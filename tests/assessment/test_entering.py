@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import plans
 import pytest
-from fleets import Fleet
+from drawn_machines import DrawnMachines
 from machines import write_orthoglide
 
 from orthocal import Choice, calibrate, decide, load_plan, simulate_session, summarize
@@ -46,8 +46,8 @@ def test_offsets_alone_are_entered_as_they_are(root):
 
 def test_offsets_are_chosen_by_least_error_at_the_tool(quarter):
     """No offsets nearby leave less; the gain is how the choice follows from the parameters."""
-    fleet = Fleet(quarter)
-    errors = fleet.machine.split_errors(fleet.draw(np.random.default_rng(1)))
+    machines = DrawnMachines(quarter)
+    errors = machines.machine.split_errors(machines.draw(np.random.default_rng(1)))
     result = calibrate(simulate_session(quarter, errors, seed=1).session, "full")
     tool = find_tool(result)
     space = tool.workspace
@@ -77,11 +77,11 @@ def test_offsets_are_chosen_by_least_error_at_the_tool(quarter):
 def test_what_is_promised_with_the_offsets_entered_is_kept(quarter):
     """Ten machines of 250 mm with all errors at tolerance: chosen offsets of the full model leave
     less than its identified ones and than those of offsets alone, and what was said."""
-    fleet = Fleet(quarter)
+    machines = DrawnMachines(quarter)
     left = {"chosen": [], "identified": [], "offsets": [], "promised": []}
     for seed in range(10):
-        drawn = fleet.draw(np.random.default_rng(100 + seed))
-        errors = fleet.machine.split_errors(drawn)
+        drawn = machines.draw(np.random.default_rng(100 + seed))
+        errors = machines.machine.split_errors(drawn)
         session = simulate_session(quarter, errors, seed=seed).session
         full, alone = (calibrate(session, m, solver="eliminated") for m in ("full", "offsets"))
         space = find_tool(alone).workspace

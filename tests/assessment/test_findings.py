@@ -9,7 +9,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from fleets import Fleet
+from drawn_machines import DrawnMachines
 from gauges import exact
 
 from orthocal import (
@@ -285,11 +285,11 @@ def test_what_a_bound_holds_and_what_is_not_stated_is_found(table1):
 @pytest.mark.parametrize("seed", range(3))
 def test_sound_machines_are_never_accused(plan, seed):
     """Before their offsets were entered and, with all other errors as they are, after."""
-    fleet = Fleet(plan)
-    drawn = fleet.draw(np.random.default_rng(70 + seed))
+    machines = DrawnMachines(plan)
+    drawn = machines.draw(np.random.default_rng(70 + seed))
     for scale in (1.0, 0.0):
-        values = np.where(fleet.is_offset, scale * drawn, drawn)
-        errors = fleet.machine.split_errors(values)
+        values = np.where(machines.is_offset, scale * drawn, drawn)
+        errors = machines.machine.split_errors(values)
         session = simulate_session(plan, errors, seed=seed).session
         for model in ("offsets", "full"):
             found = decide(calibrate(session, model))

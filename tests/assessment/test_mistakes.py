@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fleets import Fleet
+from drawn_machines import DrawnMachines
 
 from orthocal import (
     Choice,
@@ -27,12 +27,12 @@ def plan(root):
 @pytest.fixture(scope="module")
 def machines(plan):
     """Errors of three machines with all errors at tolerance, and what was identified of each."""
-    fleet, found = Fleet(plan), []
+    machines, found = DrawnMachines(plan), []
     for seed in range(3):
-        drawn = fleet.draw(np.random.default_rng(40 + seed))
+        drawn = machines.draw(np.random.default_rng(40 + seed))
         # offsets that differ clearly between the drives
-        drawn[fleet.is_offset] = np.roll([1.4e-3, -0.9e-3, 0.7e-3], seed)
-        errors = fleet.machine.split_errors(drawn)
+        drawn[machines.is_offset] = np.roll([1.4e-3, -0.9e-3, 0.7e-3], seed)
+        errors = machines.machine.split_errors(drawn)
         session = simulate_session(plan, errors, seed=seed).session
         found.append((errors, calibrate(session, solver="eliminated")))
     return found

@@ -11,8 +11,8 @@ from tolerances import KINEMATICS
 from orthocal import load_plan
 from orthocal.errors import ParameterError, RobotError
 from orthocal.estimation.problem import build_problem
-from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_frames import predict_entries
+from orthocal.estimation.solvers.symbolic_problem import SymbolicProblem
+from orthocal.observation.model import predict_readings
 
 
 @pytest.fixture(scope="module")
@@ -52,11 +52,8 @@ def test_frames_and_scales_can_be_freed_too(plan):
 def test_predictions_are_those_of_the_observation_model(plan):
     problem = build_problem(plan, model="full")
     theta = 2.0 * np.random.default_rng(3).normal(size=problem.n_free) * problem.theta_scale
-    entries = predict_entries(
-        plan,
-        build_observations(plan),
-        problem.split_errors(theta),
-        unknowns=theta[problem.n_machine :],
+    entries = predict_readings(
+        plan, problem.split_errors(theta), nuisance=theta[problem.n_machine :]
     )
     assert np.abs(problem.predict(theta) - entries).max() < KINEMATICS * 10
 
@@ -65,7 +62,7 @@ def test_known_values_are_held(plan):
     fixed = {"x_leg.length": 0.3e-3, "x_slide.offset": 1e-3}
     problem = build_problem(plan, model="lengths", known=fixed)
     assert "x_slide.offset" not in problem.free
-    entries = predict_entries(plan, build_observations(plan), fixed)
+    entries = predict_readings(plan, fixed)
     assert np.abs(problem.predict(np.zeros(problem.n_free)) - entries).max() < KINEMATICS * 10
 
 
@@ -81,7 +78,7 @@ def test_readings_depend_on_few_variables(plan):
     """A reading knows its own leg only: this is what makes large problems fast."""
     problem = build_problem(plan, model="full")
     setups = list(plan.setups.values())
-    for piece in problem.reading_pieces:
+    for piece in SymbolicProblem(problem).readings:
         (leg,) = {setups[i].sensor.leg for i in problem.observations.setup[piece.entries]}
         assert piece.passive_index.size == 3
         assert piece.theta_index.size == 21

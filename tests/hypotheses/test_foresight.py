@@ -10,13 +10,12 @@ from gauges import exact
 
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.machine_readings import Fleet
 from orthocal.hypotheses.prediction import ZERO, build_foresight
 from orthocal.measurement.files.session_file import load_plan
 from orthocal.measurement.recording.anomalies import find_oddities, name_slip
 from orthocal.measurement.recording.recording import Row
+from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_frames import predict_entries
 from orthocal.observation.simulate import draw_errors, limits_of, show_readings
 from orthocal.session.session import Gauge
 from orthocal.units import MM
@@ -42,8 +41,8 @@ def clean(plan, count, seed):
     """Readings of machines within their tolerances that a dial can show."""
     problem = build_problem(plan, free=machine_errors(plan.robot), prior=True)
     theta = np.random.default_rng(seed).normal(size=(count, problem.n_free))
-    fleet, o = Fleet(problem, problem.reference / problem.theta_scale + theta), problem.observations
-    closed, entries = fleet.close(), fleet.predict()
+    o = problem.observations
+    entries, _, closed = problem.simulate(problem.reference + theta * problem.theta_scale)
     limits = [limits_of(plan, r) for r in plan.readings]
     for k in np.flatnonzero(closed & np.isfinite(entries).all(axis=1)).tolist():
         rng = np.random.default_rng((seed, k))
@@ -148,7 +147,7 @@ def test_readings_scatter_as_they_are_expected_to(plans, foresights):
     drawn = []
     for seed in range(n):
         own = draw_errors(plan.robot, names, seed=seed)
-        h = predict_entries(exact(plan), o, own)
+        h = predict_readings(exact(plan), own, observations=o)
         drawn.append([h[i + 1] - h[i] for i in range(0, 18, 3)])
     spread = np.nanstd(np.array(drawn), axis=0)
     rows = rows_of(plan)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import plans
 import pytest
-from fleets import Fleet
+from drawn_machines import DrawnMachines
 from folders import session_folder
 from gauges import exact
 from machines import write_orthoglide
@@ -77,26 +77,26 @@ def raw_plan(root):
 
 
 @pytest.fixture(scope="module")
-def fleet(raw_plan):
-    return Fleet(raw_plan)
+def machines(raw_plan):
+    return DrawnMachines(raw_plan)
 
 
-def accused(fleet, fit):
-    name, evidence, _ = weigh_signs(fit, fleet.others)
+def accused(machines, fit):
+    name, evidence, _ = weigh_signs(fit, machines.others)
     return name if evidence > CLEARLY else None
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("level", "found"), [(0.0, 59), (0.3, 59), (1.0, 56), (3.0, 49)])
-def test_turned_setups_are_found_among_sixty_machines(fleet, level, found):
+def test_turned_setups_are_found_among_sixty_machines(machines, level, found):
     """Offsets within their tolerances, all other errors so many times theirs."""
-    o, names, count = fleet.problem.observations, list(fleet.plan.setups), 0
+    o, names, count = machines.problem.observations, list(machines.plan.setups), 0
     for machine in range(60):
         rng = np.random.default_rng(machine)
-        values = fleet.read(rng, fleet.draw(rng, level=level))
+        values = machines.read(rng, machines.draw(rng, level=level))
         setup = machine % len(names)
-        fit = fleet.fit(np.where(o.setup == setup, -values, values))
-        name = accused(fleet, fit)
+        fit = machines.fit(np.where(o.setup == setup, -values, values))
+        name = accused(machines, fit)
         assert name in (None, names[setup]) or level > 1.0
         count += name == names[setup]
     assert count >= found
@@ -125,18 +125,18 @@ def dense_plan(tmp_path_factory, length=None, plan=plans.paper):
     ],
 )
 def test_nobody_is_accused_whose_offsets_were_entered(
-    fleet, raw_plan, tmp_path_factory, kind, model, count
+    machines, raw_plan, tmp_path_factory, kind, model, count
 ):
     """200 machines with errors of 0.3, 1 and 3 tolerances, measured before and after entering."""
     if kind == "cycles":
-        own = fleet if model == "offsets" else Fleet(raw_plan, model=model)
+        own = machines if model == "offsets" else DrawnMachines(raw_plan, model=model)
     elif kind == "sweep":
-        own = Fleet(dense_plan(tmp_path_factory, plan=plans.sweep), model=model)
+        own = DrawnMachines(dense_plan(tmp_path_factory, plan=plans.sweep), model=model)
     else:
         length = float(kind.split()[0]) * 1e-3
         scaled = {k: v * length / 0.31025 for k, v in {"max": 60.0, "min": -100.0}.items()}
         paper = lambda: plans.paper(**scaled)  # noqa: E731
-        own = Fleet(dense_plan(tmp_path_factory, length, paper), model=model)
+        own = DrawnMachines(dense_plan(tmp_path_factory, length, paper), model=model)
     for machine in range(count):
         rng = np.random.default_rng(7000 + machine)
         errors = own.draw(rng, level=(0.3, 1.0, 3.0)[machine % 3])
@@ -147,10 +147,10 @@ def test_nobody_is_accused_whose_offsets_were_entered(
 
 
 def test_the_main_loop_walked_twice_accuses_nobody(raw_plan):
-    """Through sessions, with the entered offsets stated: what the fleet takes a short way to."""
-    fleet = Fleet(raw_plan)
+    """Through sessions, with the entered offsets stated: what the machines takes a short way to."""
+    machines = DrawnMachines(raw_plan)
     rng = np.random.default_rng(3)
-    errors = fleet.machine.split_errors(fleet.draw(rng))
+    errors = machines.machine.split_errors(machines.draw(rng))
     first = calibrate(simulate_session(raw_plan, errors, seed=1).session)
     assert first.turned is None
     offsets = np.array([first[f"{d.name}.offset"].value for d in raw_plan.robot.drives])
@@ -159,7 +159,7 @@ def test_the_main_loop_walked_twice_accuses_nobody(raw_plan):
     second = calibrate(session)
     assert second.turned is None
     assert second.rms_before < 1.5 * first.rms_after
-    short = fleet.fit(session.values)
+    short = machines.fit(session.values)
     entered = fit_problem(build_problem(session))
     np.testing.assert_allclose(
         short.solution.theta[:3] + offsets, entered.solution.theta[:3], rtol=0.0, atol=1e-9

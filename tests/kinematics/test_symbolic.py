@@ -13,12 +13,9 @@ from orthocal import load_robot
 from orthocal.errors import RobotError
 from orthocal.kinematics.symbolic import (
     ErrorExpressions,
-    Pose,
     SymbolicRobot,
     SymbolicTree,
     erroneous_placements,
-    exp6,
-    log6,
 )
 from orthocal.robot.frames import find_frame, place_frames
 from orthocal.robot.urdf import load_urdf
@@ -155,45 +152,6 @@ def test_error_derivatives_equal_pinocchios_kinematic_regressor(orthoglide):
         axis=1,
     )
     assert np.abs(np.vstack([linear, angular]) - theirs).max() < KINEMATICS
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-4, 0.03, 0.0447, 0.045, 0.19, 0.21, 1.0, 3.0])
-def test_exp6_and_log6_equal_pinocchios_and_undo_each_other(angle):
-    rng = np.random.default_rng(2)
-    twist = ca.SX.sym("twist", 6)
-    pose = exp6(twist)
-    forward = ca.Function("f", [twist], [pose.rotation, pose.position])
-    back = ca.Function("g", [twist], [log6(pose)])
-    axis = rng.normal(size=3)
-    xi = np.r_[rng.normal(size=3), angle * axis / np.linalg.norm(axis)]
-    rotation, position = (np.asarray(v) for v in forward(xi))
-    theirs = pin.exp6(xi)
-    assert np.abs(rotation - theirs.rotation).max() < KINEMATICS
-    assert np.abs(position.ravel() - theirs.translation).max() < KINEMATICS
-    # near half a turn the logarithm itself is ill-conditioned
-    slack = KINEMATICS * (1.0 if angle < 2.0 else 100.0)
-    assert np.abs(np.asarray(back(xi)).ravel() - xi).max() < slack
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-8, 0.0447, 0.045, 0.2, 1.0])
-def test_exp6_and_log6_have_exact_first_and_second_derivatives(angle):
-    twist = ca.SX.sym("twist", 6)
-    pose = exp6(twist)
-    weights = np.random.default_rng(4).normal(size=18)
-    relative = Pose(pose.rotation, pose.position) * Pose(
-        ca.SX(pin.exp3(np.full(3, 0.01))), ca.SX(3, 1)
-    )
-    outputs = ca.vertcat(ca.vec(pose.rotation), pose.position, log6(relative))
-    scalar = ca.dot(weights, outputs)
-    hessian, gradient = ca.hessian(scalar, twist)
-    value, first, second = (
-        ca.Function(n, [twist], [e]) for n, e in (("v", scalar), ("g", gradient), ("h", hessian))
-    )
-    xi = np.r_[0.3, -0.2, 0.5, angle * np.array([0.36, 0.48, 0.8])]
-    assert_derivative(
-        np.asarray(first(xi)).reshape(1, 6), lambda u: np.asarray(value(u)).ravel(), xi
-    )
-    assert_derivative(np.asarray(second(xi)), lambda u: np.asarray(first(u)).ravel(), xi)
 
 
 @pytest.mark.parametrize("robot", ["orthoglide", "fivebar", "biglide"])

@@ -14,7 +14,7 @@ from orthocal.errors import SessionError
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
-from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
@@ -102,7 +102,7 @@ def test_noise_is_told_for_each_session(root):
         assert abs(q.value - p.value) < 0.5 * p.std
     # were both to count alike, the coarse one would decide
     same = build_problem(join_sessions([coarse, fine]))
-    alike = EliminatedProgram(same).solve(sigma=1e-5).theta
+    alike = VariableProjection(same).solve(sigma=1e-5).theta
     assert np.abs(alike - [p.value for p in found.free]).max() > found.free[0].std
 
 
@@ -139,7 +139,7 @@ def test_both_solvers_weigh_gauges_alike(root):
         from orthocal.estimation.loss import Loss
 
         options = SolverOptions(loss=Loss(loss))
-        ours = EliminatedProgram(problem, options=options).solve(sigma=2e-5)
+        ours = VariableProjection(problem, options=options).solve(sigma=2e-5)
         for hessian in ("gauss-newton", "exact"):
             given = replace(options, hessian=hessian)
             ipopts = NonlinearProgram(problem, options=given).solve(sigma=2e-5)

@@ -23,7 +23,6 @@ from orthocal import (
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.estimation.solvers.machine_readings import Fleet
 from orthocal.kinematics.loop_closure import Assembly
 from orthocal.kinematics.workspace import cube, find_workspace
 from orthocal.measurement.files.write_session import write_session
@@ -116,10 +115,9 @@ def simulate_tool_error(plan, workspace, *, machines):
         own = rng.normal(size=problem.n_free - problem.n_machine)
         truths.append([*(drawn[n] for n in names), *(own * problem.theta_scale[len(names) :])])
     theta = np.array(truths)
-    fleet = Fleet(problem, theta / problem.theta_scale)
-    assert fleet.close().all()
     sigma = float(np.hypot(5e-6, 10e-6 / np.sqrt(12.0)))
-    values = fleet.predict()
+    values, _, reached = problem.simulate(theta)
+    assert reached.all()
     values = values + sigma * rng.normal(size=values.shape)
     found = BatchProgram(problem).solve(values, sigma=sigma).theta
     drives = Assembly(robot).inverse(workspace.points)

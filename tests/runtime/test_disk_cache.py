@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import load_afresh
 
-from orthocal.kinematics.compiled import CompiledRobot
+from orthocal.kinematics.robot_functions import CompiledRobot
 from orthocal.robot import urdf
 from orthocal.runtime import disk_cache as cache
 

@@ -23,11 +23,11 @@ from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
-from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
+from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_frames import predict_entries
 from orthocal.observation.simulate import draw_errors
 from orthocal.output.report.page import build_report
 from orthocal.sensors import registry
@@ -75,7 +75,7 @@ def plan(tmp_path):
 
 def test_its_readings_are_those_of_the_tool(plan):
     o = build_observations(plan)
-    found = predict_entries(plan, o, TRUTH, unknowns=np.array([1e-3, -2e-3]))
+    found = predict_readings(plan, TRUTH, observations=o, nuisance=np.array([1e-3, -2e-3]))
     from orthocal.kinematics.loop_closure import Assembly
 
     drives = np.array([p.drives for p in plan.postures.values()])
@@ -142,7 +142,7 @@ def test_both_solvers_find_one_optimum(plan, model, hessian):
     session = simulate_session(plan, TRUTH, seed=1).session
     problem = build_problem(session, model=model)
     given = {"sigma": 2e-6}
-    ours = EliminatedProgram(problem).solve(**given)
+    ours = VariableProjection(problem).solve(**given)
     ipopts = NonlinearProgram(problem, options=SolverOptions(hessian=hessian)).solve(**given)
     assert ours.theta.size == problem.n_machine + 2
     assert np.abs(ours.theta - ipopts.theta).max() < SAME_OPTIMUM
@@ -221,8 +221,8 @@ import numpy as np, orthocal, own
 from orthocal.sensors.compiled import compile_reading
 robot = orthocal.load_robot("orthoglide")
 value = compile_reading(robot, own.Own("x", 1e-3, None)).value
-from orthocal.kinematics.compiled import compiled_robot
-errors = compiled_robot(robot).errors
+from orthocal.kinematics.robot_functions import robot_functions
+errors = robot_functions(robot).errors
 zero = errors.placements(np.zeros(len(errors.names)))
 h, = value(robot.drive_zero[None] + 0.01, robot.zero[robot.passive_index][None], zero,
            robot.drive_zero[None], np.array([[1.0, 0.0, 0.0]]), np.zeros((1, 1)))

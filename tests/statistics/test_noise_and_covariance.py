@@ -14,9 +14,8 @@ from orthocal import calibrate, load_plan
 from orthocal.errors import NotIdentifiableError
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.estimation.solvers.machine_readings import Fleet
+from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import Observations, build_observations
-from orthocal.observation.sensor_frames import predict_entries
 from orthocal.statistics.chance import chance_of_excess, confidence_factor
 from orthocal.statistics.information import Information, decompose, marginalise
 from orthocal.statistics.noise import KnownNoise, Noise, estimate_noise, estimate_repeatability
@@ -28,7 +27,8 @@ def observations(setup, posture, zero):
     s, p, z = (np.array(v, dtype=np.int64) for v in (setup, posture, zero))
     n = int(z.max()) + 1
     rows = np.arange(len(s))
-    return Observations(s, p, z, n, ("s",) * n, (True,) * n, rows, np.full(len(s), -1))
+    known = np.zeros(n, dtype=np.bool_)
+    return Observations(s, p, z, n, ("s",) * n, (True,) * n, known, rows, np.full(len(s), -1))
 
 
 def test_covariance_of_a_line_solved_by_hand():
@@ -68,7 +68,7 @@ def test_repeatability_of_differences_is_that_of_one_reading(root):
     rows = [replace(r, minus="zero") for r in plan.readings if r.posture != "zero"]
     plan = replace(plan, readings=tuple(rows))
     o = build_observations(plan)
-    entries = predict_entries(plan, o, TRUTH)
+    entries = predict_readings(plan, TRUTH, observations=o)
     rng = np.random.default_rng(0)
     found = []
     for _ in range(60):
@@ -155,15 +155,14 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations(root, model
     rng = np.random.default_rng(0)
     # as the prior says, where there is one
     truths = rng.normal(size=(300, problem.n_free))
-    machines = Fleet(problem, truths)
-    assert machines.close().all()
-    entries = machines.predict()
+    entries, _, reached = problem.simulate(truths * problem.theta_scale)
+    assert reached.all()
     measured = entries + sigma * rng.normal(size=entries.shape)
     solved = BatchProgram(problem).solve(measured, sigma=sigma)
-    found = Fleet(problem, solved.theta / problem.theta_scale)
-    assert found.close().all()
+    _, found, reached = problem.simulate(solved.theta)
+    assert reached.all()
     whitened = []
-    for truth, theta, passive in zip(truths, solved.theta, found.passive, strict=True):
+    for truth, theta, passive in zip(truths, solved.theta, found, strict=True):
         _, jacobian = problem.linearise(theta, passive)
         covariance = decompose(jacobian, problem.observations).covariance(
             sigma=sigma, precision=problem.prior_precision

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from orthocal.estimation.diagnostics.unmodelled import OtherErrors, error_slopes, machine_errors
 from orthocal.estimation.fit import Fit
 from orthocal.io.fields import read_only
-from orthocal.kinematics.function_cache import once_a_robot
+from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.robot.frames import find_frame
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError, Parameter
@@ -117,7 +117,7 @@ def gather_columns(fit: Fit, others: OtherErrors) -> Columns:
     )
 
 
-@once_a_robot(maxsize=8)
+@cached_per_robot(maxsize=8)
 def list_suspects(robot: Robot) -> tuple[Suspect, ...]:
     """All errors of a machine, drives' offsets and the sums that its YAML names first."""
     parameters, joints = robot.parameters, _joints_of_legs(robot)

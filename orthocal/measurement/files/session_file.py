@@ -30,10 +30,10 @@ from orthocal.measurement.files.readings_checks import check_readings
 from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
 from orthocal.measurement.files.session_robot import build_offsets, require_given_zero
-from orthocal.observation.sensor_frames import locate_contacts
+from orthocal.observation.contacts import locate_contacts
 from orthocal.robot.loading import load_robot
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import Sensor, SetupKeys, Unknown
+from orthocal.sensors.protocol import Sensor, SetupKeys, Unknown, default_zero
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge, Posture, Purpose, Reading, Session, Setup
 from orthocal.units import DRIVE_UNITS, MM
@@ -275,8 +275,8 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
                 f"'{setup.aligned_at}' is not a posture; postures: {', '.join(keys.postures)}",
                 where=f"{where}.aligned_at",
             )
-        gauge = _gauge_of(setup, gauges, where)
-        setups[name] = Setup(name, sensor, gauge, aligned_at=setup.aligned_at)
+        gauge, zero = _gauge_of(setup, gauges, where), setup.zero or default_zero(sensor)
+        setups[name] = Setup(name, sensor, gauge, zero=zero, aligned_at=setup.aligned_at)
     _check_shared(setups, str(file))
     _check_planned_postures(file, keys, read)
     return Session(

@@ -13,6 +13,7 @@ import yaml
 
 from orthocal.io.files import write_files
 from orthocal.robot.loading import packaged_robots
+from orthocal.sensors.protocol import default_zero
 from orthocal.sensors.registry import write_sensor
 from orthocal.session.session import Gauge, Purpose, Reading, Session
 from orthocal.units import MM, tidy, to_mm
@@ -49,6 +50,7 @@ def session_document(session: Session, *, readings: str = "readings.csv") -> dic
             **write_sensor(s.sensor),
             **({"gauge": s.gauge} if s.gauge else {}),
             "aligned_at": aligned_at[s.name],
+            **({"zero": s.zero} if s.zero != default_zero(s.sensor) else {}),
         }
         for s in session.setups.values()
     }

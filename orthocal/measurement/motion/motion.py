@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.errors import ClosureError, SessionError
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_assembly
 from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.observation.contacts import locate_contacts
+from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations, drive_table
-from orthocal.observation.sensor_frames import locate_contacts, predict_entries
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Contact
 from orthocal.session.session import Posture, Reading, Session
@@ -292,7 +293,9 @@ def _predict(
         readings=tuple(Reading(setup, n, None, 1, 0.0, None) for n in names),
     )
     observations = build_observations(sampled)
-    predicted = observations.rows(predict_entries(sampled, observations, passive=passive))
+    predicted = observations.rows(
+        predict_readings(sampled, observations=observations, passive=passive)
+    )
     _, contact = locate_contacts(sampled)[setup]
     ends = np.cumsum([len(path.points) for path in paths]).tolist()
     relative = predicted - predicted[ends[0] - 1]

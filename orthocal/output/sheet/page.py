@@ -12,7 +12,7 @@ from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.measurement.motion.motion import SetupMotion, Stop, plan_motion, shown_joints
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
-from orthocal.observation.sensor_frames import locate_contacts
+from orthocal.observation.contacts import locate_contacts
 from orthocal.output.sheet.gauge_position import (
     ABOUT_ALONG,
     GaugePosition,

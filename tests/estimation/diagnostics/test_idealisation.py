@@ -36,7 +36,7 @@ def test_a_rod_differs_from_the_line_as_placements_say(raw_cycles):
         plus, minus = (difference(robot.with_errors({name: s * step})) for s in (1.0, -1.0))
         total += ((plus - minus) / 0.2) ** 2
     found = find_idealised(raw_cycles)
-    assert (found.setup[0], found.touches) in {("y", "a"), ("x", "a")}
+    assert (found.setup[0], found.touches) in {(leg, "a") for leg in "xyz"}  # they tie
     assert found.size == pytest.approx(np.sqrt(total), rel=1e-4)
 
 

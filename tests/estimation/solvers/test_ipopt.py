@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from tolerances import DERIVATIVE, SAME_OPTIMUM, TRUTH_BACK
 
 from orthocal import load_plan, load_session, simulate_session
-from orthocal.errors import SolverError
+from orthocal.errors import OrthocalError, SolverError
 from orthocal.estimation.linear import solve_linearised
 from orthocal.estimation.loss import SQUARES, Loss
 from orthocal.estimation.options import SolverOptions
@@ -210,3 +210,55 @@ def test_another_robot_is_calibrated_the_same_way(biglide, tmp_path, root):
     session = simulate_session(plan, truth, exact=True).session
     solution = NonlinearProgram(build_problem(session)).solve(sigma=1e-5)
     assert np.abs(solution.theta - list(truth.values())).max() < TRUTH_BACK
+
+
+def test_expressions_are_the_observation_model(root):
+    """Balls aligned by eye, all errors: readings, residuals, q, closures, nuisance by name."""
+    problem = build_problem(load_session(root / "examples/workshop"), model="full")
+    program, sigma = NonlinearProgram(problem), 1e-5
+    e = program.expressions()
+    theta = 0.3 * problem.theta_scale * np.random.default_rng(0).normal(size=problem.n_free)
+    x, p = program.begin(theta, sigma=sigma), program.pack(sigma=sigma)
+    o, n = problem.observations, problem.n_machine
+
+    def value(expression):
+        function = ca.Function("f", [e.variables, e.parameters], [expression])
+        return np.asarray(function(x, p).full()).reshape(-1)
+
+    zeros = value(e.zeros)
+    readings = value(e.readings)
+    assert np.abs(readings - zeros[o.zero] - problem.predict(theta)).max() < 1e-13
+    assert np.array_equal(value(e.residuals), problem.values - readings)
+    assert list(e.nuisance) == list(problem.free[n:])
+    assert np.abs(value(ca.vertcat(*e.nuisance.values())) - theta[n:]).max() < 1e-15
+    assert np.abs(value(ca.vertcat(*e.errors.values())) - theta).max() < 1e-15
+    passive = problem.close(theta)
+    assert list(e.passive) == list(e.closures) == list(problem.session.postures)
+    for q, name in zip(passive, problem.session.postures, strict=True):
+        assert np.abs(value(e.passive[name]) - q).max() < 1e-14
+        assert np.abs(value(e.closures[name])).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [({"nonsense": 1}, "nonsense"), ({"tol": "abc"}, "tol"), ({"max_iter": -3}, "max_iter")],
+)
+def test_an_option_that_ipopt_refuses_is_named(experiment_2, options, named, capfd):
+    problem = build_problem(experiment_2, model="offsets")
+    with pytest.raises(OrthocalError, match=f"'{named}'"):
+        NonlinearProgram(
+            problem, options=SolverOptions(ipopt={"mu_strategy": "adaptive", **options})
+        )
+    capfd.readouterr()
+
+
+def test_options_reach_ipopt(experiment_2):
+    problem = build_problem(experiment_2, model="offsets")
+    plain = NonlinearProgram(problem).solve(sigma=1e-5)
+    options = {"mu_strategy": "adaptive", "print_timing_statistics": False}
+    other = NonlinearProgram(problem, options=SolverOptions(ipopt=options)).solve(sigma=1e-5)
+    assert np.abs(plain.theta - other.theta).max() < SAME_OPTIMUM
+    with pytest.raises(SolverError):
+        NonlinearProgram(problem, options=SolverOptions(ipopt={"max_iter": 1})).solve(sigma=1e-5)
+    with pytest.raises(ValueError, match="ipopt has"):
+        SolverOptions(ipopt={"tol": None})

@@ -23,7 +23,7 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.choice import build_program
 from orthocal.estimation.solvers.linearised import LinearisedProgram
-from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+from orthocal.estimation.solvers.variable_projection import VariableProjection
 
 AGREED = 1e-6
 """Largest difference of two solvers' parameters, [tolerances]."""
@@ -177,7 +177,7 @@ def test_the_gradient_vanishes_by_central_differences(root):
     """No derivative of the solver's own is asked."""
     session = load_session(root / "examples/table1/experiment-1-printed")
     problem = build_problem(session, model="lengths")
-    solution = EliminatedProgram(problem).solve(sigma=20e-6)
+    solution = VariableProjection(problem).solve(sigma=20e-6)
     o = problem.observations
 
     def objective(theta):
@@ -200,7 +200,7 @@ def test_the_gradient_vanishes_by_central_differences(root):
 def test_it_says_when_it_does_not_converge(root):
     problem = build_problem(load_session(root / "examples/sweep"), model="full")
     with pytest.raises(SolverError, match=r"the step is still .* after 1 iterations"):
-        EliminatedProgram(problem, options=SolverOptions(max_iterations=1)).solve(sigma=5e-6)
+        VariableProjection(problem, options=SolverOptions(max_iterations=1)).solve(sigma=5e-6)
 
 
 def test_a_tip_that_passes_where_a_solver_begins_is_told(root):
@@ -210,4 +210,4 @@ def test_a_tip_that_passes_where_a_solver_begins_is_told(root):
     start = np.zeros(problem.n_free)
     start[problem.free.index("z_slide.offset")] = 25e-3
     with pytest.raises(SolverError, match="cannot begin: on the machine that the readings lead to"):
-        EliminatedProgram(problem).solve(sigma=1e-5, start=start)
+        VariableProjection(problem).solve(sigma=1e-5, start=start)

@@ -1,21 +1,35 @@
-"""An interpreter of lists of instructions, as machine code: each is taken for a lane of points.
+"""LLVM backend: CasADi functions executed for several points at once.
 
-LLVM (llvmlite) makes it for the processor that it runs on, in some hundredths of a second. It does
-what CasADi's machine does, in the same order: operations that are correctly rounded, and functions
-of the C library, so that the numbers are the same. Work is in rows of a lane, a row
-a place.
+A CasADi function of scalar expressions is a list of instructions. An interpreter in machine code,
+compiled by llvmlite for the present processor, executes each instruction for LANES points at once.
+It does the operations of CasADi's virtual machine in the same order, correctly rounded or by the C
+library, and therefore gives the same numbers in about a tenth of the time.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator, Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
 
-SHORT, LONG = 8, 32
-"""Lanes that there are: points that an instruction is taken for at once."""
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.runtime import disk_cache
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+LANES = 16
+"""Points for which an instruction is executed at once."""
+
+MIN_CACHED = 1000
+"""Instructions of a function from which its program is cached on disk."""
 
 _COMPUTED = {
     "ASSIGN": "{y} = select i1 true, {row} {a}, {row} {a}",
@@ -47,70 +61,190 @@ _COMPARED = {
     "{p} = or {flags} {q}, {r}",
 }
 _CALLED = {"SIN": 1, "COS": 1, "TAN": 1, "ASIN": 1, "ACOS": 1, "ATAN": 1, "ATAN2": 2}
-"""Functions of the C library, and how many numbers they take."""
+"""Functions of the C library and their number of arguments."""
 
 OPERATIONS = ("CONST", "INPUT", "OUTPUT", *_COMPUTED, *_COMPARED, *_CALLED)
-"""CasADi's names of operations; an instruction holds their place here."""
+"""CasADi's names of the operations; an instruction holds an index into this tuple."""
 
-Interpreter = Callable[..., None]
+_CODES = {getattr(ca, f"OP_{name}"): code for code, name in enumerate(OPERATIONS)}
 
-_ENGINES: list[object] = []
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Program:
+    """The instructions of a function."""
+
+    table: NDArray[np.int32]
+    """Operation, result and two operands of each instruction, shape (n, 4)."""
+    constants: Array
+    """Values of constant instructions, 0 elsewhere, shape (n,)."""
+    n_work: int
+    """Work variables."""
+    output_starts: Indices
+    """Start of each output among the nonzeros of all, shape (n_out + 1,)."""
 
 
 @lru_cache(maxsize=1)
 def is_installed() -> bool:
-    """Whether there is LLVM."""
+    """Whether llvmlite is installed (extra `fast`)."""
     return find_spec("llvmlite") is not None
 
 
-@lru_cache(maxsize=2)
-def interpreter(lane: int) -> Interpreter | None:
-    """The interpreter for a lane of so many points; None where it cannot be made.
+def load_program(function: ca.Function, *, key: str | None = None) -> Program | None:
+    """The instructions of a function, from disk or listed now; None if one of them is unknown.
+
+    Args:
+        function: A function of SX expressions.
+        key: Key of the function on disk; not cached without one.
+    """
+    if key is None or function.n_instructions() < MIN_CACHED:
+        return list_instructions(function)
+    key = f"instructions {_CODES}\n{key}"
+    program = _decode(disk_cache.load(key), function)
+    if program is None and (program := list_instructions(function)) is not None:
+        arrays = program.table, program.constants, np.array(program.n_work), program.output_starts
+        disk_cache.store(key, b"".join(a.tobytes() for a in arrays))
+    return program
+
+
+def _decode(content: bytes | None, function: ca.Function) -> Program | None:
+    """A program as cached on disk; None if it does not fit the function."""
+    n, outputs = function.n_instructions(), function.n_out()
+    if content is None or len(content) != 24 * n + 8 * (outputs + 2):
+        return None
+    table, constants, rest = np.split(np.frombuffer(content, np.uint8), [16 * n, 24 * n])
+    n_work, *starts = rest.view(np.int64)
+    return Program(
+        table.view(np.int32).reshape(n, 4),
+        constants.view(np.float64),
+        int(n_work),
+        np.array(starts, dtype=np.int64),
+    )
+
+
+def list_instructions(function: ca.Function) -> Program | None:
+    """The instructions of a function; None if one of them is unknown."""
+    count = function.n_instructions()
+    output_starts = np.cumsum([0, *(function.nnz_out(i) for i in range(function.n_out()))])
+    starts = output_starts.tolist()
+    rows, constants = [], np.zeros(count)
+    for k in range(count):
+        operation = function.instruction_id(k)
+        code = _CODES.get(operation)
+        if code is None:
+            return None
+        results = function.instruction_output(k)
+        if operation == ca.OP_CONST:
+            constants[k] = function.instruction_constant(k)
+            rows.append((code, results[0], 0, 0))
+            continue
+        operands = function.instruction_input(k)
+        if operation == ca.OP_OUTPUT:
+            rows.append((code, starts[results[0]] + results[1], operands[0], 0))
+        else:
+            rows.append((code, results[0], operands[0], operands[-1]))
+    table = np.array(rows, dtype=np.int32).reshape(-1, 4)
+    return Program(table, constants, int(function.sz_w()) + 1, output_starts)
+
+
+def run(program: Program, inputs: Sequence[Array], count: int) -> list[Array] | None:
+    """Execute a program at points.
+
+    Args:
+        program: The program.
+        inputs: Shape (n_rows, n) each; each row holds for count/n_rows successive points.
+        count: Number of points.
+
+    Returns:
+        Nonzeros of each output, shape (count, nnz); None if the interpreter cannot be compiled.
+    """
+    interpreter = compile_interpreter()
+    if interpreter is None:
+        return None
+    arrays = [np.ascontiguousarray(a) for a in inputs]
+    # of each input: address, numbers in a row, points of a row
+    layout = np.array(
+        [
+            [a.ctypes.data for a in arrays],
+            [a.shape[1] for a in arrays],
+            [max(count // max(len(a), 1), 1) for a in arrays],
+        ],
+        dtype=np.int64,
+    )
+    n_out = int(program.output_starts[-1])
+    result, work = np.empty((count, n_out)), np.empty((program.n_work, LANES))
+    if count:
+        interpreter(
+            program.table.ctypes.data,
+            len(program.table),
+            program.constants.ctypes.data,
+            *(row.ctypes.data for row in layout),
+            len(arrays),
+            count,
+            result.ctypes.data,
+            n_out,
+            work.ctypes.data,
+        )
+    return [result[:, a:b] for a, b in itertools.pairwise(program.output_starts.tolist())]
+
+
+class Interpreter:
+    """The compiled interpreter; its machine code lives as long as the engine.
 
     Its arguments are addresses of arrays, and numbers:
 
-        table      int32, shape (n, 4): operation, result, first and second operand; of an input
-                   its index and its column in place of operands, of an output its column in place
-                   of the result
-        n          of instructions
+        table      int32, shape (n, 4): operation, result, first and second operand; of an input its
+                   index and its column in place of operands, of an output its column in place of
+                   the result
+        n          number of instructions
         constants  shape (n,)
         inputs     addresses of the inputs, shape (n_in,)
-        strides    numbers from a row of each to the next, int64
-        shares     points that a row of each stands for, int64
+        strides    numbers from a row of each input to the next, int64
+        shares     successive points for which a row of each input holds, int64
         n_in
-        points     how many
+        points     number of points
         outputs    shape (points, n_out)
         n_out
-        work       shape (n_work, lane)
+        work       shape (n_work, LANES)
     """
-    from llvmlite import binding as llvm
+
+    def __init__(self, engine: object, address: int) -> None:
+        self._engine = engine
+        number, pointer = ctypes.c_int64, ctypes.c_void_p
+        kinds = (pointer, number, *(pointer,) * 4, number, number, pointer, number, pointer)
+        self._run = ctypes.CFUNCTYPE(None, *kinds)(address)
+
+    def __call__(self, *arguments: int) -> None:
+        """Execute a program."""
+        self._run(*arguments)
+
+
+@lru_cache(maxsize=1)
+def compile_interpreter() -> Interpreter | None:
+    """The interpreter, compiled once; None if that fails on this machine."""
+    from llvmlite import binding
 
     try:
-        library = ctypes.CDLL(None)  # what this process has, the C library among it
+        library = ctypes.CDLL(None)  # symbols of this process, the C library among them
         for name in map(str.lower, _CALLED):
             function = ctypes.cast(getattr(library, name), ctypes.c_void_p)
-            llvm.add_symbol(name, function.value)
-        llvm.initialize_native_target()
-        llvm.initialize_native_asmprinter()
-        target = llvm.Target.from_default_triple().create_target_machine(
-            cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2
+            binding.add_symbol(name, function.value)
+        binding.initialize_native_target()
+        binding.initialize_native_asmprinter()
+        features = binding.get_host_cpu_features().flatten()
+        target = binding.Target.from_default_triple().create_target_machine(
+            cpu=binding.get_host_cpu_name(), features=features, opt=2
         )
-        module = llvm.parse_assembly(_Source(lane).text())
+        module = binding.parse_assembly(_Source(LANES).text())
         module.verify()
-        engine = llvm.create_mcjit_compiler(module, target)
+        engine = binding.create_mcjit_compiler(module, target)
         engine.finalize_object()
-        address = engine.get_function_address("run")
+        return Interpreter(engine, engine.get_function_address("run"))
     except (RuntimeError, AttributeError, TypeError, OSError):
         return None
-    number, place = ctypes.c_int64, ctypes.c_void_p
-    kinds = (place, number, place, place, place, place, number, number, place, number, place)
-    run = ctypes.CFUNCTYPE(None, *kinds)(address)
-    _ENGINES.append(engine)  # or its code would go with it
-    return run
 
 
 class _Source:
-    """Its source, in LLVM's language."""
+    """Source of the interpreter in LLVM's intermediate representation."""
 
     def __init__(self, lane: int) -> None:
         self._lane, self._row = lane, f"<{lane} x double>"
@@ -118,7 +252,7 @@ class _Source:
         self._names = 0
 
     def text(self) -> str:
-        """All of it."""
+        """The complete source."""
         row, size = self._row, self._lane
         declared = [
             f"declare {row} @llvm.{name}.v{size}f64({row})\n" for name in ("sqrt", "fabs")
@@ -138,12 +272,12 @@ class _Source:
             with self._loop(str(size)) as lane:
                 self._find_point(first, lane, last, begins, ends)
             with self._loop("%n") as k:
-                self._take(k, begins, ends)
+                self._execute(k, begins, ends)
         self._put("ret void\n}")
         return "".join(declared) + "\n".join(self._lines) + "\n"
 
     def _find_point(self, first: str, lane: str, last: str, begins: str, ends: str) -> None:
-        """Where a lane's point is read and written; what is beyond the last is the last again."""
+        """Addresses a lane reads and writes; a lane beyond the last point repeats the last."""
         there = self._new(f"add i64 {first}, {lane}")
         within = self._new(f"icmp slt i64 {there}, {last}")
         point = self._new(f"select i1 {within}, i64 {there}, i64 {last}")
@@ -159,8 +293,8 @@ class _Source:
             place = self._new(f"add i64 {self._new(f'mul i64 {i}, {self._lane}')}, {lane}")
             self._store("ptr", begin, self._at(begins, place, "ptr"))
 
-    def _take(self, k: str, begins: str, ends: str) -> None:
-        """One instruction, for a lane of points."""
+    def _execute(self, k: str, begins: str, ends: str) -> None:
+        """Execute one instruction for all lanes."""
         entry = self._new(f"mul i64 {k}, 4")
         code, *places = (
             self._load("i32", self._at("%table", self._new(f"add i64 {entry}, {j}"), "i32"))
@@ -202,16 +336,16 @@ class _Source:
 
     def _compute(self, name: str, to_row: str, a_row: str, b_row: str) -> None:
         form = _COMPUTED.get(name) or _COMPARED[name]
-        given = {"a": self._load(self._row, a_row)}
+        operands = {"a": self._load(self._row, a_row)}
         if "{b}" in form:
-            given["b"] = self._load(self._row, b_row)
+            operands["b"] = self._load(self._row, b_row)
         names = {v: self._name() for v in "ypqr"}
-        same = {
+        numbers = {
             v: f"<{', '.join([f'double {number}'] * self._lane)}>"
             for v, number in (("zero", "0.0"), ("one", "1.0"), ("minus", "-1.0"))
         }
-        fixed = {"row": self._row, "flags": f"<{self._lane} x i1>", "lane": self._lane}
-        self._put(form.format(**names, **given, **same, **fixed))
+        types = {"row": self._row, "flags": f"<{self._lane} x i1>", "lane": self._lane}
+        self._put(form.format(**names, **operands, **numbers, **types))
         if name in _COMPARED:
             self._put(f"{names['y']} = uitofp <{self._lane} x i1> {names['p']} to {self._row}")
         self._store(self._row, names["y"], to_row)
@@ -219,13 +353,13 @@ class _Source:
     def _call(self, function: str, to_row: str, rows: Sequence[str]) -> None:
         with self._loop(str(self._lane)) as lane:
             values = [self._load("double", self._at(row, lane, "double")) for row in rows]
-            told = ", ".join(f"double {v}" for v in values)
-            found = self._new(f"call double @{function}({told})")
-            self._store("double", found, self._at(to_row, lane, "double"))
+            arguments = ", ".join(f"double {v}" for v in values)
+            result = self._new(f"call double @{function}({arguments})")
+            self._store("double", result, self._at(to_row, lane, "double"))
 
     @contextmanager
     def _loop(self, count: str) -> Iterator[str]:
-        """What is put within is done for 0, 1, ... count − 1."""
+        """Repeat the enclosed code for 0, 1, ... count − 1."""
         before, head, body, end = (self._label() for _ in range(4))
         index, following, on = (self._name() for _ in range(3))
         last = self._label()

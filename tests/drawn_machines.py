@@ -12,14 +12,12 @@ from orthocal.estimation.diagnostics.unmodelled import find_other_errors, machin
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
-from orthocal.kinematics.backend.lanes import expect_many
 
 
-class Fleet:
+class DrawnMachines:
     """Machines drawn from their robot's tolerances, all read by one plan."""
 
     def __init__(self, plan, *, model="offsets"):
-        expect_many()
         self.plan = plan
         robot = plan.robot
         self.machine = build_problem(plan, free=machine_errors(robot), prior=True)

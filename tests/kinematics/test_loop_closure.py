@@ -1,4 +1,4 @@
-"""Closing loops: against the closed forms, against Pinocchio, and where it cannot be done."""
+"""The loop closure solver against closed forms and Pinocchio, in batches, and its refusals."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import pytest
 from tolerances import CLOSED, CLOSED_FORM
 
 from orthocal.errors import ClosureError, RobotError
+from orthocal.kinematics import loop_closure
 from orthocal.kinematics import orthoglide as closed_form
-from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
+from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
+from orthocal.kinematics.robot_functions import robot_functions
 
 LENGTH = 0.31025
 
@@ -28,10 +30,10 @@ def reachable_points(count, seed=1):
 def test_closed_loops_equal_the_closed_forms_on_ten_thousand_points(orthoglide):
     points = reachable_points(10_000)
     joints = closed_form.inverse(points, length=LENGTH)
-    assembly = Assembly(orthoglide)
-    assert np.abs(assembly.forward(joints) - points).max() < CLOSED_FORM
+    closure = LoopClosure(orthoglide)
+    assert np.abs(closure.forward(joints) - points).max() < CLOSED_FORM
     assert np.abs(closed_form.direct(joints, length=LENGTH) - points).max() < CLOSED_FORM
-    assert np.abs(assembly.inverse(points[:2000]) - joints[:2000]).max() < CLOSED_FORM
+    assert np.abs(closure.inverse(points[:2000]) - joints[:2000]).max() < CLOSED_FORM
 
 
 def test_offsets_and_lengths_act_as_in_the_closed_forms(orthoglide):
@@ -43,7 +45,9 @@ def test_offsets_and_lengths_act_as_in_the_closed_forms(orthoglide):
     errors.update({f"{k}_leg.length": stretch for k in "xyz"})
     joints = closed_form.inverse(points, length=LENGTH + stretch, offsets=offsets)
     # a longer leg reaches further in from the same slider: the platform's own offset is unchanged
-    assert np.abs(Assembly(orthoglide, fixed=errors).forward(joints) - points).max() < CLOSED_FORM
+    assert (
+        np.abs(LoopClosure(orthoglide, fixed=errors).forward(joints) - points).max() < CLOSED_FORM
+    )
 
 
 def test_batches_equal_pinocchios_own_newton(orthoglide):
@@ -52,7 +56,7 @@ def test_batches_equal_pinocchios_own_newton(orthoglide):
     scale = np.array([orthoglide.parameters[n].tolerance for n in names])
     values = 5.0 * scale * rng.normal(size=len(names))
     joints = closed_form.inverse(reachable_points(20, seed=5), length=LENGTH)
-    passive = Assembly(orthoglide, free=names).close(joints, theta=values)
+    passive = LoopClosure(orthoglide, free=names).close(joints, theta=values)
     machine = orthoglide.with_errors(dict(zip(names, values, strict=True)))
     for d, ours in zip(joints, passive, strict=True):
         theirs = machine.close_with_pinocchio(d, orthoglide.zero[orthoglide.passive_index])
@@ -61,7 +65,7 @@ def test_batches_equal_pinocchios_own_newton(orthoglide):
 
 def test_closures_hold_at_the_solution(orthoglide):
     joints = closed_form.inverse(reachable_points(50, seed=6), length=LENGTH)
-    for d, p in zip(joints, Assembly(orthoglide).close(joints), strict=True):
+    for d, p in zip(joints, LoopClosure(orthoglide).close(joints), strict=True):
         residual, jacobian = orthoglide.evaluate_constraints(d, p)
         assert np.abs(residual).max() < CLOSED
         assert np.linalg.matrix_rank(jacobian[:, orthoglide.passive_index]) == 18
@@ -81,7 +85,7 @@ def test_a_robot_with_redundant_closure_rows_closes(fivebar):
     """Gepetto's three keys only: a planar loop with all six rows, three of them dependent."""
     assert fivebar.closure_rows == 6
     motors = np.array([[0.0, 0.0], [0.2, -0.1], [-0.4, 0.3]])
-    passive = nominal_assembly(fivebar).close(motors)
+    passive = nominal_closure(fivebar).close(motors)
     for d, p in zip(motors, passive, strict=True):
         residual, _ = fivebar.evaluate_constraints(d, p)
         assert np.abs(residual).max() < CLOSED
@@ -99,7 +103,7 @@ def test_large_motions_keep_the_elbows_where_they_were(fivebar, motors):
     between = second - first
     height = np.sqrt(abs(0.15 + 0.07j) ** 2 - abs(between) ** 2 / 4)
     apex = (first + second) / 2 + 1j * between / abs(between) * height
-    passive = nominal_assembly(fivebar).close(motors)
+    passive = nominal_closure(fivebar).close(motors)
     data = fivebar.model.createData()
     q = fivebar.configuration(fivebar.joint_coordinates(motors, passive))
     pin.framesForwardKinematics(fivebar.model, data, q)
@@ -110,9 +114,9 @@ def test_large_motions_keep_the_elbows_where_they_were(fivebar, motors):
 def test_another_robot_goes_the_same_way(biglide):
     points = np.random.default_rng(8).uniform(-0.05, 0.05, (100, 2))
     joints = np.sqrt(0.2**2 - points[:, ::-1] ** 2) + points
-    assembly = nominal_assembly(biglide)
-    assert np.abs(assembly.inverse(points) - joints).max() < CLOSED_FORM
-    assert np.abs(assembly.forward(joints)[:, :2] - points).max() < CLOSED_FORM
+    closure = nominal_closure(biglide)
+    assert np.abs(closure.inverse(points) - joints).max() < CLOSED_FORM
+    assert np.abs(closure.forward(joints)[:, :2] - points).max() < CLOSED_FORM
 
 
 def test_far_postures_stay_in_the_branch_the_machine_is_built_in(orthoglide):
@@ -122,27 +126,27 @@ def test_far_postures_stay_in_the_branch_the_machine_is_built_in(orthoglide):
     joints = closed_form.inverse(points, length=LENGTH)
     joints = joints[np.all((joints > 0.12) & (joints < 0.39), axis=1)]
     expected = closed_form.direct(joints, length=LENGTH, root=-1)
-    assert np.abs(nominal_assembly(orthoglide).forward(joints) - expected).max() < CLOSED_FORM
+    assert np.abs(nominal_closure(orthoglide).forward(joints) - expected).max() < CLOSED_FORM
 
 
 def test_an_unreachable_posture_is_named_with_what_stays_open(orthoglide):
     joints = np.array([[0.31025] * 3, [0.7, 0.3, 0.3]])
     with pytest.raises(ClosureError, match="posture 'far' cannot be reached") as caught:
-        nominal_assembly(orthoglide).close(joints, names=["near", "far"])
+        nominal_closure(orthoglide).close(joints, names=["near", "far"])
     assert caught.value.posture == "far"
     assert caught.value.residual > 0.01
 
 
 def test_coordinates_that_are_not_numbers_are_refused(orthoglide):
     with pytest.raises(ClosureError, match="posture 'here' has coordinates that are not numbers"):
-        nominal_assembly(orthoglide).close([[np.nan, 0.3, 0.3]], names=["here"])
+        nominal_closure(orthoglide).close([[np.nan, 0.3, 0.3]], names=["here"])
 
 
 def test_a_singular_posture_is_refused(biglide):
     """Sliders so far out that both rods lie on one line: the tool is free across it."""
     far = 0.2 * np.sqrt(2.0)
     with pytest.raises(ClosureError, match="posture 'line' is singular"):
-        nominal_assembly(biglide).close([[far, far]], names=["line"])
+        nominal_closure(biglide).close([[far, far]], names=["line"])
 
 
 def test_underdriven_loops_are_singular(root, tmp_path):
@@ -156,9 +160,81 @@ def test_underdriven_loops_are_singular(root, tmp_path):
     from orthocal import load_robot
 
     with pytest.raises(ClosureError, match="leave 1 of 3 passive motions free"):
-        Assembly(load_robot(folder)).close([0.1, 0.1])
+        LoopClosure(load_robot(folder)).close([0.1, 0.1])
 
 
 def test_a_robot_without_a_tool_has_no_forward(fivebar):
     with pytest.raises(RobotError, match="no tool centre point"):
-        nominal_assembly(fivebar).forward([0.0, 0.0])
+        nominal_closure(fivebar).forward([0.0, 0.0])
+
+
+OPEN = 1e-12
+"""Loops in metres that count as closed: some hundred roundings of a machine of a third of one."""
+
+
+def draw_machines(robot, *, offset, size=1e-3, seed=0, count=6):
+    """Elementary errors of machines, some drives with larger offsets; commanded postures."""
+    rng = np.random.default_rng(seed)
+    names = robot_functions(robot).errors.names
+    errors = size * rng.normal(size=(count, len(names)))
+    drives = [i for i, n in enumerate(names) if n.endswith(".offset")]
+    errors[:, drives] += offset * rng.normal(size=(count, len(drives)))
+    return names, errors, robot.drive_zero + 0.02 * rng.normal(size=(5, len(robot.drives)))
+
+
+@pytest.mark.parametrize("name", ["orthoglide", "biglide"])
+@pytest.mark.parametrize("offset", [0.0, 0.01])
+def test_a_batch_of_machines_is_closed_as_pinocchio_has_them(request, name, offset):
+    robot = request.getfixturevalue(name)
+    names, errors, postures = draw_machines(robot, offset=offset)
+    passive = LoopClosure(robot).close(postures, errors=errors)
+    tools = LoopClosure(robot).tcp(postures, passive, errors=errors)
+    for own, q, tool in zip(errors, passive, tools, strict=True):
+        values = dict(zip(names, own.tolist(), strict=True))
+        machine, alone = robot.with_errors(values), LoopClosure(robot, fixed=values)
+        for drives, joints in zip(postures, q, strict=True):
+            residual, _ = machine.evaluate_constraints(drives, joints)
+            assert np.abs(residual).max(initial=0.0) < OPEN
+        assert np.abs(alone.close(postures) - q).max() < CLOSED
+        assert np.abs(alone.forward(postures) - tool).max() < CLOSED
+
+
+@pytest.mark.parametrize("points", [loop_closure.MAX_POINTS, 7])
+def test_a_machine_out_of_reach_spoils_no_other(orthoglide, monkeypatch, points):
+    """Also where a batch is split: 7 postures are one machine."""
+    monkeypatch.setattr(loop_closure, "MAX_POINTS", points)
+    _, errors, postures = draw_machines(orthoglide, offset=0.0)
+    alone = LoopClosure(orthoglide).close(postures, errors=errors[:3])
+    far = np.array(errors)
+    far[3:] += 0.5  # no machine
+    for many in (far, np.where(np.arange(len(errors))[:, None] < 3, errors, np.nan)):
+        failures = {}
+        with np.errstate(all="ignore"):
+            passive = LoopClosure(orthoglide).close(postures, errors=many, failures=failures)
+        assert {i // len(postures) for i in failures} == {3, 4, 5}
+        assert np.isnan(passive[3:]).any(axis=(1, 2)).all()
+        assert np.abs(passive[:3] - alone).max() < OPEN
+
+
+def test_a_batch_has_the_safeguards_of_one_machine(biglide):
+    """The posture is singular with the first machine's drives, regular with the second's."""
+    far = 0.2 * np.sqrt(2.0)
+    free = tuple(f"{d.name}.offset" for d in biglide.drives)
+    closure = LoopClosure(biglide, free=free)
+    with pytest.raises(ClosureError, match="posture 'line' is singular"):
+        closure.close([[far, far]], theta=np.zeros((2, 2)), names=["line"])
+    failures = {}
+    theta = np.array([[0.0, 0.0], [-0.05, -0.05]])
+    passive = closure.close([[far, far]], theta=theta, names=["line"], failures=failures)
+    assert list(failures) == [0]
+    assert np.isnan(passive[0]).all()
+    assert np.isfinite(passive[1]).all()
+
+
+def test_a_solution_does_not_depend_on_earlier_calls(orthoglide):
+    drives = orthoglide.drive_zero + np.array([[0.01, -0.02, 0.015]])
+    start = orthoglide.zero[orthoglide.passive_index] + 0.05
+    fresh = LoopClosure(orthoglide).close(drives, start=start)
+    used = LoopClosure(orthoglide)
+    used.close(drives)
+    assert np.array_equal(used.close(drives, start=start), fresh)

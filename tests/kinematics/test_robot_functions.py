@@ -1,46 +1,46 @@
-"""Functions compiled once a robot, against expressions of the errors themselves and Pinocchio."""
+"""Functions of a robot against direct expressions of its errors and against Pinocchio."""
 
 from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-import pinocchio as pin
 import pytest
 from conftest import load_afresh
 from tolerances import KINEMATICS
 
-from orthocal.kinematics.compiled import compiled_robot, log6_jacobian
-from orthocal.kinematics.error_map import right_jacobian as right_jacobians
-from orthocal.kinematics.loop_closure import Assembly
-from orthocal.kinematics.machine_map import MachineMap, right_jacobian
-from orthocal.kinematics.symbolic import SymbolicRobot, constant_pose
+from orthocal.kinematics.error_map import SymbolicErrorMap
+from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.robot_functions import robot_functions
+from orthocal.kinematics.symbolic import SymbolicRobot
 from orthocal.robot.model import closure_row_units
 
 
 def _draw(robot, size, seed=1):
     """Errors, commanded drives and passive coordinates; loops need not be closed."""
     rng = np.random.default_rng(seed)
-    errors = size * rng.normal(size=len(compiled_robot(robot).errors.names))
+    errors = size * rng.normal(size=len(robot_functions(robot).errors.names))
     drives = robot.drive_zero + 0.03 * rng.normal(size=len(robot.drives))
     passive = robot.zero[robot.passive_index]
     return errors, drives, passive + 0.3 * rng.normal(size=passive.size)
 
 
-def _slopes(compiled, actuated, passive, placements):
+def _derivatives(functions, actuated, passive, placements):
     """g, ∂g by actuated and passive coordinates and by twists, of one posture."""
-    g, g_a, g_q, nonzeros = (v[0] for v in compiled.slopes(actuated, passive, placements))
-    g_t = np.zeros((g.size, compiled.n_twists))
-    g_t[compiled.twist_pattern] = nonzeros
+    g, g_a, g_q, nonzeros = (
+        v[0] for v in functions.closure_jacobian(actuated, passive, placements)
+    )
+    g_t = np.zeros((g.size, functions.n_twists))
+    g_t[functions.twist_pattern] = nonzeros
     return g, g_a, g_q, g_t
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-3, 0.3])
 @pytest.mark.parametrize("name", ["orthoglide", "fivebar", "biglide"])
-def test_slopes_equal_those_of_the_expressions(request, name, size):
+def test_derivatives_equal_those_of_the_expressions(request, name, size):
     """Every error the robot has: joints, frames, offsets, scales; closures and a frame."""
     robot = request.getfixturevalue(name)
-    compiled = compiled_robot(robot)
-    names = compiled.errors.names
+    functions = robot_functions(robot)
+    names = functions.errors.names
     theta = ca.SX.sym("theta", len(names))
     drives = ca.SX.sym("drives", len(robot.drives))
     passive = ca.SX.sym("passive", robot.passive_index.size)
@@ -60,20 +60,21 @@ def test_slopes_equal_those_of_the_expressions(request, name, size):
     at, d, q = _draw(robot, size)
     expected = [np.asarray(v.full()) for v in theirs(at, d, q)]
 
-    errors = compiled.errors
-    slopes = errors.slopes(at, np.eye(len(names)))
-    where = errors.drives(at, d)[None], q[None], errors.placements(at)
-    residual, g_a, g_q, g_t = _slopes(compiled, *where)
-    joints, twists = compiled.wrench_row(frame, force=ca.SX(row))
-    actuated, rest = compiled.split(joints)
-    of_frame = ca.Function("row", compiled.symbols, [actuated, rest, twists])
+    errors = functions.errors
+    slopes = errors.jacobian(at, np.eye(len(names)))
+    geometry = errors.geometry(at)
+    where = geometry.drives(d)[None], q[None], geometry.placements
+    residual, g_a, g_q, g_t = _derivatives(functions, *where)
+    joints, twists = functions.wrench_row(frame, force=ca.SX(row))
+    actuated, rest = functions.split(joints)
+    of_frame = ca.Function("row", functions.symbols, [actuated, rest, twists])
     p_a, p_q, p_t = (np.asarray(v.full()) for v in of_frame(*(w.reshape(-1) for w in where)))
 
     def by_errors(by_twists, by_drives):
         gains = (by_drives * d) @ slopes.gains
         return by_twists @ slopes.twists + by_drives @ slopes.offsets + gains
 
-    position = float(row @ compiled.position(robot.closures[0].frame_b)(*where)[0][0])
+    position = float(row @ functions.position(robot.closures[0].frame_b)(*where)[0][0])
     found = [residual[:, None], np.array([[position]]), g_q, by_errors(g_t, g_a), p_q]
     found.append(by_errors(p_t, p_a))
     for ours, wanted in zip(found, expected, strict=True):
@@ -84,29 +85,33 @@ def test_slopes_equal_those_of_the_expressions(request, name, size):
 def test_a_choice_of_parameters_as_expressions_is_the_same_in_numbers(request, name):
     """Sums and scales too: what a program of CasADi is given, and what NumPy computes with."""
     robot = request.getfixturevalue(name)
-    compiled, rng = compiled_robot(robot), np.random.default_rng(3)
-    errors = compiled.errors
+    functions, rng = robot_functions(robot), np.random.default_rng(3)
+    errors = functions.errors
     free = robot.parameters.names[::2]
     columns = errors.columns(free) * rng.uniform(0.5, 2.0, len(free))
     fixed = 1e-3 * rng.normal(size=len(errors.names))
-    chosen = MachineMap(errors, fixed=fixed, columns=columns)
+    chosen = SymbolicErrorMap(errors, fixed=fixed, columns=columns)
     theta = 1e-2 * rng.normal(size=len(free))
-    at, slopes = fixed + columns @ theta, errors.slopes(fixed + columns @ theta, columns)
+    at, slopes = fixed + columns @ theta, errors.jacobian(fixed + columns @ theta, columns)
     _, d, q = _draw(robot, 0.0)
     values = [np.asarray(v.full()).reshape(-1) for v in chosen.function(theta)]
     assert np.abs(values[1] - errors.placements(at)).max() < KINEMATICS
 
     drives = ca.SX.sym("drives", len(robot.drives))
     passive = ca.SX.sym("passive", robot.passive_index.size)
-    _, g_a, _, g_t = compiled.expressions(chosen.actuated(drives), passive, chosen.placements)
+    _, g_a, _, g_t = functions.closure_expressions(
+        chosen.actuated(drives), passive, chosen.placements
+    )
     function = ca.Function(
         "chain",
         [drives, passive, *chosen.symbols],
         [chosen.actuated(drives), ca.densify(chosen.chain(g_t, g_a, drives))],
     )
     actuated, by_theta = (np.asarray(v.full()) for v in function(d, q, *values))
-    assert np.abs(actuated[:, 0] - errors.drives(at, d)).max() < KINEMATICS
-    _, g_a, _, g_t = _slopes(compiled, errors.drives(at, d)[None], q[None], values[1])
+    assert np.abs(actuated[:, 0] - errors.geometry(at).drives(d)).max() < KINEMATICS
+    _, g_a, _, g_t = _derivatives(
+        functions, errors.geometry(at).drives(d)[None], q[None], values[1]
+    )
     expected = g_t @ slopes.twists + g_a @ slopes.offsets + (g_a * d) @ slopes.gains
     assert np.abs(by_theta - expected).max() < KINEMATICS
 
@@ -114,7 +119,7 @@ def test_a_choice_of_parameters_as_expressions_is_the_same_in_numbers(request, n
 @pytest.mark.parametrize("name", ["orthoglide", "biglide"])
 def test_placements_are_those_that_pinocchio_is_given(request, name):
     robot = request.getfixturevalue(name)
-    errors = compiled_robot(robot).errors
+    errors = robot_functions(robot).errors
     values = dict(zip(errors.names, _draw(robot, 0.05)[0], strict=True))
     values = {n: v for n, v in values.items() if not n.endswith((".offset", ".scale"))}
     machine = robot.with_errors(values)
@@ -126,28 +131,12 @@ def test_placements_are_those_that_pinocchio_is_given(request, name):
             assert np.abs(placement[9:] - expected.translation).max() < KINEMATICS
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.1, 1.0, 3.0])
-def test_the_derivative_of_exp6_in_numbers_is_pinocchios(angle):
-    xi = np.r_[0.2, -0.4, 0.1, angle * np.array([0.36, 0.48, 0.8])]
-    assert np.abs(right_jacobians(xi[None])[0] - pin.Jexp6(xi)).max() < KINEMATICS
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.1, 1.0])
-def test_jacobians_of_exp6_and_log6_equal_pinocchios(angle):
-    xi = np.r_[0.2, -0.4, 0.1, angle * np.array([0.36, 0.48, 0.8])]
-    found = np.asarray(ca.DM(ca.evalf(right_jacobian(ca.SX(xi)))))
-    assert np.abs(found - pin.Jexp6(xi)).max() < KINEMATICS
-    pose = pin.exp6(xi)
-    found = np.asarray(ca.DM(ca.evalf(log6_jacobian(constant_pose(pose)))))
-    assert np.abs(found - pin.Jlog6(pose)).max() < 10 * KINEMATICS
-
-
 def test_robots_share_functions_only_where_they_are_the_same(orthoglide):
     """One that was moved, though from the same file, has functions of its own."""
     again, moved = load_afresh("orthoglide"), orthoglide.with_errors({"x_bar_a.x": 1e-3})
     assert again is not orthoglide
-    assert compiled_robot(again) is compiled_robot(orthoglide)
+    assert robot_functions(again) is robot_functions(orthoglide)
     assert moved.yaml == orthoglide.yaml
-    assert compiled_robot(moved) is not compiled_robot(orthoglide)
-    zero = [Assembly(r).forward(orthoglide.drive_zero + 0.01) for r in (orthoglide, moved)]
+    assert robot_functions(moved) is not robot_functions(orthoglide)
+    zero = [LoopClosure(r).forward(orthoglide.drive_zero + 0.01) for r in (orthoglide, moved)]
     assert np.abs(zero[1] - zero[0]).max() > 1e-4

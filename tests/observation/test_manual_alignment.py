@@ -1,4 +1,4 @@
-"""Balls are set over the rod that is there: how far beside its drawing that is, by other ways."""
+"""Balls are aligned with the actual rod: its distance from the nominal rod, by other ways."""
 
 from __future__ import annotations
 
@@ -10,14 +10,10 @@ from workshop import Workshop
 
 from orthocal import calibrate, draw_errors, load_plan, simulate_session
 from orthocal.estimation.options import SolverOptions
-from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
-from orthocal.estimation.solvers.machine_readings import Fleet
 from orthocal.kinematics.error_map import error_map
 from orthocal.measurement.joining import join_sessions
-from orthocal.observation.manual_alignment import find_setting
-from orthocal.observation.sensor_frames import predict_entries
-from orthocal.observation.sensor_groups import sensor_unknowns
+from orthocal.observation.model import ObservationModel
+from orthocal.observation.sensor_groups import nuisance_parameters
 
 MM = 1e-3
 OFFSETS = ("x_slide.offset", "y_slide.offset", "z_slide.offset")
@@ -30,8 +26,8 @@ def plan(root):
 
 def laterals(session, errors):
     """Setup to how far its ball is beside the drawing, [m]."""
-    known = [p.name for p in sensor_unknowns(session).parameters]
-    found = find_setting(session)(error_map(session.robot).expand(errors))
+    known = [p.name for p in nuisance_parameters(session).parameters]
+    found = ObservationModel(session).alignment(error_map(session.robot).expand(errors))
     named = dict(zip(known, found.tolist(), strict=True))
     assert all(v == 0.0 for name, v in named.items() if not name.endswith(".lateral"))
     return {name: named[f"setup.{name}.lateral"] for name in session.setups}
@@ -74,37 +70,7 @@ def test_a_blade_and_what_is_known_exactly_are_as_drawn(plan):
         n: replace(s, sensor=replace(s.sensor, standing=replace(s.sensor.standing, lateral=0.0)))
         for n, s in plan.setups.items()
     }
-    assert not find_setting(replace(plan, setups=setups)).follows.any()
-
-
-def test_all_that_knows_readings_knows_it(plan):
-    """A problem, a fleet, their slopes and what simulates: the same readings, slopes by
-    differences."""
-    problem = build_problem(plan, model="full", tolerances={"*.offset": 2 * MM})
-    assert problem.setting.follows.sum() == len(plan.setups)
-    rng = np.random.default_rng(0)
-    unit = 0.5 * rng.normal(size=(3, problem.n_free))
-    theta = unit * problem.theta_scale
-    fleet = Fleet(problem, unit)
-    assert fleet.close().all()
-    slopes = FleetSlopes(problem, unit, fleet.passive)
-    shown, step = fleet.predict(), 1e-3
-    forces = rng.normal(size=shown.shape)
-    pulled, jacobians = slopes.pull(forces), slopes.jacobian()
-    for i, own in enumerate(theta):
-        errors = dict(zip(problem.free[: problem.n_machine], own.tolist(), strict=False))
-        unknowns = own[problem.n_machine :]
-        alone = predict_entries(plan, problem.observations, errors, unknowns=unknowns)
-        assert np.abs(problem.predict(own) - alone).max() < 1e-12
-        assert np.abs(shown[i] - alone).max() < 1e-12
-        reading, jacobian = problem.linearise(own)
-        assert np.abs(reading - alone).max() < 1e-12
-        assert np.abs(jacobians[i] - jacobian).max() < 1e-12
-        assert np.abs(pulled[i] - forces[i] @ jacobian).max() < 1e-11
-        for k in range(0, problem.n_free, 7):
-            moved = step * np.eye(problem.n_free)[k] * problem.theta_scale
-            central = (problem.predict(own + moved) - problem.predict(own - moved)) / (2.0 * step)
-            assert np.abs(central - jacobian[:, k]).max() < 1e-10
+    assert not ObservationModel(replace(plan, setups=setups)).alignment.aligned.any()
 
 
 @pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])

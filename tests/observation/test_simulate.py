@@ -11,8 +11,8 @@ from tolerances import KINEMATICS
 
 from orthocal import draw_errors, load_plan, load_session, simulate_session
 from orthocal.errors import ParameterError, SessionError
+from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_frames import predict_entries
 from orthocal.observation.simulate import collect_errors, load_errors, truth_document
 
 ERRORS = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
@@ -27,7 +27,7 @@ def test_exact_readings_are_the_predictions_from_where_a_setup_begins(plan):
     """A dial is set in the first posture of its setup, wherever in the world that is."""
     simulated = simulate_session(plan, ERRORS, exact=True)
     o = build_observations(plan)
-    predicted = predict_entries(plan, o, ERRORS)
+    predicted = predict_readings(plan, ERRORS, observations=o)
     for i, name in enumerate(plan.setups):
         own = o.setup == i
         assert simulated.session.values[own][0] == 0.0
@@ -58,7 +58,7 @@ def test_one_seed_one_session(plan):
 
 def test_noise_zeros_and_rounding_are_as_asked(plan):
     fine = exact(plan).with_gauge(replace(plan.gauge, resolution=None))
-    predicted = predict_entries(plan, build_observations(plan), ERRORS)
+    predicted = predict_readings(plan, ERRORS)
     residuals = []
     for seed in range(40):
         simulated = simulate_session(fine, ERRORS, seed=seed)
