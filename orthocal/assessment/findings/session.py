@@ -16,8 +16,7 @@ from orthocal.calibration.calibrate import calibrate
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.refit import restore_session
 from orthocal.errors import OrthocalError
-from orthocal.hypotheses.mistake import Mistake
-from orthocal.hypotheses.search import find_mistakes
+from orthocal.hypotheses.mistake import Mistake, find_mistakes
 from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
 from orthocal.statistics.chance import chance_of_excess
