@@ -73,13 +73,13 @@ class Explanation:
     """Sessions that are concerned, or the first session after a change; empty for a single one."""
 
     def agrees_with(self, other: Explanation) -> bool:
-        """Whether both concern the same rows, or the same rows but the first or last."""
-        if set(self.rows) == set(other.rows) and bool(self.rows) == bool(other.rows):
-            if not self.rows:
-                return self == other
-            return (
-                len(self.rows) == 1 or self.kind == other.kind or not (self.setups or other.setups)
-            )
+        """Whether both concern the same rows but one at an end, or drives of the same session."""
+        if not self.rows or not other.rows:
+            same = self.drives == other.drives and self.sessions == other.sessions
+            return self == other or (bool(self.drives) and same)
+        if set(self.rows) == set(other.rows):
+            no_setups = not (self.setups or other.setups)
+            return len(self.rows) == 1 or self.kind == other.kind or no_setups
         apart = set(self.rows) ^ set(other.rows)
         return self.kind == other.kind and self.kind in ORDERED and len(apart) <= 1
 

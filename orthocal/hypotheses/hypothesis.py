@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -30,13 +30,19 @@ class Tails:
     segments: Sequence[tuple[Indices, Array]]
     """Rows of each segment in the order of measuring, and the base vector on them, [m]."""
     segment: Indices
-    """Segment of each pattern, shape (h,)."""
+    """Segment of each pattern, ascending, shape (h,)."""
     start: Indices
     """Position in the segment from which each pattern is not 0, shape (h,)."""
 
     def select(self, chosen: slice) -> Tails:
         """Some of the patterns."""
         return Tails(self.segments, self.segment[chosen], self.start[chosen])
+
+    def by_segment(self) -> Iterator[tuple[Indices, Indices, Array]]:
+        """Patterns of each segment that has any, with its rows and base vector."""
+        used, begin = np.unique(self.segment, return_index=True)
+        for s, own in zip(used, np.split(np.arange(self.segment.size), begin[1:]), strict=True):
+            yield own, *self.segments[s]
 
     def to_sparse(self, count: int) -> Sparse:
         """The same patterns written out, shape (h, count)."""

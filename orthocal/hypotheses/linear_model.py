@@ -217,10 +217,7 @@ class LinearModel:
         if patterns.tails is not None:
             tails, o = patterns.tails, self.problem.observations
             square += 2.0 * self._overlap(tails, entries)
-            for s, (rows, base) in enumerate(tails.segments):
-                own = np.flatnonzero(tails.segment == s)
-                if not own.size:
-                    continue
+            for own, rows, base in tails.by_segment():
                 at, zero = o.plus[rows], o.zero[o.plus[rows[0]]]
                 values, start = base / self.problem.noise[at], tails.start[own]
 
@@ -249,8 +246,7 @@ class LinearModel:
         if patterns.tails is not None:
             tails, o = patterns.tails, self.problem.observations
             result = result + self._overlap(tails, sparse.csr_array(other))
-            for s, (rows, base) in enumerate(tails.segments):
-                own = np.flatnonzero(tails.segment == s)
+            for own, rows, base in tails.by_segment():
                 at = o.plus[rows]
                 total = np.cumsum((base / self.problem.noise[at])[::-1])[::-1]
                 sums[own, o.zero[at[0]]] += total[tails.start[own]]
@@ -264,12 +260,16 @@ class LinearModel:
         result = np.zeros(tails.segment.size)
         position = np.full(o.size, -1)
         base = np.zeros(o.size)
-        found = sparse.coo_array(entries)
-        for s, (rows, values) in enumerate(tails.segments):
+        start = np.repeat(tails.start, np.diff(entries.indptr))
+        pattern = np.repeat(np.arange(result.size), np.diff(entries.indptr))
+        for own, rows, values in tails.by_segment():
             at = o.plus[rows]
             position[at], base[at] = np.arange(rows.size), values / self.problem.noise[at]
-            hit = (tails.segment[found.row] == s) & (position[found.col] >= tails.start[found.row])
-            np.add.at(result, found.row[hit], found.data[hit] * base[found.col[hit]])
+            chosen = slice(entries.indptr[own[0]], entries.indptr[own[-1] + 1])
+            columns = entries.indices[chosen]
+            shared = np.where(position[columns] >= start[chosen], base[columns], 0.0)
+            shared = entries.data[chosen] * shared
+            np.add.at(result, pattern[chosen], shared)
             position[at], base[at] = -1, 0.0
         return result
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,10 @@ MOST_PAIRS_REFITTED = 12
 COARSE = 2.0
 """Logarithm of the Bayes factor below 1 at which a pair is left out after the coarse grid: the sum
 over the full grid of scales may exceed its largest term by that and `WORTH_REFITTING`."""
+
+MOST_COMBINED = 5
+"""Most likely single hypotheses that are combined in pairs where none by itself leaves readings
+that a machine shows."""
 
 MOST_PAIRED = 60
 """Rows of a session up to which pairs of hypotheses are considered."""
@@ -239,19 +244,39 @@ class _Search:
         if best < WORTH_REFITTING:
             return None, []
         scored += list(self._score(state, inconsistent_groups(rows)))
-        chosen = [(t,) for t in self._shortlist(scored, rows)] + pairs
+        single = self._shortlist(scored, rows)
+        chosen = [*((t,) for t in single), *pairs]
         tried = [self.evaluate((*state.terms, *more), state.about) for more in chosen]
+        if not any(self.is_plausible(s) for s in tried) and len(state.terms) + 2 <= MOST_ANOMALIES:
+            tried += self._combine(state, single)
+        ranked = sorted(tried, key=_posterior)
+        # of several anomalies at once a single one leaves readings that no machine shows
+        plausible = [s for s in ranked if self.is_plausible(s)]
+        outliers = [s for s in ranked if s.terms[-1].explanation.kind == "outlier"]
         least = state.log_posterior + CLEARLY
-        clear = sorted((s for s in tried if s.log_posterior >= least), key=_posterior)
-        plausible = [s for s in clear if self.is_plausible(s)]
-        clear = plausible or clear
+        clear = [c for c in (plausible, outliers, ranked) if c and c[0].log_posterior >= least]
         if not clear:
             return None, []
-        near = [s for s in clear if s.log_posterior > clear[0].log_posterior - NEARLY]
+        near = [s for s in clear[0] if s.log_posterior > clear[0][0].log_posterior - NEARLY]
         simplest = min(near, key=lambda s: s.size)
         if _is_same(simplest, near[0]):
             simplest = near[0]
         return simplest, [s for s in near if s is not simplest]
+
+    def _combine(self, state: _State, single: list[_Term]) -> list[_State]:
+        """Sets with two of the most likely hypotheses, where neither suffices by itself."""
+        apart = combinations(_distinct(single)[:MOST_COMBINED], 2)
+        tried = [self.evaluate((*state.terms, *more), state.about) for more in apart]
+        if not tried:
+            return []
+        one, other = min(tried, key=_posterior).terms[-2:]
+        others = [
+            (t, kept)
+            for out, kept in ((one, other), (other, one))
+            for t in single
+            if t is not out and not _share_rows(t, kept) and _share_rows(t, out)
+        ]
+        return tried + [self.evaluate((*state.terms, *more), state.about) for more in others]
 
     def is_plausible(self, state: _State) -> bool:
         """Whether corrected readings are those of a machine near its tolerances."""
@@ -444,7 +469,7 @@ class _Search:
             causes, alternatives = _others(term, near)
             e = _with_amount(term, amounts)
             row = e.rows[0] if len(e.rows) == 1 else None
-            if causes:
+            if causes and e.rows:
                 causes = (e, *causes)
                 kind: AnomalyKind = "inconsistent posture" if row is None else "outlier"
                 e = replace(e, kind=kind, factor=None, amount=None)
@@ -560,6 +585,21 @@ def _is_same(one: _State, other: _State) -> bool:
     return not unmatched[0] and not unmatched[1]
 
 
+def _share_rows(one: _Term, other: _Term) -> bool:
+    return bool(set(one.explanation.rows) & set(other.explanation.rows))
+
+
+def _distinct(terms: Sequence[_Term]) -> list[_Term]:
+    """Hypotheses that share no row with one before."""
+    found: list[_Term] = []
+    used: set[int] = set()
+    for t in terms:
+        if not used & set(t.explanation.rows):
+            found.append(t)
+            used |= set(t.explanation.rows)
+    return found
+
+
 def _unmatched(one: Sequence[_Term], other: Sequence[_Term]) -> tuple[list[_Term], list[_Term]]:
     """Hypotheses of each of two sets that none of the other set agrees with."""
 
@@ -604,7 +644,7 @@ def _others(
                 alternatives.update(dict.fromkeys(found))
             continue
         for t, a in zip(s.terms, s.amounts, strict=True):
-            same = set(t.explanation.rows) == set(e.rows) and e.rows
+            same = set(t.explanation.rows) == set(e.rows)
             if same and e.agrees_with(t.explanation) and t.explanation.kind != e.kind:
                 cause = _with_amount(t, a)
                 amount = cause.amount if cause.kind == "misread dial" else None

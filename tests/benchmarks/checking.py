@@ -178,7 +178,8 @@ def main() -> None:
             shares = [f"{n / made:.2f}" for n in others]
             table.add_row(name, f"{size:g}" if size else "", str(made), *shares)
         every = [sum(row[k] for row in counts.values()) for k in range(5)]
-        table.add_row("all", "", str(every[0]), *(f"{n / every[0]:.2f}" for n in every[1:]))
+        shares = [f"{n / max(every[0], 1):.2f}" for n in every[1:]]
+        table.add_row("all", "", str(every[0]), *shares)
         console.print(f"\n{example}")
         console.print(table)
         accused = count_accused(example, given.sound)
