@@ -56,7 +56,7 @@ def measure_twice(plan, active, *, changed=0.0, seed=1):
         (2.0 * ENTERED, "offsets entered twice", (0, 1, 2)),
         (ENTERED[[0, 2, 1]], "offsets interchanged", (1, 2)),
         (ENTERED * [1.0, 1.0, 0.0], "offsets not entered", (2,)),
-        (ENTERED + [0.0, 0.8e-3, 0.0], "offset of one drive", (1,)),
+        (np.add(ENTERED, (0.0, 0.8e-3, 0.0)), "offset of one drive", (1,)),
     ],
 )
 def test_offsets_that_are_not_as_stated_are_named(plan, active, kind, drives):
