@@ -71,8 +71,13 @@ class Mistake:
 
 
 def find_mistakes(session: Session, model: str | None = None) -> tuple[Mistake, ...]:
-    """Anomalies of a session with their wording; arguments as `find_anomalies`."""
+    """Anomalies of a session with their wording; arguments as `find_anomalies`.
+
+    None where they do not explain the readings: then something else is wrong.
+    """
     found = find_anomalies(session, model)
+    if not found.explained:
+        return ()
     return tuple(_mistake(session, found, a) for a in found.found)
 
 
