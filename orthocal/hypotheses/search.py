@@ -10,14 +10,14 @@ where the others explain them (backward elimination). The best ones are linearis
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError
-from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind, Explanation
+from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
 from orthocal.hypotheses.families.inconsistent_group import inconsistent_groups
 from orthocal.hypotheses.families.row_offset import row_offsets
@@ -26,6 +26,19 @@ from orthocal.hypotheses.families.single_reading import wrong_readings
 from orthocal.hypotheses.families.swapped_rows import swapped_rows
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
 from orthocal.hypotheses.hypothesis import Family, MachineShift, Patterns, Rows, marks
+from orthocal.hypotheses.hypothesis_set import (
+    HypothesisSet,
+    Term,
+    correct_rows,
+    distinct_terms,
+    explain_with_amount,
+    find_alternatives,
+    is_local,
+    is_same_place,
+    negative_log_posterior,
+    share_rows,
+    split_amounts,
+)
 from orthocal.hypotheses.likelihood import Products, Score, log_of_sum
 from orthocal.hypotheses.linear_model import (
     FURTHEST,
@@ -81,54 +94,9 @@ LARGEST_NOISE_SCALE = 2.5
 LARGEST_VOLUME = float(np.log(1000.0))
 """Logarithm of the factor on volumes beyond which a family is not considered in pairs."""
 
-MOST_ALTERNATIVES = 8
-"""Alternatives of an anomaly that are listed."""
 
 CHUNK = 4096
 """Hypotheses that are scored at a time, for their memory."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Term:
-    """One hypothesis of a set."""
-
-    explanation: Explanation
-    prior: float
-    """Logarithm of its prior probability, with its factor on volumes."""
-    change: Array | None = None
-    """Correction of the rows, shape (n_rows,), [m]."""
-    effects: Array | None = None
-    """Effects of unknown amounts on the rows, shape (k, n_rows)."""
-    silent: NDArray[np.int64] | None = None
-    """Rows that say nothing."""
-    shift: MachineShift | None = None
-    known: bool = True
-    """Whether the amount of the shift is known."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _State:
-    """A set of hypotheses, linearised where it leads."""
-
-    terms: tuple[_Term, ...]
-    score: Score
-    about: Linearisation
-    remaining: Array
-    """Deviation of the corrected entries, shape (n_entries,), [m]."""
-    corrected: Array
-    """Corrected rows, shape (n_rows,), [m]."""
-    amounts: tuple[Array, ...]
-    """Unknown amounts of each term, [m]; of machine shifts in units of their direction."""
-
-    @property
-    def log_posterior(self) -> float:
-        """Logarithm of marginal likelihood times prior probability."""
-        return self.score.log_likelihood + sum(t.prior for t in self.terms)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Number of hypotheses and of rows concerned: the simpler set is the smaller one."""
-        return len(self.terms), sum(len(t.explanation.rows) for t in self.terms)
 
 
 def find_anomalies(session: Session, model: str | None = None) -> Anomalies:
@@ -163,18 +131,18 @@ class _Search:
     def run(self) -> Anomalies:
         """Forward selection, backward elimination and their result."""
         state = self.sound
-        near: list[tuple[_State, _State]] = []
+        near: list[tuple[HypothesisSet, HypothesisSet]] = []
         while len(state.terms) < MOST_ANOMALIES:
             found, alternatives = self._step(state)
             if found is None:
                 break
             state = self._eliminate(found)
             near += [(found, s) for s in alternatives]
-            if alternatives and not _is_local(self.session, state, alternatives):
+            if alternatives and not is_local(self.session, state, alternatives):
                 break
         return self._result(state, near)
 
-    def evaluate(self, terms: Sequence[_Term], start: Linearisation) -> _State:
+    def evaluate(self, terms: Sequence[Term], start: Linearisation) -> HypothesisSet:
         """Score a set of hypotheses, linearised where it leads."""
         model = self.model
         rows = self.values + sum((t.change for t in terms if t.change is not None), 0.0)
@@ -193,7 +161,7 @@ class _Search:
             every = [*groups, *([] if silent is None else [silent])]
             remaining = deviation - (score.amounts @ np.concatenate(every) if every else 0.0)
             errors = about.errors_for(remaining, score)
-            amounts = _split(terms, score.amounts)
+            amounts = split_amounts(terms, score.amounts)
             if k == MOST_ROUNDS or np.abs(errors - last).max(initial=0.0) < NEAR:
                 break
             if not np.abs(errors).max(initial=0.0) < FURTHEST:
@@ -211,12 +179,12 @@ class _Search:
             except (ClosureError, np.linalg.LinAlgError):
                 break
             last, applied = errors, step
-        return _State(
-            tuple(terms), score, about, remaining, _correct(rows, terms, amounts), amounts
+        return HypothesisSet(
+            tuple(terms), score, about, remaining, correct_rows(rows, terms, amounts), amounts
         )
 
     def _vectors(
-        self, terms: Sequence[_Term], about: Linearisation
+        self, terms: Sequence[Term], about: Linearisation
     ) -> tuple[list[Array], Array | None, Array]:
         """Effects of each term on the entries, silent rows, and effects of unknown shifts."""
         model, groups, silent, steps = self.model, [], [], []
@@ -234,7 +202,7 @@ class _Search:
             np.array(steps).reshape(len(steps), -1 if steps else about.expected.size),
         )
 
-    def _step(self, state: _State) -> tuple[_State | None, list[_State]]:
+    def _step(self, state: HypothesisSet) -> tuple[HypothesisSet | None, list[HypothesisSet]]:
         """The best set with one or two hypotheses more, and others nearly as likely."""
         rows = Rows(self.session, state.corrected)
         scored = list(self._score(state, _families(self.model, rows)))
@@ -249,7 +217,7 @@ class _Search:
         tried = [self.evaluate((*state.terms, *more), state.about) for more in chosen]
         if not any(self.is_plausible(s) for s in tried) and len(state.terms) + 2 <= MOST_ANOMALIES:
             tried += self._combine(state, single)
-        ranked = sorted(tried, key=_posterior)
+        ranked = sorted(tried, key=negative_log_posterior)
         # of several anomalies at once a single one leaves readings that no machine shows
         plausible = [s for s in ranked if self.is_plausible(s)]
         outliers = [s for s in ranked if s.terms[-1].explanation.kind == "outlier"]
@@ -259,32 +227,32 @@ class _Search:
             return None, []
         near = [s for s in clear[0] if s.log_posterior > clear[0][0].log_posterior - NEARLY]
         simplest = min(near, key=lambda s: s.size)
-        if _is_same(simplest, near[0]):
+        if is_same_place(simplest, near[0]):
             simplest = near[0]
         return simplest, [s for s in near if s is not simplest]
 
-    def _combine(self, state: _State, single: list[_Term]) -> list[_State]:
+    def _combine(self, state: HypothesisSet, single: list[Term]) -> list[HypothesisSet]:
         """Sets with two of the most likely hypotheses, where neither suffices by itself."""
-        apart = combinations(_distinct(single)[:MOST_COMBINED], 2)
+        apart = combinations(distinct_terms(single)[:MOST_COMBINED], 2)
         tried = [self.evaluate((*state.terms, *more), state.about) for more in apart]
         if not tried:
             return []
-        one, other = min(tried, key=_posterior).terms[-2:]
+        one, other = min(tried, key=negative_log_posterior).terms[-2:]
         others = [
             (t, kept)
             for out, kept in ((one, other), (other, one))
             for t in single
-            if t is not out and not _share_rows(t, kept) and _share_rows(t, out)
+            if t is not out and not share_rows(t, kept) and share_rows(t, out)
         ]
         return tried + [self.evaluate((*state.terms, *more), state.about) for more in others]
 
-    def is_plausible(self, state: _State) -> bool:
+    def is_plausible(self, state: HypothesisSet) -> bool:
         """Whether corrected readings are those of a machine near its tolerances."""
         score = state.score
         quiet = score.noise_scale < LARGEST_NOISE_SCALE or not self.model.stated
         return score.tolerance_scale < LARGEST_TOLERANCE_SCALE and quiet
 
-    def _eliminate(self, state: _State) -> _State:
+    def _eliminate(self, state: HypothesisSet) -> HypothesisSet:
         """Take out hypotheses that the others make superfluous."""
         while len(state.terms) > 1:
             fewer = [
@@ -297,7 +265,9 @@ class _Search:
             state = best
         return state
 
-    def _score(self, state: _State, families: Iterable[Family]) -> Iterator[tuple[Family, Array]]:
+    def _score(
+        self, state: HypothesisSet, families: Iterable[Family]
+    ) -> Iterator[tuple[Family, Array]]:
         """Log evidence of each hypothesis of families beside those of a state, to first order."""
         likelihood = state.about.likelihood
         deviation = state.remaining
@@ -326,7 +296,9 @@ class _Search:
                 )
             yield family, logs - sound + _prior(family)
 
-    def _score_rows(self, state: _State, family: Family, chosen: slice, base: Products) -> Array:
+    def _score_rows(
+        self, state: HypothesisSet, family: Family, chosen: slice, base: Products
+    ) -> Array:
         model, about, deviation = self.model, state.about, state.remaining
         products, inner = base, np.zeros(1)
         edits = None if family.edits is None else family.edits.select(chosen)
@@ -348,7 +320,7 @@ class _Search:
             )
         return about.likelihood.score(products, added, cross + inner)
 
-    def _score_silent(self, state: _State, rows: NDArray[np.int64]) -> float:
+    def _score_silent(self, state: HypothesisSet, rows: NDArray[np.int64]) -> float:
         vectors = self.model.entries(_indicators(rows, self.values.size))
         return state.about.likelihood.score_set(state.remaining, (), vectors).log_likelihood - len(
             rows
@@ -359,7 +331,7 @@ class _Search:
         setup = self.session.setups[self.session.readings[row].setup]
         return self.session.gauges[setup.gauge].resolution or self.model.sigma
 
-    def _score_shifts(self, state: _State, family: Family) -> Array:
+    def _score_shifts(self, state: HypothesisSet, family: Family) -> Array:
         likelihood = state.about.likelihood
         vectors = np.array([shift_entries(self.model, state.about, s) for s in family.shifts])
         if family.known:
@@ -369,30 +341,30 @@ class _Search:
         base = likelihood.products(np.broadcast_to(state.remaining, vectors.shape))
         return likelihood.score(base, likelihood.products(vectors), vectors @ state.remaining)
 
-    def _term(self, family: Family, h: int, rows: Rows) -> _Term:
+    def _term(self, family: Family, h: int, rows: Rows) -> Term:
         prior = float(_prior(family)[h])
         explanation = family.explain(h)
         if family.groups:
-            return _Term(explanation, prior, effects=_marks(family.groups[h], rows.count))
+            return Term(explanation, prior, effects=_marks(family.groups[h], rows.count))
         if family.silent:
             silent = family.silent[h]
             prior -= len(silent) * float(np.log(self._resolution(int(silent[0]))))
-            return _Term(explanation, prior, silent=silent)
+            return Term(explanation, prior, silent=silent)
         if family.shifts:
             shift = family.shifts[h]
             if not family.known:
                 size = float(np.abs(shift_entries(self.model, self.sound.about, shift)).max())
                 size = size or 1.0
                 shift = replace(shift, direction=shift.direction / size, unit=1.0 / size)
-            return _Term(explanation, prior, shift=shift, known=family.known)
-        return _Term(
+            return Term(explanation, prior, shift=shift, known=family.known)
+        return Term(
             explanation,
             prior,
             None if family.edits is None else family.edits.one(h),
             None if family.effects is None else family.effects.one(h)[None],
         )
 
-    def _shortlist(self, scored: list[tuple[Family, Array]], rows: Rows) -> list[_Term]:
+    def _shortlist(self, scored: list[tuple[Family, Array]], rows: Rows) -> list[Term]:
         """The most likely single hypotheses, and the most likely one of each kind."""
         ranked = sorted(
             (
@@ -413,8 +385,8 @@ class _Search:
         return chosen[:MOST_REFITTED]
 
     def _pairs(
-        self, state: _State, scored: list[tuple[Family, Array]]
-    ) -> tuple[list[tuple[_Term, _Term]], float]:
+        self, state: HypothesisSet, scored: list[tuple[Family, Array]]
+    ) -> tuple[list[tuple[Term, Term]], float]:
         """The most likely pairs of hypotheses, and the log evidence of all of them together."""
         few = self.values.size <= MOST_PAIRED
         rows = Rows(self.session, state.corrected)
@@ -439,7 +411,7 @@ class _Search:
         which = np.repeat(np.arange(len(families)), [f.count for f in families])
         begin = np.cumsum([0, *(f.count for f in families)])
 
-        def term(m: int) -> _Term:
+        def term(m: int) -> Term:
             i = int(which[m])
             return self._term(families[i], m - int(begin[i]), rows)
 
@@ -459,15 +431,17 @@ class _Search:
         entries = self.model.entries
         return Singles(entries(edits), entries(effects), prior, (edits != 0.0) | (effects != 0.0))
 
-    def _result(self, state: _State, near: list[tuple[_State, _State]]) -> Anomalies:
+    def _result(
+        self, state: HypothesisSet, near: list[tuple[HypothesisSet, HypothesisSet]]
+    ) -> Anomalies:
         """Records of the anomalies of a state, and of sets that are nearly as likely."""
         sound = self.sound
         named = []
         for term, amounts in zip(state.terms, state.amounts, strict=True):
             without = [t for t in state.terms if t is not term]
             fewer = self.evaluate(without, sound.about) if without else sound
-            causes, alternatives = _others(term, near)
-            e = _with_amount(term, amounts)
+            causes, alternatives = find_alternatives(term, near)
+            e = explain_with_amount(term, amounts)
             row = e.rows[0] if len(e.rows) == 1 else None
             if causes and e.rows:
                 causes = (e, *causes)
@@ -521,10 +495,6 @@ def _prior(family: Family) -> Array:
     return prior if family.log_volume is None else prior + family.log_volume
 
 
-def _posterior(state: _State) -> float:
-    return -state.log_posterior
-
-
 def _indicators(rows: NDArray[np.int64], count: int) -> Array:
     """One vector per row that is 1 there, shape (k, count)."""
     return _marks(list(rows[:, None]), count)
@@ -542,117 +512,7 @@ def shift_entries(model: LinearModel, about: Linearisation, shift: MachineShift)
     return np.asarray(model.project(changed[None])[0])
 
 
-def _split(terms: Sequence[_Term], amounts: Array) -> tuple[Array, ...]:
-    """Amounts of each term, from those of all effects followed by all silent rows."""
-    sizes = [
-        len(t.effects) if t.effects is not None else int(t.shift is not None and not t.known)
-        for t in terms
-    ]
-    silent = [0 if t.silent is None else len(t.silent) for t in terms]
-    at, after = np.cumsum([0, *sizes]), np.cumsum([sum(sizes), *silent])
-    return tuple(
-        amounts[after[i] : after[i + 1]] if silent[i] else amounts[at[i] : at[i + 1]]
-        for i in range(len(terms))
-    )
-
-
-def _correct(rows: Array, terms: Sequence[_Term], amounts: Sequence[Array]) -> Array:
-    """Rows without the effects of unknown amounts."""
-    corrected = rows.copy()
-    for t, a in zip(terms, amounts, strict=True):
-        if t.effects is not None:
-            corrected -= a @ t.effects
-        elif t.silent is not None:
-            corrected[t.silent] -= a
-    return corrected
-
-
-def _with_amount(term: _Term, amounts: Array) -> Explanation:
-    """Explanation with the amount that was estimated."""
-    e = term.explanation
-    if term.shift is not None and not term.known:
-        return replace(e, amount=float(amounts[0] * term.shift.unit))
-    if term.effects is not None and len(term.effects) == 1 and e.kind != "row offset":
-        return replace(e, amount=float(amounts[0]))
-    return e
-
-
-def _is_same(one: _State, other: _State) -> bool:
-    """Whether two sets of hypotheses concern the same rows, hypothesis by hypothesis."""
-    if len(one.terms) != len(other.terms):
-        return False
-    unmatched = _unmatched(one.terms, other.terms)
-    return not unmatched[0] and not unmatched[1]
-
-
-def _share_rows(one: _Term, other: _Term) -> bool:
-    return bool(set(one.explanation.rows) & set(other.explanation.rows))
-
-
-def _distinct(terms: Sequence[_Term]) -> list[_Term]:
-    """Hypotheses that share no row with one before."""
-    found: list[_Term] = []
-    used: set[int] = set()
-    for t in terms:
-        if not used & set(t.explanation.rows):
-            found.append(t)
-            used |= set(t.explanation.rows)
-    return found
-
-
-def _unmatched(one: Sequence[_Term], other: Sequence[_Term]) -> tuple[list[_Term], list[_Term]]:
-    """Hypotheses of each of two sets that none of the other set agrees with."""
-
-    def without(a: Sequence[_Term], b: Sequence[_Term]) -> list[_Term]:
-        return [t for t in a if not any(t.explanation.agrees_with(u.explanation) for u in b)]
-
-    return without(one, other), without(other, one)
-
-
-def _is_local(session: Session, state: _State, near: Sequence[_State]) -> bool:
-    """Whether alternatives concern no setups but those of the newest hypotheses."""
-
-    def setups(s: _State) -> set[str]:
-        return {session.readings[i].setup for t in s.terms for i in t.explanation.rows}
-
-    return all(setups(s) <= setups(state) for s in near)
-
-
-def _others(
-    term: _Term, near: Sequence[tuple[_State, _State]]
-) -> tuple[tuple[Explanation, ...], tuple[Explanation, ...]]:
-    """Other causes in the same rows, and alternatives elsewhere, the most likely first.
-
-    Args:
-        term: A hypothesis.
-        near: Sets of hypotheses as they were chosen, each with one that is nearly as likely.
-    """
-    e = term.explanation
-    causes: dict[tuple[object, ...], Explanation] = {}
-    alternatives: dict[Explanation, None] = {}
-    for chosen, s in sorted(near, key=lambda pair: _posterior(pair[1])):
-        if not any(t is term for t in chosen.terms):
-            continue
-        mine, others = _unmatched(chosen.terms, s.terms)
-        if any(t is term for t in mine):
-            if others:
-                found = [
-                    _with_amount(t, a)
-                    for t, a in zip(s.terms, s.amounts, strict=True)
-                    if any(t is o for o in others)
-                ]
-                alternatives.update(dict.fromkeys(found))
-            continue
-        for t, a in zip(s.terms, s.amounts, strict=True):
-            same = set(t.explanation.rows) == set(e.rows)
-            if same and e.agrees_with(t.explanation) and t.explanation.kind != e.kind:
-                cause = _with_amount(t, a)
-                amount = cause.amount if cause.kind == "misread dial" else None
-                causes.setdefault((cause.kind, cause.factor, amount), cause)
-    return tuple(causes.values()), tuple(alternatives)[:MOST_ALTERNATIVES]
-
-
-def _rms(model: LinearModel, state: _State) -> float:
+def _rms(model: LinearModel, state: HypothesisSet) -> float:
     """RMS of what remains of the corrected rows, [m]."""
     unit = Score(0.0, 1.0, 1.0, np.empty(0))
     errors = state.about.errors_for(state.remaining, unit)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +11,30 @@ from numpy.typing import NDArray
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, Tails, sparse_rows
 
+Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 FEWEST = 3
 """Rows of a setup below which a row offset is a swap."""
+
+
+class _Offsets(NamedTuple):
+    """Row offsets of one kind in a setup or cycle."""
+
+    rows: Indices
+    """Rows in the order of measuring, shape (m,)."""
+    base: Array
+    """Correction of each row from the start on, shape (m,), [m]."""
+    position: Indices
+    """Place of the first row that is wrong, shape (h,)."""
+    start: Indices
+    """Place from which on `base` applies, shape (h,)."""
+    at: Indices
+    """Row with a correction of its own, shape (h,)."""
+    value: Array
+    """That correction, shape (h,), [m]."""
+    lost: Indices
+    """Row whose reading is lost, shape (h,)."""
 
 
 def row_offsets(rows: Rows) -> Iterator[Family]:
@@ -28,38 +49,15 @@ def row_offsets(rows: Rows) -> Iterator[Family]:
     ]
     if not segments:
         return
-    tails: list[tuple[Indices, NDArray[np.float64]]] = []
-    segment, start, at, lost, value = [], [], [], [], []
-    missing, first = [], []
-    for own in segments:
-        v = rows.values[own]
-        before, after = np.append(0.0, v[:-1]) - v, np.append(v[1:], v[-1]) - v
-        before[0] = 0.0
-        k = np.arange(own.size - 1)
-        tails += [(own, before), (own, after)]
-        # a missed step: rows after k get the reading before; row k gets the last one
-        segment.append(np.full(k.size, len(tails) - 2))
-        start.append(k + 1)
-        at.append(own[k])
-        value.append(v[-1] - v[k])
-        lost.append(own[k])
-        missing.append(np.ones(k.size, dtype=bool))
-        first.append(k)
-        # a step written twice: rows from k on get the reading after; the last is lost
-        twice = k[k > 0]
-        segment.append(np.full(twice.size, len(tails) - 1))
-        start.append(twice)
-        at.append(own[twice])
-        value.append(np.zeros(twice.size))
-        lost.append(np.full(twice.size, own[-1]))
-        missing.append(np.zeros(twice.size, dtype=bool))
-        first.append(twice)
-    segment_of, position = np.concatenate(segment), np.concatenate(first)
-    missed = np.concatenate(missing)
-    singles = np.concatenate(at)[:, None], np.concatenate(value)[:, None]
+    offsets = [_offsets(own, rows.values[own], m) for own in segments for m in (True, False)]
+    sizes = [o.position.size for o in offsets]
+    which = np.repeat(np.arange(len(offsets)), sizes)
+    position, start, at, value, lost = (
+        np.concatenate([getattr(o, name) for o in offsets]) for name in _Offsets._fields[2:]
+    )
 
     def explain(h: int) -> Explanation:
-        own = tails[segment_of[h]][0][position[h] :]
+        own = offsets[which[h]].rows[position[h] :]
         cycles = {rows.session.readings[i].cycle for i in own}
         return Explanation(
             "row offset",
@@ -67,19 +65,22 @@ def row_offsets(rows: Rows) -> Iterator[Family]:
             tuple(own.tolist()),
             names=(rows.session.readings[own[0]].setup,),
             cycle=cycles.pop() if len(cycles) == 1 else None,
-            missing=bool(missed[h]),
+            missing=int(which[h]) % 2 == 0,
         )
 
-    count = segment_of.size
-    yield Family(
-        explain,
-        count,
-        count,
-        Patterns(
-            sparse_rows(list(singles[0]), list(singles[1]), rows.count),
-            Tails(tails, segment_of, np.concatenate(start)),
-        ),
-        Patterns(
-            sparse_rows(list(np.concatenate(lost)[:, None]), list(np.ones((count, 1))), rows.count)
-        ),
-    )
+    count, ones = which.size, np.ones((which.size, 1))
+    tails = Tails([(o.rows, o.base) for o in offsets], which, start)
+    edits = Patterns(sparse_rows(list(at[:, None]), list(value[:, None]), rows.count), tails)
+    effects = Patterns(sparse_rows(list(lost[:, None]), list(ones), rows.count))
+    yield Family(explain, count, count, edits, effects)
+
+
+def _offsets(own: Indices, values: Array, missing: bool) -> _Offsets:
+    """Row offsets of one kind in some rows, one per row from which on it may begin."""
+    k = np.arange(0 if missing else 1, own.size - 1)
+    if missing:  # rows after k get the reading before, row k gets the last one
+        base = np.append(0.0, values[:-1] - values[1:])
+        return _Offsets(own, base, k, k + 1, own[k], values[-1] - values[k], own[k])
+    # rows from k on get the reading after, the last one is lost
+    base = np.append(values[1:] - values[:-1], 0.0)
+    return _Offsets(own, base, k, k, own[k], np.zeros(k.size), np.full(k.size, own[-1]))
