@@ -129,18 +129,37 @@ class _Search:
         self.sound = self.evaluate((), start)
 
     def run(self) -> Anomalies:
-        """Forward selection, backward elimination and their result."""
+        """Forward selection, backward elimination and their result.
+
+        A unit or a decimal point of many readings explains several gross errors a little: where one
+        is found, single readings are tried by themselves as well.
+        """
+        state, near = self._select(grouped=True)
+        if any(t.explanation.factor and len(t.explanation.rows) > 1 for t in state.terms):
+            other = self._select(grouped=False)
+            if other[0].log_posterior > state.log_posterior + NEARLY:
+                state, near = other
+        return self._result(state, near)
+
+    def _select(
+        self, *, grouped: bool
+    ) -> tuple[HypothesisSet, list[tuple[HypothesisSet, HypothesisSet]]]:
+        """A set of hypotheses, and others nearly as likely beside each step that led to it.
+
+        Args:
+            grouped: Whether units and signs of groups of readings are considered.
+        """
         state = self.sound
         near: list[tuple[HypothesisSet, HypothesisSet]] = []
         while len(state.terms) < MOST_ANOMALIES:
-            found, alternatives = self._step(state)
+            found, alternatives = self._step(state, grouped=grouped)
             if found is None:
                 break
             state = self._eliminate(found)
             near += [(found, s) for s in alternatives]
             if alternatives and not is_local(self.session, state, alternatives):
                 break
-        return self._result(state, near)
+        return state, near
 
     def evaluate(self, terms: Sequence[Term], start: Linearisation) -> HypothesisSet:
         """Score a set of hypotheses, linearised where it leads."""
@@ -202,10 +221,12 @@ class _Search:
             np.array(steps).reshape(len(steps), -1 if steps else about.expected.size),
         )
 
-    def _step(self, state: HypothesisSet) -> tuple[HypothesisSet | None, list[HypothesisSet]]:
+    def _step(
+        self, state: HypothesisSet, *, grouped: bool
+    ) -> tuple[HypothesisSet | None, list[HypothesisSet]]:
         """The best set with one or two hypotheses more, and others nearly as likely."""
         rows = Rows(self.session, state.corrected)
-        scored = list(self._score(state, _families(self.model, rows)))
+        scored = list(self._score(state, _families(self.model, rows, grouped=grouped)))
         totals = [log_of_sum(evidence) for _, evidence in scored if evidence.size]
         pairs, total = self._pairs(state, scored)
         best = float(log_of_sum(np.array([*totals, total]))) if totals else -np.inf
@@ -215,17 +236,17 @@ class _Search:
         single = self._shortlist(scored, rows)
         chosen = [*((t,) for t in single), *pairs]
         tried = [self.evaluate((*state.terms, *more), state.about) for more in chosen]
-        if not any(self.is_plausible(s) for s in tried) and len(state.terms) + 2 <= MOST_ANOMALIES:
+        likeliest = min(tried, key=negative_log_posterior)
+        if not self.is_plausible(likeliest) and len(state.terms) + 2 <= MOST_ANOMALIES:
             tried += self._combine(state, single)
         ranked = sorted(tried, key=negative_log_posterior)
         # of several anomalies at once a single one leaves readings that no machine shows
         plausible = [s for s in ranked if self.is_plausible(s)]
-        outliers = [s for s in ranked if s.terms[-1].explanation.kind == "outlier"]
-        least = state.log_posterior + CLEARLY
-        clear = [c for c in (plausible, outliers, ranked) if c and c[0].log_posterior >= least]
-        if not clear:
+        if plausible and plausible[0].log_posterior > ranked[0].log_posterior - CLEARLY:
+            ranked = plausible
+        if ranked[0].log_posterior < state.log_posterior + CLEARLY:
             return None, []
-        near = [s for s in clear[0] if s.log_posterior > clear[0][0].log_posterior - NEARLY]
+        near = [s for s in ranked if s.log_posterior > ranked[0].log_posterior - NEARLY]
         simplest = min(near, key=lambda s: s.size)
         if is_same_place(simplest, near[0]):
             simplest = near[0]
@@ -468,8 +489,9 @@ class _Search:
         )
 
 
-def _families(model: LinearModel, rows: Rows) -> Iterator[Family]:
-    yield from wrong_units_and_signs(rows, model.sigma)
+def _families(model: LinearModel, rows: Rows, *, grouped: bool = True) -> Iterator[Family]:
+    if grouped:
+        yield from wrong_units_and_signs(rows, model.sigma)
     yield from displaced_gauges(rows)
     yield from wrong_readings(rows)
     yield from swapped_rows(rows)

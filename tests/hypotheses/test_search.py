@@ -227,6 +227,19 @@ HIDDEN = (3, (1, 13))
 """Seed of a machine, and two rows of different setups."""
 
 
+def test_three_mistakes_in_different_setups_are_found_together(sheet):
+    values, setups = sheet.session.values, list(sheet.setups.values())
+    one, other = (int(rows[np.argmax(np.abs(values[rows]))]) for rows in setups[:2])
+    third = int(setups[2][1])
+    values[one] *= -1.0
+    values[other] *= 10.0
+    values[third] += 0.7e-3
+    found = find_anomalies(sheet.session.with_values(values))
+    assert sorted(a.explanation.rows for a in found.found) == sorted([(one,), (other,), (third,)])
+    assert found.explained
+    assert not found.ambiguous
+
+
 def test_tails_by_cumulative_sums_equal_those_written_out(cycles):
     """Displaced gauges and row offsets, and their products with the linearised model."""
     from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
