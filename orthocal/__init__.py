@@ -17,16 +17,20 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Assessment": "orthocal.calibration.assessment_record",
+    "Recommendation": "orthocal.assessment.recommendation",
+    "assess": "orthocal.assessment.assess",
+    "recommend_model": "orthocal.assessment.recommendation",
     "Calibration": "orthocal.calibration.calibration",
     "CalibrationFileError": "orthocal.errors",
     "CalibrationProblem": "orthocal.estimation.problem",
     "Choice": "orthocal.estimation.choice",
     "ClosureError": "orthocal.errors",
     "Comparison": "orthocal.assessment.comparison",
-    "Decision": "orthocal.assessment.findings.decision",
+    "Decision": "orthocal.calibration.assessment_record",
     "ExportError": "orthocal.errors",
     "ExportOptions": "orthocal.export.options",
-    "Finding": "orthocal.assessment.findings.finding",
+    "Finding": "orthocal.calibration.assessment_record",
     "Gauge": "orthocal.session.session",
     "GcodeError": "orthocal.errors",
     "LiveScene": "orthocal.viewer.live",
@@ -64,12 +68,9 @@ _HOMES = {
     "build_bootstrap_study": "orthocal.study.bootstrap",
     "build_linearisation_study": "orthocal.study.linearisation",
     "build_sensitivity_study": "orthocal.study.sensitivity",
-    "calibrate": "orthocal.calibration.calibrate",
-    "check_session": "orthocal.assessment.findings.session",
+    "calibrate": "orthocal.assessment.assess",
+    "check_session": "orthocal.assessment.assess",
     "compare_models": "orthocal.assessment.comparison",
-    "decide": "orthocal.assessment.findings.calibration",
-    "decide_comparison": "orthocal.assessment.findings.comparison",
-    "decide_validation": "orthocal.assessment.findings.validation",
     "draw_errors": "orthocal.observation.simulate",
     "draw_scene": "orthocal.output.scene.drawing",
     "export_calibration": "orthocal.export.formats",
@@ -98,6 +99,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "Assessment",
     "Calibration",
     "CalibrationFileError",
     "CalibrationProblem",
@@ -122,6 +124,7 @@ __all__ = [
     "ParameterError",
     "Posture",
     "Reading",
+    "Recommendation",
     "Robot",
     "RobotError",
     "Scene",
@@ -140,6 +143,7 @@ __all__ = [
     "UnreachableError",
     "Validation",
     "Workspace",
+    "assess",
     "assess_tool",
     "build_accuracy_study",
     "build_bootstrap_study",
@@ -148,9 +152,6 @@ __all__ = [
     "calibrate",
     "check_session",
     "compare_models",
-    "decide",
-    "decide_comparison",
-    "decide_validation",
     "draw_errors",
     "draw_scene",
     "export_calibration",
@@ -165,6 +166,7 @@ __all__ = [
     "parameter_table",
     "plan_readings",
     "reading_table",
+    "recommend_model",
     "register_sensor",
     "repeat_calibration",
     "restore_session",
@@ -179,16 +181,12 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from orthocal.assessment.assess import assess, calibrate, check_session
     from orthocal.assessment.comparison import Comparison, compare_models
-    from orthocal.assessment.findings.calibration import decide
-    from orthocal.assessment.findings.comparison import decide_comparison
-    from orthocal.assessment.findings.decision import Decision
-    from orthocal.assessment.findings.finding import Finding
-    from orthocal.assessment.findings.session import check_session
-    from orthocal.assessment.findings.validation import decide_validation
+    from orthocal.assessment.recommendation import Recommendation, recommend_model
     from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
     from orthocal.assessment.validation import Validation, validate_calibration
-    from orthocal.calibration.calibrate import calibrate
+    from orthocal.calibration.assessment_record import Assessment, Decision, Finding
     from orthocal.calibration.calibration import Calibration
     from orthocal.calibration.file import load_calibration, write_calibration
     from orthocal.calibration.machine import Machine

@@ -58,10 +58,6 @@ def find_tool(calibration: Calibration) -> CalibratedTool | None:
     Returns:
         None for a robot whose drives do not command a tool, or whose tool hardly moves.
     """
-    return calibration.remember("tool", lambda: _find_tool(calibration))
-
-
-def _find_tool(calibration: Calibration) -> CalibratedTool | None:
     robot = calibration.robot
     if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
         return None
@@ -92,9 +88,6 @@ def place_tool(
         RobotError: If the robot has no tool centre point, or the drives do not command it.
         ClosureError: If a point cannot be reached.
     """
-    known = calibration.remember("tool", lambda: _find_tool(calibration))
-    if known is not None and np.array_equal(known.workspace.points, workspace.points):
-        return known
     named = names or [f"point {i + 1}" for i in range(len(workspace.points))]
     return _place(calibration, workspace, _sensitivity(calibration), named)
 
@@ -106,9 +99,7 @@ def _sensitivity(calibration: Calibration) -> ToolSensitivity:
     own = [row.any() for row in calibration.offset_weights]
     offsets = [f"{d.name}.offset" for d, has in zip(robot.drives, own, strict=True) if has]
     free += [n for n in offsets if n not in free]
-    return calibration.remember(
-        "tool sensitivity", lambda: ToolSensitivity(robot, free=free, values=errors)
-    )
+    return ToolSensitivity(robot, free=free, values=errors)
 
 
 def _place(

@@ -26,22 +26,13 @@ from orthocal.assessment.calibrated_tool import (
     place_tool,
 )
 from orthocal.assessment.controller_entries import entered_offsets
+from orthocal.calibration.assessment_record import ToolErrorSummary
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
-from orthocal.statistics.distributions import chi_square_tail
 
 Array = NDArray[np.float64]
-
-ROUNDING = 1e-9
-"""Residuals below which there are none: as many parameters as readings leave that, [m]."""
-
-EXCESS = 1.5
-"""Residuals by which errors must exceed their tolerances for the machine to be called worse."""
-
-RARE = 0.01
-"""Share of the machines within their tolerances that are called worse."""
 
 MOST_POINTS = 5_000
 """Points that are assessed together; each takes 40 kB. `rows.accuracy_rows` takes any number."""
@@ -203,11 +194,17 @@ def assess_tool(
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     if workspace is None:
-        return calibration.remember("accuracy", lambda: _assess_largest_cube(calibration))
+        return assess_placed(calibration, require_tool(calibration))
     return _assess(calibration, place_tool(calibration, workspace, names=names), names)
 
 
-def _assess_largest_cube(calibration: Calibration) -> ToolAccuracy:
+def require_tool(calibration: Calibration) -> CalibratedTool:
+    """The tool over its workspace.
+
+    Raises:
+        RobotError: If the robot has no tool centre point, or its drives do not command it.
+        ClosureError: If its tool hardly moves at all.
+    """
     tool = find_tool(calibration)
     robot = calibration.robot
     if robot.tcp is None:
@@ -224,6 +221,11 @@ def _assess_largest_cube(calibration: Calibration) -> ToolAccuracy:
             "machine reaches within its limits",
             posture="mechanical zero",
         )
+    return tool
+
+
+def assess_placed(calibration: Calibration, tool: CalibratedTool) -> ToolAccuracy:
+    """`assess_tool` over points whose tool is known."""
     return _assess(calibration, tool, None)
 
 
@@ -250,70 +252,49 @@ def _assess(
     )
 
 
-def find_excess(calibration: Calibration) -> float:
-    """How many times their tolerances unmodelled errors must be for what remains of the readings.
+def assess_remaining(
+    calibration: Calibration, accuracy: ToolAccuracy, *, scale: float | None = None
+) -> ToolUncertainty | None:
+    """Uncertainty after a calibration, unmodelled errors at their tolerances times a factor.
 
-    Of the residuals only what the noise does not explain counts, r² = n² + e² u², with n from
-    repeated cycles or the gauge's own σ and u what errors at their tolerances would leave.
+    Args:
+        calibration: The calibration.
+        accuracy: Its errors at the tool.
+        scale: That factor; by default as it was assessed.
 
     Returns:
-        e; 1 where that is no more than EXCESS, where one in a hundred machines within tolerances
-        leaves as much, where noise explains what remains (99 %), where nothing tells the noise but
-        the residuals themselves, or where no errors were left out: the machine may be as good as
-        its tolerances.
+        None if nothing determines the noise.
     """
-    noise, gauge = calibration.noise, calibration.session.gauge_sigma
-    known = noise.cycles_sigma if noise.cycles_dof > 0 else gauge
-    foretold, parts = calibration.unmodelled.residual_rms, calibration.unmodelled.residual_dof
-    if known is None or foretold < ROUNDING or not noise.leaves_more(gauge):
-        return 1.0
-    # residuals keep the noise that parameters and gauge zeros have not taken up
-    kept = noise.residual_dof / len(calibration.residuals)
-    variance = (known * calibration.row_factor) ** 2 * kept
-    ratio = math.sqrt(max(calibration.rms_after**2 - variance, 0.0)) / foretold
-    if ratio <= EXCESS or chi_square_tail(parts, parts * ratio**2) > RARE:
-        return 1.0
-    return ratio
-
-
-def assess_excess(
-    calibration: Calibration, accuracy: ToolAccuracy, excess: float
-) -> ToolUncertainty:
-    """Uncertainty after a calibration with unmodelled errors beyond their tolerances."""
-    covariance = error_covariance(calibration, excess=excess)
+    factor = calibration.tolerance_scale if scale is None else scale
+    if accuracy.after is None or factor == 1.0:
+        return accuracy.after
+    covariance = error_covariance(calibration, excess=factor)
     return measure_uncertainty(accuracy.jacobian, covariance, accuracy.workspace, accuracy.targets)
 
 
-def assess_remaining(
-    calibration: Calibration, accuracy: ToolAccuracy
-) -> tuple[ToolUncertainty | None, float]:
-    """What is not known after a calibration, as far as the readings tell of the machine.
+def summarise_tool(
+    calibration: Calibration, accuracy: ToolAccuracy, *, scale: float | None = None
+) -> ToolErrorSummary | None:
+    """Expected tool error now, with the offsets entered, and with all errors compensated.
+
+    Each is the root of the sum of squares of the known deviation and of the uncertainty.
 
     Returns:
-        Uncertainty, None where nothing tells the noise, and how many times their tolerances
-        unmodelled errors are taken to be: `find_excess`.
+        None if nothing determines the noise.
     """
-    if accuracy.after is None:
-        return None, 1.0
-    excess = find_excess(calibration)
-    if excess == 1.0:
-        return accuracy.after, excess
-    return assess_excess(calibration, accuracy, excess), excess
-
-
-def expect_after_offsets(calibration: Calibration, accuracy: ToolAccuracy) -> float | None:
-    """Error of the tool to be expected with what is to be entered, r.m.s. and headline form, [m].
-
-    What the offsets cannot make up for of the identified errors, and what is not known of them.
-
-    Returns:
-        None where nothing tells the noise.
-    """
-    remaining, _ = assess_remaining(calibration, accuracy)
+    remaining = assess_remaining(calibration, accuracy, scale=scale)
     if remaining is None:
         return None
-    left = accuracy.measure(accuracy.error_after_offsets)
-    return math.hypot(left.headline.rms, remaining.sizes.headline.rms)
+    known = remaining.sizes
+    now, entered = (accuracy.measure(d) for d in (accuracy.deviation, accuracy.error_after_offsets))
+    return ToolErrorSummary(
+        box=accuracy.workspace.box,
+        now=math.hypot(now.headline.rms, known.headline.rms),
+        entered=math.hypot(entered.headline.rms, known.headline.rms),
+        compensated=known.headline.rms,
+        now_absolute=math.hypot(now.absolute.rms, known.absolute.rms),
+        entered_absolute=math.hypot(entered.absolute.rms, known.absolute.rms),
+    )
 
 
 def _spread_size(covariances: Array, workspace: Workspace) -> ErrorSize:

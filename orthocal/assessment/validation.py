@@ -16,10 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.arguments import require_kind
-from orthocal.assessment.controller_entries import ControllerEntry, find_entries
+from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.entry_mistakes import EnteringMistake, find_mistake
+from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
 from orthocal.assessment.predictive import Expectation, expect
 from orthocal.assessment.repetition import Repetition, measure_repetition
+from orthocal.assessment.words import validation as words
+from orthocal.calibration.assessment_record import (
+    Assessment,
+    ControllerEntry,
+    Decision,
+    Finding,
+    Place,
+)
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.refit import repeat_fit, restore_gauge_covariance
@@ -31,12 +40,18 @@ from orthocal.session.session import Session
 from orthocal.statistics.chance import BY_CHANCE, confidence_factor
 from orthocal.statistics.distributions import f_tail
 from orthocal.statistics.zeros import project_out_zeros
-from orthocal.units import InUnit, Unit
+from orthocal.units import MM, InUnit, Unit
 
 Array = NDArray[np.float64]
 
 FEWEST = 5.0
 """Degrees of freedom below which what does not repeat of two sessions is not known."""
+
+REMOVED = 0.7
+"""Part of the deviations below which a fit of the new readings is said to remove them."""
+
+MOST_NAMED = 3
+"""Parameters that are named of those that change most."""
 
 CHANGE_CHANCE = 0.05
 """Probability that any parameter of a calibration that is right is said to change."""
@@ -85,6 +100,8 @@ class Validation:
     """Whether what both fits leave is the same."""
     rows: tuple[ResidualRow, ...]
     """Rows of the new session: nominal is the machine as the controller knows it."""
+    judgement: Judgement
+    """Of the new readings, whatever the calibration is."""
 
     @property
     def as_expected(self) -> bool | None:
@@ -107,6 +124,11 @@ class Validation:
     def nothing_to_change(self) -> bool:
         """Whether no parameter would change beyond its standard error."""
         return not any(c.significant for c in self.changes)
+
+    @property
+    def assessment(self) -> Assessment:
+        """The decision: whether the calibration is confirmed, and what to do."""
+        return _assess(self)
 
     def to_json(self) -> str:
         """As JSON, SI units."""
@@ -195,6 +217,7 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
         enter=entries,
         repetition=repetition,
         rows=refit.residuals,
+        judgement=judge_session(session),
     )
     if found.confirmed is not False:
         return found
@@ -202,6 +225,107 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
     slip = mistake is not None and mistake.kind != "one differs"
     enter = entries if slip else find_entries(refit)
     return replace(found, mistake=mistake, enter=enter)
+
+
+def _assess(validation: Validation) -> Assessment:
+    """The judgement of the new readings, and what they say of the calibration."""
+    lead = _agreement(validation)
+    causes = _causes(validation)
+    findings = rank(
+        [
+            *validation.judgement.findings,
+            lead,
+            *causes,
+            _repetition(validation),
+            *([] if validation.offsets_stated else [words.controller_assumed()]),
+        ]
+    )
+    headlines = {True: words.CONFIRMED, False: words.NOT_CONFIRMED, None: words.UNKNOWN}
+    verdict = verdict_of(findings)
+    anomaly = next((f for f in validation.judgement.findings if f.severity != "note"), None)
+    reason = " ".join(f.text for f in (lead, *causes))
+    action = causes[0].action if causes else lead.action
+    if anomaly is not None:
+        reason, action = f"{anomaly.text} {reason}", anomaly.action
+    return Assessment(
+        decision=Decision(verdict, headlines[validation.confirmed], reason, action),
+        findings=findings,
+        entries=validation.enter,
+        tool=None,
+        tolerance_scale=validation.judgement.tolerance_scale,
+    )
+
+
+def _agreement(validation: Validation) -> Finding:
+    """Whether the deviations are those that were predicted."""
+    achieved, expected = validation.achieved_rms, validation.expected_rms
+    numbers = {
+        "expected_rms_mm": expected / MM,
+        "achieved_rms_mm": achieved / MM,
+        "refit_rms_mm": validation.refit_rms / MM,
+        "chance": validation.excess_probability,
+    }
+    if validation.as_expected is None:
+        return words.nothing_predicted(numbers)
+    if not validation.as_expected:
+        worst = max(validation.rows, key=lambda r: abs(r.deviation))
+        place = Place(line=worst.line, setup=worst.setup, posture=worst.postures)
+        return words.larger_than_predicted(achieved, expected, numbers, [place])
+    if validation.nothing_to_change:
+        return words.confirmed(achieved, expected, numbers)
+    changed = [c.name for c in validation.changes if c.significant]
+    return words.further_change(changed, numbers, explained=validation.mistake is not None)
+
+
+def _causes(validation: Validation) -> list[Finding]:
+    """What may have happened if the calibration is not confirmed."""
+    if validation.confirmed is not False:
+        return []
+    mistake = validation.mistake
+    if mistake is not None:
+        numbers = _mistake_numbers(validation, mistake)
+        if mistake.kind == "one differs":
+            entry = next(e for e in validation.enter if e.drive == mistake.drives[0])
+            return [words.one_differs(entry, mistake.by[0], mistake.rms, numbers)]
+        return [
+            words.slip(
+                mistake.kind,
+                mistake.drives,
+                mistake.rms,
+                numbers,
+                all_drives=mistake.all_drives,
+            )
+        ]
+    if validation.as_expected:
+        return []
+    if validation.refit_rms < REMOVED * validation.achieved_rms:
+        largest = sorted(validation.changes, key=lambda c: -abs(c.change) / max(c.std, 1e-300))
+        names = [c.name for c in largest[:MOST_NAMED]]
+        significant = any(c.significant for c in largest)
+        return [words.geometry_changed(validation.refit_rms, names, significant=significant)]
+    return [words.not_the_offsets()]
+
+
+def _mistake_numbers(validation: Validation, mistake: EnteringMistake) -> dict[str, float]:
+    """Controller values less those to be entered, drive by drive, and the residual."""
+    units = {e.drive: (e.edge_factor, e.edge_unit.replace("°", "deg")) for e in validation.enter}
+    found = {"left_rms_mm": mistake.rms / MM}
+    for drive, by in zip(mistake.drives, mistake.by, strict=True):
+        factor, unit = units.get(drive, (1.0, "si"))
+        found[f"{drive}_by_{unit}"] = by * factor
+    return found
+
+
+def _repetition(validation: Validation) -> Finding:
+    """Whether the residuals are the same in both sessions."""
+    found = validation.repetition
+    if found.repeats is None:
+        return words.repetition_unknown(found.untold)
+    if found.repeats:
+        return words.residuals_repeat(found.correlation, found.matched, found.chance)
+    return words.residuals_differ(
+        found.correlation, found.matched, found.chance, new=validation.as_expected is False
+    )
 
 
 def _entered(calibration: Calibration, session: Session) -> Session:
@@ -239,7 +363,7 @@ def _find_mistake(
     entries = {e.drive: e for e in find_entries(calibration)}
     identified, scatter = (
         np.array([getattr(entries[d.name], key) if d.name in entries else 0.0 for d in drives])
-        for key in ("identified", "scatter")
+        for key in ("identified", "std_scatter")
     )
     share = _share_that_is_new(calibration, repetition, expected.sigma)
 
@@ -310,7 +434,7 @@ def _require_offsets(calibration: Calibration, session: Session) -> None:
     others, where = [], ""
     for entry in find_entries(calibration):
         stated = float(session.active_offsets[drives.index(entry.drive)])
-        allowed = max(0.5 * entry.scatter, 0.02e-3)
+        allowed = max(0.5 * entry.std_scatter, 0.02e-3)
         if not math.isnan(allowed) and abs(stated - entry.enter) > allowed:
             factor, unit = entry.edge_factor, entry.edge_unit
             where = f"{session.path or 'session'}: controller.offsets_{unit}"

@@ -7,6 +7,9 @@ from collections.abc import Sequence
 
 from orthocal.units import MM, UM
 
+LARGEST_IN_UM = 0.1 * MM
+"""Lengths from which on a sentence is in mm, [m]."""
+
 
 def mm(value: float) -> str:
     """A length in mm, three decimals."""
@@ -48,3 +51,14 @@ def count_of(value: int) -> str:
     """A number of things, below ten as a word."""
     words = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
     return words[value] if 0 <= value < len(words) else str(value)
+
+
+def lengths(*values: float) -> tuple[str, ...]:
+    """Lengths of one sentence in one unit, two or three significant digits: 0.12 mm, 17.8 µm.
+
+    Args:
+        values: Lengths, [m].
+    """
+    if max(values) >= LARGEST_IN_UM:
+        return tuple(f"{v / MM:.2g} mm" if v / MM < 1.0 else f"{v / MM:.3g} mm" for v in values)
+    return tuple(f"{um(v)} µm" for v in values)

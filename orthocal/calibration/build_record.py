@@ -119,9 +119,9 @@ def assemble_calibration(
         gauges=_gauge_records(fit),
         changes=find_session_changes(fit, others),
         version=__version__,
+        robot=session.robot,
     )
     require_loadable(calibration)
-    calibration.remember("robot", lambda: session.robot)  # no need to load it again
     return calibration
 
 

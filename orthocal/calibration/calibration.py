@@ -6,21 +6,13 @@ It holds all that a report, a scene or an export needs: none of them asks for th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.calibration.machine import Machine
-from orthocal.calibration.recorded_robot import (
-    load_recorded_robot,
-    require_offsets,
-    require_parameters,
-    require_rows,
-)
 from orthocal.calibration.records import CalibrationRecord, ParameterEstimate
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow, root_mean_square
 from orthocal.robot.model import Robot
@@ -28,17 +20,15 @@ from orthocal.statistics.chance import confidence_factor
 
 Array = NDArray[np.float64]
 
-Found = TypeVar("Found")
 
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Calibration(CalibrationRecord):
-    """A calibration, and what follows from it."""
+    """A calibration: its record, the robot that it is of, and what follows from both."""
 
+    robot: Robot
+    """The nominal robot, with the tolerances that the session states."""
     path: Path | None = None
-    """Where it was loaded from."""
-    _kept: dict[str, Any] = field(init=False, default_factory=dict)
-    """What follows from the rest, once it was asked for."""
+    """File that it was loaded from."""
 
     def __getitem__(self, name: str) -> ParameterEstimate:
         for p in self.parameters:
@@ -182,28 +172,6 @@ class Calibration(CalibrationRecord):
         return np.where(bound, 0.0, bias)
 
     @property
-    def robot(self) -> Robot:
-        """The nominal robot.
-
-        Raises:
-            RobotError: If it cannot be found or loaded.
-            CalibrationFileError: If its files are not those that were calibrated.
-        """
-        return self.remember("robot", self._load_robot)
-
-    def remember(self, name: str, find: Callable[[], Found]) -> Found:
-        """What follows from this calibration, found once and kept with it.
-
-        Args:
-            name: Of what is found.
-            find: How.
-        """
-        if name not in self._kept:
-            self._kept[name] = find()
-        found: Found = self._kept[name]
-        return found
-
-    @property
     def active_offsets(self) -> Array:
         """Offsets in the controller while measuring, 0 where not stated, (n_drives,), [m, rad]."""
         stated = self.session.controller_offsets
@@ -227,24 +195,17 @@ class Calibration(CalibrationRecord):
         return np.asarray(self.offset_weights @ np.array([p.value for p in self.parameters]))
 
     @property
-    def machine(self) -> Machine:
-        """The machine as it was identified: it moves.
+    def tolerance_scale(self) -> float:
+        """Factor by which errors that were not identified exceed their tolerances, as assessed."""
+        return 1.0 if self.assessment is None else self.assessment.tolerance_scale
 
-        Raises:
-            RobotError, CalibrationFileError: As `robot`.
-        """
-        return self.remember("machine", lambda: Machine(self.robot, self.errors))
+    @property
+    def machine(self) -> Machine:
+        """The identified machine: forward and inverse kinematics with its errors."""
+        return Machine(self.robot, self.errors)
 
     def _repr_html_(self) -> str:
         """In a notebook: the short answer."""
         import orthocal  # what is shown follows in later stages
 
         return orthocal.summarize(self, html=True)
-
-    def _load_robot(self) -> Robot:
-        robot = load_recorded_robot(self.robot_record, file=self.path)
-        prefix = "" if self.path is None else f"{self.path}: "
-        require_parameters(robot, self.parameters, self.unmodelled.names, prefix=prefix)
-        require_rows(robot, self.setups, self.postures, self.residuals, prefix=prefix)
-        require_offsets(robot, self.session.controller_offsets, prefix=prefix)
-        return robot

@@ -16,10 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.recorded_robot import (
+    load_recorded_robot,
+    require_offsets,
+    require_parameters,
+    require_rows,
+)
 from orthocal.calibration.records import CalibrationRecord
 from orthocal.errors import CalibrationFileError, SolverError
 from orthocal.io.documents import read_json, validate, write_plain
 from orthocal.io.files import exists, is_folder, write_file
+from orthocal.robot.model import Robot
 from orthocal.statistics.identifiability import Identifiability
 from orthocal.text import shorten
 
@@ -93,7 +100,9 @@ def require_loadable(calibration: Calibration) -> None:
         SolverError: Naming the number that cannot be.
     """
     try:
-        _read_document(calibration_document(calibration), "calibration.json")
+        _read_document(
+            calibration_document(calibration), "calibration.json", robot=calibration.robot
+        )
     except CalibrationFileError as e:
         raise SolverError(
             f"the result makes no sense ({e}); look for readings, a σ, tolerances or bounds that "
@@ -103,13 +112,20 @@ def require_loadable(calibration: Calibration) -> None:
         ) from None
 
 
-def _read_document(data: Any, file: str, *, path: Path | None = None) -> Calibration:  # noqa: ANN401 - any document
-    """A document as a calibration, each of its parts held against the others.
+def _read_document(
+    data: Any,  # noqa: ANN401 - any document
+    file: str,
+    *,
+    path: Path | None = None,
+    robot: Robot | None = None,
+) -> Calibration:
+    """A document as a calibration, each of its parts checked against the others.
 
     Args:
         data: The document; what does not belong to the record is taken out of it.
         file: Where it is from, for messages.
         path: The file, where it is from one.
+        robot: The robot that it is of; by default that which the document names.
 
     Raises:
         CalibrationFileError: Naming the key.
@@ -125,8 +141,15 @@ def _read_document(data: Any, file: str, *, path: Path | None = None) -> Calibra
         )
     _check_singular_values(record.identifiability, file)
     _check_changes(record, file)
+    known = load_recorded_robot(record.robot_record, file=path) if robot is None else robot
+    prefix = "" if path is None else f"{path}: "
+    require_parameters(known, record.parameters, record.unmodelled.names, prefix=prefix)
+    require_rows(known, record.setups, record.postures, record.residuals, prefix=prefix)
+    require_offsets(known, record.session.controller_offsets, prefix=prefix)
     calibration = Calibration(
-        **{name: getattr(record, name) for name in CalibrationRecord.__slots__}, path=path
+        **{name: getattr(record, name) for name in CalibrationRecord.__slots__},
+        robot=known,
+        path=path,
     )
     for place, value in _derive(calibration):
         if place in derived:

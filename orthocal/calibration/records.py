@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from orthocal.calibration.assessment_record import Assessment
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.diagnostics.unmodelled import Unmodelled
 from orthocal.estimation.loss import LossKind
@@ -235,3 +236,5 @@ class CalibrationRecord:
     gauges: Many[GaugeRecord]
     changes: Changes | None = None
     """What has changed between the sessions; None for a single one."""
+    assessment: Assessment | None = None
+    """Verdict, findings, what to enter and the tool error; None if it was not assessed."""

@@ -65,8 +65,7 @@ def find_changes(calibration: Calibration) -> Changes | None:
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     if calibration.changes is not None or not calibration.session.parts:
         return calibration.changes
-    again = repeat_calibration(calibration, restore_session(calibration))
-    return calibration.remember("changes", lambda: again.changes)
+    return repeat_calibration(calibration, restore_session(calibration)).changes
 
 
 def repeat_fit(calibration: Calibration, session: Session) -> Fit:

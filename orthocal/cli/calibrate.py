@@ -26,8 +26,8 @@ def calibrate(
     model: Annotated[
         str | None,
         typer.Option(
-            help="Which errors are free: offsets, lengths, full, or one of the robot's own; by "
-            "default what the session says, or offsets.",
+            help="Which errors are free: full (all, with priors), offsets, lengths, or one of the "
+            "robot's own; by default what the session states, otherwise full.",
         ),
     ] = None,
     free: Annotated[
@@ -104,11 +104,11 @@ def calibrate(
 ) -> None:
     """Identify the errors of a machine from sessions of readings: what to enter, and whether.
 
-    Exit code 3: what was identified is not to be entered, for the reason that is printed; all
-    outputs are written all the same.
+    Exit code 3: the readings are to be reviewed or rejected, for the reason that is printed; all
+    outputs are written nevertheless.
     """
-    from orthocal.assessment.findings.calibration import decide
-    from orthocal.calibration.calibrate import calibrate as run
+    from orthocal.assessment.assess import assessment_of
+    from orthocal.assessment.assess import calibrate as run
     from orthocal.estimation.choice import Choice
     from orthocal.estimation.selection import read_bounds, read_known, read_tolerances
     from orthocal.io.files import require_writable, write_files
@@ -139,7 +139,7 @@ def calibrate(
 
         put_out(printed_calibration(result).rstrip("\n"))
     else:
-        print_summary(result, details=details, all_rows=all_rows)
+        print_summary(result, details=details, all_rows=all_rows, saved=out)
     if out is not None:
         from orthocal.calibration.file import calibration_json
         from orthocal.output.report.page import build_report
@@ -147,7 +147,7 @@ def calibrate(
         files = {"calibration.json": calibration_json(result), "report.html": build_report(result)}
         write_files(out, files)
         put_note(f"Wrote {out / 'calibration.json'} and {out / 'report.html'}")
-    if code := decide(result).exit_code:
+    if code := assessment_of(result).decision.exit_code:
         raise typer.Exit(code)
 
 
@@ -171,11 +171,9 @@ def compare(
 ) -> None:
     """Which model do the readings support: offsets, lengths, full, linearised and exact?
 
-    Exit code 0: one is supported, and what it leaves is noise. 3: one is supported, but what it
-    leaves is error of the model. 4: none is supported.
+    Exit code 3: the readings are to be reviewed or rejected; the verdict is that of `calibrate`.
     """
     from orthocal.assessment.comparison import compare_models
-    from orthocal.assessment.findings.comparison import decide_comparison
     from orthocal.estimation.selection import read_tolerances
     from orthocal.output.text.printed_json import printed_comparison
     from orthocal.output.text.summary import print_summary
@@ -192,7 +190,8 @@ def compare(
         put_out(printed_comparison(result).rstrip("\n"))
     else:
         print_summary(result, all_rows=all_rows)
-    raise typer.Exit(decide_comparison(result).exit_code)
+    if code := result.assessment.decision.exit_code:
+        raise typer.Exit(code)
 
 
 @app.command()
@@ -209,9 +208,8 @@ def validate(
 ) -> None:
     """Hold a new session against a calibration: is it confirmed?
 
-    Exit code 0: it is. 3: it is not, or a further fit would change something.
+    Exit code 0: it is. 3: it is not, or the new readings are to be reviewed or rejected.
     """
-    from orthocal.assessment.findings.validation import decide_validation
     from orthocal.assessment.validation import validate_calibration
     from orthocal.calibration.file import load_calibration
     from orthocal.output.text.printed_json import printed_validation
@@ -222,5 +220,5 @@ def validate(
         put_out(printed_validation(result).rstrip("\n"))
     else:
         print_summary(result, all_rows=all_rows)
-    if code := decide_validation(result).exit_code:
+    if code := result.assessment.decision.exit_code:
         raise typer.Exit(code)

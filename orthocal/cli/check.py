@@ -1,8 +1,6 @@
-"""Whether readings are in order, before anything is made of them: check."""
+"""The command `check`."""
 
 from __future__ import annotations
-
-from typing import Annotated
 
 import typer
 
@@ -13,27 +11,22 @@ from orthocal.cli.printing import put_out
 @app.command()
 def check(
     sessions: SessionPaths,
-    model: Annotated[
-        str | None,
-        typer.Option(
-            help="Errors that the machine may have, as a model of the robot; all by default."
-        ),
-    ] = None,
     json: Json = False,
 ) -> None:
-    """Look for mistakes in readings: units, signs, rows, steps, a stuck dial, a bumped stand.
+    """Check readings for mistakes: units, signs, rows, a stuck dial, a displaced stand.
 
-    Exit code 0: nothing odd. 3: look at the readings before measuring on, or calibrating.
+    Exit code 0: no anomaly. 3: check the readings before you continue. The verdict is that of
+    `calibrate` on the same readings.
     """
-    from orthocal.assessment.findings.session import decide_session
+    from orthocal.assessment.assess import check_session
     from orthocal.measurement.joining import join_sessions
-    from orthocal.output.text.check import print_check
-    from orthocal.output.text.printed_json import printed_decision
+    from orthocal.output.text.answer import print_decision
+    from orthocal.output.text.printed_json import printed_assessment
 
-    decision = decide_session(join_sessions(load_each_once(sessions)), model)
+    found = check_session(join_sessions(load_each_once(sessions)))
     if json:
-        put_out(printed_decision(decision).rstrip("\n"))
+        put_out(printed_assessment(found).rstrip("\n"))
     else:
-        print_check(decision)
-    if code := decision.exit_code:
+        print_decision(found)
+    if code := found.decision.exit_code:
         raise typer.Exit(code)

@@ -20,7 +20,17 @@ from orthocal.units import Unit
 Array = NDArray[np.float64]
 Known = float | tuple[float, float]
 
-DEFAULT_MODEL = "offsets"
+COMPLETE_MODELS = ("full", "complete")
+"""Names under which a robot has its complete model, the first of them that it has."""
+
+
+def complete_model(parameters: ParameterSet) -> str:
+    """Name of a robot's complete model; its largest if it names none so."""
+    for name in COMPLETE_MODELS:
+        if name in parameters.models:
+            return name
+    return max(parameters.models, key=lambda m: len(parameters.select_model(m)))
+
 
 LARGEST_KNOWN = 100.0
 """Tolerances beyond which a known value is taken for a length or an angle instead of an error."""
@@ -94,7 +104,8 @@ def select_parameters(
 
     Args:
         parameters: Of the robot.
-        model: A model of the robot's YAML; `offsets` where neither a model nor `free` is given.
+        model: A model of the robot's YAML; the complete one if neither a model nor `free` is
+            given.
         free: Names or globs that are free too, after the model's; '!' takes out again.
         prior: Whether tolerances act as a prior; by default not where only offsets are free.
         known: Name to a known value, which is then held, or to a value and its standard
@@ -106,7 +117,7 @@ def select_parameters(
         ParameterError: If a name, glob or model is unknown, nothing is left free, two of the
             parameters are partly the same error, or a number makes no sense.
     """
-    base = DEFAULT_MODEL if model is None and not free else model
+    base = complete_model(parameters) if model is None and not free else model
     patterns: list[str] = []
     if base is not None:
         patterns += parameters.patterns(base)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from orthocal.assessment.findings.calibration import decide
+from orthocal.assessment.assess import assessment_of
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError, ParameterError
 from orthocal.export.corrections import export_corrections
@@ -78,11 +78,11 @@ def export_calibration(
 
 
 def require_entering(calibration: Calibration) -> None:
-    """Refuse a calibration that is not to be entered.
+    """Refuse a calibration whose verdict is to review or to reject the readings.
 
     Raises:
-        ExportError: If its decision is not to enter it.
+        ExportError: If its verdict is not to enter it.
     """
-    decision = decide(calibration)
-    if decision.answer == "do not enter":
+    decision = assessment_of(calibration).decision
+    if decision.verdict != "enter":
         raise ExportError(f"{decision.headline} {decision.reason} {decision.action}".strip())

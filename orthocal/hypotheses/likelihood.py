@@ -193,17 +193,25 @@ def likelihood_of(
     errors, sizes, rows = np.linalg.svd(slopes.T, full_matrices=False)
     kept = sizes > LEAST * max(float(sizes.max(initial=0.0)), sigma)
     excess = -0.5 * (np.log(EXCESSES) / EXCESS_SPREAD) ** 2
-    noise = _normal(NOISES, NOISE_UNKNOWN)
-    if stated:
-        noise = np.logaddexp(
-            np.log1p(-STATED_WRONGLY) + _normal(NOISES, NOISE_SPREAD),
-            np.log(STATED_WRONGLY) + noise,
-        )
+    noise = noise_weights(stated=stated)
     weights = np.repeat(excess - log_of_sum(excess), NOISES.size)
     likelihood = Likelihood(
         rows[kept], sizes[kept] ** 2, sigma, dof, weights + np.tile(noise, EXCESSES.size)
     )
     return likelihood, errors[:, kept], sizes[kept]
+
+
+def noise_weights(*, stated: bool) -> Array:
+    """Logarithms of the prior weights of NOISES, shape (n_noises,).
+
+    Args:
+        stated: Whether the standard deviation of a reading is stated.
+    """
+    noise = _normal(NOISES, NOISE_UNKNOWN)
+    if not stated:
+        return noise
+    known = np.log1p(-STATED_WRONGLY) + _normal(NOISES, NOISE_SPREAD)
+    return np.asarray(np.logaddexp(known, np.log(STATED_WRONGLY) + noise))
 
 
 def _normal(values: Array, spread: float) -> Array:

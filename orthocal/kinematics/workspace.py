@@ -59,6 +59,14 @@ class Workspace:
         return cls(p, read_only(np.full(len(p), 1.0 / len(p))))
 
     @property
+    def box(self) -> tuple[tuple[float, float], ...]:
+        """Lowest and highest coordinate: about the mechanical zero for a cube, [m]."""
+        if self.half_side is not None:
+            return ((-self.half_side, self.half_side),) * int(self.points.shape[1])
+        ends = zip(self.points.min(axis=0), self.points.max(axis=0), strict=True)
+        return tuple((float(low), float(high)) for low, high in ends)
+
+    @property
     def words(self) -> str:
         """What it is: a cube of ±60 mm around the zero."""
         if self.half_side is None:

@@ -13,6 +13,7 @@ from folders import session_folder
 from gauges import exact
 from machines import place, write_orthoglide
 from models import JOINTS
+from orthocal.assessment.findings.comparison import decide_comparison
 
 from orthocal import (
     Choice,
@@ -25,7 +26,6 @@ from orthocal import (
     summarize,
 )
 from orthocal.assessment.controller_entries import entered_offsets
-from orthocal.assessment.findings.comparison import decide_comparison
 from orthocal.assessment.remaining_errors import find_remaining_errors
 from orthocal.assessment.tool_error import (
     assess_tool,

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from orthocal.assessment.findings.comparison import decide_comparison
 
 from orthocal import load_session, summarize
 from orthocal.assessment.comparison import compare_models
-from orthocal.assessment.findings.comparison import decide_comparison
 from orthocal.errors import ParameterError
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem

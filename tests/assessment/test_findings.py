@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 from fleets import Fleet
 from gauges import exact
+from orthocal.assessment.findings.calibration import decide
+from orthocal.assessment.findings.finding import Finding, Kind, Severity
+from orthocal.assessment.findings.validation import decide_validation
 
 from orthocal import (
     Choice,
@@ -21,9 +24,6 @@ from orthocal import (
     simulate_session,
     validate_calibration,
 )
-from orthocal.assessment.findings.calibration import decide
-from orthocal.assessment.findings.finding import Finding, Kind, Severity
-from orthocal.assessment.findings.validation import decide_validation
 from orthocal.assessment.tool_error import assess_tool, expect_after_offsets
 from orthocal.calibration.file import calibration_document
 from orthocal.output.text.printed_json import printed_calibration, printed_validation

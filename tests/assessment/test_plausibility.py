@@ -11,13 +11,13 @@ import plans
 import pytest
 from folders import session_folder
 from machines import write_orthoglide
+from orthocal.assessment.findings.calibration import decide
+from orthocal.output.text.explanation import advise
 
 from orthocal import calibrate, load_plan, load_robot, load_session, simulate_session, summarize
-from orthocal.assessment.findings.calibration import decide
 from orthocal.assessment.plausibility import describe_machine, find_doubts
 from orthocal.calibration.file import calibration_json
 from orthocal.errors import RobotError
-from orthocal.output.text.explanation import advise
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from orthocal.output.text.explanation import explain_fit
 from tolerances import CLOSED_FORM, KINEMATICS
 
 from orthocal import (
@@ -23,7 +24,6 @@ from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.file import calibration_document, calibration_json, write_calibration
 from orthocal.errors import CalibrationFileError, ClosureError
 from orthocal.kinematics import orthoglide as closed_form
-from orthocal.output.text.explanation import explain_fit
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 

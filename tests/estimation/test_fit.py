@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gauges import exact
+from orthocal.output.text.explanation import explain_fit
 from scipy.optimize import lsq_linear
 from tolerances import SAME_OPTIMUM
 
@@ -15,7 +16,6 @@ from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchProgram
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
-from orthocal.output.text.explanation import explain_fit
 from orthocal.statistics.information import decompose
 from orthocal.statistics.zeros import project_out_zeros
 

@@ -12,6 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from made_mistakes import Sheet, is_named, make_mistakes, plain_mistakes, sound_session
+from orthocal.assessment.findings.calibration import decide
+from orthocal.assessment.findings.session import MISTAKES, _sureness, decide_session
 from typer.testing import CliRunner
 
 from orthocal import (
@@ -22,8 +24,6 @@ from orthocal import (
     load_session,
     simulate_session,
 )
-from orthocal.assessment.findings.calibration import decide
-from orthocal.assessment.findings.session import MISTAKES, _sureness, decide_session
 from orthocal.cli.run import app
 from orthocal.hypotheses.edits import Table
 from orthocal.hypotheses.families.single_reading import find_single

@@ -10,6 +10,7 @@ import plans
 import pytest
 from folders import session_folder
 from machines import write_orthoglide
+from orthocal.assessment.findings.calibration import decide
 from rich.console import Group
 
 from orthocal import (
@@ -22,7 +23,6 @@ from orthocal import (
     simulate_session,
     summarize,
 )
-from orthocal.assessment.findings.calibration import decide
 from orthocal.output.report.page import build_report
 from orthocal.output.text.answer import _suspicion, render_answer
 from orthocal.output.text.layout import to_text

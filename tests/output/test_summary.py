@@ -6,9 +6,9 @@ import math
 from dataclasses import replace
 
 import pytest
+from orthocal.output.text.explanation import advise, explain_fit
 
 from orthocal import Choice, calibrate, load_session, summarize
-from orthocal.output.text.explanation import advise, explain_fit
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,8 @@ from pathlib import Path
 from rich.console import Group
 
 from orthocal.arguments import require_kind
-from orthocal.assessment.controller_entries import find_entries
-from orthocal.assessment.findings.calibration import decide
-from orthocal.assessment.tool_error import ToolAccuracy, assess_tool, find_excess
+from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.io.files import write_file
@@ -31,9 +30,8 @@ from orthocal.output.report.rich_markup import to_markup
 from orthocal.output.report.tool_map import Field, plot_tool_map
 from orthocal.output.scene.drawing import draw_scene
 from orthocal.output.text.accuracy import render_tool
-from orthocal.output.text.answer import render_answer, shows_entries
+from orthocal.output.text.answer import render_answer
 from orthocal.output.text.entries import entry_table, render_meaning
-from orthocal.output.text.explanation import explain_fit
 from orthocal.output.text.heading import render_heading
 from orthocal.output.text.layout import bullets, mm, plain, signed
 from orthocal.output.text.sensors import render_parts
@@ -139,12 +137,12 @@ def _verdict(calibration: Calibration) -> str:
         f"largest was {mm(calibration.largest_before)} mm and is {mm(calibration.largest_after)} "
         "mm."
     )
-    decision = decide(calibration)
+    found = assessment_of(calibration)
     answer = to_markup(render_answer(calibration, heading=False))
     meaning = Group()
-    if find_entries(calibration):
+    if found.entries:
         # what the answer leaves out: where the sliders are, and what is not to be entered
-        told_all = shows_entries(decision) and calibration.only_offsets
+        told_all = found.decision.verdict != "reject" and calibration.only_offsets
         listed = [] if told_all else [entry_table(calibration)]
         meaning = Group(*listed, *render_meaning(calibration))
     return (
@@ -153,7 +151,7 @@ def _verdict(calibration: Calibration) -> str:
         + to_markup(meaning)
         + paragraph(told)
         + heading("What it means", level=3)
-        + to_markup(bullets(explain_fit(calibration)))
+        + to_markup(bullets([f.words for f in found.findings]))
     )
 
 
@@ -166,7 +164,7 @@ def _tool(calibration: Calibration) -> str:
 
 
 def _maps(calibration: Calibration, found: ToolAccuracy) -> str:
-    excess = find_excess(calibration)
+    excess = calibration.tolerance_scale
     times = f"{excess:.1f} times " if excess > 1.0 else ""
     captions: dict[Field, str] = {
         "now": "Where the tool is, less where it is sent, with the controller as it was while "

@@ -58,7 +58,7 @@ def draw_tool_errors(stage: Stage, calibration: Calibration, *, shown: bool) -> 
     fields = found.align(found.deviation), found.align(found.error_after_offsets)
     now, left = (float(np.linalg.norm(d, axis=1).max()) for d in fields)
     # in space, as in all tables: the axes of an ellipsoid are shorter
-    after, excess = assess_remaining(calibration, found)
+    after, excess = assess_remaining(calibration, found), calibration.tolerance_scale
     spread = 0.0 if after is None else after.sizes.headline.largest
     largest = max(now, left, spread)
     if largest < VANISHING:

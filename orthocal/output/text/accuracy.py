@@ -11,8 +11,6 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from orthocal.assessment.controller_entries import find_entries
-from orthocal.assessment.findings.residuals import find_tolerances
-from orthocal.assessment.findings.tool import promise
 from orthocal.assessment.remaining_errors import find_remaining_errors
 from orthocal.assessment.tool_error import (
     ErrorSize,
@@ -20,9 +18,11 @@ from orthocal.assessment.tool_error import (
     ToolAccuracy,
     assess_remaining,
     assess_tool,
+    summarise_tool,
 )
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
+from orthocal.output.text.answer import describe_tool_error
 from orthocal.output.text.layout import add_row, print_rich, table_of, um
 from orthocal.units import MM, UM
 
@@ -73,7 +73,7 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
     if not calibration.only_offsets and find_entries(calibration):
         rows.append(("with the offsets entered", accuracy.measure(accuracy.error_after_offsets)))
     rows.append(("not known before", accuracy.before.sizes))
-    remaining, excess = assess_remaining(calibration, accuracy)
+    remaining, excess = assess_remaining(calibration, accuracy), calibration.tolerance_scale
     if accuracy.after is not None:
         rows.append(("not known after", accuracy.after.sizes))
     if remaining is not None and excess > 1.0:
@@ -92,8 +92,9 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
             "were not identified at their tolerances."
         )
     )
-    lines += [Text(found.text) for found in find_tolerances(calibration)]
-    lines += [Text(found.text) for found in promise(calibration, accuracy)]
+    summary = summarise_tool(calibration, accuracy)
+    if summary is not None and find_entries(calibration):
+        lines.append(Text(describe_tool_error(summary)))
     lines += [Text(line) for line in describe_remaining(calibration, accuracy)]
     return Group(*lines)
 

@@ -7,7 +7,8 @@ import math
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from orthocal.assessment.findings.parameters import FEW_NAMES, find_held, find_hidden
+from orthocal.assessment.fit_findings import find_held, find_unresolved
+from orthocal.assessment.words.fit import FEW_NAMES
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
@@ -164,8 +165,8 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
             f"O5 {o['O5'] / MM:.3g} mm a tolerance: of {counted(found.rank, 'direction')}, and "
             "to be compared only with plans that see as many."
         )
-    hidden = find_hidden(calibration)
-    alike = [f.text for f in hidden if f.kind == "not told apart"]
+    hidden = find_unresolved(calibration)
+    alike = [f.text for f in hidden if f.kind == "inseparable"]
     shown = alike if all_rows else alike[:MOST_GROUPS]
     lines += shown
     if len(shown) < len(alike):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from orthocal.assessment.findings.validation import decide_validation
 from orthocal.assessment.validation import FurtherChange, Validation
 from orthocal.output.text.layout import (
     add_row,
@@ -64,9 +63,10 @@ def render_validation(validation: Validation, *, all_rows: bool = False) -> Rend
 
 def explain_validation(validation: Validation) -> list[str]:
     """The verdict of a validation and its reasons."""
-    decision = decide_validation(validation)
-    verdict = f"{decision.reason} {decision.action}".strip()
-    others = [f for f in decision.findings[1:] if f.severity == "informs"]
+    found = validation.assessment
+    decision = found.decision
+    verdict = f"{decision.headline} {decision.reason} {decision.action}".strip()
+    others = [f for f in found.findings if f.severity == "note" and f.text not in decision.reason]
     return [verdict, *(f.words for f in others)]
 
 

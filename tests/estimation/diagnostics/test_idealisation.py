@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from machines import place, reading_by_pinocchio
+from orthocal.assessment.findings.calibration import decide
 
 from orthocal import calibrate, load_plan, simulate_session
-from orthocal.assessment.findings.calibration import decide
 from orthocal.estimation.diagnostics.idealisation import find_idealised
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.units import MM

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gauges import exact
+from orthocal.output.text.explanation import explain_fit
 
 from orthocal import SolverOptions, calibrate, load_plan, load_session, simulate_session
 from orthocal.errors import SolverError
@@ -15,7 +16,6 @@ from orthocal.estimation.fit import fit_problem, require_assembly
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
-from orthocal.output.text.explanation import explain_fit
 from orthocal.session.session import Gauge, Session
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}

@@ -1,4 +1,4 @@
-"""From a session to a calibration: the one call that most users need."""
+"""Identification: from a session to a calibration, before it is assessed."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.continuation import as_rows
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
+from orthocal.session.session import Session
 from orthocal.statistics.identifiability import (
     find_base_parameters,
 )
@@ -32,7 +33,7 @@ Array = NDArray[np.float64]
 MAX_BASE_ROUNDS = 8
 
 
-def calibrate(
+def identify(
     sessions: Given | Sequence[Given],
     choice: Choice | str | None = None,
     *,
@@ -40,8 +41,8 @@ def calibrate(
     solver: SolverOptions | SolverKind = "ipopt",
     profile: Sequence[str] = (),
     start: ArrayLike | None = None,
-) -> Calibration:
-    """Identify the errors of a machine from a session, exactly, with their uncertainty.
+) -> tuple[Calibration, Session]:
+    """Identify the errors of a machine from a session, with their uncertainty; not assessed.
 
     Args:
         sessions: The session, or the path to one; or several, which are fitted together.
@@ -53,6 +54,9 @@ def calibrate(
         profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
         start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
             solution.
+
+    Returns:
+        The calibration, and the session (or the joined sessions) that it is of.
 
     Raises:
         NotIdentifiableError: If the readings leave a parameter open and there is no prior.
@@ -81,7 +85,7 @@ def calibrate(
         fit = fit_problem(problem, options=options, start=start)
     profiled = _match_profiled(fit.problem, profile)
     intervals = {name: profile_interval(fit, name) for name in profiled}
-    return assemble_calibration(fit, whole=whole, intervals=intervals)
+    return assemble_calibration(fit, whole=whole, intervals=intervals), session
 
 
 def _solver_options(
