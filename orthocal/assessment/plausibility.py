@@ -162,6 +162,7 @@ def _coarse(session: Session, fit: Fit) -> Finding | None:
 
 def _near(session: Session) -> Finding | None:
     """A posture hardly away from another one, beside far ones: given in metres."""
+    session = session.select(session.readings)  # of several sessions its own postures
     drives = np.array([p.drives for p in session.postures.values()])
     places, first = np.unique(drives, axis=0, return_index=True)
     if len(places) < 3:

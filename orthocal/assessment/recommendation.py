@@ -32,6 +32,9 @@ Array = NDArray[np.float64]
 STRONG = 5.0
 """ln of the Bayes factor from which evidence is strong: 150 to 1 (Kass and Raftery, 1995)."""
 
+NEARLY = 3.0
+"""Difference of ln evidence up to which models are nearly as well supported."""
+
 SCALES = np.geomspace(0.1, 10.0, 41)
 """Scales of the tolerances that are weighed."""
 
@@ -91,7 +94,9 @@ def recommend_model(session: Session, models: Sequence[str] = ()) -> Recommendat
         default=None,
     )
     strong_scale = gain >= STRONG
-    if smaller is not None and smaller.log_evidence >= max(STRONG, gain if strong_scale else 0.0):
+    # a smaller model is simpler than other tolerances that are nearly as well supported
+    least = max(STRONG, gain - NEARLY)
+    if smaller is not None and smaller.log_evidence >= least:
         return Recommendation(smaller.model, 1.0, tuple(evidence), 0.0)
     scale = float(SCALES[best]) if strong_scale else 1.0
     return Recommendation(complete, scale, tuple(evidence), gain if strong_scale else 0.0)

@@ -80,9 +80,7 @@ def _scores(comparison: Comparison) -> RenderableType:
         table,
         Text("–: no redundant reading checks that model"),
         Text("effective: number of parameters that the readings determine beside the priors"),
-        Text(
-            "AICc, BIC: lower is better; ln evidence relative to the complete model: higher is better"
-        ),
+        Text("AICc, BIC: lower is better; ln evidence, of the complete model 0: higher is better"),
         Text("unseen: RMS error of predicting each setup from all others"),
         Text("tool: RMS uncertainty over the workspace, workpiece aligned on the machine"),
     )
