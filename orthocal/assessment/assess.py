@@ -13,7 +13,7 @@ from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import compute_entries
 from orthocal.assessment.fit_findings import find_fit_findings
 from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
-from orthocal.assessment.recommendation import recommend_model
+from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.tool_error import assess_placed, require_tool, summarise_tool
 from orthocal.assessment.words import entries as words
 from orthocal.assessment.words.comparison import describe_recommendation
@@ -106,6 +106,7 @@ def assess(
     session: Session | None = None,
     *,
     judgement: Judgement | None = None,
+    recommendation: Recommendation | None = None,
 ) -> Assessment:
     """Judge a calibration: verdict, findings, what to enter, the tool error.
 
@@ -114,6 +115,7 @@ def assess(
         session: The session, or the joined sessions, that it was made from; by default as the
             calibration keeps them.
         judgement: Of that session, if it is known already.
+        recommendation: Of a model for that session, if it is known already.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
@@ -127,7 +129,9 @@ def assess(
     notes = [
         *find_fit_findings(calibration),
         *_entry_findings(calibration, entries, tool),
-        *describe_recommendation(recommend_model(measured), chosen=calibration.model),
+        *describe_recommendation(
+            recommendation or recommend_model(measured), chosen=calibration.model
+        ),
         *unreached,
     ]
     findings = rank([*judgement.findings, *notes])
@@ -177,9 +181,13 @@ def _entry_findings(
     tool: ToolErrorSummary | None,
 ) -> list[Finding]:
     """Findings about the values to enter."""
+
+    def expected(*, keep: bool) -> list[Finding]:
+        return [] if tool is None else [words.tool_error(tool, keep=keep)]
+
     if not entries:
-        return [words.no_offset()]
-    found = [] if tool is None else [words.tool_error(tool)]
+        return [words.no_offset(), *expected(keep=True)]
+    found = []
     if entries[0].active is None:
         found.append(words.controller_not_stated([e.drive for e in entries]))
     by_readings = [e for e in entries if e.held is None and math.isfinite(e.std)]
@@ -189,7 +197,9 @@ def _entry_findings(
     worthwhile = tool is not None and not tool.now <= WORTHWHILE * tool.entered
     if small and not large and not worthwhile:
         ratio = max((abs(e.change) / e.std for e in small if e.std > 0.0), default=0.0)
-        return [words.no_change_needed([e.drive for e in small], ratio, tool), *found]
+        kept = words.no_change_needed([e.drive for e in small], ratio, tool)
+        return [kept, *expected(keep=True), *found]
+    found = [*expected(keep=False), *found]
     if large:
         found.append(words.must_change([e.drive for e in large]))
     if small:

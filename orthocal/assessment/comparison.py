@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from orthocal.arguments import require_names
+from orthocal.assessment.assess import assess
 from orthocal.assessment.judgement import Judgement, judge_session, rank
 from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.repetition import Repetition, measure_repetition
 from orthocal.assessment.scores import ModelResult, Score, Undetermined, score_model
-from orthocal.assessment.tool_error import ErrorSize, summarise_tool
+from orthocal.assessment.tool_error import ErrorSize
 from orthocal.assessment.words import comparison as words
 from orthocal.assessment.words.entries import SESSION_HEADLINES
 from orthocal.assessment.words.validation import (
@@ -21,7 +22,7 @@ from orthocal.assessment.words.validation import (
     residuals_differ,
     residuals_repeat,
 )
-from orthocal.calibration.assessment_record import Assessment, Decision, Finding
+from orthocal.calibration.assessment_record import Assessment, Decision, Finding, ToolErrorSummary
 from orthocal.calibration.refit import repeat_calibration
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.options import SolverOptions
@@ -52,6 +53,10 @@ class Comparison:
     recommendation: Recommendation
     judgement: Judgement
     """Of the readings, whatever the model is."""
+    tool: ToolErrorSummary | None
+    """Of the recommended model, as `calibrate` states it; None if it is unknown."""
+    tool_findings: tuple[Finding, ...]
+    """The same as findings."""
 
     def __getitem__(self, model: str) -> ModelResult:
         for result in self.results:
@@ -147,7 +152,7 @@ def compare_models(
             except NotIdentifiableError as e:
                 undetermined.append(Undetermined(model, problem.n_machine, e.problem))
     results.sort(key=lambda r: r.n_free)
-    recommendation = recommend_model(session, models)
+    recommendation, judgement = recommend_model(session, models), judge_session(session)
     compared = Comparison(
         title=session.title,
         labels=tuple(r.label + (f", cycle {r.cycle}" if cycles else "") for r in session.readings),
@@ -158,12 +163,20 @@ def compare_models(
         repetition=None,
         repeat_title=join_sessions(others).title if others else "",
         recommendation=recommendation,
-        judgement=judge_session(session),
+        judgement=judgement,
+        tool=None,
+        tool_findings=(),
     )
-    if compared.best is None or not others:
+    if compared.best is None:
         return compared
-    again = repeat_calibration(compared.best.calibration, others)
-    return replace(compared, repetition=measure_repetition(compared.best.calibration, again))
+    best = compared.best.calibration
+    assessed = assess(best, session, judgement=judgement, recommendation=recommendation)
+    found = assessed.of_kind("tool error", "out of reach")
+    compared = replace(compared, tool=assessed.tool, tool_findings=found)
+    if not others:
+        return compared
+    again = repeat_calibration(best, others)
+    return replace(compared, repetition=measure_repetition(best, again))
 
 
 def _assess(comparison: Comparison) -> Assessment:
@@ -182,7 +195,7 @@ def _assess(comparison: Comparison) -> Assessment:
         Decision(judged.verdict, headline, lead.text, lead.action),
         findings,
         (),
-        None,
+        comparison.tool,
         judged.tolerance_scale,
     )
 
@@ -230,14 +243,9 @@ def _repetition(comparison: Comparison) -> list[Finding]:
 
 def _tool(comparison: Comparison, best: ModelResult) -> list[Finding]:
     """The expected tool error of the recommended model."""
-    if best.tool is None:
-        return []
-    summary = summarise_tool(
-        best.calibration, best.tool, scale=comparison.judgement.tolerance_scale
-    )
-    if summary is None:
-        return []
-    found = [words.tool_error(best.model, summary.compensated, summary.region)]
+    found = list(comparison.tool_findings)
+    if comparison.tool is not None and not best.calibration.only_offsets:
+        found.append(words.compensated(comparison.tool.compensated))
     if best.linearisation_cost is not None:
         found.append(words.linearisation_cost(best.linearisation_cost.rms))
     return found

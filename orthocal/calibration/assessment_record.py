@@ -250,6 +250,11 @@ class Assessment:
     tolerance_scale: PositiveInSI
     """Factor by which errors that were not identified exceed their tolerances; 1 if they do not."""
 
+    @property
+    def keeps_offsets(self) -> bool:
+        """Whether the offsets in the controller stay as they are."""
+        return bool(self.of_kind("no change needed", "no offset"))
+
     def of_kind(self, *kinds: FindingKind) -> tuple[Finding, ...]:
         """Findings of some kinds, in their order."""
         return tuple(f for f in self.findings if f.kind in kinds)

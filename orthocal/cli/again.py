@@ -34,7 +34,7 @@ def again(
         ),
     ] = None,
     anyway: Annotated[
-        bool, typer.Option("--anyway", help="Also where the decision is not to enter it.")
+        bool, typer.Option("--anyway", help="Also against the verdict of the calibration.")
     ] = False,
 ) -> None:
     """The same readings once more, with the offsets entered: session, empty readings, sheet.

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +20,34 @@ from orthocal.cli.options import (
     split_globs,
 )
 from orthocal.cli.printing import put_note, put_out
+from orthocal.errors import ClosureError, OrthocalError, SolverError
+
+if TYPE_CHECKING:
+    from orthocal.session.session import Session
+
+
+@contextmanager
+def _judge_on_failure(session: Session, *, json: bool) -> Iterator[None]:
+    """Print the judgement of the readings in place of a solver's failure that they explain."""
+    try:
+        yield
+    except (SolverError, ClosureError) as failure:
+        from orthocal.assessment.assess import check_session
+        from orthocal.output.text.answer import print_decision
+        from orthocal.output.text.printed_json import printed_assessment
+
+        try:
+            found = check_session(session)
+        except OrthocalError:
+            raise failure from None
+        if not found.decision.exit_code:
+            raise
+        if json:
+            put_out(printed_assessment(found).rstrip("\n"))
+        else:
+            print_decision(found)
+        put_note(f"orthocal: {failure}")
+        raise typer.Exit(found.decision.exit_code) from None
 
 
 @app.command()
@@ -105,7 +135,7 @@ def calibrate(
     """Identify the errors of a machine from sessions of readings: what to enter, and whether.
 
     Exit code 3: the readings are to be reviewed or rejected, for the reason that is printed; all
-    outputs are written nevertheless.
+    outputs are written nevertheless, unless the solver fails.
     """
     from orthocal.assessment.assess import assessment_of
     from orthocal.assessment.assess import calibrate as run
@@ -119,21 +149,22 @@ def calibrate(
         require_writable(out, ("calibration.json", "report.html"))
     loaded = join_sessions(load_each_once(sessions))
     parameters = loaded.robot.parameters
-    result = run(
-        loaded,
-        Choice(
-            model=model,
-            free=split_globs(free),
-            prior=prior,
-            known=read_known(known or [], parameters, where="--known"),
-            tolerances=read_tolerances(tolerance or [], parameters, where="--tolerance"),
-            bounds=read_bounds(bound or [], parameters, where="--bound"),
-            base=base,
-        ),
-        loss=loss,  # type: ignore[arg-type] # checked there
-        solver=solver,  # type: ignore[arg-type] # likewise
-        profile=split_globs(profile),
-    )
+    with _judge_on_failure(loaded, json=json):
+        result = run(
+            loaded,
+            Choice(
+                model=model,
+                free=split_globs(free),
+                prior=prior,
+                known=read_known(known or [], parameters, where="--known"),
+                tolerances=read_tolerances(tolerance or [], parameters, where="--tolerance"),
+                bounds=read_bounds(bound or [], parameters, where="--bound"),
+                base=base,
+            ),
+            loss=loss,  # type: ignore[arg-type] # checked there
+            solver=solver,  # type: ignore[arg-type] # likewise
+            profile=split_globs(profile),
+        )
     if json:
         from orthocal.output.text.printed_json import printed_calibration
 
@@ -175,17 +206,19 @@ def compare(
     """
     from orthocal.assessment.comparison import compare_models
     from orthocal.estimation.selection import read_tolerances
+    from orthocal.measurement.joining import join_sessions
     from orthocal.output.text.printed_json import printed_comparison
     from orthocal.output.text.summary import print_summary
 
     loaded = load_each_once(sessions)
     parameters = loaded[0].robot.parameters
-    result = compare_models(
-        loaded,
-        models=split_globs([models] if models else None),
-        tolerances=read_tolerances(tolerance or [], parameters, where="--tolerance"),
-        repeat=load_each_once(repeat) if repeat else None,
-    )
+    with _judge_on_failure(join_sessions(loaded), json=json):
+        result = compare_models(
+            loaded,
+            models=split_globs([models] if models else None),
+            tolerances=read_tolerances(tolerance or [], parameters, where="--tolerance"),
+            repeat=load_each_once(repeat) if repeat else None,
+        )
     if json:
         put_out(printed_comparison(result).rstrip("\n"))
     else:

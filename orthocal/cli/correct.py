@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import io
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -92,7 +93,7 @@ def correct(
         Path | None, typer.Option(help="File for the result, instead of standard output.")
     ] = None,
     anyway: Annotated[
-        bool, typer.Option("--anyway", help="Also where the decision is not to enter it.")
+        bool, typer.Option("--anyway", help="Also against the verdict of the calibration.")
     ] = False,
 ) -> None:
     """Correct a G-code program for a controller with nominal kinematics.
@@ -100,12 +101,12 @@ def correct(
     Lines and arcs are cut so that chords stay near the corrected path; feed along it and all other
     words are kept. What cannot be corrected is named by its line, and nothing is written.
 
-    Exit code 3: the decision is not to enter the calibration.
+    Exit code 3: the verdict is not to enter the calibration.
     """
     from orthocal.assessment.controller_entries import entered_offsets
     from orthocal.calibration.file import load_calibration
     from orthocal.export.correction_field import CorrectionField
-    from orthocal.export.formats import require_entering
+    from orthocal.export.formats import require_entering, warn_against_verdict
     from orthocal.export.options import ExportOptions
     from orthocal.gcode.program import ProgramCorrector
     from orthocal.gcode.state import Interpreter
@@ -119,6 +120,7 @@ def correct(
     result = load_calibration(calibration)
     if not anyway:
         require_entering(result)
+    warning = warn_against_verdict(result)
     active = offsets is Offsets.ACTIVE
     values = result.active_offsets if active else entered_offsets(result)
     within = within_um * UM
@@ -130,7 +132,8 @@ def correct(
     )
     with tempfile.TemporaryFile() as spool:  # nothing is written before all of it is good
         with _frozen():
-            _spool(corrector.run(_lines(program, file)), spool)
+            texts = corrector.run(_lines(program, file))
+            _spool(_with_comment(texts, warning) if warning else texts, spool)
         if not corrector.summary.lines:
             raise GcodeError("is empty; expected a program", where=file)
         if out is not None:
@@ -145,6 +148,7 @@ def correct(
         + "\n"
         + _describe_controller(result, values, active=active)
         + _describe_tool(tip)
+        + (f"\n{warning}" if warning else "")
         + ("" if zeros else "\nThe program's coordinates are taken for the machine's own.")
         + ("\nNo G20 or G21 before its coordinates: mm." if corrector.summary.unit_assumed else "")
     )
@@ -192,6 +196,21 @@ def _tell_progress(parts: Iterable[bytes], source: Path) -> Iterator[bytes]:
             told = 100 * done // size
             put_note(f"FILTER_PROGRESS={min(told, 100)}")
         yield part
+
+
+def _with_comment(texts: Iterable[str], comment: str) -> Iterator[str]:
+    """A program with a comment as its first line, or after the % that begins it."""
+    begun = False
+    for text in texts:
+        if begun or not text:
+            yield text
+            continue
+        begun = True
+        mark = re.match(r"\s*%[^\n]*(\n|$)", text)
+        at = mark.end() if mark else 0
+        end = "\r\n" if "\r\n" in text else "\n"
+        head = text[:at] if text[:at].endswith("\n") or not at else text[:at] + end
+        yield f"{head}; {comment}{end}{text[at:]}"
 
 
 def _spool(texts: Iterable[str], spool: IO[bytes]) -> None:

@@ -69,12 +69,12 @@ def export(
         ),
     ] = None,
     anyway: Annotated[
-        bool, typer.Option("--anyway", help="Also where the decision is not to enter it.")
+        bool, typer.Option("--anyway", help="Also against the verdict of the calibration.")
     ] = False,
 ) -> None:
     """Write a calibration for a controller or for another program.
 
-    Exit code 3: the decision is not to enter it, or the machine cannot be what was asked; nothing
+    Exit code 3: the verdict is not to enter it, or the machine cannot be what was asked; nothing
     was written.
     """
     from orthocal.calibration.file import load_calibration

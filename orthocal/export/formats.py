@@ -57,7 +57,7 @@ def export_calibration(
     Args:
         calibration: The calibration.
         to: Name of the format.
-        anyway: Also where its decision is not to enter it.
+        anyway: Also against its verdict, which the files then state.
         options: What is asked for beside the format; nothing by default.
 
     Returns:
@@ -65,7 +65,7 @@ def export_calibration(
 
     Raises:
         ParameterError: If there is no such format, or it has no such option.
-        ExportError: If its decision is not to enter it, or the machine does not reach what the
+        ExportError: If its verdict is not to enter it, or the machine does not reach what the
             format needs.
     """
     if to not in EXPORTERS:
@@ -74,7 +74,9 @@ def export_calibration(
         )
     if not anyway:
         require_entering(calibration)
-    return EXPORTERS[to](calibration, options or ExportOptions())
+    files = EXPORTERS[to](calibration, options or ExportOptions())
+    warning = warn_against_verdict(calibration)
+    return _warned(files, warning) if warning else files
 
 
 def require_entering(calibration: Calibration) -> None:
@@ -86,3 +88,19 @@ def require_entering(calibration: Calibration) -> None:
     decision = assessment_of(calibration).decision
     if decision.verdict != "enter":
         raise ExportError(f"{decision.headline} {decision.reason} {decision.action}".strip())
+
+
+def warn_against_verdict(calibration: Calibration) -> str:
+    """What is written with a calibration whose verdict is review or reject; empty otherwise."""
+    verdict = assessment_of(calibration).decision.verdict
+    if verdict == "enter":
+        return ""
+    return f"Written against the verdict '{verdict}' of the calibration (--anyway)."
+
+
+def _warned(files: dict[str, str], warning: str) -> dict[str, str]:
+    """Files of which one begins with a warning: errors.yaml, or README.md."""
+    if "errors.yaml" in files:
+        return {**files, "errors.yaml": f"# {warning}\n{files['errors.yaml']}"}
+    page = files.get("README.md", "")
+    return {**files, "README.md": f"**{warning}**\n" + (f"\n{page}" if page else "")}

@@ -6,6 +6,7 @@ import math
 
 from orthocal.assessment.recommendation import Recommendation
 from orthocal.assessment.wording import lengths, mm, times
+from orthocal.assessment.words.entries import describe_compensated
 from orthocal.calibration.assessment_record import Finding
 from orthocal.units import MM, UM
 
@@ -99,15 +100,10 @@ def residuals_exceed_noise(model: str, sizes: str, source: str, ratio: float) ->
     )
 
 
-def tool_error(model: str, rms: float, region: str) -> Finding:
-    """Expected tool error with a controller that corrects the model's errors."""
-    (size,) = lengths(rms)
+def compensated(rms: float) -> Finding:
+    """Expected tool error with a controller that corrects all errors."""
     return Finding(
-        "tool error",
-        "note",
-        f"Expected tool error with a controller that corrects all errors of {model}: {size} RMS, "
-        f"workspace {region}, workpiece aligned on the machine.",
-        numbers={"compensated_um": rms / UM},
+        "tool error", "note", describe_compensated(rms), numbers={"compensated_um": rms / UM}
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import joined, um
+from orthocal.assessment.wording import joined, lengths
 from orthocal.assessment.words.fit import named
 from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, Verdict
 from orthocal.units import UM
@@ -94,13 +94,33 @@ def controller_not_stated(drives: Sequence[str]) -> Finding:
     )
 
 
-def tool_error(tool: ToolErrorSummary) -> Finding:
+def describe_tool_error(tool: ToolErrorSummary, *, keep: bool = False) -> str:
+    """The expected tool error in one sentence, the same in every output.
+
+    Args:
+        tool: The tool error.
+        keep: Whether the offsets stay as they are.
+    """
+    where = f"workspace {tool.region}, workpiece aligned on the machine"
+    if keep:
+        (now,) = lengths(tool.now)
+        return f"Expected tool error as it is: {now} RMS, {where}."
+    entered, now = lengths(tool.entered, tool.now)
+    return f"Expected tool error: {entered} RMS (now {now}), {where}."
+
+
+def describe_compensated(rms: float) -> str:
+    """The expected tool error with a controller that corrects all identified errors."""
+    (size,) = lengths(rms)
+    return f"With a controller that corrects all errors: {size} RMS."
+
+
+def tool_error(tool: ToolErrorSummary, *, keep: bool) -> Finding:
     """Expected error of the tool."""
     return Finding(
         "tool error",
         "note",
-        f"Expected tool error with these offsets: {um(tool.entered)} µm RMS (now {um(tool.now)} "
-        f"µm), workspace {tool.region}, after aligning the workpiece.",
+        describe_tool_error(tool, keep=keep),
         numbers={
             "entered_um": tool.entered / UM,
             "now_um": tool.now / UM,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.remaining_errors import find_remaining_errors
 from orthocal.assessment.tool_error import (
@@ -20,9 +21,9 @@ from orthocal.assessment.tool_error import (
     assess_tool,
     summarise_tool,
 )
+from orthocal.assessment.words.entries import describe_tool_error
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
-from orthocal.output.text.answer import describe_tool_error
 from orthocal.output.text.layout import add_row, print_rich, table_of, um
 from orthocal.units import MM, UM
 
@@ -93,8 +94,9 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
         )
     )
     summary = summarise_tool(calibration, accuracy)
-    if summary is not None and find_entries(calibration):
-        lines.append(Text(describe_tool_error(summary)))
+    if summary is not None:
+        keep = assessment_of(calibration).keeps_offsets
+        lines.append(Text(describe_tool_error(summary, keep=keep)))
     lines += [Text(line) for line in describe_remaining(calibration, accuracy)]
     return Group(*lines)
 

@@ -10,13 +10,13 @@ from rich.padding import Padding
 from rich.text import Text
 
 from orthocal.assessment.assess import assessment_of
-from orthocal.assessment.wording import joined, lengths
+from orthocal.assessment.wording import joined
+from orthocal.assessment.words.entries import describe_compensated
 from orthocal.calibration.assessment_record import (
     Assessment,
     Decision,
     Finding,
     FindingKind,
-    ToolErrorSummary,
     Verdict,
 )
 from orthocal.calibration.calibration import Calibration
@@ -81,21 +81,6 @@ def print_decision(found: Assessment) -> None:
     print_rich(render_decision(found))
 
 
-def describe_tool_error(tool: ToolErrorSummary, *, keep: bool = False) -> str:
-    """The expected tool error in one sentence, the same in every output.
-
-    Args:
-        tool: The tool error.
-        keep: Whether the offsets stay as they are.
-    """
-    where = f"workspace {tool.region}, workpiece aligned on the machine"
-    if keep:
-        (now,) = lengths(tool.now)
-        return f"Expected tool error as it is: {now} RMS, {where}."
-    entered, now = lengths(tool.entered, tool.now)
-    return f"Expected tool error: {entered} RMS (now {now}), {where}."
-
-
 def _decision(decision: Decision) -> Text:
     headline = (decision.headline, STYLES[decision.verdict])
     return Text.assemble(headline, f" {decision.reason}".rstrip())
@@ -125,12 +110,10 @@ def _tool(calibration: Calibration, found: Assessment) -> list[RenderableType]:
     if found.tool is None:
         unreached = found.of_kind("out of reach")
         return [Text(unreached[0].text if unreached else "The tool error is unknown.")]
-    keep = bool(found.of_kind("no change needed", "no offset"))
-    lines = [Text(describe_tool_error(found.tool, keep=keep))]
+    lines = [Text(f.text) for f in found.of_kind("tool error")]
     if not calibration.only_offsets:
-        (compensated,) = lengths(found.tool.compensated)
-        lines.append(Text(f"With a controller that corrects all errors: {compensated}."))
-    return list(lines)
+        lines.append(Text(describe_compensated(found.tool.compensated)))
+    return [*lines]
 
 
 def _listed(calibration: Calibration, found: Assessment) -> Sequence[Finding]:
@@ -150,7 +133,7 @@ def _listed(calibration: Calibration, found: Assessment) -> Sequence[Finding]:
 def _next_step(found: Assessment, saved: Path | None) -> str:
     """What to do next."""
     decision = found.decision
-    if decision.verdict != "enter" or found.of_kind("no change needed", "no offset"):
+    if decision.verdict != "enter" or found.keeps_offsets:
         return decision.action or "nothing to do."
     if saved is None:
         return "keep the result with --out DIRECTORY; then `orthocal again DIRECTORY`."
