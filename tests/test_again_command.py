@@ -67,7 +67,7 @@ def test_it_is_the_same_session_with_offsets_active(calibrated, capsys, tmp_path
     )
 
 
-def test_what_is_not_to_be_entered_is_not_measured_again(calibrated, capsys, tmp_path):
+def test_what_is_to_be_reviewed_is_not_measured_again(calibrated, capsys, tmp_path):
     wrong = tmp_path / "wrong"
     shutil.copytree(calibrated / "first", wrong)
     lines = (wrong / "readings.csv").read_text().splitlines()
@@ -78,7 +78,9 @@ def test_what_is_not_to_be_entered_is_not_measured_again(calibrated, capsys, tmp
     assert code == 3
     code, _, err = run(capsys, "again", tmp_path / "cal", "--out", tmp_path / "next")
     assert code == 3
-    assert err.startswith("orthocal: Do not enter these. ")
+    decision = load_calibration(tmp_path / "cal").assessment.decision
+    assert decision.verdict == "review"
+    assert err.startswith(f"orthocal: {decision.headline} ")
     assert not (tmp_path / "next").exists()
     code, _, _ = run(capsys, "again", tmp_path / "cal", "--anyway", "--out", tmp_path / "next")
     assert code == 0

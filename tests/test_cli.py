@@ -12,7 +12,14 @@ import sys
 import numpy as np
 import pytest
 
-from orthocal import __version__, cli, load_calibration, load_session
+from orthocal import (
+    __version__,
+    check_session,
+    cli,
+    load_calibration,
+    load_session,
+    write_session,
+)
 from orthocal.output.report import parameter_plots, reading_plots, tool_map
 
 
@@ -65,7 +72,7 @@ def calibrated(orthocal, experiment, written, tmp_path):
 def test_calibrate_prints_and_writes(orthocal, experiment, tmp_path):
     code, out, err = orthocal("calibrate", experiment, "--out", tmp_path / "new/folder")
     assert code == 0
-    assert "Enter these, and measure again. What remains" in out
+    assert load_calibration(tmp_path / "new/folder").assessment.decision.headline in out
     folder = tmp_path / "new/folder"
     assert err == f"Wrote {folder / 'calibration.json'} and {folder / 'report.html'}\n"
     found = load_calibration(folder)
@@ -147,22 +154,20 @@ def turn_a_setup(root, folder):
     return folder
 
 
-def test_what_is_not_to_be_entered_exits_3_with_all_that_was_asked_for(orthocal, root, tmp_path):
+def test_what_is_to_be_reviewed_exits_3_with_all_that_was_asked_for(orthocal, root, tmp_path):
     session = turn_a_setup(root, tmp_path / "turned")
     code, out, err = orthocal("calibrate", session, "--out", tmp_path / "out")
     assert code == 3
-    assert "Do not enter these. The readings of setup zx seem to have the wrong sign" in " ".join(
-        out.split()
-    )
     assert err.startswith("Wrote ")
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"calibration.json", "report.html"}
-    load_calibration(tmp_path / "out")
+    decision = load_calibration(tmp_path / "out").assessment.decision
+    assert f"{decision.headline} {decision.reason}" in " ".join(out.split())
     code, out, err = orthocal("calibrate", session, "--json")
     assert (code, err) == (3, "")
     document = json.loads(out)
-    assert document["decision"]["answer"] == "do not enter"
-    assert document["decision"]["exit_code"] == 3
-    assert document["findings"][0]["kind"] == "turned setup"
+    assert document["decision"] == decision.to_document()
+    assert (decision.verdict, decision.exit_code) == ("review", 3)
+    assert document["findings"][0]["kind"] == "reversed setup"
     assert document["findings"][0]["places"][0]["setup"] == "zx"
     code, out, _ = orthocal("calibrate", session, "--details")
     assert code == 3
@@ -178,7 +183,8 @@ def test_the_printed_json_holds_what_the_file_holds_and_the_decision(
     written = json.loads((tmp_path / "calibration.json").read_text())
     assert set(printed) - set(written) == {"decision", "findings"}
     assert {k: printed[k] for k in written} == written
-    assert printed["decision"]["answer"] == "enter"
+    assert printed["decision"] == written["assessment"]["decision"] | {"exit_code": 0}
+    assert printed["decision"]["verdict"] == "enter"
     (tmp_path / "again.json").write_text(out)
     assert orthocal("report", tmp_path / "again.json", "--out", tmp_path)[0] == 0
 
@@ -209,7 +215,12 @@ def test_only_the_command_that_is_called_is_made():
 
 
 def test_help_says_what_exit_code_3_means(orthocal):
-    for command, words in (("calibrate", "is not to be entered"), ("validate", "it is not")):
+    for command, words in (
+        ("check", "check the readings"),
+        ("calibrate", "reviewed or rejected"),
+        ("compare", "reviewed or rejected"),
+        ("validate", "it is not"),
+    ):
         text = " ".join(orthocal(command, "--help")[1].split())
         assert words in text[text.index("3: ") :]
 
@@ -233,18 +244,19 @@ def test_forward_and_inverse_undo_each_other(orthocal, calibrated, tmp_path):
     assert np.abs(back - [[310.25] * 3, [330, 290, 300.5]]).max() < 2e-5
 
 
-def test_compare_gives_its_verdict_as_exit_code(orthocal, experiment, root):
+def test_compare_has_the_verdict_of_the_readings_as_exit_code(orthocal, experiment, root):
     repeat = experiment.parent / "experiment-3"
     code, out, err = orthocal("compare", experiment, "--repeat", repeat)
-    assert (code, err) == (3, "")
-    assert "Six independent readings support offsets only." in out
+    assert (code, err) == (0, "")
+    assert "Recommended model: full." in out
     code, out, _ = orthocal(
         "compare", root / "examples/raw-cycles", "--models", "offsets,lengths", "--json"
     )
     assert code == 0
     document = json.loads(out)
     assert [m["model"] for m in document["models"]] == ["offsets", "lengths"]
-    assert document["verdict"]["supported"] == "offsets"
+    assert document["recommendation"]["model"] == "offsets"
+    assert document["decision"]["verdict"] == "enter"
 
 
 def test_accuracy_over_a_cube_and_at_points(orthocal, calibrated, tmp_path):
@@ -303,7 +315,7 @@ def test_validate_holds_experiment_3_against_2(orthocal, calibrated, experiment)
     assert "The calibration is confirmed" in out
     code, out, _ = orthocal("validate", calibrated, new, "--json")
     assert json.loads(out)["as_expected"] is True
-    assert json.loads(out)["decision"]["answer"] == "confirmed"
+    assert json.loads(out)["decision"]["verdict"] == "enter"
 
 
 def test_simulate_writes_a_session_that_calibrates_back(orthocal, root, tmp_path):
@@ -360,13 +372,34 @@ def test_a_solve_that_does_not_converge_exits_1(orthocal, experiment, monkeypatc
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.parametrize("command", ["calibrate", "compare"])
+def test_a_failing_solver_gives_way_to_the_judgement_of_the_readings(
+    orthocal, root, tmp_path, monkeypatch, command
+):
+    from orthocal.estimation.solvers import ipopt as nlp
+
+    monkeypatch.setattr(nlp, "CONVERGED", frozenset())
+    session = load_session(root / "examples/workshop")
+    values = session.values.copy()
+    values[[12, 13]] = values[[13, 12]]
+    write_session(session.with_values(values), tmp_path / "swapped")
+    words = (command, tmp_path / "swapped")
+    code, out, err = orthocal(*words)
+    assert code == 3
+    assert "did not converge" in err
+    decision = check_session(load_session(tmp_path / "swapped")).decision
+    assert f"{decision.headline} {decision.reason}" in " ".join(out.split())
+    code, out, _ = orthocal(*words, "--json")
+    assert (code, json.loads(out)["decision"]) == (3, decision.to_document())
+
+
 def test_a_bug_is_said_to_be_one(orthocal, experiment, monkeypatch):
-    from orthocal.calibration import calibrate
+    from orthocal.assessment import assess
 
     def broken(*_, **__):
         raise RuntimeError("no such thing")
 
-    monkeypatch.setattr(calibrate, "calibrate", broken)
+    monkeypatch.setattr(assess, "calibrate", broken)
     code, _, err = orthocal("calibrate", experiment)
     assert code == 70
     assert "this is a bug of orthocal" in err

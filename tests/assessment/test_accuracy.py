@@ -13,7 +13,6 @@ from folders import session_folder
 from gauges import exact
 from machines import place, write_orthoglide
 from models import JOINTS
-from orthocal.assessment.findings.comparison import decide_comparison
 
 from orthocal import (
     Choice,
@@ -26,10 +25,10 @@ from orthocal import (
     summarize,
 )
 from orthocal.assessment.controller_entries import entered_offsets
+from orthocal.assessment.judgement import find_tolerance_scale
 from orthocal.assessment.remaining_errors import find_remaining_errors
 from orthocal.assessment.tool_error import (
     assess_tool,
-    find_excess,
     measure_deviations,
     measure_uncertainty,
 )
@@ -215,7 +214,7 @@ def test_a_machine_that_does_not_reach_60_mm_has_results_at_the_tool(tmp_path):
     session = simulate_session(
         load_plan(plans.write(tmp_path, plan)), {"x_slide.offset": 1e-3}, seed=1
     ).session
-    result = calibrate(session)
+    result = calibrate(session, "offsets")
     found = assess_tool(result)
     # drives end 30 mm beyond the zero, and some µm of offsets belong into the controller
     assert found.workspace.half_side == pytest.approx(0.029)
@@ -223,7 +222,8 @@ def test_a_machine_that_does_not_reach_60_mm_has_results_at_the_tool(tmp_path):
     assert "Over a cube of ±29 mm around the zero." in text
     assert "missing" not in text
     compared = compare_models(session, models=["offsets", "lengths"])
-    assert "a cube of ±29 mm" in " ".join(f.text for f in decide_comparison(compared).findings)
+    assert result.assessment.tool.region == "±29 mm"
+    assert compared.assessment.tool.box == result.assessment.tool.box
     assert all(r.tool is not None for r in compared.results)
 
 
@@ -315,7 +315,8 @@ def test_what_is_entered_is_in_where_the_tool_is_then(calibrated):
 def test_offsets_alone_are_as_good_as_the_machines_are(root):
     """What is promised of them, whatever scatters; all errors but those of rods' ends and drives
     are in the independent model's 0.102 and 0.045 mm."""
-    found = assess_tool(calibrate(root / "examples/sweep", Choice(tolerances={"*.offset_m": 2e-3})))
+    choice = Choice("offsets", tolerances={"*.offset_m": 2e-3})
+    found = assess_tool(calibrate(root / "examples/sweep", choice))
     assert found.after.sizes.relative.rms * 1e3 == pytest.approx(0.102, rel=0.05)
     assert found.after.sizes.aligned.rms * 1e3 == pytest.approx(0.045, rel=0.06)
     full = calibrate(root / "examples/sweep", Choice(model="full", tolerances={"*.offset_m": 2e-3}))
@@ -362,7 +363,7 @@ def test_noise_does_not_make_a_machine_worse_than_its_tolerances(root, sigma):
     """One offset and nothing else: whatever the noise, no leg or axis is worse than expected."""
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     session = simulate_session(plan, {"x_slide.offset": 1e-3}, sigma=sigma).session
-    assert find_excess(calibrate(session)) == 1.0
+    assert find_tolerance_scale(session) == 1.0
 
 
 FULL = ["*", "!frame.*", "!*.scale", "!*_leg.length"]
@@ -379,7 +380,7 @@ def test_machines_that_are_worse_than_their_tolerances_are_found_to_be(root, tim
         drawn = draw_errors(plan.robot, FULL, seed=seed)
         errors = {n: v * (1.0 if n.endswith(".offset") else times) for n, v in drawn.items()}
         session = simulate_session(wide, errors, seed=seed).session
-        found.append(find_excess(calibrate(session, solver="eliminated")))
+        found.append(find_tolerance_scale(session))
     # of one machine the square scatters by 0.84 of its mean: a few combinations of errors decide
     three_sigma = 3.0 * 0.84 / 2.0 / np.sqrt(count)
     assert np.sqrt(np.mean(np.square(found))) == pytest.approx(times, rel=three_sigma)

@@ -13,6 +13,7 @@ import pytest
 
 from orthocal import (
     ExportError,
+    ExportOptions,
     ParameterError,
     calibrate,
     export_calibration,
@@ -40,7 +41,7 @@ def full(root):
 
 @pytest.fixture(scope="module")
 def turned(root):
-    """A machine whose setup zy was read with the wrong sign: not to be entered."""
+    """A machine whose setup zy was read with the wrong sign: to be reviewed."""
     from dataclasses import replace
 
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
@@ -81,17 +82,44 @@ def test_parameters_are_read_again_as_they_were(full, tmp_path):
     assert "#   x_slide_mm: " in path.read_text()
 
 
-def test_what_is_not_to_be_entered_is_not_exported_unless_told_so(turned, tmp_path, capsys):
-    with pytest.raises(ExportError, match="Do not enter these"):
-        export_calibration(turned, "yaml")
-    assert "errors.yaml" in export_calibration(turned, "yaml", anyway=True)
+STATED = {"yaml": "errors.yaml", "table": "README.md", "urdf": "README.md", "linuxcnc": "README.md"}
+"""File of each format that states that it was written against the verdict."""
+
+
+@pytest.mark.parametrize("to", STATED)
+def test_against_the_verdict_nothing_is_exported_unless_asked_for_and_stated(turned, full, to):
+    with pytest.raises(ExportError) as refused:
+        export_calibration(turned, to)
+    assert refused.value.exit_code == 3
+    assert turned.assessment.decision.headline in str(refused.value)
+    files = export_calibration(turned, to, anyway=True)
+    assert "against the verdict 'review'" in files[STATED[to]].splitlines()[0]
+    options = ExportOptions(module=False) if to == "linuxcnc" else None
+    sound = export_calibration(full, to, anyway=True, options=options)
+    assert "against the verdict" not in sound.get(STATED[to], "")
+
+
+PROGRAM = "%\nG21 G90\nG1 X10 Y0 Z0 F600\nX20\nM2\n%\n"
+
+
+def test_against_the_verdict_nothing_is_written_by_command(turned, tmp_path, capsys):
     file = write_calibration(turned, tmp_path / "calibration.json")
-    words = ["export", str(file), "--to", "yaml", "--out", str(tmp_path / "out")]
-    assert run(words) == 3
-    assert "Do not enter these" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-    assert run([*words, "--anyway"]) == 0
-    assert (tmp_path / "out/errors.yaml").exists()
+    (tmp_path / "part.ngc").write_text(PROGRAM)
+    out = tmp_path / "out"
+    for words in (
+        ["export", str(file), "--to", "yaml", "--out", str(out)],
+        ["correct", str(file), str(tmp_path / "part.ngc"), "--out", str(out / "part.ngc")],
+    ):
+        assert run(words) == 3
+        assert turned.assessment.decision.headline in capsys.readouterr().err
+        assert not out.exists()
+        assert not run([*words, "--anyway"])
+        capsys.readouterr()
+        if words[0] == "correct":
+            first, second, *_ = (out / "part.ngc").read_text().splitlines()
+            assert first == "%"
+            assert second.startswith("; Written against the verdict 'review'")
+        shutil.rmtree(out)
 
 
 def test_unknown_formats_and_machines_without_a_tool(experiment_2):

@@ -13,7 +13,6 @@ from pairs import Several
 from orthocal import (
     CalibrationFileError,
     calibrate,
-    decide,
     find_changes,
     load_calibration,
     load_plan,
@@ -78,17 +77,16 @@ def test_a_slide_that_moved_is_named_with_its_size_and_since_when(changed, days)
     assert 5e-6 < change.std < 25e-6
     assert change.perhaps == ("x_leg.length",)  # which moves the platform by as much
     assert not change.perhaps_since
-    decision = decide(changed)
-    assert decision.answer == "do not enter"
-    assert decision.exit_code == 3
+    decision = changed.assessment.decision
+    assert (decision.verdict, decision.exit_code) == ("review", 3)
     assert "x_slide moved by +0." in decision.reason
     assert "between tuesday and wednesday" in decision.reason
     assert decision.action.startswith("Calibrate wednesday alone")
-    assert "make sure that wednesday says which offsets were active" in decision.action
-    (lead,) = decision.of_kind("machine changed")
+    assert "wednesday states the active offsets" in decision.action
+    (lead,) = changed.assessment.of_kind("machine changed")
     assert lead.places[0].file == str(days / "wednesday/session.yaml")
     assert lead.numbers["x_slide.offset_by_mm"] == pytest.approx(change.size * 1e3)
-    assert "Do not enter these. The machine changed" in summarize(changed).replace("\n", " ")
+    assert f"{decision.headline} The machine changed" in summarize(changed).replace("\n", " ")
 
 
 def test_where_nothing_moved_the_answer_says_what_would_have_been_seen(days):
@@ -97,10 +95,10 @@ def test_where_nothing_moved_the_answer_says_what_would_have_been_seen(days):
     assert found.none_found
     sizes = [found.seen_from(t) for t in found.tested if t.name.endswith(".offset")]
     assert 0.05e-3 < max(sizes) < 0.12e-3
-    (informs,) = decide(calibration).of_kind("nothing changed")
+    (informs,) = calibration.assessment.of_kind("no change")
     assert informs.numbers == {"seen_from_mm": pytest.approx(max(sizes) * 1e3)}
     text = " ".join(summarize(calibration).split())
-    assert f"a change of one offset by {max(sizes) * 1e3:.3f} mm would have been seen" in text
+    assert f"A change of one offset by {max(sizes) * 1e3:.3f} mm would have been" in text
     printed = json.loads(printed_calibration(calibration))
     assert printed["changes"]["sessions"] == ["monday", "tuesday"]
 
@@ -109,13 +107,13 @@ def test_one_session_says_nothing_of_changes(days):
     alone = calibrate(days / "monday")
     assert alone.changes is None
     assert find_changes(alone) is None
-    assert not decide(alone).of_kind("nothing changed", "change not known", "machine changed")
+    assert not alone.assessment.of_kind("no change", "change unknown", "machine changed")
 
 
 def test_changes_are_kept_in_the_file_and_found_again_without_it(changed, tmp_path):
     path = write_calibration(changed, tmp_path / "calibration.json")
     loaded = load_calibration(path)
-    assert decide(loaded).to_document() == decide(changed).to_document()
+    assert loaded.assessment.to_document() == changed.assessment.to_document()
     document = json.loads(path.read_text())
     del document["changes"]
     path.write_text(json.dumps(document))
@@ -234,7 +232,10 @@ def test_offsets_that_were_entered_and_not_stated_are_asked_for(root):
     assert {c.of for c in together.changes.found} == {"x_slide", "y_slide", "z_slide"}
     for change in together.changes.found:
         assert change.size == pytest.approx(-first[change.name].value, abs=0.15e-3)
-    assert "(`controller.offsets_mm`) in experiment-3: if others" in decide(together).action
+    assert (
+        "(`controller.offsets_mm`) in experiment-3: if others"
+        in together.assessment.decision.action
+    )
 
 
 def test_nothing_is_told_where_nothing_tells_the_noise(root):
@@ -244,7 +245,7 @@ def test_nothing_is_told_where_nothing_tells_the_noise(root):
     few = replace(silent, readings=silent.readings[:2])
     found = calibrate([silent, few])
     assert found.changes.none_found
-    assert decide(found).of_kind("change not known", "nothing changed")
+    assert found.assessment.of_kind("change unknown", "no change")
 
 
 @pytest.mark.slow

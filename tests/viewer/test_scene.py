@@ -17,7 +17,7 @@ from tolerances import KINEMATICS
 from orthocal import calibrate, draw_scene, load_robot, load_session
 from orthocal.assessment.calibrated_tool import error_covariance
 from orthocal.assessment.controller_entries import find_entries
-from orthocal.assessment.tool_error import assess_tool, find_excess, measure_uncertainty
+from orthocal.assessment.tool_error import assess_tool, measure_uncertainty
 from orthocal.calibration.file import load_calibration, write_calibration
 from orthocal.errors import ParameterError
 from orthocal.measurement.files.session_file import load_plan
@@ -501,13 +501,13 @@ def test_a_scene_of_the_tool_says_how_far_it_is_off(calibration):
     largest = np.linalg.norm(found.align(found.deviation), axis=1).max() * 1e6
     assert scene.headline.startswith(f"The tool is up to {largest:.0f} µm off where it is sent")
     # with errors as far beyond their tolerances as what remains of the readings says
-    covariance = error_covariance(calibration, excess=find_excess(calibration))
+    covariance = error_covariance(calibration, excess=calibration.tolerance_scale)
     known = measure_uncertainty(found.jacobian, covariance, found.workspace, found.targets)
     known = known.sizes.aligned.largest
     assert known > 1.2 * found.after.sizes.aligned.largest
     assert f"known to {known * 1e6:.0f} µm or better" in scene.headline
     (told,) = (e.text for e in scene.legend if e.nodes == (tool_errors.TOOL_UNKNOWN,))
-    assert "errors 2.1 × tolerances" in told
+    assert f"errors {calibration.tolerance_scale:.1f} × tolerances" in told
 
 
 def test_only_machines_sessions_and_calibrations_are_drawn():
