@@ -93,7 +93,7 @@ def test_reading_order_is_verdict_tool_fit_residuals_and_the_rest(page, read):
 
 def test_what_to_enter_stands_first_and_is_what_was_identified(calibration, read):
     first = read.rows[1:4]
-    for row, entry in zip(first, find_entries(calibration), strict=True):
+    for row, entry in zip(first, calibration.assessment.entries, strict=True):
         assert row[0] == entry.drive
         assert row[2:] == [
             f"{entry.enter * 1e3:+.3f}",
