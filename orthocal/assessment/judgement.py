@@ -106,7 +106,7 @@ def find_tolerance_scale(session: Session) -> float:
         if any(g.sigma is None for g in part.gauges.values()) or len(part.readings) < 2:
             continue
         model = ReadingModel(part)
-        about = model.settle(part.values, None, model.reference_machine())
+        about = model.most_likely(part.values)
         deviation = model.deviations(part.values[None], about)[0]
         directions, noise = about.likelihood.directions, about.likelihood.sigma**2
         along, variances = directions @ deviation, about.likelihood.variances

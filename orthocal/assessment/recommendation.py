@@ -109,7 +109,7 @@ def _evidence(session: Session, model: str) -> tuple[float, Array]:
         if len(part.readings) < 2:
             continue
         readings = ReadingModel(part, model)
-        about = readings.settle(part.values, None, readings.reference_machine())
+        about = readings.most_likely(part.values)
         deviation = readings.deviations(part.values[None], about)[0]
         logs = _log_evidence(about, deviation, np.append(1.0, SCALES), stated=readings.stated)
         total += float(logs[0])

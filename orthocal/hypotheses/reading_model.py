@@ -28,6 +28,12 @@ MOST_ROUNDS = 2
 NEAR = 0.2
 """Change of the errors, in tolerances, below which a linearisation holds."""
 
+MOST_STEPS = 8
+"""Gauss-Newton steps to the most likely machine."""
+
+SETTLED = 0.02
+"""Change of the errors, in tolerances, below which the most likely machine is found."""
+
 FURTHEST = 6.0
 """Tolerances beyond which no linearisation is sought."""
 
@@ -128,6 +134,30 @@ class ReadingModel:
             errors = found.errors_for(left, excess, noise)
             change, last = float(np.abs(errors - last).max(initial=0.0)), errors
             if change < NEAR or not np.abs(errors).max(initial=0.0) < FURTHEST:
+                break
+            theta = self.reference + errors * self.problem.theta_scale
+            try:
+                found = self._linearise(theta, found.passive)
+            except (ClosureError, np.linalg.LinAlgError):
+                break
+        return found
+
+    def most_likely(self, rows: Array) -> Linearised:
+        """Linearised about the most likely machine, errors at their tolerances as prior.
+
+        Gauss-Newton steps until the errors change by less than SETTLED tolerances: offsets of some
+        mm bend readings by more than other errors move them. Where no machine is reached, the last
+        one that was.
+
+        Args:
+            rows: Readings, shape (n_rows,), [m].
+        """
+        entries = self.entries(rows[None])[0]
+        found, last = self.reference_machine(), np.zeros(self.reference.size)
+        for _ in range(MOST_STEPS):
+            errors = found.errors_for(entries - found.expected, 1.0, 1.0)
+            change, last = float(np.abs(errors - last).max(initial=0.0)), errors
+            if not change > SETTLED:
                 break
             theta = self.reference + errors * self.problem.theta_scale
             try:

@@ -280,7 +280,7 @@ def test_a_validation_is_decided(table1, plan):
     assert blind.assessment.decision.exit_code == 3
 
 
-EVIDENCE = {"workshop": -70.2, "raw-cycles": 11.8, "table1/experiment-2": -117.1}
+EVIDENCE = {"workshop": -43.8, "raw-cycles": 11.8, "table1/experiment-2": -117.1}
 """ln evidence of offsets against the complete model, at the stated noise."""
 
 
