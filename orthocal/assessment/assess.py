@@ -156,7 +156,8 @@ def check_session(session: Session, judgement: Judgement | None = None) -> Asses
     found = judgement or judge_session(session)
     findings = found.findings
     if found.verdict == "enter":
-        findings = rank([*findings, words.sound(len(session.readings))])
+        within = found.tolerance_scale == 1.0
+        findings = rank([*findings, words.sound(len(session.readings), within_tolerances=within)])
     lead = next((f for f in findings if f.severity != "note"), findings[-1])
     decision = Decision(
         found.verdict, words.SESSION_HEADLINES[found.verdict], lead.text, lead.action

@@ -37,10 +37,10 @@ def session(plan):
 def test_a_bound_holds_a_parameter_and_the_others_make_up_for_it(session):
     """As the linear problem with the same bounds, to what linearising costs."""
     bounds = {"x_slide.offset": (-1e-3, 0.9e-3)}
-    fit = fit_problem(build_problem(session, bounds=bounds))
+    fit = fit_problem(build_problem(session, bounds=bounds, model="offsets"))
     assert list(fit.solution.at_bound) == [1, 0, 0]
     assert fit.solution.theta[0] == pytest.approx(0.9e-3, abs=1e-8)
-    linear = linearise_at_reference(build_problem(session))
+    linear = linearise_at_reference(build_problem(session, model="offsets"))
     low = np.array([-1e-3, -np.inf, -np.inf]) / 5e-3
     high = np.array([0.9e-3, np.inf, np.inf]) / 5e-3
     bounds = (low, high)
@@ -90,7 +90,7 @@ def test_a_known_value_with_its_tolerance_is_weighed_with_the_readings(session):
     own = alone.covariance()
     gain = own[:, i] / (own[i, i] + spread**2)
     expected = alone.solution.theta + gain * (value - alone.solution.theta[i])
-    problem = build_problem(session, known={"x_slide.offset": (value, spread)})
+    problem = build_problem(session, known={"x_slide.offset": (value, spread)}, model="offsets")
     found = NonlinearProgram(problem).solve(sigma=sigma)
     assert np.abs(found.theta - expected).max() < 0.05 * spread
     fit = fit_problem(problem)
@@ -102,7 +102,7 @@ def test_a_known_value_with_its_tolerance_is_weighed_with_the_readings(session):
 def test_the_robust_covariance_is_that_of_many_simulated_calibrations(plan):
     """Huber's loss on normal noise: whitened errors are standard normal."""
     sigma = 20e-6
-    problem = build_problem(plan)
+    problem = build_problem(plan, model="offsets")
     options = SolverOptions(loss=Loss("huber"))
     entries = problem.predict(np.array(list(TRUTH.values())))
     rng, white, loss = np.random.default_rng(0), [], Loss("huber")

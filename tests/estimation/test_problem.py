@@ -74,7 +74,7 @@ def test_what_the_controller_corrects_is_the_reference(root):
 
     plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
     active = replace(plan, controller_offsets=np.array([1e-3, 2e-3, 3e-3]))
-    assert np.array_equal(build_problem(active).reference, [1e-3, 2e-3, 3e-3])
+    assert np.array_equal(build_problem(active, model="offsets").reference, [1e-3, 2e-3, 3e-3])
 
 
 def test_readings_depend_on_few_variables(plan):
@@ -110,4 +110,4 @@ def test_closure_rows_that_depend_on_others_are_named(root, tmp_path):
         "setups:\n  yx: {leg: x, direction: y, section: {fraction: 0.5}}\n"
     )
     with pytest.raises(RobotError, match=r"closure rows depend on others: z of apex; leave them"):
-        build_problem(load_plan(tmp_path / "plan.yaml"))
+        build_problem(load_plan(tmp_path / "plan.yaml"), model="offsets")

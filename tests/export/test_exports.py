@@ -99,7 +99,7 @@ def test_against_the_verdict_nothing_is_exported_unless_asked_for_and_stated(tur
     assert "against the verdict" not in sound.get(STATED[to], "")
 
 
-PROGRAM = "%\nG21 G90\nG1 X10 Y0 Z0 F600\nX20\nM2\n%\n"
+PROGRAM = "%\nG21 G90\nG0 X0 Y0 Z0\nG1 X10 F600\nM2\n%\n"
 
 
 def test_against_the_verdict_nothing_is_written_by_command(turned, tmp_path, capsys):

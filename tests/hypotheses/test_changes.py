@@ -96,9 +96,10 @@ def test_where_nothing_moved_the_answer_says_what_would_have_been_seen(days):
     sizes = [found.seen_from(t) for t in found.tested if t.name.endswith(".offset")]
     assert 0.05e-3 < max(sizes) < 0.12e-3
     (informs,) = calibration.assessment.of_kind("no change")
-    assert informs.numbers == {"seen_from_mm": pytest.approx(max(sizes) * 1e3)}
+    seen = informs.numbers["seen_from_mm"]  # by the complete model
+    assert seen == pytest.approx(max(sizes) * 1e3, rel=0.01)
     text = " ".join(summarize(calibration).split())
-    assert f"A change of one offset by {max(sizes) * 1e3:.3f} mm would have been" in text
+    assert f"A change of one offset by {seen:.3f} mm would have been" in text
     printed = json.loads(printed_calibration(calibration))
     assert printed["changes"]["sessions"] == ["monday", "tuesday"]
 

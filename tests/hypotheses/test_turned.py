@@ -160,7 +160,7 @@ def test_the_main_loop_walked_twice_accuses_nobody(raw_plan):
     assert second.turned is None
     assert second.rms_before < 1.5 * first.rms_after
     short = fleet.fit(session.values)
-    entered = fit_problem(build_problem(session))
+    entered = fit_problem(build_problem(session, model="offsets"))
     np.testing.assert_allclose(
         short.solution.theta[:3] + offsets, entered.solution.theta[:3], rtol=0.0, atol=1e-9
     )

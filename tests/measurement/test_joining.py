@@ -101,7 +101,7 @@ def test_noise_is_told_for_each_session(root):
         assert q.std > 0.9 * p.std
         assert abs(q.value - p.value) < 0.5 * p.std
     # were both to count alike, the coarse one would decide
-    same = build_problem(join_sessions([coarse, fine]))
+    same = build_problem(join_sessions([coarse, fine]), model="offsets")
     alike = EliminatedProgram(same).solve(sigma=1e-5).theta
     assert np.abs(alike - [p.value for p in found.free]).max() > found.free[0].std
 
@@ -116,7 +116,7 @@ def test_deviations_of_mixed_sessions_are_those_of_many(root):
             simulate_session(plan, TRUTH, seed=2 * seed + i, sigma=s).session
             for i, s in enumerate((40e-6, 5e-6))
         ]
-        fit = fit_problem(build_problem(join_sessions(pair)), options=options)
+        fit = fit_problem(build_problem(join_sessions(pair), model="offsets"), options=options)
         n = fit.problem.n_machine
         names, values = fit.problem.free[:n], fit.solution.theta[:n]
         std = np.sqrt(np.diag(fit.covariance())[:n])

@@ -104,7 +104,7 @@ def test_its_deviations_are_those_of_many_simulated_calibrations(plan):
     options, scores = SolverOptions(solver="eliminated"), []
     for seed in range(60):
         simulated = simulate_session(plan, TRUTH, seed=seed)
-        fit = fit_problem(build_problem(simulated.session), options=options)
+        fit = fit_problem(build_problem(simulated.session, model="offsets"), options=options)
         truth = {**TRUTH, **simulated.unknowns}
         names, std = fit.problem.free, np.sqrt(np.diag(fit.covariance()))
         scores.append((fit.solution.theta - [truth[name] for name in names]) / std)

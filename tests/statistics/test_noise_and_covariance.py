@@ -136,7 +136,7 @@ def test_readings_of_one_leg_leave_an_offset_open(raw_cycles):
 
 
 def test_six_equations_have_the_closed_form_covariance(experiment_2):
-    problem = build_problem(exact(experiment_2))
+    problem = build_problem(exact(experiment_2), model="offsets")
     _, jacobian = problem.linearise(problem.reference)
     information = decompose(jacobian, problem.observations)
     scale = np.outer(problem.theta_scale, problem.theta_scale)

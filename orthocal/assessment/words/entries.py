@@ -30,13 +30,14 @@ def next_step(session: str | None) -> str:
     return "`orthocal again` makes the session that measures again, `orthocal validate` judges it."
 
 
-def sound(readings: int) -> Finding:
+def sound(readings: int, *, within_tolerances: bool) -> Finding:
     """No anomaly was found."""
     noun = "reading agrees" if readings == 1 else "readings agree"
     return Finding(
         "fits",
         "note",
-        f"The {readings} {noun} with each other and with a machine within its tolerances.",
+        f"The {readings} {noun} with each other"
+        + (" and with a machine within its tolerances." if within_tolerances else "."),
         numbers={"readings": float(readings)},
     )
 

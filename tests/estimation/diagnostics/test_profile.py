@@ -33,7 +33,7 @@ def test_where_the_problem_is_nearly_linear_it_is_students_interval(raw_cycles):
 
 def test_its_ends_cost_what_they_should_by_another_solver(experiment_2):
     """SciPy on the reduced problem, the offset held at the ends of its interval."""
-    fit = fit_problem(build_problem(experiment_2))
+    fit = fit_problem(build_problem(experiment_2, model="offsets"))
     problem, sigma = fit.problem, fit.noise.sigma
     factor = confidence_factor(fit.noise.dof)
 
@@ -53,7 +53,7 @@ def test_its_ends_cost_what_they_should_by_another_solver(experiment_2):
 
 def test_where_the_problem_bends_it_is_not_symmetric(experiment_2):
     """At 99.9 % and three degrees of freedom the interval is 10 mm wide."""
-    fit = fit_problem(build_problem(exact(experiment_2)))
+    fit = fit_problem(build_problem(exact(experiment_2), model="offsets"))
     p = fit.solution.theta[0]
     low, high = profile_interval(fit, "x_slide.offset", level=0.999)
     skew = (high + low - 2 * p) / (high - low)

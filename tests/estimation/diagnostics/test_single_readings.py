@@ -79,7 +79,7 @@ def test_leaving_a_row_out_changes_the_estimate_as_predicted(readings, experimen
 
 def test_studentised_residuals_are_those_of_a_regression_with_an_extra_column(readings):
     """The error of one reading as a parameter of its own, in plain least squares."""
-    fit = fit_problem(build_problem(readings))
+    fit = fit_problem(build_problem(readings, model="offsets"))
     problem, o = fit.problem, fit.problem.observations
     found = diagnose_readings(fit)
     zeros = problem.zero_incidence
@@ -108,7 +108,7 @@ def test_studentised_residuals_of_noise_are_students(root, form):
         session = session.with_gauge(Gauge(None, None, None))
         if form == "differences":
             session = differences_of(session)
-        problem = build_problem(session)
+        problem = build_problem(session, model="offsets")
         found = diagnose_readings(fit_problem(problem))
         values.append(found.studentised)
         alarms += found.suspicious.size > 0
@@ -193,7 +193,7 @@ def test_readings_of_a_wrong_setup_are_said_to_be_of_one(root):
 
 
 def test_errors_that_make_no_machine_are_refused(readings):
-    fit = fit_problem(build_problem(readings))
+    fit = fit_problem(build_problem(readings, model="offsets"))
     absurd = replace(fit.solution, theta=np.array([0.3, 0.0, 0.0]))
     with pytest.raises(SolverError, match="make no machine: posture 'zero' cannot be reached"):
         require_assembly(fit.problem, absurd, robust=False)

@@ -51,7 +51,7 @@ def test_an_unmodelled_error_moves_the_estimate_by_its_leakage(plan, name, model
 @pytest.fixture(scope="module")
 def machines(plan):
     """Offsets and residuals found on 1,000 machines with all other errors, perfect readings."""
-    offsets = build_problem(plan)
+    offsets = build_problem(plan, model="offsets")
     errors = [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
     others = build_problem(plan, free=errors)
     rng = np.random.default_rng(0)

@@ -95,7 +95,7 @@ def test_the_exact_hessian_is_that_of_the_lagrangian(perfect, model, loss, size)
 
 def test_the_gauss_newton_hessian_is_the_exact_one_without_curvature(perfect):
     """At zero residuals and zero multipliers they are the same."""
-    problem = build_problem(perfect, prior=True)
+    problem = build_problem(perfect, prior=True, model="offsets")
     theta = np.array(list(TRUTH.values()))
     passive = problem.close(theta)
     left = problem.values - problem.predict(theta, passive)
@@ -118,7 +118,7 @@ def test_perfect_data_give_the_truth_back_from_any_start(perfect, seed, hessian)
     start = rng.uniform(-0.02, 0.02, 3)
     if seed == 0:
         start = np.array([0.02, -0.02, 0.02])
-    problem = build_problem(perfect)
+    problem = build_problem(perfect, model="offsets")
     program = NonlinearProgram(problem, options=SolverOptions(hessian=hessian))
     solution = program.solve(sigma=1e-5, start=start)
     assert np.abs(solution.theta - list(TRUTH.values())).max() < TRUTH_BACK
@@ -165,9 +165,9 @@ def test_another_solver_finds_the_same(plan, model):
 
 def test_new_readings_do_not_rebuild(plan):
     first, second = (simulate_session(plan, TRUTH, seed=s).session for s in (5, 6))
-    program = NonlinearProgram(build_problem(first))
-    again = program.solve(sigma=1e-5, values=build_problem(second).values)
-    fresh = NonlinearProgram(build_problem(second)).solve(sigma=1e-5)
+    program = NonlinearProgram(build_problem(first, model="offsets"))
+    again = program.solve(sigma=1e-5, values=build_problem(second, model="offsets").values)
+    fresh = NonlinearProgram(build_problem(second, model="offsets")).solve(sigma=1e-5)
     assert np.abs(again.theta - fresh.theta).max() < SAME_OPTIMUM
 
 
@@ -189,7 +189,9 @@ def test_where_gauss_newton_does_not_converge_the_exact_hessian_does(root, exper
 
 def test_not_converged_is_an_error_and_never_a_result(plan):
     session = simulate_session(plan, TRUTH, seed=7).session
-    program = NonlinearProgram(build_problem(session), options=SolverOptions(max_iterations=1))
+    program = NonlinearProgram(
+        build_problem(session, model="offsets"), options=SolverOptions(max_iterations=1)
+    )
     with pytest.raises(SolverError, match="Ipopt did not converge: Maximum_Iterations") as caught:
         program.solve(sigma=1e-5)
     assert caught.value.iterations == 1
@@ -208,5 +210,5 @@ def test_another_robot_is_calibrated_the_same_way(biglide, tmp_path, root):
     plan = exact(load_plan(tmp_path / "plan.yaml"))
     truth = {"x_slide.offset": 0.7e-3, "y_slide.offset": -1.1e-3}
     session = simulate_session(plan, truth, exact=True).session
-    solution = NonlinearProgram(build_problem(session)).solve(sigma=1e-5)
+    solution = NonlinearProgram(build_problem(session, model="offsets")).solve(sigma=1e-5)
     assert np.abs(solution.theta - list(truth.values())).max() < TRUTH_BACK

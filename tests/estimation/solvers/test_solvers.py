@@ -97,7 +97,7 @@ def test_the_linearised_solver_is_least_squares_about_what_the_controller_correc
 def test_linearised_offsets_of_the_paper_are_equation_8s(root):
     """Residuals and offsets of Experiment 2 by the paper's own matrix."""
     session = exact(load_session(root / "examples/table1/experiment-2"))
-    problem = build_problem(session)
+    problem = build_problem(session, model="offsets")
     matrix = leg_parallelism_matrix(
         length=0.31025, displacement_max=0.06, displacement_min=-0.1, rows=6
     )
