@@ -9,7 +9,7 @@ from gauges import exact
 from models import JOINTS
 
 from orthocal import Choice, calibrate, load_plan, simulate_session
-from orthocal.assessment.tool_error import RARE
+from orthocal.assessment.judgement import RARE
 from orthocal.calibration import build_record as recording
 from orthocal.estimation.diagnostics.unmodelled import (
     find_other_errors,
