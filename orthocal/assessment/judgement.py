@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocal.assessment.plausibility import find_implausible, find_scattered
 from orthocal.assessment.words import plausibility as words
@@ -21,18 +22,24 @@ from orthocal.estimation.diagnostics.unmodelled import find_other_errors, machin
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
-from orthocal.hypotheses.reading_model import ReadingModel
+from orthocal.hypotheses.reading_model import Linearised, ReadingModel
 from orthocal.hypotheses.search import find_mistakes
 from orthocal.hypotheses.sessions.changes import find_session_changes
 from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
 from orthocal.statistics.chance import chance_of_excess
+from orthocal.statistics.noise import estimate_repeatability
+
+Array = NDArray[np.float64]
 
 RARE = 0.01
 """Share of the machines within their tolerances that are called worse."""
 
 LARGEST_SCALE = 4.0
 """Factor of the tolerances beyond which no machine in working order is."""
+
+RESOLVED = 1e-3
+"""Part of the noise by which one prior standard deviation of an offset must move the readings."""
 
 SCALES = np.geomspace(1.0, 30.0, 86)
 """Factors of the tolerances that are tried."""
@@ -98,8 +105,10 @@ def judge_session(session: Session) -> Judgement:
 def find_tolerance_scale(session: Session) -> float:
     """Factor by which the machine's errors exceed their tolerances, by maximum likelihood.
 
-    Readings are y ~ N(h, e² J P Jᵀ + σ²), gauge zeros free, with the stated noise. 1 where one in a
-    hundred machines within tolerances shows as much, or nothing is stated of the noise.
+    Readings are y ~ N(h, e² J P Jᵀ + G + σ²) with P of all errors but offsets, G of how gauges are
+    mounted. Offsets and gauge zeros are free: home switches are as far off as they are. σ is the
+    stated noise, or the scatter of repeated readings if that is larger. 1 where one in a hundred
+    machines within tolerances shows as much, or nothing is stated of the noise.
     """
     scales = [1.0]
     for part in split_sessions(session):
@@ -108,16 +117,43 @@ def find_tolerance_scale(session: Session) -> float:
         model = ReadingModel(part)
         about = model.most_likely(part.values)
         deviation = model.deviations(part.values[None], about)[0]
-        directions, noise = about.likelihood.directions, about.likelihood.sigma**2
-        along, variances = directions @ deviation, about.likelihood.variances
-        rest = max(float(deviation @ deviation - along @ along), 0.0)
-        square = float((along**2 / (variances + noise)).sum()) + rest / noise
-        if model.dof < 1 or chance_of_excess(square, model.dof) >= RARE:
+        repeated, _ = estimate_repeatability(model.problem.values, model.problem.observations)
+        noise = max(about.likelihood.sigma, repeated)
+        within, excess, rest, dof = _parts(model, about, deviation, noise)
+        square = float((within**2 / (1.0 + excess)).sum()) + rest
+        if dof < 1 or chance_of_excess(square, dof) >= RARE:
             continue
-        spread = SCALES[:, None] ** 2 * variances + noise
-        logs = (along**2 / spread + np.log(spread)).sum(axis=1)
+        spread = 1.0 + SCALES[:, None] ** 2 * excess
+        logs = (within**2 / spread + np.log(spread)).sum(axis=1)
         scales.append(float(SCALES[int(np.argmin(logs))]))
     return max(scales)
+
+
+def _parts(
+    model: ReadingModel, about: Linearised, deviation: Array, noise: float
+) -> tuple[Array, Array, float, int]:
+    """Independent parts of a deviation, offsets taken out.
+
+    Returns:
+        Parts over the standard deviation that noise and gauges leave, shape (n,); variances that
+        the machine's errors at their tolerances add to the 1 of each, shape (n,); the sum of
+        squares of what neither moves, over the noise; degrees of freedom of all.
+    """
+    directions, problem = about.likelihood.directions, model.problem
+    along = directions @ deviation
+    rest = max(float(deviation @ deviation - along @ along), 0.0) / noise**2
+    slopes = about.sizes[:, None] * about.errors.T / noise  # along each direction, by each error
+    known, n = problem.robot.parameters, problem.n_machine
+    machine = slopes[:, :n]
+    offset = np.array([known.are_offsets(name) for name in problem.free[:n]], dtype=bool)
+    basis, sizes, _ = np.linalg.svd(machine[:, offset])
+    rank = int((sizes > RESOLVED).sum())
+    kept = basis[:, rank:].T
+    gauges, errors = kept @ slopes[:, n:], kept @ machine[:, ~offset]
+    root = np.linalg.cholesky(np.eye(len(kept)) + gauges @ gauges.T)
+    white = np.linalg.solve(root, np.column_stack([kept @ along / noise, errors]))
+    variances, turned = np.linalg.eigh(white[:, 1:] @ white[:, 1:].T)
+    return turned.T @ white[:, 0], np.maximum(variances, 0.0), rest, model.dof - rank
 
 
 def _find_changes(session: Session) -> list[Finding]:

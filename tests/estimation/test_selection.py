@@ -68,9 +68,7 @@ def test_known_values_are_held_or_become_a_prior(parameters):
 
 
 def test_bounds_are_open_where_none_is_given(parameters):
-    chosen = select_parameters(
-        parameters, model="offsets", bounds={"x_*.offset": (-1e-3, np.inf)}
-    )
+    chosen = select_parameters(parameters, model="offsets", bounds={"x_*.offset": (-1e-3, np.inf)})
     assert chosen.lower[0] == -1e-3
     assert np.isinf(chosen.upper).all()
     assert np.isinf(chosen.lower[1:]).all()
