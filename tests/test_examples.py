@@ -140,7 +140,7 @@ CALIBRATE = f"calibrate {EXPERIMENT}"
         ("docs/results.md", "Calibration of orthoglide", f"{CALIBRATE} --out out/experiment-2"),
         ("docs/results.md", "What was identified\n", f"{CALIBRATE} --details"),
         ("docs/results.md", "At the tool\n", f"{CALIBRATE} --details"),
-        ("docs/results.md", "Verdict", f"compare {EXPERIMENT}"),
+        ("docs/results.md", "Recommendation\n", f"compare {EXPERIMENT}"),
         (
             "docs/planning.md",
             "at the tool are to be expected",
