@@ -36,6 +36,7 @@ from orthocal.sensors.compiled import compile_reading
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
 PLAN = """robot: orthoglide
+calibration: {model: offsets}
 title: tool and legs
 gauges:
   fine: {sigma_mm: 0.002, resolution_mm: 0.001, range_mm: [-200, 200]}
