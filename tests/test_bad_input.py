@@ -215,8 +215,8 @@ SESSION_KEY_CASES = [
         "xy: {leg:",
         "xy: {legs:",
         ": setups.xy.legs: unknown key; known keys: sensor, gauge, postures, "
-        "direction_tolerance_mrad, section_tolerance_mm, lateral_tolerance_mm, scale_tolerance, "
-        "stand, square_tolerance_mrad, leg, direction, section, touches, tip, "
+        "aligned_at, direction_tolerance_mrad, section_tolerance_mm, lateral_tolerance_mm, "
+        "scale_tolerance, stand, square_tolerance_mrad, leg, direction, section, touches, tip, "
         "beside_mm",
     ),
     session(
@@ -228,41 +228,41 @@ SESSION_KEY_CASES = [
     session("key-missing", "robot: orthoglide\n", "", ": robot: is missing"),
     session(
         "calibration-model",
-        "readings: readings.csv",
-        "calibration: {model: all}\nreadings: readings.csv",
+        "calibration: {model: offsets}",
+        "calibration: {model: all}",
         ": calibration.model: 'all' is not a model of this robot; models: offsets, lengths, full",
     ),
     session(
         "calibration-free",
-        "readings: readings.csv",
-        "calibration: {free: ['*.ofset']}\nreadings: readings.csv",
+        "calibration: {model: offsets}",
+        "calibration: {free: ['*.ofset']}",
         ": calibration.free: '*.ofset' matches no error parameter; did you mean z_slide.offset, "
         "y_slide.offset, x_slide.offset?",
     ),
     session(
         "calibration-nothing-free",
-        "readings: readings.csv",
-        "calibration: {model: offsets, free: ['!*.offset']}\nreadings: readings.csv",
+        "calibration: {model: offsets}",
+        "calibration: {model: offsets, free: ['!*.offset']}",
         ": calibration.free: leaves no error free",
     ),
     session(
         "calibration-tolerance-without-unit",
-        "readings: readings.csv",
-        "calibration: {tolerances: {'*.offset': 2}}\nreadings: readings.csv",
+        "calibration: {model: offsets}",
+        "calibration: {tolerances: {'*.offset': 2}}",
         ": calibration.tolerances: '*.offset' carries no unit; expected one of the suffixes _mm, "
         "_um, _m, _mrad, _deg, _rad, _ppm",
     ),
     session(
         "calibration-tolerance-in-metres",
-        "readings: readings.csv",
-        "calibration: {tolerances: {'*.offset_m': 2}}\nreadings: readings.csv",
+        "calibration: {model: offsets}",
+        "calibration: {tolerances: {'*.offset_m': 2}}",
         ": calibration.tolerances: the tolerance of 'x_slide.offset' is 2000 mm; expected at most "
         "200 times the robot's own, 5 mm",
     ),
     session(
         "calibration-tolerance-below-zero",
-        "readings: readings.csv",
-        "calibration: {tolerances: {'*.offset_mm': -2}}\nreadings: readings.csv",
+        "calibration: {model: offsets}",
+        "calibration: {tolerances: {'*.offset_mm': -2}}",
         ": calibration.tolerances.*.offset_mm: found '-2'; expected greater than 0",
     ),
     session("key-missing-in-setup", "xy: {leg: y, ", "xy: {", ": setups.xy.leg: is missing"),
@@ -431,7 +431,7 @@ SESSION_FILE_CASES = [
         "two-documents",
         "readings: readings.csv",
         "readings: readings.csv\n---\nmore: 1",
-        ":31: is not valid YAML: expected a single document in the stream, but found another "
+        ":32: is not valid YAML: expected a single document in the stream, but found another "
         "document",
     ),
     session(
@@ -682,7 +682,7 @@ SESSION_SENSE_CASES = [
         "readings-with-null",
         "readings.csv",
         '"a\\0.csv"',
-        ":30: is not valid YAML: a text holds a control character",
+        ":31: is not valid YAML: a text holds a control character",
     ),
     Case(
         "model-unknown",
@@ -1634,8 +1634,8 @@ CALIBRATION_CASES = [
     ),
     calibration(
         "of-other-robot",
-        "{tmp}/session.yaml: is of robot 'machine'; the calibration is of another, or of another "
-        "version of 'machine'",
+        "{tmp}/calibration.json: was made for another version of robot 'machine': the files in "
+        "{tmp}/machine have changed since",
         swap(YAML, "zero_mm: 310.25", "zero_mm: 310.2"),
         command=VALIDATE,
     ),
