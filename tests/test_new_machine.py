@@ -146,7 +146,7 @@ def test_what_joints_that_count_down_must_show_is_said(made, capsys, tmp_path):
     assert code == 0, err
     _, text, _ = run(capsys, "calibrate", tmp_path / "try", "--model", "offsets")
     said = " ".join(text.split())
-    assert "y_slide counts down in the controller: there its joint must show so much less" in said
+    assert "y_slide counts down in the controller: subtract the value there" in said
 
 
 def test_readings_belong_to_the_sizes_of_their_day(copied, capsys):
