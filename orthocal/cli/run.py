@@ -41,8 +41,8 @@ def main() -> None:
     """Run the command line; no traceback ever reaches a user.
 
     Exit codes: 0 done, 1 a solve did not converge or an output cannot be written, 2 bad input,
-    3 some rows of a table cannot be reached, or what was found is not to be entered, or is not
-    confirmed, 70 a bug of ours, 130 Ctrl-C; `compare` has more.
+    3 the verdict is to review or to reject the readings, a calibration is not confirmed, or some
+    rows of a table cannot be reached, 70 a bug of ours, 130 Ctrl-C.
     """
     # small matrices only: more threads would but get in each other's way
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
