@@ -89,7 +89,7 @@ def test_offsets_in_the_controller_lead_to_the_same_truth(tmp_path, robot, unit)
     results = []
     for plan in (plain, active):
         session = simulate_session(plan, OFFSETS, exact=True).session
-        results.append((session, calibrate(session)))
+        results.append((session, calibrate(session, "offsets")))
     (first, one), (second, other) = results
     assert np.abs(first.values - second.values).max() > 1e-5
     for name, value in OFFSETS.items():

@@ -75,7 +75,7 @@ def test_options_come_before_what_a_session_says(stated):
 
 
 def test_where_nothing_is_said(raw_cycles, stated):
-    silent = replace(raw_cycles, purpose=Purpose())
+    silent = replace(raw_cycles, purpose=None)
     assert choose(None, raw_cycles).model == "offsets"  # as it states
     assert choose(None, silent).model == "full"
     assert choose(None, silent, usual="lengths").model == "lengths"
@@ -105,7 +105,7 @@ def test_sessions_agree_or_are_asked(raw_cycles, stated, tmp_path):
         f"{offsets.path}; say which"
     )
     assert choose("full", joined).model == "full"
-    silent = replace(raw_cycles, purpose=Purpose())
+    silent = replace(raw_cycles, purpose=None)
     assert choose(None, join_sessions([stated, silent])).model == "full"
 
 
