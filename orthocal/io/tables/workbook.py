@@ -332,7 +332,7 @@ class _Workbook:
                 )
         try:
             text = self._archive.read(info)
-        except Exception:
+        except Exception:  # damaged archives raise zlib.error, BadZipFile, RuntimeError and more
             raise SessionError(
                 f"is damaged or protected by a password: {shorten(part)} cannot be unpacked",
                 where=self._where,
