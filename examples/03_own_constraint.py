@@ -37,7 +37,7 @@ for p, value in zip(free.free, own, strict=True):
     print(f"{p.name:<16}{p.value * 1e3:+9.4f}{value * 1e3:+15.4f}")
 
 row = np.array([p.name.endswith("length") for p in free.free], dtype=float)
-values, covariance = np.array([p.value for p in free.free]), free.covariance
+values, covariance = np.array([p.value for p in free.free]), free.model_covariance
 gain = covariance @ row / (row @ covariance @ row)
 apart = np.abs(values - gain * (row @ values) - own).max()
 print(f"From the covariance alone it would be the same, to {apart * 1e6:.2f} um.")

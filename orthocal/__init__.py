@@ -21,28 +21,34 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:  # the public names; each is imported when it is first used
+    from orthocal.assessment.assess import assess as assess
+    from orthocal.assessment.assess import calibrate as calibrate
+    from orthocal.assessment.assess import check_session as check_session
     from orthocal.assessment.comparison import Comparison as Comparison
     from orthocal.assessment.comparison import compare_models as compare_models
-    from orthocal.assessment.findings.calibration import decide as decide
-    from orthocal.assessment.findings.comparison import decide_comparison as decide_comparison
-    from orthocal.assessment.findings.decision import Decision as Decision
-    from orthocal.assessment.findings.finding import Finding as Finding
-    from orthocal.assessment.findings.session import check_session as check_session
-    from orthocal.assessment.findings.validation import decide_validation as decide_validation
+    from orthocal.assessment.recommendation import Recommendation as Recommendation
+    from orthocal.assessment.recommendation import recommend_model as recommend_model
     from orthocal.assessment.tool_error import ToolAccuracy as ToolAccuracy
     from orthocal.assessment.tool_error import assess_tool as assess_tool
     from orthocal.assessment.validation import Validation as Validation
     from orthocal.assessment.validation import validate_calibration as validate_calibration
-    from orthocal.calibration.calibrate import calibrate as calibrate
+    from orthocal.builder.build import make_robot as make_robot
+    from orthocal.builder.machine_file import Dimensions as Dimensions
+    from orthocal.calibration.assessment_record import Assessment as Assessment
+    from orthocal.calibration.assessment_record import Decision as Decision
+    from orthocal.calibration.assessment_record import Finding as Finding
     from orthocal.calibration.calibration import Calibration as Calibration
     from orthocal.calibration.file import load_calibration as load_calibration
     from orthocal.calibration.file import write_calibration as write_calibration
     from orthocal.calibration.machine import Machine as Machine
-    from orthocal.calibration.refit import find_changes as find_changes
     from orthocal.calibration.refit import repeat_calibration as repeat_calibration
     from orthocal.calibration.refit import restore_session as restore_session
     from orthocal.calibration.tables import parameter_table as parameter_table
     from orthocal.calibration.tables import reading_table as reading_table
+    from orthocal.effects.loading import load_robot as load_robot
+    from orthocal.effects.protocol import Effect as Effect
+    from orthocal.effects.protocol import EffectKeys as EffectKeys
+    from orthocal.effects.registry import register_effect as register_effect
     from orthocal.errors import CalibrationFileError as CalibrationFileError
     from orthocal.errors import ClosureError as ClosureError
     from orthocal.errors import ExportError as ExportError
@@ -76,15 +82,14 @@ if TYPE_CHECKING:  # the public names; each is imported when it is first used
     from orthocal.output.report.page import write_report as write_report
     from orthocal.output.scene.drawing import draw_scene as draw_scene
     from orthocal.output.text.summary import summarize as summarize
-    from orthocal.planning.equipment import Means as Means
+    from orthocal.planning.equipment import Equipment as Equipment
     from orthocal.planning.plan import MeasuringPlan as MeasuringPlan
     from orthocal.planning.plan import plan_readings as plan_readings
-    from orthocal.robot.builder.build import make_robot as make_robot
-    from orthocal.robot.builder.dimensions import Sizes as Sizes
-    from orthocal.robot.loading import load_robot as load_robot
     from orthocal.robot.model import Robot as Robot
+    from orthocal.robot.parameters import ElementaryError as ElementaryError
     from orthocal.sensors.protocol import Sensor as Sensor
     from orthocal.sensors.registry import register_sensor as register_sensor
+    from orthocal.session.session import Conditions as Conditions
     from orthocal.session.session import Gauge as Gauge
     from orthocal.session.session import Posture as Posture
     from orthocal.session.session import Reading as Reading

@@ -14,7 +14,7 @@ MRAD = 1e-3
 DEG = math.pi / 180.0
 PPM = 1e-6
 
-Unit = Literal["m", "rad", "1"]
+Unit = Literal["m", "rad", "1", "1/K", "m/s"]
 """SI unit of an error parameter or of a drive."""
 
 UNIT_SUFFIXES: dict[str, tuple[Unit, float]] = {
@@ -25,6 +25,8 @@ UNIT_SUFFIXES: dict[str, tuple[Unit, float]] = {
     "_deg": ("rad", DEG),
     "_rad": ("rad", 1.0),
     "_ppm": ("1", PPM),
+    "_ppm_per_K": ("1/K", PPM),
+    "_um_per_min": ("m/s", UM / 60.0),
 }
 """Suffix of a key to the SI unit and the size of the unit that the suffix names."""
 
@@ -32,6 +34,8 @@ EDGE_UNITS: dict[Unit, tuple[str, float]] = {
     "m": ("mm", MM),
     "rad": ("mrad", MRAD),
     "1": ("ppm", PPM),
+    "1/K": ("ppm_per_K", PPM),
+    "m/s": ("um_per_min", UM / 60.0),
 }
 """SI unit to the unit in which users read errors, and its size."""
 
@@ -47,7 +51,7 @@ class InUnit:
 
     @property
     def edge_unit(self) -> str:
-        """Unit that users read: mm, mrad or ppm."""
+        """Unit that users read: mm, mrad, ppm, ppm_per_K or um_per_min."""
         return EDGE_UNITS[self.unit][0]
 
     @property

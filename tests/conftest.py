@@ -29,12 +29,10 @@ ROOT = Path(__file__).parents[1]
 
 WANTED_BY_ALL = """
 from orthocal import load_robot
-from orthocal.kinematics.loop_closure import nominal_assembly
-from orthocal.kinematics.backend.lanes import Way, is_installed, running
+from orthocal.kinematics.loop_closure import nominal_closure
 
 robot = load_robot("orthoglide")
-with running(Way.LLVM if is_installed() else Way.CASADI):
-    nominal_assembly(robot).close(robot.drive_zero)
+nominal_closure(robot).close([robot.drive_zero] * 100)
 """
 """Fills the cache with what takes long to compile."""
 

@@ -140,7 +140,7 @@ KINDS = {
 
 def lay_out(folder: Path) -> None:
     """Good files of every kind."""
-    from orthocal import Sizes, calibrate, load_session, make_robot
+    from orthocal import Dimensions, calibrate, load_session, make_robot
     from orthocal.measurement.files.session_file import load_plan
     from orthocal.measurement.files.write_session import write_session
     from orthocal.observation.simulate import simulate_session
@@ -165,13 +165,13 @@ def lay_out(folder: Path) -> None:
     write_calibration(calibrate(load_session(folder), "full"), folder / "calibration.json")
     (folder / "part.ngc").write_text(PROGRAM, encoding="utf-8")
     (folder / "dial.yaml").write_text(DIAL, encoding="utf-8")
-    make_robot(Sizes(), folder / "made")
+    make_robot(Dimensions(), folder / "made")
     lay_out_journals(folder)
 
 
 def lay_out_journals(folder: Path) -> None:
     """A recording and a study that were killed, the recording before its CSV was written."""
-    from orthocal.measurement.recording.recording import open_recording
+    from orthocal.measurement.recording import open_recording
     from orthocal.study.runner import open_results
 
     recorded = folder / "recorded"
@@ -548,13 +548,12 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     from orthocal.measurement.files.session_file import load_plan
     from orthocal.measurement.files.write_session import write_session
     from orthocal.measurement.importing.import_readings import TableOptions, import_readings
-    from orthocal.measurement.recording.recording import open_recording
+    from orthocal.measurement.recording import open_recording
     from orthocal.observation.simulate import load_errors, simulate_session, truth_document
     from orthocal.output.scene.drawing import draw_scene
     from orthocal.output.text.accuracy import format_points
     from orthocal.output.text.import_report import format_import, format_import_json
-    from orthocal.planning.equipment import Means
-    from orthocal.planning.gauge_range import load_dial
+    from orthocal.planning.equipment import Equipment, load_dial
     from orthocal.study.runner import open_results
 
     deep = rng.random() < thorough
@@ -596,7 +595,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     elif kind == "machine":
         use_machine(folder / "made", deep=deep)
     elif kind == "dial":
-        load_dial(folder / "dial.yaml", Means())
+        load_dial(folder / "dial.yaml", Equipment())
     elif kind == "journal":
         with restored(folder / "recorded"), open_recording(folder / "recorded") as recording:
             assert recording.rows
@@ -691,8 +690,8 @@ def use_program(folder: Path, *, deep: bool) -> None:
 
 def use_machine(folder: Path, *, deep: bool) -> None:
     """Make a machine again from its sizes."""
-    from orthocal.robot.builder.build import remake_robot
-    from orthocal.robot.builder.machine_file import read_machine
+    from orthocal.builder.build import remake_robot
+    from orthocal.builder.machine_file import read_machine
 
     read_machine(folder / "machine.yaml")
     if deep:

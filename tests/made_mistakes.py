@@ -10,6 +10,7 @@ import numpy as np
 from orthocal import draw_errors, simulate_session
 from orthocal.errors import OrthocalError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.hypotheses.anomaly import ORDERED, Explanation
 
 MM = 1e-3
 SIZES = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
@@ -89,17 +90,17 @@ class Sheet:
     def swapped(self, one, other):
         values = self.values.copy()
         values[one], values[other] = self.values[other], self.values[one]
-        return Made(values, frozenset([*one.tolist(), *other.tolist()]), ("exchanged readings",))
+        return Made(values, frozenset([*one.tolist(), *other.tolist()]), ("swapped rows",))
 
     def missed(self, rows, at):
         values, rest = self.values.copy(), rows[at:]
         values[rest[:-1]] = self.values[rest[1:]]
-        return Made(values, frozenset(rest.tolist()), ("shifted rows",))
+        return Made(values, frozenset(rest.tolist()), ("row offset",))
 
     def doubled(self, rows, at):
         values, rest = self.values.copy(), rows[at:]
         values[rest] = self.values[rows[at - 1 : -1]]
-        return Made(values, frozenset(rest.tolist()), ("shifted rows",))
+        return Made(values, frozenset(rest.tolist()), ("row offset",))
 
     def stuck(self, rows, begin, count):
         values, run = self.values.copy(), rows[begin : begin + count]
@@ -195,48 +196,48 @@ def plain_mistakes() -> dict[str, Make]:
         text = f"{abs(float(s.values[row[0]])) / MM:.2f}"
         turned = float(text[:-2] + text[-1] + text[-2]) * MM
         by = turned - float(text) * MM
-        return s.plus(row, by, "suspicious reading") if abs(by) > 0.2 * MM else None
+        return s.plus(row, by, "outlier") if abs(by) > 0.2 * MM else None
 
     def two_slips(s: Sheet):
         a, b = s.rng.choice(s.values.size, 2, replace=False)
         first = s.plus(a, s.sign() * 60.0 * s.noise)
         values = first.values.copy()
         values[b] += s.sign() * 60.0 * s.noise
-        return Made(values, frozenset([int(a), int(b)]), ("suspicious reading",))
+        return Made(values, frozenset([int(a), int(b)]), ("outlier",))
 
     return {
         "all in inches": every(1 / 25.4, "wrong unit"),
         "all in mm, said to be inches": every(25.4, "wrong unit"),
         "all in um": every(1e3, "wrong unit"),
         "all in m": every(1e-3, "wrong unit"),
-        "all ten times": every(10.0, "decimal place"),
-        "all a tenth": every(0.1, "decimal place"),
-        "all a hundred times": every(100.0, "decimal place"),
+        "all ten times": every(10.0, "decimal point"),
+        "all a tenth": every(0.1, "decimal point"),
+        "all a hundred times": every(100.0, "decimal point"),
         "setup in inches": setup(1 / 25.4, "wrong unit"),
         "setup in um": setup(1e3, "wrong unit"),
         "setup in m": setup(1e-3, "wrong unit"),
-        "setup ten times": setup(10.0, "decimal place"),
-        "setup a tenth": setup(0.1, "decimal place"),
+        "setup ten times": setup(10.0, "decimal point"),
+        "setup a tenth": setup(0.1, "decimal point"),
         "cycle of a setup ten times": with_cycles(
-            lambda s: s.times(s.pick(s.cycles), 10.0, "decimal place")
+            lambda s: s.times(s.pick(s.cycles), 10.0, "decimal point")
         ),
         "leg in inches": lambda s: s.times(s.of_leg(s.leg()), 1 / 25.4, "wrong unit"),
-        "leg ten times": lambda s: s.times(s.of_leg(s.leg()), 10.0, "decimal place"),
-        "sign of a reading": one(-1.0, "turned reading"),
+        "leg ten times": lambda s: s.times(s.of_leg(s.leg()), 10.0, "decimal point"),
+        "sign of a reading": one(-1.0, "reversed sign"),
         "sign of a posture, all cycles": with_cycles(
-            lambda s: s.times(s.pick(s.repeated), -1.0, "turned reading")
+            lambda s: s.times(s.pick(s.repeated), -1.0, "reversed sign")
         ),
-        "sign of a setup": setup(-1.0, "turned setup"),
+        "sign of a setup": setup(-1.0, "reversed sign"),
         "sign of two setups": lambda s: s.times(
-            np.concatenate(s.pick_two(s.setups)), -1.0, "turned setup"
+            np.concatenate(s.pick_two(s.setups)), -1.0, "reversed sign"
         ),
-        "sign of a leg": lambda s: s.times(s.of_leg(s.leg()), -1.0, "turned setup"),
-        "sign of all": every(-1.0, "turned setup"),
-        "reading ten times": one(10.0, "decimal place"),
-        "reading a tenth": one(0.1, "decimal place"),
-        "reading a hundred times": one(100.0, "decimal place"),
+        "sign of a leg": lambda s: s.times(s.of_leg(s.leg()), -1.0, "reversed sign"),
+        "sign of all": every(-1.0, "reversed sign"),
+        "reading ten times": one(10.0, "decimal point"),
+        "reading a tenth": one(0.1, "decimal point"),
+        "reading a hundred times": one(100.0, "decimal point"),
         "posture ten times, all cycles": with_cycles(
-            lambda s: s.times(s.pick(s.repeated), 10.0, "decimal place")
+            lambda s: s.times(s.pick(s.repeated), 10.0, "decimal point")
         ),
         "neighbouring rows exchanged": neighbours,
         "rows of a setup exchanged": apart,
@@ -272,7 +273,7 @@ def sized_mistakes(size: float) -> dict[str, Make]:
         rows = s.pick(s.setups)
         if rows.size < 4:
             return None
-        return s.plus(rows[int(s.rng.integers(2, rows.size - 1)) :], by(s), "bumped stand")
+        return s.plus(rows[int(s.rng.integers(2, rows.size - 1)) :], by(s), "displaced gauge")
 
     def bump_between(s: Sheet):
         if not s.has_cycles:
@@ -280,11 +281,11 @@ def sized_mistakes(size: float) -> dict[str, Make]:
         rows = s.pick(s.setups)
         cycles = [s.session.readings[i].cycle for i in rows]
         at = cycles.index(int(s.rng.integers(2, max(cycles) + 1)))
-        return s.plus(rows[at:], by(s), "bumped stand")
+        return s.plus(rows[at:], by(s), "displaced gauge")
 
     def reset(s: Sheet):
         inner = {k: v for k, v in s.cycles.items() if k[1] == 2}
-        return s.plus(s.pick(inner), by(s), "bumped stand") if inner else None
+        return s.plus(s.pick(inner), by(s), "displaced gauge") if inner else None
 
     def drift(s: Sheet):
         rows = s.pick(s.setups)
@@ -301,10 +302,10 @@ def sized_mistakes(size: float) -> dict[str, Make]:
 
     def posture(s: Sheet):
         rows = s.pick(s.repeated)
-        return s.plus(rows, by(s), "suspicious posture") if rows.size > 1 else None
+        return s.plus(rows, by(s), "inconsistent posture") if rows.size > 1 else None
 
     return {
-        "slip": lambda s: s.plus(s.row(), by(s), "suspicious reading"),
+        "slip": lambda s: s.plus(s.row(), by(s), "outlier"),
         "slip, all cycles": posture,
         "stand bumped": bump,
         "stand bumped between cycles": bump_between,
@@ -353,11 +354,11 @@ def make_mistakes(session, seed: int, *, sizes=SIZES) -> Iterator[tuple[str, flo
                 yield name, size, made
 
 
-def is_named(found, made: Made) -> bool:
-    """Whether a mistake is named rightly: by its kind, and where it is."""
-    if found.kind not in made.kinds:
+def is_named(explanation: Explanation, made: Made) -> bool:
+    """Whether an explanation has the kind and the rows of a mistake that was made."""
+    if explanation.kind not in made.kinds:
         return False
-    rows = set(found.rows)
-    if found.kind in ("bumped stand", "shifted rows", "stuck dial"):  # a row more or less
+    rows = set(explanation.rows)
+    if explanation.kind in ORDERED:  # a row more or less
         return len(rows ^ made.rows) <= 1
     return rows == made.rows or (len(made.rows) == 2 and len(rows) == 1 and rows < made.rows)

@@ -63,11 +63,11 @@ def test_it_is_the_same_session_with_offsets_active(calibrated, capsys, tmp_path
     code, _, err = run(capsys, "again", calibrated / "one", "--out", out)
     assert (code, err) == (
         2,
-        f"orthocal: {out}/session.yaml: is there already; expected a new folder\n",
+        f"orthocal: {out}/session.yaml: exists already; expected a new directory\n",
     )
 
 
-def test_what_is_not_to_be_entered_is_not_measured_again(calibrated, capsys, tmp_path):
+def test_what_is_to_be_reviewed_is_not_measured_again(calibrated, capsys, tmp_path):
     wrong = tmp_path / "wrong"
     shutil.copytree(calibrated / "first", wrong)
     lines = (wrong / "readings.csv").read_text().splitlines()
@@ -78,7 +78,9 @@ def test_what_is_not_to_be_entered_is_not_measured_again(calibrated, capsys, tmp
     assert code == 3
     code, _, err = run(capsys, "again", tmp_path / "cal", "--out", tmp_path / "next")
     assert code == 3
-    assert err.startswith("orthocal: Do not enter these. ")
+    decision = load_calibration(tmp_path / "cal").assessment.decision
+    assert decision.verdict == "review"
+    assert err.startswith(f"orthocal: {decision.headline} ")
     assert not (tmp_path / "next").exists()
     code, _, _ = run(capsys, "again", tmp_path / "cal", "--anyway", "--out", tmp_path / "next")
     assert code == 0
@@ -110,6 +112,6 @@ def test_a_copy_is_no_second_session(calibrated, capsys, tmp_path):
     code, _, err = run(capsys, "calibrate", calibrated / "first", copy)
     assert code == 2
     assert err == (
-        f"orthocal: {copy}/readings.csv: holds the very readings of {calibrated}/first/session.yaml"
-        ": a copy that was not measured anew?\n"
+        f"orthocal: {copy}/readings.csv: has the same readings as {calibrated}/first/session.yaml"
+        ": a copy that was not measured again?\n"
     )

@@ -12,7 +12,7 @@ from conftest import ROOT
 import orthocal
 
 BASE = "text arguments errors units runtime io"
-MACHINE = f"{BASE} robot kinematics sensors session observation measurement"
+MACHINE = f"{BASE} robot effects kinematics sensors session observation measurement"
 ESTIMATE = f"{MACHINE} statistics estimation"
 
 ALLOWED = {
@@ -24,11 +24,13 @@ ALLOWED = {
     "io": "text arguments errors units runtime",
     "gcode": BASE,
     "robot": BASE,
-    "kinematics": f"{BASE} robot",
-    "sensors": f"{BASE} robot kinematics",
-    "session": f"{BASE} robot kinematics sensors",
-    "observation": f"{BASE} robot kinematics sensors session",
-    "measurement": f"{BASE} robot kinematics sensors session observation",
+    "effects": f"{BASE} robot",
+    "builder": f"{BASE} robot effects",
+    "kinematics": f"{BASE} robot effects",
+    "sensors": f"{BASE} robot effects kinematics",
+    "session": f"{BASE} robot effects kinematics sensors",
+    "observation": f"{BASE} robot effects kinematics sensors session",
+    "measurement": f"{BASE} robot effects kinematics sensors session observation",
     "statistics": f"{BASE} robot observation",
     "estimation": f"{MACHINE} statistics",
     "hypotheses": ESTIMATE,
@@ -36,11 +38,11 @@ ALLOWED = {
     "assessment": f"{ESTIMATE} hypotheses calibration",
     "planning": f"{ESTIMATE} hypotheses assessment",
     "study": f"{ESTIMATE} hypotheses assessment planning",
-    "export": f"{BASE} robot kinematics calibration assessment",
+    "export": f"{BASE} robot effects kinematics calibration assessment",
     "viewer": f"{BASE} robot",
     "output": f"{ESTIMATE} hypotheses calibration assessment planning study viewer",
-    "cli": f"{ESTIMATE} hypotheses calibration assessment planning study export gcode viewer "
-    "output",
+    "cli": f"{ESTIMATE} builder hypotheses calibration assessment planning study export gcode "
+    "viewer output",
     "__main__": "cli runtime",
 }
 """Packages that each package may import besides itself."""
@@ -125,8 +127,8 @@ def test_everything_exported_is_there():
 def test_help_imports_nothing_heavy():
     code = (
         "import sys; sys.argv = ['orthocal', '--help']\n"
-        "from orthocal.cli import app\n"
-        "try: app()\n"
+        "from orthocal.cli import main\n"
+        "try: main()\n"
         "except SystemExit: pass\n"
         "heavy = {'numpy', 'casadi', 'pinocchio', 'scipy', 'yourdfpy', 'pydantic', 'meshcat', "
         "'matplotlib', 'tornado', 'coal'}\n"

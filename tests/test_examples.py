@@ -140,10 +140,10 @@ CALIBRATE = f"calibrate {EXPERIMENT}"
         ("docs/results.md", "Calibration of orthoglide", f"{CALIBRATE} --out out/experiment-2"),
         ("docs/results.md", "What was identified\n", f"{CALIBRATE} --details"),
         ("docs/results.md", "At the tool\n", f"{CALIBRATE} --details"),
-        ("docs/results.md", "Verdict", f"compare {EXPERIMENT}"),
+        ("docs/results.md", "Recommendation\n", f"compare {EXPERIMENT}"),
         (
             "docs/planning.md",
-            "at the tool are to be expected",
+            "Expected tool error",
             "plan orthoglide --tolerance '*.offset_mm=2' --out out/monday",
         ),
         (
@@ -196,13 +196,13 @@ def test_what_is_said_of_the_papers_readings_is_what_the_example_prints(run_exam
         assert left < 1.15 * promised  # as promised
 
 
-def test_what_the_readme_says_of_its_picture_and_of_what_remains_is_so(root):
+def test_the_enlargement_and_the_residuals_on_the_pages_are_right(root):
     text = " ".join((ROOT / "README.md").read_text().split())
     said = " ".join((ROOT / "docs/results.md").read_text().split())
     calibration = calibrate(root / "examples/table1/experiment-2")
-    assert "drawn twelve times its size" in text
+    assert "enlarged twelve times" in text
     assert draw_scene(calibration).exaggeration == 12.0
-    assert "what remains is ten times what the gauge itself would leave" in said
+    assert "the residuals are ten times the noise of the gauge" in said
     noise, gauge = calibration.noise, calibration.session.gauge_sigma
     assert noise.residual_sigma / gauge == pytest.approx(10.0, abs=0.5)
 

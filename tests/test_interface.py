@@ -11,10 +11,10 @@ from orthocal import (
     Choice,
     LiveScene,
     SolverOptions,
+    assess,
     assess_tool,
     calibrate,
     compare_models,
-    decide,
     draw_scene,
     load_calibration,
     load_plan,
@@ -100,7 +100,7 @@ def test_millimetres_cannot_pass_for_metres(arguments, experiment_2):
 
 def test_a_choice_in_any_unit_is_the_same_choice(experiment_2):
     found = [
-        calibrate(experiment_2, Choice(known={f"y_slide.offset_{u}": v})).covariance
+        calibrate(experiment_2, Choice(known={f"y_slide.offset_{u}": v})).total_covariance
         for u, v in (("mm", (0.5, 0.1)), ("um", (500.0, 100.0)), ("m", (0.5e-3, 0.1e-3)))
     ]
     for other in found[1:]:
@@ -183,7 +183,7 @@ def test_other_things_than_calibrations_and_sessions(calibration, experiment_2, 
             lambda: summarize(5),
             "expected a Calibration, a Comparison, a Validation, a MeasuringPlan or a StudyTable",
         ),
-        (lambda: decide(5), "expected a Calibration"),
+        (lambda: assess(5), "expected a Calibration"),
         (lambda: validate_calibration(5, experiment_2), "expected a Calibration"),
         (lambda: validate_calibration(calibration, 5), "expected a Session"),
         (lambda: compare_models(5), "expected a Session"),

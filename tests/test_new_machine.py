@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import pty
 import re
@@ -15,10 +16,11 @@ import pytest
 from lxml import etree
 
 from orthocal import load_plan, load_robot
+from orthocal.builder.build import remake_robot
 from orthocal.cli import dialogue as asking
 from orthocal.cli.run import main
 from orthocal.errors import ParameterError
-from orthocal.robot.builder.build import remake_robot
+from orthocal.kinematics.workspace import find_workspace
 from orthocal.session.session import Purpose
 
 SIZES = {
@@ -65,7 +67,7 @@ def copied(made, tmp_path):
     return tmp_path / "mill"
 
 
-def test_a_folder_has_all_that_is_needed(made):
+def test_a_new_directory_has_all_files(made):
     assert {p.name for p in made.iterdir()} == {"machine.yaml", "mill.yaml", "mill.urdf", "first"}
     assert {p.name for p in (made / "first").iterdir()} == {
         *("session.yaml", "readings.csv", "sheet.html"),
@@ -99,7 +101,7 @@ def test_what_is_read_on_it_calibrates_it(made, capsys, tmp_path):
     assert code == 0
 
 
-def test_it_is_made_again_after_a_change(copied, capsys):
+def test_a_machine_is_made_again_after_a_change(copied, capsys):
     file = copied / "machine.yaml"
     file.write_text(file.read_text().replace("leg_mm: 250", "leg_mm: 260"))
     code, out, _ = run(capsys, "new", copied, "--again")
@@ -112,7 +114,7 @@ def test_it_is_made_again_after_a_change(copied, capsys):
     assert load_plan(copied / "first").purpose == Purpose("full")
 
 
-def test_readings_are_not_written_over(copied, capsys):
+def test_readings_are_not_overwritten(copied, capsys):
     file = copied / "first/readings.csv"
     head, *rows = file.read_text().splitlines()
     file.write_text("\n".join([head, *(f"{row}0.12" for row in rows)]) + "\n")
@@ -124,49 +126,88 @@ def test_readings_are_not_written_over(copied, capsys):
         code, _, err = run(capsys, *words, "--force")
         assert (code, err) == (
             2,
-            f"orthocal: {copied}/first/readings.csv: holds {len(rows)} readings, which --force "
-            "does not write over; take them elsewhere first\n",
+            f"orthocal: {copied}/first/readings.csv: contains {len(rows)} readings, which "
+            "--force does not overwrite; move them first\n",
         )
     assert {p: p.read_bytes() for p in copied.rglob("*") if p.is_file()} == before
 
 
-def test_a_folder_that_was_named_otherwise_says_so(copied, capsys):
+def test_the_workspace_is_written_and_a_plan_for_another_one_is_old(capsys, tmp_path):
+    """Into machine.yaml and the robot's YAML; each of both changes makes the plan old."""
+    mill = tmp_path / "mill"
+    given = ["new", mill, *options(workspace_mm="40"), "--hours", "0.2"]
+    code, out, err = run(capsys, *given)
+    assert code == 0, err
+    assert "workspace ±40 mm" in out
+    assert find_workspace(load_robot(mill)).half_side == pytest.approx(0.04)
+    assert json.loads((mill / "first/plan.json").read_text())["workspace_mm"] == [[-40, 40]] * 3
+    code, _, _ = run(capsys, "new", mill, "--again")
+    assert code == 0
+    file = mill / "machine.yaml"
+    before = file.read_text()
+    for old, new, changed in (
+        ("[[-40, 40], [-40, 40], [-40, 40]]", "[[-40, 50], [-40, 40], [-30, 40]]", "workspace"),
+        ("travel_mm: [100, 320]", "travel_mm: [90, 320]", "travel"),
+    ):
+        assert old in before
+        file.write_text(before.replace(old, new))
+        code, _, err = run(capsys, "new", mill, "--again")
+        assert code == 3
+        assert f"{mill}/first: the plan is old ({changed} changed)" in err
+    assert load_robot(mill).drives[0].lower == pytest.approx(0.09)
+
+
+def test_a_workspace_out_of_reach_is_refused_and_nothing_is_written(copied, capsys):
+    file = copied / "machine.yaml"
+    text = file.read_text()
+    line = "# workspace_mm: [[-60, 60], [-60, 60], [-60, 60]]"
+    assert line in text
+    file.write_text(text.replace(line, "workspace_mm: [[-90, 90], [-90, 90], [-90, 90]]"))
+    before = {p: p.read_bytes() for p in copied.rglob("*") if p.is_file()}
+    code, _, err = run(capsys, "new", copied, "--again")
+    assert code == 2
+    assert err.startswith(f"orthocal: {file}: workspace_mm: the machine does not reach the workspa")
+    assert "; it reaches ±" in err
+    assert {p: p.read_bytes() for p in copied.rglob("*") if p.is_file()} == before
+
+
+def test_a_renamed_directory_is_named(copied, capsys):
     renamed = copied.rename(copied.with_name("lathe"))
     code, _, err = run(capsys, "new", renamed, "--again")
     assert (code, err) == (
         2,
         f"orthocal: {renamed}/lathe.yaml: there is no such file; there is {copied.name}.yaml: was "
-        "the folder named otherwise?\n",
+        "the directory renamed?\n",
     )
 
 
-def test_what_joints_that_count_down_must_show_is_said(made, capsys, tmp_path):
+def test_entries_of_joints_that_count_down_are_described(made, capsys, tmp_path):
     words = ["--out", tmp_path / "try", "--error", "y_slide.offset_mm=1.5"]
     code, _, err = run(capsys, "simulate", made / "first", *words)
     assert code == 0, err
     _, text, _ = run(capsys, "calibrate", tmp_path / "try", "--model", "offsets")
     said = " ".join(text.split())
-    assert "y_slide counts down in the controller: there its joint must show so much less" in said
+    assert "y_slide counts down in the controller: subtract the value there" in said
 
 
-def test_readings_belong_to_the_sizes_of_their_day(copied, capsys):
+def test_sheets_with_readings_stay_unchanged(copied, capsys):
     csv = copied / "first/readings.csv"
     csv.write_text(csv.read_text().replace("yx,zero,1,", "yx,zero,1,0.12"))
     before = (copied / "first/sheet.html").read_text()
     code, out, err = run(capsys, "new", copied, "--again")
     assert code == 0
-    assert f"orthocal: {copied}/first: has readings, whose postures were other joint" in err
-    assert "sheet" not in out
+    assert f"orthocal: {copied}/first: has readings, which belong to the dimensions at" in err
+    assert "sheet.html" not in out
     assert (copied / "first/sheet.html").read_text() == before
 
 
-def test_a_plan_that_is_out_of_reach_now_is_told(copied, capsys):
+def test_a_plan_out_of_reach_is_old(copied, capsys):
     file = copied / "machine.yaml"
     file.write_text(file.read_text().replace("[100, 320]", "[200, 320]"))
     code, _, err = run(capsys, "new", copied, "--again")
     assert code == 3
     assert "first/session.yaml: postures.x_min: " in err
-    assert "sheet.html is not for these sizes any more; plan again" in err
+    assert "first: the plan is old (the machine does not reach its postures); plan again" in err
 
 
 @pytest.mark.parametrize(
@@ -185,15 +226,17 @@ def test_a_plan_that_is_out_of_reach_now_is_told(copied, capsys):
         ({"counts": "left"}, "--counts: found 'left'; expected up or down"),
         ({"counts": "up,down"}, "--counts: has 2 parts; expected one for all, or three: x,y,z"),
         ({"at_zero_mm": "1e6"}, "--at-zero-mm: 1000000 mm in the mechanical zero; expected with"),
-        ({"leg_mm": None}, "--leg-mm: is missing, and nobody can be asked: this is no terminal"),
-        ({"leg_mm": None, "counts": None}, "--leg-mm, --counts: missing, and nobody can be asked"),
+        ({"leg_mm": None}, "--leg-mm: is missing; without a terminal every dimension must"),
+        ({"leg_mm": None, "counts": None}, "--leg-mm, --counts: are missing; without a terminal"),
+        ({"workspace_mm": "90"}, "--workspace-mm: the machine does not reach the workspace ±90 mm"),
+        ({"workspace_mm": "1:2,3:4"}, "--workspace-mm: has 2 ranges; expected one for all, or one"),
         ({"hours": "2"}, "--hours: found with --paper"),
         ({"gauge": "nowhere.yaml"}, "nowhere.yaml: there is no such file"),
         ({"model": "all"}, "'all' is not a model of this robot"),
         ({"travel_mm": "245:300"}, "expected 10 mm to either side of the mechanical zero"),
     ],
 )
-def test_what_makes_no_machine_is_refused(capsys, tmp_path, changed, message):
+def test_impossible_machines_are_refused(capsys, tmp_path, changed, message):
     given = ["new", tmp_path / "mill", "--paper", *options(**changed)]
     code, out, err = run(capsys, *given)
     assert (code, out) == (2, "")
@@ -202,12 +245,12 @@ def test_what_makes_no_machine_is_refused(capsys, tmp_path, changed, message):
     assert not (tmp_path / "mill").exists()
 
 
-def test_what_is_there_is_not_written_over(copied, capsys):
+def test_existing_files_are_not_overwritten(copied, capsys):
     before = (copied / "mill.urdf").read_text()
     given = ["new", copied, *options(leg_mm="260"), "--paper"]
     code, _, err = run(capsys, *given)
     assert code == 2
-    assert err == f"orthocal: {copied}/machine.yaml: is there already; --force writes over it\n"
+    assert err == f"orthocal: {copied}/machine.yaml: exists already; --force overwrites it\n"
     assert (copied / "mill.urdf").read_text() == before
     code, _, _ = run(capsys, *given, "--force")
     assert code == 0
@@ -218,11 +261,12 @@ def test_what_is_there_is_not_written_over(copied, capsys):
     ("words", "message"),
     [
         (["orthoglide", "--paper"], "'orthoglide' is a robot that comes with orthocal"),
+        (["machine", "--paper"], "'machine' would name its YAML machine.yaml"),
         (["mill", "--again"], "machine.yaml: there is no such file"),
-        (["mill", "--again", "--leg-mm", "260"], "--leg-mm: found with --again, which takes mach"),
+        (["mill", "--again", "--leg-mm", "260"], "--leg-mm: found with --again, which reads mach"),
     ],
 )
-def test_other_mistakes_are_told(capsys, tmp_path, words, message):
+def test_other_mistakes_are_refused(capsys, tmp_path, words, message):
     code, _, err = run(capsys, "new", tmp_path / words[0], *words[1:])
     assert code == 2
     assert message in err
@@ -250,9 +294,10 @@ def talk(command, answers, cwd):
     return process.wait(timeout=300), said.decode(errors="replace").replace("\r\n", "\n")
 
 
-def test_at_a_terminal_it_asks_and_asks_back(root, tmp_path):
+def test_invalid_answers_are_asked_for_again(root, tmp_path):
     answers = ["250000\n", "\n", "250\n", "10:600\n", "100:320\n", "30\n", "60\n", "40\n", "4\n"]
-    answers += ["sideways\n", "up,down,up\n", "0\n", "0\n", "1.5\n"]
+    answers += ["sideways\n", "up,down,up\n", "0\n", "90\n", "40:30\n", "-50:60,-50:60,-40:40\n"]
+    answers += ["0\n", "1.5\n"]
     command = [sys.executable, "-m", "orthocal", "new", str(tmp_path / "mill"), "--paper"]
     code, said = talk(command, answers, root)
     assert code == 0, said
@@ -261,16 +306,19 @@ def test_at_a_terminal_it_asks_and_asks_back(root, tmp_path):
     assert "  travel from 10 to 600 mm; legs of 250 mm reach 25 to 475 mm" in said
     assert "  rods of radius 40 mm, 60 mm apart; expected them to clear each other" in said
     assert "  found 'sideways'; expected up or down" in said
+    assert "  the machine does not reach the workspace ±90 mm" in said
+    assert "  found '40:30'; expected half the side of a cube" in said
     assert "  found 0 mm; expected more than 0, and at most 50 mm" in said
     assert "Plan: 24 readings in 6 setups." in said
     robot = load_robot(tmp_path / "mill")
+    assert robot.workspace.tolist() == [[-0.05, 0.06], [-0.05, 0.06], [-0.04, 0.04]]
     assert [d.direction for d in robot.drives] == [1, -1, 1]
     assert robot.legs["x"].rods["a"].radius == pytest.approx(0.004)
     session = load_plan(tmp_path / "mill/first")
     assert session.robot.parameters.stated == {"*.offset_mm": 1.5}
 
 
-def test_nothing_is_made_where_answers_end(root, tmp_path):
+def test_nothing_is_written_when_the_input_ends(root, tmp_path):
     command = [sys.executable, "-m", "orthocal", "new", str(tmp_path / "mill"), "--paper"]
     code, said = talk(command, ["250\n", "\x04"], root)
     assert code == 2
@@ -290,17 +338,20 @@ def test_options_are_not_asked_for(monkeypatch):
 
     monkeypatch.setattr(sys, "stdin", Terminal())
     given = {**SIZES, "--leg-mm": None}
-    assert asking.find_answers(given).sizes.leg == pytest.approx(0.26)
+    assert asking.find_answers(given).dimensions.leg == pytest.approx(0.26)
     with pytest.raises(ParameterError, match=r"--travel-mm: travel from 10 to 20 mm"):
         asking.find_answers({**given, "--travel-mm": "10:20"})
 
 
 @pytest.mark.slow
-def test_without_the_papers_plan_one_is_chosen(capsys, tmp_path):
+def test_without_paper_a_plan_is_chosen(capsys, tmp_path):
     given = [*options(), "--tolerance", "*.offset_mm=2"]
-    code, out, _ = run(capsys, "new", tmp_path / "mill", *given)
+    code, out, err = run(capsys, "new", tmp_path / "mill", *given)
     assert code == 0
-    assert re.search(r"24 readings in 6 setups, about 72 min: [\d.]+ µm at the tool are to be", out)
+    steps = [line.split()[1] for line in err.splitlines()]
+    assert list(dict.fromkeys(steps)) == ["computing", "choosing", "start", "comparing", "drawing"]
+    assert "Plan: 24 readings in 6 setups, about 72 min." in out
+    assert re.search(r"Expected tool error: [\d.]+ µm \(now \d+ µm\), workspace ±60 mm, workp", out)
     first = tmp_path / "mill/first"
     assert {p.name for p in first.iterdir()} == {
         *("session.yaml", "readings.csv", "sheet.html", "plan.json", "plan.svg"),

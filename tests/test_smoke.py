@@ -62,5 +62,6 @@ def test_prepare_measure_calibrate_and_use(root, workplace):
 
 
 def test_study(root, workplace):
-    words = ["study", "bootstrap", root / "examples/workshop", "--draws", 20, "--seed", 1]
+    words = ["study", "bootstrap", root / "examples/workshop", "--model", "offsets"]
+    words += ["--draws", 20, "--seed", 1]
     run(*words, "--out", "study", cwd=workplace)

@@ -1,1 +1,1 @@
-"""What a calibration is good for: at the tool, beside other models, validated; its findings."""
+"""Assessment of calibrations: tool error, entries, comparison, validation, findings, decision."""

@@ -13,7 +13,7 @@ from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.kinematics.workspace import Workspace, largest_cube
+from orthocal.kinematics.workspace import Workspace, find_workspace
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ class CalibratedTool:
     """∂p/∂θ there, with the offsets active while measuring, shape (K, 3, n), [m per unit]."""
 
     def deviation(self, offsets: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
-        """Where the tool is less where it is sent, shape (K, 3), [m].
+        """Actual less commanded position of the tool, shape (K, 3), [m].
 
         Args:
             offsets: In the controller, shape (n_drives,), [m, rad].
@@ -50,7 +50,7 @@ class CalibratedTool:
 
 
 def find_tool(calibration: Calibration) -> CalibratedTool | None:
-    """The tool over the largest cube around the zero that it reaches, of ±60 mm at most.
+    """The tool over the workspace, or over the largest box of its shape that the machine reaches.
 
     That is within all limits and reached by the nominal and the calibrated machine, with the
     offsets that were active while measuring and with the identified ones.
@@ -58,10 +58,6 @@ def find_tool(calibration: Calibration) -> CalibratedTool | None:
     Returns:
         None for a robot whose drives do not command a tool, or whose tool hardly moves.
     """
-    return calibration.remember("tool", lambda: _find_tool(calibration))
-
-
-def _find_tool(calibration: Calibration) -> CalibratedTool | None:
     robot = calibration.robot
     if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
         return None
@@ -74,8 +70,11 @@ def _find_tool(calibration: Calibration) -> CalibratedTool | None:
             _require_travel(robot, drives - offsets)
             sensitivity.assembly.forward(drives - offsets, start=passive)
 
-    space = largest_cube(robot, reach)
-    return None if space is None else _place(calibration, space, sensitivity, None)
+    try:
+        space = find_workspace(robot, reach)
+    except ClosureError:
+        return None
+    return _place(calibration, space, sensitivity, None)
 
 
 def place_tool(
@@ -92,23 +91,18 @@ def place_tool(
         RobotError: If the robot has no tool centre point, or the drives do not command it.
         ClosureError: If a point cannot be reached.
     """
-    known = calibration.remember("tool", lambda: _find_tool(calibration))
-    if known is not None and np.array_equal(known.workspace.points, workspace.points):
-        return known
     named = names or [f"point {i + 1}" for i in range(len(workspace.points))]
     return _place(calibration, workspace, _sensitivity(calibration), named)
 
 
 def _sensitivity(calibration: Calibration) -> ToolSensitivity:
-    """Of the tool, by the free parameters, those left out, and offsets that are in neither."""
+    """Tool sensitivity by the free parameters, the unmodelled errors and the remaining offsets."""
     robot, errors = calibration.robot, calibration.errors
     free = [*(p.name for p in calibration.free), *calibration.unmodelled.names]
     own = [row.any() for row in calibration.offset_weights]
     offsets = [f"{d.name}.offset" for d, has in zip(robot.drives, own, strict=True) if has]
     free += [n for n in offsets if n not in free]
-    return calibration.remember(
-        "tool sensitivity", lambda: ToolSensitivity(robot, free=free, values=errors)
-    )
+    return ToolSensitivity(robot, free=free, values=errors)
 
 
 def _place(
@@ -152,7 +146,7 @@ def error_covariance(calibration: Calibration, *, excess: float = 1.0) -> Array:
     taken_on = unmodelled.leakage * variance
     return np.block(
         [
-            [calibration.covariance + taken_on @ unmodelled.leakage.T, -taken_on],
+            [calibration.model_covariance + taken_on @ unmodelled.leakage.T, -taken_on],
             [-taken_on.T, np.diag(variance)],
         ]
     )

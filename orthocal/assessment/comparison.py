@@ -5,14 +5,20 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from orthocal.arguments import require_names
-from orthocal.assessment.model_verdict import Verdict, give_verdict, judge_models
-from orthocal.assessment.repetition import Repetition, measure_repetition
+from orthocal.assessment.assess import assess
+from orthocal.assessment.judgement import Judgement, judge_session, rank
+from orthocal.assessment.predictive import Repetition, measure_repetition
+from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.scores import ModelResult, Score, Undetermined, score_model
 from orthocal.assessment.tool_error import ErrorSize
+from orthocal.assessment.words import comparison as words
+from orthocal.assessment.words.entries import SESSION_HEADLINES
+from orthocal.assessment.words.validation import describe_repetition
+from orthocal.calibration.assessment_record import Assessment, Decision, Finding, ToolErrorSummary
 from orthocal.calibration.refit import repeat_calibration
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.options import SolverOptions
@@ -20,6 +26,7 @@ from orthocal.estimation.problem import build_problem
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.session.session import Session
 from orthocal.statistics.noise import KnownNoise, estimate_repeatability
+from orthocal.units import MM
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,10 +43,16 @@ class Comparison:
     results: tuple[ModelResult, ...]
     undetermined: tuple[Undetermined, ...]
     repetition: Repetition | None
-    """Residuals of the supported model held against those of another session."""
+    """Residuals of the recommended model against those of another session."""
     repeat_title: str
     """Of that other session; empty without."""
-    verdict: Verdict
+    recommendation: Recommendation
+    judgement: Judgement
+    """Of the readings, whatever the model is."""
+    tool: ToolErrorSummary | None
+    """Of the recommended model, as `calibrate` states it; None if it is unknown."""
+    tool_findings: tuple[Finding, ...]
+    """The same as findings."""
 
     def __getitem__(self, model: str) -> ModelResult:
         for result in self.results:
@@ -47,10 +60,22 @@ class Comparison:
                 return result
         raise KeyError(model)
 
+    @property
+    def best(self) -> ModelResult | None:
+        """The recommended model among those compared; else the largest of them."""
+        by_name = {r.model: r for r in self.results}
+        largest = self.results[-1] if self.results else None
+        return by_name.get(self.recommendation.model, largest)
+
+    @property
+    def assessment(self) -> Assessment:
+        """The judgement of the readings, and what the comparison shows."""
+        return _assess(self)
+
     def to_json(self) -> str:
-        """As JSON, SI units."""
+        """JSON document, SI units."""
         document = {
-            "schema": "orthocal/comparison/3",
+            "schema": "orthocal/comparison/4",
             "title": self.title,
             "noise": _number(self.noise.sigma),
             "noise_source": self.noise.source,
@@ -61,12 +86,11 @@ class Comparison:
                 for u in self.undetermined
             ],
             "repetition": None if self.repetition is None else self.repetition.to_document(),
-            "verdict": {
-                "supported": self.verdict.supported,
-                "model_error": self.verdict.model_error,
-                "models": {
-                    j.model: {"standing": j.standing, "reason": j.reason}
-                    for j in self.verdict.judgements
+            "recommendation": {
+                "model": self.recommendation.model,
+                "tolerance_scale": self.recommendation.tolerance_scale,
+                "log_evidence": {
+                    e.model: _number(e.log_evidence) for e in self.recommendation.evidence
                 },
             },
         }
@@ -81,7 +105,7 @@ def compare_models(
     repeat: Given | Sequence[Given] | None = None,
     options: SolverOptions | None = None,
 ) -> Comparison:
-    """Identify a session by several models, both ways, and say which one it supports.
+    """Identify a session by several models, linearised and exactly, and recommend one.
 
     Args:
         sessions: The session, or several, or paths to them.
@@ -124,27 +148,94 @@ def compare_models(
             except NotIdentifiableError as e:
                 undetermined.append(Undetermined(model, problem.n_machine, e.problem))
     results.sort(key=lambda r: r.n_free)
-    best, _ = judge_models(results, undetermined)
-    repetition = None
-    if best is not None and others:
-        again = repeat_calibration(best.calibration, others)
-        repetition = measure_repetition(best.calibration, again)
-    return Comparison(
+    recommendation, judgement = recommend_model(session, models), judge_session(session)
+    compared = Comparison(
         title=session.title,
         labels=tuple(r.label + (f", cycle {r.cycle}" if cycles else "") for r in session.readings),
         noise=noise,
         independent=results[0].spare + results[0].rank if results else 0,
         results=tuple(results),
         undetermined=tuple(undetermined),
-        repetition=repetition,
+        repetition=None,
         repeat_title=join_sessions(others).title if others else "",
-        verdict=give_verdict(
-            results,
-            undetermined,
-            noise=noise,
-            repetition=repetition,
-        ),
+        recommendation=recommendation,
+        judgement=judgement,
+        tool=None,
+        tool_findings=(),
     )
+    if compared.best is None:
+        return compared
+    best = compared.best.calibration
+    assessed = assess(best, session, judgement=judgement, recommendation=recommendation)
+    found = assessed.of_kind("tool error", "out of reach")
+    compared = replace(compared, tool=assessed.tool, tool_findings=found)
+    if not others:
+        return compared
+    again = repeat_calibration(best, others)
+    return replace(compared, repetition=measure_repetition(best, again))
+
+
+def _assess(comparison: Comparison) -> Assessment:
+    judged, best = comparison.judgement, comparison.best
+    notes = words.describe_recommendation(comparison.recommendation)
+    notes += [words.not_determined(u.model, u.reason) for u in comparison.undetermined]
+    if best is not None:
+        notes += _others(comparison, best)
+        notes += _residuals(comparison, best)
+        if comparison.repetition is not None:
+            title = comparison.repeat_title
+            notes.append(describe_repetition(comparison.repetition, title=title))
+        notes += _tool(comparison, best)
+    findings = rank([*judged.findings, *notes])
+    lead = next((f for f in findings if f.severity != "note"), notes[0])
+    headline = SESSION_HEADLINES[judged.verdict]
+    return Assessment(
+        Decision(judged.verdict, headline, lead.text, lead.action),
+        findings,
+        (),
+        comparison.tool,
+        judged.tolerance_scale,
+    )
+
+
+def _others(comparison: Comparison, best: ModelResult) -> list[Finding]:
+    """Models that are not recommended, and why."""
+    found = comparison.recommendation
+    return [
+        words.not_recommended(
+            r.model,
+            found.of(r.model) - found.of(best.model),
+            r.exact.unseen_rms,
+            best.exact.unseen_rms,
+        )
+        for r in comparison.results
+        if r is not best
+    ]
+
+
+def _residuals(comparison: Comparison, best: ModelResult) -> list[Finding]:
+    """Finding about the residuals of the recommended model: noise or not."""
+    calibration, noise = best.calibration, comparison.noise
+    exceeded = noise.is_exceeded(best.exact.chi_square, best.exact.dof)
+    if exceeded is None:
+        return [words.noise_unknown()] if noise.source == "unknown" else []
+    found, factor = calibration.noise.residual_sigma, calibration.row_factor
+    row = "a difference" if calibration.rows_are_differences else "a reading"
+    source = {"cycles": "from repeated readings", "gauge": "as stated for the gauge"}[noise.source]
+    sizes = f"σ {found * factor / MM:.3g} mm of {row}, noise {noise.sigma * factor / MM:.2g} mm"
+    if not exceeded:
+        return [words.residuals_are_noise(best.model, sizes, source)]
+    return [words.residuals_exceed_noise(best.model, sizes, source, found / noise.sigma)]
+
+
+def _tool(comparison: Comparison, best: ModelResult) -> list[Finding]:
+    """The expected tool error of the recommended model."""
+    found = list(comparison.tool_findings)
+    if comparison.tool is not None and not best.calibration.only_offsets:
+        found.append(words.compensated(comparison.tool.compensated))
+    if best.linearisation_cost is not None:
+        found.append(words.linearisation_cost(best.linearisation_cost.rms))
+    return found
 
 
 def _require_another(other: Session, sessions: Sequence[Session]) -> None:

@@ -1,4 +1,4 @@
-"""What to enter into a controller that takes nothing but offsets.
+"""Offsets to enter into a controller that corrects offsets only.
 
 A machine whose legs and axes are off as well is not served best by its true offsets: others make up
 for a part of its other errors. Entered is what leaves the least error at the tool, over the region
@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.assessment.calibrated_tool import CalibratedTool, error_covariance, find_tool
+from orthocal.calibration.assessment_record import ControllerEntry
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.io.fields import read_only
-from orthocal.units import InUnit, Unit
 
 Array = NDArray[np.float64]
 
@@ -33,36 +33,16 @@ SETTLED = 1e-10
 """Steps of the offsets that are none, [m, rad]."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ControllerEntry(InUnit):
-    """What to enter into the controller for one drive."""
-
-    drive: str
-    unit: Unit
-    active: float | None
-    """Offset now in the controller, [unit]; None where the session does not say."""
-    identified: float
-    """Offset of the identified machine, [unit]."""
-    enter: float
-    """Offset to enter, [unit]; what to add to the present one where that is not known."""
-    change: float
-    """enter − active, [unit]."""
-    std: float
-    """Standard deviation from all that is not known, [unit]; NaN if nothing tells."""
-    scatter: float
-    """What the scatter of the readings has in it, [unit]."""
-    held: Literal["known", "lower bound", "upper bound"] | None
-    """What holds it instead of the readings."""
-
-
 def find_entries(calibration: Calibration) -> tuple[ControllerEntry, ...]:
-    """What to enter into a controller that takes nothing but offsets.
+    """Offsets to enter into a controller that corrects offsets only.
 
     The offsets that leave the least error at the tool (`choose_offsets`); they are the identified
     ones where the machine has no other errors, or no tool to judge by. Empty where no offset was
     identified.
     """
-    return calibration.remember("entries", lambda: _find_entries(calibration))
+    if calibration.assessment is not None:
+        return calibration.assessment.entries
+    return compute_entries(calibration, find_tool(calibration))
 
 
 def entered_offsets(calibration: Calibration) -> Array:
@@ -74,7 +54,15 @@ def entered_offsets(calibration: Calibration) -> Array:
     return offsets
 
 
-def _find_entries(calibration: Calibration) -> tuple[ControllerEntry, ...]:
+def compute_entries(
+    calibration: Calibration, tool: CalibratedTool | None
+) -> tuple[ControllerEntry, ...]:
+    """Offsets to enter, computed anew.
+
+    Args:
+        calibration: The calibration.
+        tool: Its tool over the workspace; None if there is none.
+    """
     drives, weights = calibration.robot.drives, calibration.offset_weights
     own = {
         i: [calibration.parameters[j] for j in np.flatnonzero(row).tolist()]
@@ -89,15 +77,15 @@ def _find_entries(calibration: Calibration) -> tuple[ControllerEntry, ...]:
     of_free = weights[:, [j for j, p in enumerate(calibration.parameters) if p.free]]
     total, scatter = (
         np.array([_size(row, covariance) for row in of_free])
-        for covariance in (calibration.total_covariance, calibration.covariance)
+        for covariance in (calibration.total_covariance, calibration.noise_covariance)
     )
-    tool = None if calibration.only_offsets else find_tool(calibration)
-    if tool is not None:
-        chosen = choose_offsets(tool, enter, drives=list(own))
+    judged = None if calibration.only_offsets else tool
+    if judged is not None:
+        chosen = choose_offsets(judged, enter, drives=list(own))
         everything = error_covariance(calibration)
         enter = chosen.offsets
         total = _spread(chosen.gain[:, : len(everything)], everything)
-        scatter = _spread(chosen.gain[:, : len(names)], calibration.covariance)
+        scatter = _spread(chosen.gain[:, : len(names)], calibration.noise_covariance)
     active = calibration.session.controller_offsets
     return tuple(
         ControllerEntry(
@@ -106,10 +94,9 @@ def _find_entries(calibration: Calibration) -> tuple[ControllerEntry, ...]:
             active=None if active is None else active[i],
             identified=float(identified[i]),
             enter=float(enter[i]),
-            change=float(enter[i]) - (0.0 if active is None else active[i]),
             std=float(total[i]),
-            scatter=float(scatter[i]),
-            held=_hold(parts[0]) if tool is None and len(parts) == 1 else None,
+            std_scatter=float(scatter[i]),
+            held=_hold(parts[0]) if judged is None and len(parts) == 1 else None,
         )
         for i, parts in own.items()
     )

@@ -1,112 +1,164 @@
-"""What a new session is expected to show of a machine that was calibrated, and how surely.
+"""Agreement of a new session with a calibration: predicted deviations, and residuals that repeat.
 
-Readings differ from those of the calibrated machine by noise, by what the calibration does not know
-of its parameters, and by how the gauges stand this time: together with covariance V = σ² I + S Sᵀ.
+New readings y differ from those of the calibrated machine by noise, by the uncertainty of its
+parameters, and by how the gauges are mounted this time:
+
+    y - h(θ, 0) ~ N(0, V),   V = σ² I + J C Jᵀ + G Γ Gᵀ,
+
+with C the covariance of the calibration's parameters and Γ the tolerances of the mountings.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.refit import restore_gauge_covariance
+from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.fit import Fit
-from orthocal.statistics.distributions import chi_square_tail, f_tail
+from orthocal.measurement.joining import name_within
+from orthocal.session.session import known_approach
+from orthocal.statistics.distributions import beta_share, chi_square_tail, f_tail
 from orthocal.statistics.whitening import whiten
 from orthocal.statistics.zeros import project_out_zeros
 
 Array = NDArray[np.float64]
 
+FEWEST = 3
+"""Rows below which residuals have no correlation."""
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Expectation:
-    """A new session's readings against those that were expected; gauge zeros are eliminated."""
-
-    fit: Fit
-    """Of the new session."""
-    theta: Array
-    """The calibration's parameters, gauges standing as they are said to, shape (n_free,), [SI]."""
-    slopes: Array
-    """How readings answer to the parameters, in units of their tolerances, shape
-    (n_entries, n_free), [m]."""
-    known: Array
-    """Covariance of the parameters before the session, in these units, shape (n_free, n_free): of
-    the machine what the calibration left, of gauges their tolerances."""
-    by_gauges: Array
-    """What of it is from how the gauges of the calibration stood."""
-    sigma: float
-    """Standard deviation of a reading, with error of the model, [m]; NaN where nothing tells it."""
-    dof: int
-    """Independent readings."""
-
-    def deviations(self, *, more: Mapping[str, float] | None = None) -> Array:
-        """Readings less those of the calibrated machine, shape (n_entries,), [m].
-
-        Args:
-            more: Parameter to what it has more than the calibration says, [SI].
-        """
-        problem = self.fit.problem
-        theta = np.array(self.theta)
-        for name, value in (more or {}).items():
-            theta[problem.free.index(name)] += value
-        return project_out_zeros(problem.values - problem.predict(theta), problem.observations)
-
-    def spread(self, *, share: float = 1.0) -> Array:
-        """S, shape (n_entries, n_free), [m].
-
-        Args:
-            share: Part of σ that is new each time: error of the model repeats, and what it did to
-                the calibration's parameters it does again.
-        """
-        gauges = self.by_gauges
-        values, vectors = np.linalg.eigh(share**2 * (self.known - gauges) + gauges)
-        return np.asarray(self.slopes @ (vectors * np.sqrt(np.maximum(values, 0.0))))
-
-    def chance(self, *, sigma_dof: float) -> float:
-        """Probability that deviations are as large, or larger; NaN where nothing was expected.
-
-        Args:
-            sigma_dof: Degrees of freedom of σ, of which infinitely many are what was stated.
-        """
-        if not (self.sigma > 0.0 and sigma_dof > 0.0 and self.dof > 0):
-            return math.nan
-        weighed = whiten(self.deviations(), self.spread(), sigma=self.sigma)
-        square = float(weighed @ weighed)
-        if math.isinf(sigma_dof):
-            return chi_square_tail(self.dof, square)
-        return f_tail(self.dof, sigma_dof, square / self.dof)
+CHANCE = 0.05
+"""Probability below which a repetition of residuals is not due to chance."""
 
 
-def expect(calibration: Calibration, fit: Fit, *, stood: Array) -> Expectation:
-    """What was expected of a session that was fitted as the calibration was.
+def chance_of_deviations(calibration: Calibration, fit: Fit) -> float:
+    """Probability of deviations as large as those of a new session, or larger.
+
+    χ² = rᵀ V⁻¹ r with r = y - h(θ, 0), gauge zeros eliminated. It is an F statistic where the noise
+    was estimated. Without a prior the residuals of the calibration are the noise: they contain the
+    errors that its model omits.
 
     Args:
         calibration: The calibration.
-        fit: Of the new session, with the same parameters.
-        stood: What of the calibration's covariance is from how its gauges stood, shape
-            (n_machine, n_machine), [SI].
+        fit: The same parameters fitted to the new session.
+
+    Returns:
+        The probability; NaN if the calibration does not determine the noise.
     """
     problem, n = fit.problem, fit.problem.n_machine
-    scale, o = problem.theta_scale, problem.observations
-    gauges = problem.prior_mean[n:] * scale[n:]
-    of_machine = np.outer(scale[:n], scale[:n])
-    known = np.zeros((problem.n_free, problem.n_free))
-    known[:n, :n] = np.nan_to_num(calibration.covariance) / of_machine
-    known[n:, n:] = np.diag(1.0 / problem.prior_precision[n:])
-    by_gauges = np.array(known)
-    by_gauges[:n, :n] = stood / of_machine
-    noise = calibration.noise
-    sigmas = [s for s in (noise.sigma, noise.residual_sigma) if not math.isnan(s)]
-    return Expectation(
-        fit=fit,
-        theta=np.append([p.value for p in calibration.free], gauges),
-        slopes=project_out_zeros(fit.jacobian, o),
-        known=known,
-        by_gauges=by_gauges,
-        sigma=max(sigmas, default=math.nan),
-        dof=o.size - o.n_zeros,
+    scale, o, noise = problem.theta_scale, problem.observations, calibration.noise
+    sigma, sigma_dof = noise.residual_sigma, noise.residual_dof
+    if calibration.prior:
+        sigma, sigma_dof = float(np.fmax(sigma, noise.sigma)), noise.dof
+    dof = o.size - o.n_free_zeros
+    if not (sigma > 0.0 and sigma_dof > 0.0 and dof > 0):
+        return math.nan
+    covariance = np.diag(np.append(np.zeros(n), 1.0 / problem.prior_precision[n:]))
+    covariance[:n, :n] = np.nan_to_num(calibration.model_covariance) / np.outer(
+        scale[:n], scale[:n]
     )
+    variances, directions = np.linalg.eigh(covariance)
+    root = directions * np.sqrt(np.maximum(variances, 0.0))
+    theta = np.append([p.value for p in calibration.free], problem.prior_mean[n:] * scale[n:])
+    deviation = project_out_zeros(problem.values - problem.predict(theta), o)
+    white = whiten(deviation, project_out_zeros(fit.jacobian, o) @ root, sigma=sigma)
+    square = float(white @ white)
+    if math.isinf(sigma_dof):
+        return chi_square_tail(dof, square)
+    return f_tail(dof, sigma_dof, square / dof)
+
+
+def expect_rms(calibration: Calibration, fit: Fit) -> float:
+    """RMS of the deviations that are expected in the rows of a new session, [m].
+
+    It is the RMS residual of the calibration, and the effect of mountings that differ from session
+    to session: rms² + tr(J (G_old + G_new) Jᵀ) / n.
+
+    Args:
+        calibration: The calibration.
+        fit: The same parameters fitted to the new session.
+    """
+    problem, n = fit.problem, fit.problem.n_machine
+    by_gauges = restore_gauge_covariance(calibration) + fit.gauge_covariance
+    slopes = project_out_zeros(fit.jacobian[:, :n] / problem.theta_scale[:n], problem.observations)
+    square = max(float(np.trace(slopes @ by_gauges @ slopes.T)), 0.0)
+    rows = problem.session.readings
+    per_row = sum(2.0 if r.minus else 1.0 for r in rows) / len(rows)
+    return math.sqrt(calibration.rms_after**2 + per_row * square / len(rows))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Repetition:
+    """Correlation of the residuals of two sessions: unmodelled errors repeat, noise does not."""
+
+    matched: int
+    """Rows that both sessions have."""
+    correlation: float
+    """Of the residuals of both fits over those rows; NaN below three."""
+    chance: float
+    """Probability of such a correlation between residuals that are noise; NaN if unknown."""
+
+    @property
+    def repeats(self) -> bool | None:
+        """Whether the residuals are unmodelled errors, not noise; None if unknown."""
+        if math.isnan(self.chance):
+            return None
+        return self.chance < CHANCE and self.correlation > 0.0
+
+    def to_document(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            "matched": self.matched,
+            "correlation": None if math.isnan(self.correlation) else self.correlation,
+            "chance": None if math.isnan(self.chance) else self.chance,
+            "residuals_repeat": self.repeats,
+        }
+
+
+def measure_repetition(first: Calibration, second: Calibration) -> Repetition:
+    """Correlation of the residuals of two calibrations of the same parameters.
+
+    Directions of noise are distributed evenly over the space that the fit leaves to residuals.
+    """
+    matched, correlation, cosine = _correlate(first, second)
+    dimensions = matched - len(second.residuals) + second.noise.residual_dof
+    chance = math.nan
+    if matched >= FEWEST and dimensions > 1.0 and not math.isnan(correlation):
+        tail = 0.5 * (1.0 - beta_share(0.5, 0.5 * (dimensions - 1.0), cosine**2))
+        chance = tail if cosine > 0.0 else 1.0 - tail
+    return Repetition(matched, correlation, chance)
+
+
+_Row = tuple[str, str, str | None, str | None]
+"""Setup, posture, posture that was subtracted, as named in their session, and approach."""
+
+
+def _rows(calibration: Calibration) -> Iterator[tuple[_Row, ResidualRow]]:
+    joined = bool(calibration.session.parts)
+    for r in calibration.residuals:
+        setup, posture = (name_within(n, joined=joined) for n in (r.setup, r.posture))
+        minus = None if r.minus is None else name_within(r.minus, joined=joined)
+        yield (setup, posture, minus, known_approach(r.conditions)), r
+
+
+def _correlate(first: Calibration, second: Calibration) -> tuple[int, float, float]:
+    """Rows that two sessions share, cycles averaged; correlation and cosine of their residuals."""
+    means = []
+    for calibration in (first, second):
+        collected: dict[_Row, list[float]] = defaultdict(list)
+        for key, r in _rows(calibration):
+            collected[key].append(r.residual)
+        means.append({key: sum(v) / len(v) for key, v in collected.items()})
+    common = [key for key in means[0] if key in means[1]]
+    a, b = (np.array([m[key] for key in common]) for m in means)
+    if len(common) < FEWEST or not np.any(a) or not np.any(b):
+        return len(common), math.nan, math.nan
+    cosine = float(a @ b / np.sqrt((a @ a) * (b @ b)))
+    return len(common), float(np.corrcoef(a, b)[0, 1]), cosine

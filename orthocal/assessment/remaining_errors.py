@@ -1,4 +1,4 @@
-"""Which errors of a machine, together, matter most of those that are not known."""
+"""Combinations of unknown errors that contribute most to the tool error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a model, identified linearised and exactly, describes and predicts the readings."""
+"""Scores of a model, identified to first order and exactly."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Method = Literal["linearised", "exact"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Score:
-    """How one model, identified in one way, describes and predicts the readings."""
+    """Score of one model, identified in one way."""
 
     model: str
     method: Method
@@ -39,7 +39,7 @@ class Score:
     rms: float
     """Of the residuals, [m]."""
     chi_square: float
-    """Σ r²/σ² with the noise of the session; NaN if nothing tells it."""
+    """Σ r²/σ² with the noise of the session; NaN if it is unknown."""
     dof: float
     """Independent readings, repeated ones too, less effective parameters."""
     aicc: float
@@ -64,9 +64,9 @@ class ModelResult:
     model: str
     n_free: int
     rank: int
-    """Combinations of its parameters that perfect readings would tell."""
+    """Number of combinations of its parameters that perfect readings would determine."""
     spare: int
-    """Independent readings (repeated ones once) less the rank: what is left to check it."""
+    """Independent readings (repeated ones once) less the rank, which check the model."""
     effective: float
     """Parameters that the readings determine, beside the prior."""
     prior: bool

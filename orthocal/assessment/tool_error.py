@@ -1,4 +1,4 @@
-"""How well the tool's position is known: the number that users decide by.
+"""Tool error over the workspace, before and after a calibration.
 
 A machine with errors θ, commanded to a posture, has its tool at p(θ). What is not known of θ
 becomes a position error J dθ with J = ∂p/∂θ (`kinematics.sensitivity`).
@@ -26,22 +26,13 @@ from orthocal.assessment.calibrated_tool import (
     place_tool,
 )
 from orthocal.assessment.controller_entries import entered_offsets
+from orthocal.calibration.assessment_record import ToolErrorSummary
 from orthocal.calibration.calibration import Calibration
-from orthocal.errors import ClosureError, RobotError
+from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
-from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
-from orthocal.statistics.distributions import chi_square_tail
+from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace, require_commanded_tool
 
 Array = NDArray[np.float64]
-
-ROUNDING = 1e-9
-"""Residuals below which there are none: as many parameters as readings leave that, [m]."""
-
-EXCESS = 1.5
-"""Residuals by which errors must exceed their tolerances for the machine to be called worse."""
-
-RARE = 0.01
-"""Share of the machines within their tolerances that are called worse."""
 
 MOST_POINTS = 5_000
 """Points that are assessed together; each takes 40 kB. `rows.accuracy_rows` takes any number."""
@@ -55,15 +46,15 @@ class ErrorSize:
     """Size of position errors over a workspace, [m]."""
 
     rms: float
-    """Root mean square over the points, and over what is not known."""
+    """Root mean square over the points and the uncertainty."""
     largest: float
-    """At the worst point; of what is not known, root mean square there."""
+    """Largest error; for an uncertainty the root mean square at the worst point."""
     find_percentile: Callable[[], float] = field(repr=False)
     """How the next is found, which takes time."""
 
     @cached_property
     def percentile_95(self) -> float:
-        """What 95 % of the errors, at any point, stay below."""
+        """95 % quantile of the errors over all points."""
         return self.find_percentile()
 
 
@@ -96,7 +87,7 @@ class ToolUncertainty:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolAccuracy:
-    """Where the tool is and how well that is known, before and after a calibration."""
+    """Deviation and uncertainty of the tool position, before and after a calibration."""
 
     workspace: Workspace
     targets: Array
@@ -112,7 +103,7 @@ class ToolAccuracy:
     before: ToolUncertainty
     """With all errors within their tolerances and nothing known."""
     after: ToolUncertainty | None
-    """With the machine as calibrated; None where nothing tells the noise."""
+    """Uncertainty after the calibration; None if the noise is unknown."""
 
     def align(self, field: Array) -> Array:
         """A field of position errors with shift and rotation taken out, shape (K, 3, ...)."""
@@ -186,15 +177,14 @@ def assess_tool(
     *,
     names: Sequence[str] | None = None,
 ) -> ToolAccuracy:
-    """Where the tool is and how well that is known, before and after a calibration.
+    """Deviation and uncertainty of the tool position, before and after a calibration.
 
     Errors that were not free are taken at their tolerances, together with what the estimate has
     taken on of them: a calibration of offsets alone is only as good as legs and axes are.
 
     Args:
         calibration: The calibration.
-        workspace: Tool positions that are commanded; by default the largest cube around the zero
-            that the machine reaches, of ±60 mm at most.
+        workspace: Tool positions that are commanded; by default the workspace.
         names: What to call the points in messages.
 
     Raises:
@@ -203,27 +193,30 @@ def assess_tool(
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     if workspace is None:
-        return calibration.remember("accuracy", lambda: _assess_largest_cube(calibration))
+        return assess_placed(calibration, require_tool(calibration))
     return _assess(calibration, place_tool(calibration, workspace, names=names), names)
 
 
-def _assess_largest_cube(calibration: Calibration) -> ToolAccuracy:
+def require_tool(calibration: Calibration) -> CalibratedTool:
+    """The tool over its workspace.
+
+    Raises:
+        RobotError: If the robot has no tool centre point, or its drives do not command it.
+        ClosureError: If its tool hardly moves at all.
+    """
     tool = find_tool(calibration)
-    robot = calibration.robot
-    if robot.tcp is None:
-        raise RobotError("has no tool centre point; add orthocal.tcp", where=str(robot.yaml))
-    if len(robot.tcp.coordinates) != len(robot.drives):
-        raise RobotError(
-            f"orthocal.tcp.coordinates names {len(robot.tcp.coordinates)} coordinates for "
-            f"{len(robot.drives)} drives: they do not command it",
-            where=str(robot.yaml),
-        )
+    require_commanded_tool(calibration.robot)
     if tool is None:
         raise ClosureError(
-            "cannot be reached: there is no cube around it, not even of a millimetre, that the "
+            "cannot be reached: there is no region around it, not even of a millimetre, that the "
             "machine reaches within its limits",
             posture="mechanical zero",
         )
+    return tool
+
+
+def assess_placed(calibration: Calibration, tool: CalibratedTool) -> ToolAccuracy:
+    """`assess_tool` over points whose tool is known."""
     return _assess(calibration, tool, None)
 
 
@@ -235,7 +228,7 @@ def _assess(
     jacobian = tool.jacobian[:, :, : len(tolerances)]
     space, where = tool.workspace, tool.targets
     after = None
-    if np.isfinite(calibration.covariance).all():
+    if np.isfinite(calibration.model_covariance).all():
         after = measure_uncertainty(jacobian, error_covariance(calibration), space, where)
     left = tool.deviation(entered_offsets(calibration), names=names)
     return ToolAccuracy(
@@ -250,70 +243,50 @@ def _assess(
     )
 
 
-def find_excess(calibration: Calibration) -> float:
-    """How many times their tolerances unmodelled errors must be for what remains of the readings.
+def assess_remaining(
+    calibration: Calibration, accuracy: ToolAccuracy, *, scale: float | None = None
+) -> ToolUncertainty | None:
+    """Uncertainty after a calibration, unmodelled errors at their tolerances times a factor.
 
-    Of the residuals only what the noise does not explain counts, r² = n² + e² u², with n from
-    repeated cycles or the gauge's own σ and u what errors at their tolerances would leave.
+    Args:
+        calibration: The calibration.
+        accuracy: Its errors at the tool.
+        scale: That factor; by default as it was assessed.
 
     Returns:
-        e; 1 where that is no more than EXCESS, where one in a hundred machines within tolerances
-        leaves as much, where noise explains what remains (99 %), where nothing tells the noise but
-        the residuals themselves, or where no errors were left out: the machine may be as good as
-        its tolerances.
+        None if nothing determines the noise.
     """
-    noise, gauge = calibration.noise, calibration.session.gauge_sigma
-    known = noise.cycles_sigma if noise.cycles_dof > 0 else gauge
-    foretold, parts = calibration.unmodelled.residual_rms, calibration.unmodelled.residual_dof
-    if known is None or foretold < ROUNDING or not noise.leaves_more(gauge):
-        return 1.0
-    # residuals keep the noise that parameters and gauge zeros have not taken up
-    kept = noise.residual_dof / len(calibration.residuals)
-    variance = (known * calibration.row_factor) ** 2 * kept
-    ratio = math.sqrt(max(calibration.rms_after**2 - variance, 0.0)) / foretold
-    if ratio <= EXCESS or chi_square_tail(parts, parts * ratio**2) > RARE:
-        return 1.0
-    return ratio
-
-
-def assess_excess(
-    calibration: Calibration, accuracy: ToolAccuracy, excess: float
-) -> ToolUncertainty:
-    """Uncertainty after a calibration with unmodelled errors beyond their tolerances."""
-    covariance = error_covariance(calibration, excess=excess)
+    factor = calibration.tolerance_scale if scale is None else scale
+    if accuracy.after is None or factor == 1.0:
+        return accuracy.after
+    covariance = error_covariance(calibration, excess=factor)
     return measure_uncertainty(accuracy.jacobian, covariance, accuracy.workspace, accuracy.targets)
 
 
-def assess_remaining(
-    calibration: Calibration, accuracy: ToolAccuracy
-) -> tuple[ToolUncertainty | None, float]:
-    """What is not known after a calibration, as far as the readings tell of the machine.
+def summarise_tool(
+    calibration: Calibration, accuracy: ToolAccuracy, *, scale: float | None = None
+) -> ToolErrorSummary | None:
+    """Expected tool error now, with the offsets entered, and with all errors compensated.
+
+    Each is the root of the sum of squares of the known deviation and of the uncertainty.
 
     Returns:
-        Uncertainty, None where nothing tells the noise, and how many times their tolerances
-        unmodelled errors are taken to be: `find_excess`.
+        None if nothing determines the noise.
     """
-    if accuracy.after is None:
-        return None, 1.0
-    excess = find_excess(calibration)
-    if excess == 1.0:
-        return accuracy.after, excess
-    return assess_excess(calibration, accuracy, excess), excess
-
-
-def expect_after_offsets(calibration: Calibration, accuracy: ToolAccuracy) -> float | None:
-    """Error of the tool to be expected with what is to be entered, r.m.s. and headline form, [m].
-
-    What the offsets cannot make up for of the identified errors, and what is not known of them.
-
-    Returns:
-        None where nothing tells the noise.
-    """
-    remaining, _ = assess_remaining(calibration, accuracy)
+    remaining = assess_remaining(calibration, accuracy, scale=scale)
     if remaining is None:
         return None
-    left = accuracy.measure(accuracy.error_after_offsets)
-    return math.hypot(left.headline.rms, remaining.sizes.headline.rms)
+    known = remaining.sizes
+    now, entered = (accuracy.measure(d) for d in (accuracy.deviation, accuracy.error_after_offsets))
+    return ToolErrorSummary(
+        box=tuple((float(low), float(high)) for low, high in accuracy.workspace.limits),
+        coordinates=accuracy.workspace.letters,
+        now=math.hypot(now.headline.rms, known.headline.rms),
+        entered=math.hypot(entered.headline.rms, known.headline.rms),
+        compensated=known.headline.rms,
+        now_absolute=math.hypot(now.absolute.rms, known.absolute.rms),
+        entered_absolute=math.hypot(entered.absolute.rms, known.absolute.rms),
+    )
 
 
 def _spread_size(covariances: Array, workspace: Workspace) -> ErrorSize:
@@ -327,13 +300,13 @@ def _spread_size(covariances: Array, workspace: Workspace) -> ErrorSize:
 
 
 def _length_percentile(field: Array, workspace: Workspace) -> float:
-    """What 95 % of the lengths of a field, shape (K, 3), stay below."""
+    """95 % quantile of the lengths of a field, shape (K, 3)."""
     parts, weights = workspace.spread(field)
     return _weighted_percentile(np.linalg.norm(parts, axis=1), weights)
 
 
 def _drawn_percentile(covariances: Array, workspace: Workspace) -> float:
-    """What 95 % of normal errors stay below, by draws; covariances have the shape (K, 3, 3)."""
+    """95 % quantile of normal errors, by sampling; covariances have the shape (K, 3, 3)."""
     parts, weights = workspace.spread(covariances)
     values, vectors = np.linalg.eigh(parts)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
@@ -344,7 +317,7 @@ def _drawn_percentile(covariances: Array, workspace: Workspace) -> float:
 
 
 def _weighted_percentile(lengths: Array, weights: Array) -> float:
-    """What 95 % of the weight stays below."""
+    """95 % quantile by weight."""
     if weights.min() == weights.max():  # without sorting all
         return float(np.quantile(lengths, 0.95, method="inverted_cdf"))
     order = np.argsort(lengths)

@@ -15,8 +15,13 @@ from orthocal.assessment.calibrated_tool import error_covariance
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
-from orthocal.kinematics.continuation import Failures, as_rows
-from orthocal.kinematics.loop_closure import Assembly, find_beyond_travel, nominal_assembly
+from orthocal.kinematics.loop_closure import (
+    Assembly,
+    Failures,
+    as_rows,
+    find_beyond_travel,
+    nominal_assembly,
+)
 from orthocal.kinematics.sensitivity import ToolSensitivity
 
 Array = NDArray[np.float64]
@@ -113,7 +118,7 @@ def inverse_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterato
 def accuracy_rows(
     calibration: Calibration, points: ArrayLike, *, names: Sequence[str] | None = None
 ) -> Iterator[Chunk]:
-    """Where the tool is when it is commanded to points, and how well that is known, absolutely.
+    """Actual tool positions for commanded points, with absolute uncertainty.
 
     As `assess_tool` has it, point by point.
 
@@ -133,7 +138,7 @@ def accuracy_rows(
     rows, _ = as_rows(points, len(robot.drives), "coordinates")
     active = calibration.session.controller_offsets
     offsets = np.zeros(len(robot.drives)) if active is None else np.array(active)
-    known = bool(np.isfinite(calibration.covariance).all())
+    known = bool(np.isfinite(calibration.model_covariance).all())
     covariance = error_covariance(calibration) if known else None
 
     def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:

@@ -1,8 +1,9 @@
 """Validation of a calibration by a new session, as the paper's third experiment.
 
-The new session is taken with the identified offsets active in the controller. If the calibration
-is right, the deviations it shows are those that the calibration expected, and a further fit would
-change nothing.
+The new session is measured with the calibrated offsets active in the controller. The calibration
+is confirmed if the new readings deviate as predicted, within the uncertainty of the calibration,
+and no change between the sessions is found. A confirmed calibration can still be improved by the
+new readings: then the values to enter are those of a calibration from them.
 """
 
 from __future__ import annotations
@@ -11,311 +12,244 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocal.arguments import require_kind
-from orthocal.assessment.controller_entries import ControllerEntry, find_entries
-from orthocal.assessment.entry_mistakes import EnteringMistake, find_mistake
-from orthocal.assessment.predictive import Expectation, expect
-from orthocal.assessment.repetition import Repetition, measure_repetition
+from orthocal.assessment.assess import (
+    assess,
+    assessment_of,
+    expanded_uncertainty,
+    is_significant,
+)
+from orthocal.assessment.controller_entries import find_entries
+from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
+from orthocal.assessment.predictive import (
+    Repetition,
+    chance_of_deviations,
+    expect_rms,
+    measure_repetition,
+)
+from orthocal.assessment.words import validation as words
+from orthocal.assessment.words.anomalies import describe_anomalies
+from orthocal.calibration.assessment_record import (
+    Assessment,
+    ControllerEntry,
+    Decision,
+    Finding,
+    FindingKind,
+    Place,
+    first_of,
+)
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
-from orthocal.calibration.refit import repeat_fit, restore_gauge_covariance
+from orthocal.calibration.refit import repeat_fit, restore_session
 from orthocal.errors import SessionError
-from orthocal.estimation.diagnostics.residual_rows import ResidualRow
-from orthocal.estimation.fit import Fit
+from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomaly
+from orthocal.hypotheses.search import find_anomalies
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.session.session import Session
-from orthocal.statistics.chance import BY_CHANCE, confidence_factor
-from orthocal.statistics.distributions import f_tail
-from orthocal.statistics.zeros import project_out_zeros
-from orthocal.units import InUnit, Unit
+from orthocal.statistics.chance import BY_CHANCE
+from orthocal.units import MM
 
-Array = NDArray[np.float64]
+REMOVED = 0.7
+"""Part of the deviations below which a fit of the new readings is said to remove them."""
 
-FEWEST = 5.0
-"""Degrees of freedom below which what does not repeat of two sessions is not known."""
+ROUNDING = 0.02e-3
+"""Difference of a stated offset from the calibrated one that is due to rounding, [m, rad]."""
 
-CHANGE_CHANCE = 0.05
-"""Probability that any parameter of a calibration that is right is said to change."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FurtherChange(InUnit):
-    """What a further fit would still change in one parameter."""
-
-    name: str
-    unit: Unit
-    change: float
-    """[unit]."""
-    std: float
-    """Standard deviation of the change: both sessions know the parameter only so well, [unit]."""
-    significant: bool
-    """Whether it is outside the interval around 0 that holds all changes together with 95 %."""
+ENTRY_KINDS: tuple[FindingKind, ...] = (
+    "no offset",
+    "no change needed",
+    "must change",
+    "not significant",
+    "tool error",
+    "out of reach",
+)
+"""Kinds of findings about the values to enter after the new readings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Validation:
-    """A new session held against what a calibration expected."""
+    """Comparison of a new session with the predictions of a calibration."""
 
-    title: str
+    confirmed: bool | None
+    """Whether the calibration is confirmed; None if it predicts nothing, or if the new readings
+    agree with it but contradict each other."""
     offsets_stated: bool
-    """Whether the session says which offsets were active; else the identified ones are taken."""
+    """Whether the session states the active offsets; otherwise the calibrated ones are assumed."""
     expected_rms: float
-    """Of the residuals of the calibration, with what readings are off for how gauges stood, [m]."""
+    """RMS of the deviations as predicted, [m]."""
     expected_largest: float
-    achieved_rms: float
-    """Of the deviations in the new session, [m]."""
-    achieved_largest: float
-    refit_rms: float
-    """What a further fit would leave, [m]."""
-    refit_largest: float
+    """Largest deviation as predicted, [m]."""
     excess_probability: float
-    """Probability that the achieved sum of squares would be as large by chance (F test); NaN if
-    the calibration had no readings to spare."""
-    changes: tuple[FurtherChange, ...]
-    mistake: EnteringMistake | None
-    """What seems to have gone wrong in entering; None where nothing did, or nothing explains it."""
+    """Probability of deviations as large as those measured, or larger; NaN if the calibration
+    predicts nothing."""
+    refit: Calibration
+    """The same fit to the new readings, with its assessment. Its deviations are those from the
+    machine as it was calibrated."""
+    mistake: Anomaly | None
+    """Change between the sessions: offsets that were entered wrongly, or a machine that changed."""
     enter: tuple[ControllerEntry, ...]
-    """What belongs into the controller: as it was, where a mistake explains the readings or nothing
-    is to change; else what the new readings say, with their session."""
+    """Values to enter: those of the calibration if they were entered wrongly or the new readings
+    change none significantly, otherwise those from the new readings."""
     repetition: Repetition
-    """Whether what both fits leave is the same."""
-    rows: tuple[ResidualRow, ...]
-    """Rows of the new session: nominal is the machine as the controller knows it."""
+    """Correlation of the residuals of both fits."""
+    assessment: Assessment
+    """Decision whether the calibration is confirmed, with its findings."""
 
     @property
     def as_expected(self) -> bool | None:
-        """Whether the achieved deviations are no larger than expected, but for chance.
-
-        None if the calibration had no readings to spare: then it expected nothing.
-        """
-        if math.isnan(self.excess_probability):
-            return None
-        return self.excess_probability >= BY_CHANCE
-
-    @property
-    def confirmed(self) -> bool | None:
-        """Whether the calibration is confirmed; None if it expected nothing."""
-        if self.as_expected is None:
-            return None
-        return self.as_expected and self.nothing_to_change
+        """Whether the deviations are within the predictive distribution; None if unknown."""
+        return _is_expected(self.excess_probability)
 
     @property
     def nothing_to_change(self) -> bool:
-        """Whether no parameter would change beyond its standard error."""
-        return not any(c.significant for c in self.changes)
+        """Whether a calibration from the new readings keeps the active offsets."""
+        return assessment_of(self.refit).keeps_offsets
 
     def to_json(self) -> str:
         """As JSON, SI units."""
-
-        def number(value: float) -> float | None:
-            return value if math.isfinite(value) else None
-
+        refit = self.refit
+        changes = [
+            {
+                "drive": e.drive,
+                "unit": e.unit,
+                "change": e.change,
+                "expanded_uncertainty": _number(expanded_uncertainty(refit, e)),
+                "significant": is_significant(refit, e),
+            }
+            for e in assessment_of(refit).entries
+        ]
         document = {
-            "schema": "orthocal/validation/2",
-            "title": self.title,
+            "schema": "orthocal/validation/3",
+            "title": refit.session.title,
             "offsets_stated": self.offsets_stated,
+            "confirmed": self.confirmed,
             "expected_rms": self.expected_rms,
             "expected_largest": self.expected_largest,
-            "achieved_rms": self.achieved_rms,
-            "achieved_largest": self.achieved_largest,
-            "refit_rms": self.refit_rms,
-            "refit_largest": self.refit_largest,
+            "achieved_rms": refit.rms_before,
+            "achieved_largest": refit.largest_before,
+            "refit_rms": refit.rms_after,
+            "refit_largest": refit.largest_after,
             "as_expected": self.as_expected,
-            "excess_probability": number(self.excess_probability),
+            "excess_probability": _number(self.excess_probability),
             "nothing_to_change": self.nothing_to_change,
-            "changes": [
-                {
-                    "name": c.name,
-                    "unit": c.unit,
-                    "change": c.change,
-                    "std": number(c.std),
-                    "significant": c.significant,
-                }
-                for c in self.changes
-            ],
-            "mistake": None
-            if self.mistake is None
-            else {
-                "kind": self.mistake.kind,
-                "drives": list(self.mistake.drives),
-                "active": self.mistake.active.tolist(),
-                "by": list(self.mistake.by),
-                "rms": self.mistake.rms,
-            },
+            "changes": changes,
+            "mistake": None if self.mistake is None else _mistake_document(self.mistake),
             "enter": [{"drive": e.drive, "unit": e.unit, "value": e.enter} for e in self.enter],
             **self.repetition.to_document(),
         }
         return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _mistake_document(mistake: Anomaly) -> dict[str, Any]:
+    e = mistake.explanation
+    return {
+        "kind": e.kind,
+        "session": e.sessions[0],
+        "drives": list(e.drives),
+        "parameters": list(e.parameters),
+        "active": list(e.offsets) or None,
+        "change": e.amount,
+        "change_std": e.std,
+        "log_evidence": mistake.log_evidence,
+    }
+
+
+def _is_expected(probability: float) -> bool | None:
+    return None if math.isnan(probability) else probability >= BY_CHANCE
+
+
 def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Given]) -> Validation:
-    """Hold a new session, or several, against a calibration.
+    """Compare a new session, or several, with the predictions of a calibration.
 
     Args:
         calibration: The calibration whose offsets were entered.
-        sessions: Taken afterwards, with its offsets active in the controller. Where a session
-            does not state its controller's offsets, they are taken to be the identified ones.
+        sessions: Measured afterwards, with its offsets active in the controller. A session that
+            does not state the offsets of its controller is assumed to have them.
 
     Raises:
-        SessionError: If the session is of another robot, or states offsets of another calibration.
-        NotIdentifiableError: If the session does not determine the parameters.
-        SolverError: If a further fit does not converge.
+        SessionError: If a session is of another robot, or states offsets of another calibration.
+        NotIdentifiableError: If the sessions do not determine the parameters.
+        SolverError: If the fit of the new readings does not converge.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     given = gather_sessions(sessions)
-    session = join_sessions([_entered(calibration, one) for one in given])
-    entries = find_entries(calibration)
+    measured = [_with_active_offsets(calibration, one) for one in given]
+    session = join_sessions(measured)
+    judgement = judge_session(session)
     fit = repeat_fit(calibration, session)
-    stood = restore_gauge_covariance(calibration), fit.gauge_covariance
     refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
-    differ = _gauges_differ(fit, refit, stood)
-    more = math.hypot(calibration.rms_after, differ) / (calibration.rms_after or math.nan)
+    refit = replace(refit, assessment=assess(refit, session, judgement=judgement))
+    mistake, changes, wrongly_entered = _find_changes(calibration, measured, judgement)
+    expected_rms, excess = expect_rms(calibration, fit), chance_of_deviations(calibration, fit)
+    lead = _agreement(refit, excess, expected_rms, explained=bool(changes))
+    confirmed = None
+    if not math.isnan(excess):
+        confirmed = lead.severity == "note" and not changes
+        confirmed = None if confirmed and judgement.verdict != "enter" else confirmed
+    keep = wrongly_entered or (confirmed is not False and lead.kind != "further change")
+    entries = find_entries(calibration) if keep else assessment_of(refit).entries
     repetition = measure_repetition(calibration, refit)
-    expected = expect(calibration, fit, stood=stood[0])
-    if calibration.prior:  # residuals beside a prior are few, and expect nothing
-        excess = expected.chance(sigma_dof=calibration.noise.dof)
-    else:
-        excess = _excess_probability(calibration, fit, refit, stood)
-    found = Validation(
-        title=session.title,
-        offsets_stated=all(one.controller_offsets is not None for one in given),
-        expected_rms=math.hypot(calibration.rms_after, differ),
-        expected_largest=more * calibration.largest_after if math.isfinite(more) else differ,
-        achieved_rms=refit.rms_before,
-        achieved_largest=refit.largest_before,
-        refit_rms=refit.rms_after,
-        refit_largest=refit.largest_after,
+    stated = all(one.controller_offsets is not None for one in given)
+    notes = [
+        *([] if wrongly_entered else assessment_of(refit).of_kind(*ENTRY_KINDS)),
+        words.describe_repetition(repetition, new=_is_expected(excess) is False),
+        *([] if stated else [words.controller_assumed()]),
+    ]
+    return Validation(
+        confirmed=confirmed,
+        offsets_stated=stated,
+        expected_rms=expected_rms,
+        expected_largest=_expect_largest(calibration, expected_rms),
         excess_probability=excess,
-        changes=_further_changes(calibration, refit, repetition, stood),
-        mistake=None,
+        refit=refit,
+        mistake=mistake,
         enter=entries,
         repetition=repetition,
-        rows=refit.residuals,
+        assessment=Assessment(
+            decision=_decide(confirmed, judgement, lead, changes),
+            findings=rank([*judgement.findings, lead, *changes, *notes]),
+            entries=entries,
+            tool=assessment_of(refit).tool,
+            tolerance_scale=judgement.tolerance_scale,
+        ),
     )
-    if found.confirmed is not False:
-        return found
-    mistake = _find_mistake(calibration, expected, repetition)
-    slip = mistake is not None and mistake.kind != "one differs"
-    enter = entries if slip else find_entries(refit)
-    return replace(found, mistake=mistake, enter=enter)
 
 
-def _entered(calibration: Calibration, session: Session) -> Session:
-    """A new session with the offsets that were active: as it states, or as identified."""
+def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
+    """The session with the offsets that were active: as stated, otherwise as calibrated.
+
+    Raises:
+        SessionError: If it is of another robot, or states other offsets.
+    """
     if session.robot.sha256 != calibration.robot_record.sha256:
         raise SessionError(
             f"is of robot '{session.robot.name}'; the calibration is of another, or of another "
             f"version of '{calibration.robot_record.name}'",
             where=None if session.path is None else str(session.path),
         )
-    if session.controller_offsets is not None:
-        _require_offsets(calibration, session)
-        return session
-    by_drive = {e.drive: e.enter for e in find_entries(calibration)}
-    if not by_drive:
-        return session
-    offsets = [by_drive.get(d.name, 0.0) for d in session.robot.drives]
-    return session.with_controller(np.array(offsets))
-
-
-def _find_mistake(
-    calibration: Calibration, expected: Expectation, repetition: Repetition
-) -> EnteringMistake | None:
-    """The mistake in entering offsets that explains a session, if one does."""
-    if not expected.sigma > 0.0:
-        return None
-    problem = expected.fit.problem
-    session, drives = problem.session, problem.robot.drives
-    offsets = {i: f"{d.name}.offset" for i, d in enumerate(drives)}
-    told = {i: name for i, name in offsets.items() if name in problem.free}
-    slopes = np.zeros((problem.observations.size, len(drives)))
-    for i, name in told.items():
-        k = problem.free.index(name)
-        slopes[:, i] = expected.slopes[:, k] / problem.theta_scale[k]
-    entries = {e.drive: e for e in find_entries(calibration)}
-    identified, scatter = (
-        np.array([getattr(entries[d.name], key) if d.name in entries else 0.0 for d in drives])
-        for key in ("identified", "scatter")
-    )
-    share = _share_that_is_new(calibration, repetition, expected.sigma)
-
-    def deviate(active: Array) -> Array:
-        missing = session.active_offsets - active
-        return expected.deviations(more={name: missing[i] for i, name in told.items()})
-
-    return find_mistake(
-        deviate,
-        slopes,
-        spread=expected.spread(share=share),
-        sigma=share * expected.sigma,
-        model_sigma=expected.sigma,
-        model_dof=calibration.noise.residual_dof,
-        dof=expected.dof,
-        before=calibration.active_offsets,
-        identified=identified,
-        entered=session.active_offsets,
-        names=tuple(d.name for d in drives),
-        rounding=np.nan_to_num(scatter),
-    )
-
-
-def _share_that_is_new(calibration: Calibration, repetition: Repetition, sigma: float) -> float:
-    """Part of σ that differs from session to session: errors of the model repeat.
-
-    1 where the readings do not tell.
-    """
-    if calibration.prior or not repetition.scatter_dof >= FEWEST:
-        return 1.0
-    return min(repetition.scatter / sigma, 1.0)
-
-
-def _further_changes(
-    calibration: Calibration, refit: Calibration, repetition: Repetition, stood: Sequence[Array]
-) -> tuple[FurtherChange, ...]:
-    """New less old estimates, against the standard error of the difference of the two.
-
-    What repeats in both sessions, as errors of the model do, moves both estimates alike: where the
-    readings tell how much does not repeat, only that counts, and how the gauges stood, each time
-    otherwise.
-    """
-    pairs = list(zip(calibration.free, refit.free, strict=True))
-    scale, dof = (1.0, 1.0), min(calibration.dof, refit.dof)
-    if not calibration.prior and repetition.scatter_dof >= FEWEST:
-        scatter = repetition.scatter
-        scale = (min(scatter / calibration.sigma, 1.0), min(scatter / refit.sigma, 1.0))
-        dof = repetition.scatter_dof
-    # so many chances to be wrong by chance: each gets its share
-    factor = confidence_factor(dof, 1.0 - CHANGE_CHANCE / len(pairs))
-    changes = []
-    variances = np.maximum([np.diag(g) for g in stood], 0.0).T
-    for pair, by_gauges in zip(pairs, variances.tolist(), strict=True):
-        old, new = pair
-        change = new.value - old.value
-        scattered = (
-            share**2 * max(p.std**2 - g, 0.0)
-            for p, g, share in zip(pair, by_gauges, scale, strict=True)
-        )
-        std = math.sqrt(sum(scattered) + sum(by_gauges))
-        changes.append(FurtherChange(new.name, new.unit, change, std, abs(change) > factor * std))
-    return tuple(changes)
-
-
-def _require_offsets(calibration: Calibration, session: Session) -> None:
-    """The offsets that a session states must be those of the calibration, up to rounding."""
     drives = [d.name for d in session.robot.drives]
+    entries = {drives.index(e.drive): e for e in find_entries(calibration)}
+    if session.controller_offsets is None:
+        offsets = np.zeros(len(drives))
+        offsets[list(entries)] = [e.enter for e in entries.values()]
+        return session.with_controller(offsets) if entries else session
     others, where = [], ""
-    for entry in find_entries(calibration):
-        stated = float(session.active_offsets[drives.index(entry.drive)])
-        allowed = max(0.5 * entry.scatter, 0.02e-3)
-        if not math.isnan(allowed) and abs(stated - entry.enter) > allowed:
+    for i, entry in entries.items():
+        active = float(session.active_offsets[i])
+        allowed = max(0.5 * entry.std_scatter, ROUNDING)
+        if not math.isnan(allowed) and abs(active - entry.enter) > allowed:
             factor, unit = entry.edge_factor, entry.edge_unit
             where = f"{session.path or 'session'}: controller.offsets_{unit}"
             others.append(
-                f"{entry.drive} has {stated * factor:g} {unit} where the calibration says to enter "
+                f"{entry.drive} has {active * factor:g} {unit} where the calibration says to enter "
                 f"{entry.enter * factor:.3f} {unit}"
             )
     if others:
@@ -324,47 +258,90 @@ def _require_offsets(calibration: Calibration, session: Session) -> None:
             "calibration says to enter",
             where=where,
         )
+    return session
 
 
-def _gauges_differ(fit: Fit, refit: Calibration, stood: Sequence[Array]) -> float:
-    """What rows of the new session are off for how the gauges stood, then and now, r.m.s., [m]."""
-    rows = refit.residuals
-    gram = _gauge_gram(fit, stood)
-    of_differences = sum(2.0 if r.minus else 1.0 for r in rows) / len(rows)
-    return math.sqrt(of_differences * max(float(np.trace(gram)), 0.0) / len(rows))
+def _find_changes(
+    calibration: Calibration, measured: Sequence[Session], judgement: Judgement
+) -> tuple[Anomaly | None, list[Finding], bool]:
+    """Changes between the sessions of a calibration and new ones.
 
+    Args:
+        calibration: The calibration.
+        measured: The new sessions, with their active offsets.
+        judgement: Judgement of the new sessions by themselves.
 
-def _gauge_gram(fit: Fit, stood: Sequence[Array]) -> Array:
-    """Of readings, zeros eliminated, what parameters are off for how gauges stood: its Gram matrix.
-
-    Shape (n_machine, n_machine); its trace is the sum of squares that it makes, [m²].
+    Returns:
+        The most likely change, all findings, and whether the offsets of the calibration were
+        entered wrongly.
     """
-    problem, n = fit.problem, fit.problem.n_machine
-    scaled = fit.jacobian[:, :n] / problem.theta_scale[:n]
-    slopes = project_out_zeros(scaled, problem.observations)
-    return np.asarray(slopes.T @ slopes @ sum(stood))
+    before = restore_session(calibration)
+    every = join_sessions([before, *measured])
+    result = find_anomalies(every)
+    changes = tuple(a for a in result.found if a.between_sessions)
+    if not changes and judgement.verdict != "enter":  # its findings explain the readings
+        return None, [], False
+    mistake = next((a for a in changes if a.explanation.sessions), None)
+    findings = describe_anomalies(every, replace(result, found=changes))
+    if mistake is None:
+        return None, findings, False
+    new = {name.partition("/")[0] for name in list(every.setups)[len(before.setups) :]}
+    e = mistake.explanation
+    return mistake, findings, e.kind in WRONGLY_ENTERED and e.sessions[0] in new
 
 
-def _excess_probability(
-    calibration: Calibration, fit: Fit, refit: Calibration, stood: Sequence[Array]
-) -> float:
-    """Upper tail of the ratio of achieved to expected mean squares.
+def _agreement(refit: Calibration, excess: float, expected: float, *, explained: bool) -> Finding:
+    """Agreement of the deviations with their prediction, and of the values to enter.
 
-    Expected is what the calibration left, once more for what it did not know of its parameters,
-    and what both are off for how the gauges stood; that is of a few directions, which counts for
-    as few degrees of freedom (Satterthwaite).
+    Args:
+        refit: Fit of the new readings, assessed.
+        excess: Probability of deviations as large as those measured.
+        expected: RMS of the deviations as predicted, [m].
+        explained: Whether a change between the sessions explains the deviations.
     """
-    expected = calibration.noise.residual_sigma
-    dof = calibration.noise.residual_dof
-    if not (expected > 0.0 and dof > 0.0):
-        return math.nan
-    rows = refit.residuals
-    zeros = len({r.setup for r in rows if r.minus is None})
-    achieved = sum(r.deviation**2 / (2.0 if r.minus else 1.0) for r in rows)
-    count = len(rows) - zeros
-    each = expected**2 * (1.0 + (count - refit.noise.residual_dof) / count)
-    gram = _gauge_gram(fit, stood)
-    mean = each + float(np.trace(gram)) / count
-    square = count * each**2 + 2.0 * each * float(np.trace(gram)) + float(np.trace(gram @ gram))
-    independent = (count * mean) ** 2 / square
-    return f_tail(independent, dof, achieved / count / mean)
+    achieved, judged = refit.rms_before, assessment_of(refit)
+    numbers = {
+        "expected_rms_mm": expected / MM,
+        "achieved_rms_mm": achieved / MM,
+        "refit_rms_mm": refit.rms_after / MM,
+        "chance": excess,
+    }
+    as_expected = _is_expected(excess)
+    if as_expected is None:
+        return words.nothing_predicted(numbers)
+    if not as_expected:
+        worst = max(refit.residuals, key=lambda r: abs(r.deviation))
+        return words.larger_than_predicted(
+            achieved,
+            expected,
+            None if explained else refit.rms_after,
+            removed=refit.rms_after < REMOVED * achieved,
+            numbers=numbers,
+            place=Place(line=worst.line, setup=worst.setup, posture=worst.postures),
+        )
+    if judged.keeps_offsets:
+        return words.as_predicted(achieved, expected, numbers)
+    changed = first_of(judged.findings, "must change")
+    drives = [] if changed is None else [p.parameter or "" for p in changed.places]
+    return words.further_change(achieved, expected, drives, numbers)
+
+
+def _expect_largest(calibration: Calibration, expected_rms: float) -> float:
+    """Largest deviation as predicted, [m]: that of the calibration, in proportion to the RMS."""
+    if calibration.rms_after == 0.0:
+        return expected_rms
+    return expected_rms / calibration.rms_after * calibration.largest_after
+
+
+def _decide(
+    confirmed: bool | None, judgement: Judgement, lead: Finding, changes: Sequence[Finding]
+) -> Decision:
+    """The decision: readings that cannot be trusted come first, then the agreement, its causes."""
+    anomalies = [f for f in judgement.findings if f.severity != "note"][:1]
+    headlines = {True: words.CONFIRMED, False: words.NOT_CONFIRMED, None: words.UNKNOWN}
+    return Decision(
+        verdict_of([*judgement.findings, lead, *changes]),
+        headlines[confirmed],
+        " ".join(f.text for f in (*anomalies, lead, *changes)),
+        next((f.action for f in (*anomalies, *changes, lead) if f.action), ""),
+    )

@@ -1,11 +1,22 @@
-"""Numbers and lists as they stand in sentences."""
+"""Numbers, lists and directions in sentences."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from orthocal.units import MM, UM
+
+Array = NDArray[np.float64]
+
+LARGEST_IN_UM = 0.1 * MM
+"""Lengths from which on a sentence is in mm, [m]."""
+
+ALONG_AXIS = 0.9999
+"""Cosine above which a direction is named after an axis of the world."""
 
 
 def mm(value: float) -> str:
@@ -35,7 +46,7 @@ def counted(count: int, noun: str) -> str:
 
 
 def times(ratio: float) -> str:
-    """How many times something is something else."""
+    """Ratio in words: 2.5 times."""
     return f"{ratio:.1f} times" if ratio < 3.0 else f"{ratio:.0f} times"
 
 
@@ -48,3 +59,29 @@ def count_of(value: int) -> str:
     """A number of things, below ten as a word."""
     words = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
     return words[value] if 0 <= value < len(words) else str(value)
+
+
+def lengths(*values: float) -> tuple[str, ...]:
+    """Lengths of one sentence in one unit, two or three significant digits: 0.12 mm, 17.8 µm.
+
+    Args:
+        values: Lengths, [m].
+    """
+    if max(values) >= LARGEST_IN_UM:
+        return tuple(f"{v / MM:.2g} mm" if v / MM < 1.0 else f"{v / MM:.3g} mm" for v in values)
+    return tuple(f"{um(v)} µm" for v in values)
+
+
+def axis_name(direction: Array, *, cosine: float = ALONG_AXIS) -> str:
+    """Name of the world axis along a direction, such as −y; "" for other directions."""
+    k = int(np.abs(direction).argmax())
+    if abs(direction[k]) <= cosine * np.linalg.norm(direction):
+        return ""
+    return f"{'+' if direction[k] > 0.0 else '−'}{'xyz'[k]}"
+
+
+def name_direction(direction: Array, *, cosine: float = ALONG_AXIS) -> str:
+    """Name of the world axis along a direction, else the components of its unit vector."""
+    unit = direction / np.linalg.norm(direction)
+    components = ", ".join(f"{round(v, 2) + 0.0:.2f}".replace("-", "−") for v in unit)
+    return axis_name(direction, cosine=cosine) or f"({components})"

@@ -35,8 +35,6 @@ from orthocal.estimation.fit import Fit
 from orthocal.estimation.linear import Linearisation, linearise_at_reference
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.weighting import split_by_gauge
-from orthocal.hypotheses.reversed_setup import find_turned_setup
-from orthocal.hypotheses.sessions.changes import find_session_changes
 from orthocal.io.fields import read_only
 from orthocal.robot.loading import packaged_robots
 from orthocal.robot.parameters import Parameter
@@ -75,13 +73,19 @@ def assemble_calibration(
     problem, noise, loss = fit.problem, fit.noise, fit.loss
     session = problem.session
     n = problem.n_machine
-    covariance = fit.covariance()
+    covariance, noise_covariance = fit.covariance(), fit.noise_covariance()
     # a base parameter is the whole combination: nothing of it is left out
     others = find_other_errors(
         fit, spoken_for=() if whole is None else whole.machine_selection.names
     )
     unmodelled, taken_on = measure_unmodelled(fit, others)
-    estimates = _estimates(fit, covariance, _widen(fit, unmodelled, intervals or {}))
+    bias = np.append(np.sqrt(np.diag(unmodelled.bias_covariance)), taken_on)
+    estimates = _estimates(
+        fit,
+        std=np.hypot(np.sqrt(np.diag(covariance)), bias),
+        std_scatter=np.sqrt(np.diag(noise_covariance)),
+        intervals=_widen(fit, unmodelled, intervals or {}),
+    )
     diagnostics = diagnose_readings(fit)
     residuals = _residual_rows(fit, diagnostics, nominal)
     calibration = Calibration(
@@ -101,39 +105,37 @@ def assemble_calibration(
         ),
         parameters=(*estimates[:n], *_held_estimates(problem)),
         sensors=estimates[n:],
-        sensor_bias=read_only(taken_on),
-        covariance=read_only(covariance[:n, :n]),
+        model_covariance=read_only(covariance[:n, :n]),
+        noise_covariance=read_only(noise_covariance[:n, :n]),
         unmodelled=unmodelled,
         identifiability=_identifiability(fit, whole),
         base=whole is not None,
         noise=noise,
         rows_are_differences=session.only_differences,
         residuals=residuals,
-        turned=find_turned_setup(fit, others, residuals),
         critical=diagnostics.critical,
         postures=tuple(
-            PostureRecord(name, tuple(p.drives.tolist()), tuple(fit.solution.passive[i].tolist()))
-            for i, (name, p) in enumerate(session.postures.items())
+            PostureRecord(p.name, tuple(p.drives.tolist()), tuple(fit.solution.passive[i].tolist()))
+            for i, p in zip(problem.states.first_of_posture, session.postures.values(), strict=True)
         ),
         setups=_setup_records(fit),
         gauges=_gauge_records(fit),
-        changes=find_session_changes(fit, others),
         version=__version__,
+        robot=session.robot,
     )
     require_loadable(calibration)
-    calibration.remember("robot", lambda: session.robot)  # no need to load it again
     return calibration
 
 
 def _identifiability(fit: Fit, whole: CalibrationProblem | None) -> Identifiability:
-    """Of the free parameters; of base parameters, together with what they stand for."""
+    """Identifiability of the free parameters; for base parameters with the sums they represent."""
 
     def analyse(information: Information, parameters: Sequence[Parameter]) -> Identifiability:
         return analyse_identifiability(
             information,
             parameters,
             sigma=fit.noise.sigma,
-            n_postures=fit.problem.n_postures,
+            n_postures=len(fit.problem.session.postures),
             n_readings=fit.independent_readings,
         )
 
@@ -169,11 +171,15 @@ def _widen(
 
 
 def _estimates(
-    fit: Fit, covariance: Array, intervals: Mapping[str, tuple[float, float]]
+    fit: Fit,
+    *,
+    std: Array,
+    std_scatter: Array,
+    intervals: Mapping[str, tuple[float, float]],
 ) -> tuple[ParameterEstimate, ...]:
+    """Estimates of the machine, then of the sensors; standard deviations in [SI]."""
     problem, solution = fit.problem, fit.solution
     selection = problem.selection
-    std = np.sqrt(np.diag(covariance))
     told = fit.machine_information.determined(sigma=fit.noise.sigma)
     determined = np.append(told, np.zeros(problem.n_free - told.size, dtype=bool))
     words: dict[int, Literal["lower", "upper"] | None] = {-1: "lower", 0: None, 1: "upper"}
@@ -184,6 +190,7 @@ def _estimates(
             value=float(solution.theta[i]),
             linear=float(fit.linear[i]),
             std=float(std[i]),
+            std_scatter=float(std_scatter[i]),
             tolerance=p.tolerance,
             free=True,
             identifiable=bool(determined[i]),
@@ -210,6 +217,7 @@ def _held_estimates(problem: CalibrationProblem) -> tuple[ParameterEstimate, ...
                 value=value,
                 linear=value,
                 std=0.0,
+                std_scatter=0.0,
                 tolerance=p.tolerance,
                 free=False,
                 identifiable=False,
@@ -299,6 +307,7 @@ def _residual_rows(
             influence=float(diagnostics.influence[i]),
             influenced=problem.free[diagnostics.influenced[i]],
             unseen=float(unseen[i]),
+            conditions=r.conditions,
         )
         for i, r in enumerate(session.readings)
     )
@@ -337,6 +346,7 @@ def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
             active=None if s.active is None else tuple(s.active.tolist()),
             zero=zeros.get(s.name),
             aligned_at=aligned_at[s.name],
+            zero_kind=s.zero,
         )
         for s in fit.problem.session.setups.values()
     )

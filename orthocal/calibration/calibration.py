@@ -6,39 +6,29 @@ It holds all that a report, a scene or an export needs: none of them asks for th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.calibration.machine import Machine
-from orthocal.calibration.recorded_robot import (
-    load_recorded_robot,
-    require_offsets,
-    require_parameters,
-    require_rows,
-)
 from orthocal.calibration.records import CalibrationRecord, ParameterEstimate
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow, root_mean_square
 from orthocal.robot.model import Robot
-from orthocal.statistics.chance import confidence_factor
+from orthocal.statistics.chance import expanded_uncertainty
 
 Array = NDArray[np.float64]
 
-Found = TypeVar("Found")
 
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Calibration(CalibrationRecord):
-    """A calibration, and what follows from it."""
+    """A calibration: its record, the robot that it is of, and what follows from both."""
 
+    robot: Robot
+    """The nominal robot, with the tolerances that the session states."""
     path: Path | None = None
-    """Where it was loaded from."""
-    _kept: dict[str, Any] = field(init=False, default_factory=dict)
-    """What follows from the rest, once it was asked for."""
+    """File that it was loaded from."""
 
     def __getitem__(self, name: str) -> ParameterEstimate:
         for p in self.parameters:
@@ -58,15 +48,18 @@ class Calibration(CalibrationRecord):
 
     @property
     def standard_deviations(self) -> Array:
-        """Of the free parameters, shape (n_free,), [SI]."""
+        """Standard deviations of the free parameters, everything unknown included, [SI]."""
         return np.array([p.std for p in self.free])
 
     @property
     def correlation(self) -> Array:
-        """Correlation of the free parameters, shape (n_free, n_free); NaN at a bound."""
-        std = self.standard_deviations
+        """Correlation by noise and priors, shape (n_free, n_free); NaN at a bound.
+
+        Of the model's own parameters: it shows which of them the readings do not tell apart.
+        """
+        std = np.sqrt(np.diag(self.model_covariance))
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(self.covariance / np.outer(std, std))
+            return np.asarray(self.model_covariance / np.outer(std, std))
 
     def correlated(self, *, above: float = 0.5) -> tuple[tuple[str, str, float], ...]:
         """Pairs of free parameters with a correlation above a size, strongest first."""
@@ -133,75 +126,27 @@ class Calibration(CalibrationRecord):
         return math.sqrt(2.0) if self.rows_are_differences else 1.0
 
     @property
-    def confidence_factor(self) -> float:
-        """Standard deviations on either side of an estimate in its 95 % interval."""
-        return confidence_factor(self.dof)
-
-    @property
-    def total_std(self) -> Array:
-        """Standard deviations of the free parameters from all that is not known, (n_free,), [SI].
-
-        What the scatter of the readings and the priors leave open, and what errors of the machine
-        that were not free, at their tolerances, have moved.
-        """
-        return np.asarray(np.hypot(self.standard_deviations, self._bias_std))
-
-    @property
-    def sensor_total_std(self) -> Array:
-        """As `total_std`, of what was not known of the sensors, shape (n_sensors,), [SI]."""
-        return np.asarray(np.hypot([p.std for p in self.sensors], self.sensor_bias))
-
-    @property
     def total_covariance(self) -> Array:
-        """Covariance of the free parameters from all that is not known, (n_free, n_free), [SI]."""
-        open_ones = np.array([p.at_bound is None for p in self.free])
-        bias = np.where(np.outer(open_ones, open_ones), self.unmodelled.bias_covariance, 0.0)
-        return np.asarray(self.covariance + bias)
+        """Covariance of the free parameters, everything unknown included, (n_free, n_free), [SI].
+
+        Scatter of the readings, priors, and errors of the machine that were not free.
+        """
+        return np.asarray(self.model_covariance + self.unmodelled.bias_covariance)
+
+    @property
+    def expanded_uncertainties(self) -> Array:
+        """Expanded uncertainties (k = 2) of the free parameters, shape (n_free,), [SI].
+
+        See `orthocal.statistics.chance.expanded_uncertainty`.
+        """
+        scatter = [p.std_scatter for p in self.free]
+        return expanded_uncertainty(self.standard_deviations, scatter, dof=self.dof)
 
     @property
     def intervals(self) -> tuple[tuple[float, float], ...]:
-        """95 % intervals of the free parameters, with all that is not known, [unit].
-
-        Student's factor counts for the share that the readings told: what only the prior tells, or
-        the tolerances of errors that were not free, has no part in the degrees of freedom of their
-        scatter. Infinite where nothing tells the noise.
-        """
-        student, normal = self.confidence_factor, confidence_factor(math.inf)
-        found = []
-        for p, bias in zip(self.free, self._bias_std, strict=True):
-            share = 1.0 if math.isnan(p.data_share) else max(p.data_share, 0.0)
-            square = (share * student**2 if share > 0.0 else 0.0) + (1.0 - share) * normal**2
-            half = math.sqrt(square * p.std**2 + (normal * float(bias)) ** 2)
-            found.append((p.value - half, p.value + half))
-        return tuple(found)
-
-    @property
-    def _bias_std(self) -> Array:
-        bound = np.array([p.at_bound is not None for p in self.free])
-        bias = np.sqrt(np.diag(self.unmodelled.bias_covariance))
-        return np.where(bound, 0.0, bias)
-
-    @property
-    def robot(self) -> Robot:
-        """The nominal robot.
-
-        Raises:
-            RobotError: If it cannot be found or loaded.
-            CalibrationFileError: If its files are not those that were calibrated.
-        """
-        return self.remember("robot", self._load_robot)
-
-    def remember(self, name: str, find: Callable[[], Found]) -> Found:
-        """What follows from this calibration, found once and kept with it.
-
-        Args:
-            name: Of what is found.
-            find: How.
-        """
-        if name not in self._kept:
-            self._kept[name] = find()
-        found: Found = self._kept[name]
-        return found
+        """Free parameters ± their expanded uncertainties, [unit]."""
+        half = self.expanded_uncertainties.tolist()
+        return tuple((p.value - u, p.value + u) for p, u in zip(self.free, half, strict=True))
 
     @property
     def active_offsets(self) -> Array:
@@ -211,13 +156,13 @@ class Calibration(CalibrationRecord):
 
     @property
     def only_offsets(self) -> bool:
-        """Whether the machine as identified has no errors but offsets."""
+        """True if the identified machine has no errors but offsets."""
         known = self.robot.parameters
         return all(known.are_offsets(p.name) for p in self.parameters if p.free or p.value != 0.0)
 
     @property
     def offset_weights(self) -> Array:
-        """What each parameter adds to the drives' offsets, shape (n_drives, n_parameters)."""
+        """Contribution of each parameter to the drive offsets, shape (n_drives, n_parameters)."""
         drives = [f"{d.name}.offset" for d in self.robot.drives]
         return self.robot.parameters.coefficients(drives, [p.name for p in self.parameters])
 
@@ -227,24 +172,17 @@ class Calibration(CalibrationRecord):
         return np.asarray(self.offset_weights @ np.array([p.value for p in self.parameters]))
 
     @property
-    def machine(self) -> Machine:
-        """The machine as it was identified: it moves.
+    def tolerance_scale(self) -> float:
+        """Factor by which errors that were not identified exceed their tolerances, as assessed."""
+        return 1.0 if self.assessment is None else self.assessment.tolerance_scale
 
-        Raises:
-            RobotError, CalibrationFileError: As `robot`.
-        """
-        return self.remember("machine", lambda: Machine(self.robot, self.errors))
+    @property
+    def machine(self) -> Machine:
+        """The identified machine: forward and inverse kinematics with its errors."""
+        return Machine(self.robot, self.errors)
 
     def _repr_html_(self) -> str:
         """In a notebook: the short answer."""
         import orthocal  # what is shown follows in later stages
 
         return orthocal.summarize(self, html=True)
-
-    def _load_robot(self) -> Robot:
-        robot = load_recorded_robot(self.robot_record, file=self.path)
-        prefix = "" if self.path is None else f"{self.path}: "
-        require_parameters(robot, self.parameters, self.unmodelled.names, prefix=prefix)
-        require_rows(robot, self.setups, self.postures, self.residuals, prefix=prefix)
-        require_offsets(robot, self.session.controller_offsets, prefix=prefix)
-        return robot

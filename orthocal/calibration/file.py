@@ -16,10 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.recorded_robot import (
+    load_recorded_robot,
+    require_offsets,
+    require_parameters,
+    require_rows,
+)
 from orthocal.calibration.records import CalibrationRecord
 from orthocal.errors import CalibrationFileError, SolverError
 from orthocal.io.documents import read_json, validate, write_plain
 from orthocal.io.files import exists, is_folder, write_file
+from orthocal.robot.model import Robot
 from orthocal.statistics.identifiability import Identifiability
 from orthocal.text import shorten
 
@@ -93,7 +100,9 @@ def require_loadable(calibration: Calibration) -> None:
         SolverError: Naming the number that cannot be.
     """
     try:
-        _read_document(calibration_document(calibration), "calibration.json")
+        _read_document(
+            calibration_document(calibration), "calibration.json", robot=calibration.robot
+        )
     except CalibrationFileError as e:
         raise SolverError(
             f"the result makes no sense ({e}); look for readings, a σ, tolerances or bounds that "
@@ -103,30 +112,43 @@ def require_loadable(calibration: Calibration) -> None:
         ) from None
 
 
-def _read_document(data: Any, file: str, *, path: Path | None = None) -> Calibration:  # noqa: ANN401 - any document
-    """A document as a calibration, each of its parts held against the others.
+def _read_document(
+    data: Any,  # noqa: ANN401 - any document
+    file: str,
+    *,
+    path: Path | None = None,
+    robot: Robot | None = None,
+) -> Calibration:
+    """A document as a calibration, each of its parts checked against the others.
 
     Args:
         data: The document; what does not belong to the record is taken out of it.
         file: Where it is from, for messages.
         path: The file, where it is from one.
+        robot: The robot that it is of; by default that which the document names.
 
     Raises:
         CalibrationFileError: Naming the key.
     """
     derived = _take_derived(data)
     record = validate(CalibrationRecord, data, where=file, error=CalibrationFileError)
-    _check_estimates(record, file)
+    count = sum(p.free for p in record.parameters)
+    if not count:
+        raise CalibrationFileError("holds none that is free", where=f"{file}: parameters")
+    for key in ("model_covariance", "noise_covariance"):
+        _require_covariance(getattr(record, key), count, f"{file}: {key}")
     _check_unmodelled(record, file)
-    if record.sensor_bias.shape != (len(record.sensors),):
-        raise CalibrationFileError(
-            f"has {record.sensor_bias.size} numbers; expected {len(record.sensors)}, as sensors",
-            where=f"{file}: sensor_bias",
-        )
+    _check_estimates(record, file)
     _check_singular_values(record.identifiability, file)
-    _check_changes(record, file)
+    known = load_recorded_robot(record.robot_record, file=path) if robot is None else robot
+    prefix = "" if path is None else f"{path}: "
+    require_parameters(known, record.parameters, record.unmodelled.names, prefix=prefix)
+    require_rows(known, record.setups, record.postures, record.residuals, prefix=prefix)
+    require_offsets(known, record.session.controller_offsets, prefix=prefix)
     calibration = Calibration(
-        **{name: getattr(record, name) for name in CalibrationRecord.__slots__}, path=path
+        **{name: getattr(record, name) for name in CalibrationRecord.__slots__},
+        robot=known,
+        path=path,
     )
     for place, value in _derive(calibration):
         if place in derived:
@@ -159,7 +181,7 @@ _FOLLOWING = {
 
 
 def _take_derived(data: Any) -> dict[_Place, Any]:  # noqa: ANN401 - any document
-    """What a document says of numbers that follow, taken out of it."""
+    """Metadata of the numbers that follow, removed from the document."""
     found: dict[_Place, Any] = {}
     for key, names in _FOLLOWING.items():
         part = data.get(key) if key and isinstance(data, dict) else data
@@ -199,34 +221,44 @@ def _check_derived(
 
 
 def _check_estimates(record: CalibrationRecord, file: str) -> None:
-    """Refuse parameters and a covariance that do not belong to each other."""
+    """Refuse parameters and covariances that do not belong to each other."""
     free = [(i, p) for i, p in enumerate(record.parameters) if p.free]
-    count, covariance = len(free), record.covariance
-    if not free:
-        raise CalibrationFileError("holds none that is free", where=f"{file}: parameters")
-    if covariance.shape != (count, count):
-        raise CalibrationFileError(
-            f"expected {count} × {count} numbers, as free parameters", where=f"{file}: covariance"
-        )
     names = [p.name for p in record.parameters]
     for i, name in enumerate(names):
         if name in names[:i]:
             raise CalibrationFileError(
                 f"'{name}' stands twice", where=f"{file}: parameters[{i}].name"
             )
-    if not np.isfinite(covariance).all():
+    variances = {
+        key: np.diag(getattr(record, key)) for key in ("model_covariance", "noise_covariance")
+    }
+    bias = np.diag(record.unmodelled.bias_covariance)
+    for key, variance in (
+        ("std", variances["model_covariance"] + bias),
+        ("std_scatter", variances["noise_covariance"]),
+    ):
+        for (i, p), size in zip(free, np.sqrt(np.abs(variance)).tolist(), strict=True):
+            if math.isfinite(size):
+                _check_derived(("parameters", i, key), getattr(p, key), size, file)
+
+
+def _require_covariance(matrix: Array, count: int, where: str) -> None:
+    """Refuse numbers that are no covariance of the free parameters."""
+    if matrix.shape != (count, count):
+        raise CalibrationFileError(
+            f"expected {count} × {count} numbers, as free parameters", where=where
+        )
+    if not np.isfinite(matrix).all():
         return
-    scale = float(np.abs(covariance).max())
-    std = np.sqrt(np.abs(np.diag(covariance)))
-    unit = covariance / np.outer(*(np.where(std > 0.0, std, 1.0),) * 2)
-    symmetric = np.abs(covariance - covariance.T).max() <= FOLLOWS * scale
+    scale = float(np.abs(matrix).max())
+    std = np.sqrt(np.abs(np.diag(matrix)))
+    unit = matrix / np.outer(*(np.where(std > 0.0, std, 1.0),) * 2)
+    symmetric = np.abs(matrix - matrix.T).max() <= FOLLOWS * scale
     if not symmetric or np.linalg.eigvalsh(unit).min() < -1e-6:
         raise CalibrationFileError(
             "is not a covariance: expected symmetric numbers without negative variances",
-            where=f"{file}: covariance",
+            where=where,
         )
-    for (i, p), size in zip(free, std.tolist(), strict=True):
-        _check_derived(("parameters", i, "std"), p.std, size, file)
 
 
 def _check_singular_values(found: Identifiability, file: str) -> None:
@@ -245,7 +277,7 @@ def _check_singular_values(found: Identifiability, file: str) -> None:
 
 
 def _check_unmodelled(record: CalibrationRecord, file: str) -> None:
-    found, n_free = record.unmodelled, len(record.covariance)
+    found, n_free = record.unmodelled, len(record.model_covariance)
     count = len(found.names)
     if found.tolerances.shape != (count,):
         raise CalibrationFileError(
@@ -257,38 +289,6 @@ def _check_unmodelled(record: CalibrationRecord, file: str) -> None:
             f"expected {n_free} × {count} numbers, free parameters by names",
             where=f"{file}: unmodelled.leakage",
         )
-
-
-def _check_changes(record: CalibrationRecord, file: str) -> None:
-    """Refuse changes of what was not tested, or between sessions that are none."""
-    found = record.changes
-    if found is None:
-        return
-    where = f"{file}: changes"
-    read = list(dict.fromkeys(r.setup.partition("/")[0] for r in record.residuals))
-    if sorted(found.sessions) != sorted(read):
-        raise CalibrationFileError(
-            f"found {', '.join(map(shorten, found.sessions)) or 'none'}; the readings are of "
-            f"{', '.join(map(shorten, read))}",
-            where=f"{where}.sessions",
-        )
-    later = found.sessions[1:]
-    tested = {(t.name, t.unit) for t in found.tested}
-    since = [(f"tested[{i}]", t.since) for i, t in enumerate(found.tested)]
-    since += [(f"found[{i}]", c.since) for i, c in enumerate(found.found)]
-    since += [] if found.other is None else [("other", found.other.since)]
-    for key, label in since:
-        if label not in later:
-            raise CalibrationFileError(
-                f"found '{shorten(label)}'; expected one of {', '.join(later) or 'none'}",
-                where=f"{where}.{key}.since",
-            )
-    for i, change in enumerate(found.found):
-        if (change.name, change.unit) not in tested:
-            raise CalibrationFileError(
-                f"'{shorten(change.name)}' in '{change.unit}' is not among what was tested",
-                where=f"{where}.found[{i}].name",
-            )
 
 
 def _number(value: float) -> float | None:

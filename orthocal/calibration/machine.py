@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.kinematics.continuation import as_rows
-from orthocal.kinematics.loop_closure import Assembly, find_beyond_travel
+from orthocal.kinematics.loop_closure import Assembly, as_rows, find_beyond_travel
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]

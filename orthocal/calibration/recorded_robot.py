@@ -9,10 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from orthocal.calibration.records import ParameterEstimate, PostureRecord, RobotRecord, SetupRecord
+from orthocal.effects.loading import load_robot
 from orthocal.errors import CalibrationFileError, ParameterError, RobotError, SessionError
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.io.files import is_folder
-from orthocal.robot.loading import load_robot, packaged_robots
+from orthocal.measurement.files.readings_checks import check_conditions
+from orthocal.robot.loading import packaged_robots
 from orthocal.robot.model import Robot
 
 
@@ -132,6 +134,13 @@ def require_rows(
                     f"has {len(values)} numbers; expected {count}, one a {kind}",
                     where=f"{prefix}postures[{i}].{key}",
                 )
+    for i, row in enumerate(residuals):
+        if row.conditions is not None:
+            where = f"{prefix}residuals[{i}].conditions"
+            try:
+                check_conditions(row.conditions, robot, row.minus is not None, where)
+            except SessionError as e:
+                raise CalibrationFileError(e.problem, where=e.where) from None
     posture_names, setup_names = {p.name for p in postures}, {s.name for s in setups}
     for i, setup in enumerate(setups):
         if setup.aligned_at not in posture_names:

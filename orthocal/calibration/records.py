@@ -1,4 +1,4 @@
-"""What a calibration is as plain data: these records are the schema of calibration.json."""
+"""Records of a calibration as plain data: the schema of calibration.json."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from orthocal.calibration.assessment_record import Assessment
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.diagnostics.unmodelled import Unmodelled
 from orthocal.estimation.loss import LossKind
 from orthocal.estimation.options import SolverKind
-from orthocal.hypotheses.reversed_setup import TurnedSetup
-from orthocal.hypotheses.sessions.change_records import Changes
 from orthocal.io.documents import Count, Number, PositiveInSI, PositiveNumber
-from orthocal.io.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN, Sizes
-from orthocal.sensors.protocol import Sensor
+from orthocal.io.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN
+from orthocal.sensors.protocol import GaugeZero, Sensor
 from orthocal.sensors.registry import RECORDED
 from orthocal.statistics.identifiability import Identifiability
 from orthocal.statistics.noise import Noise
@@ -68,7 +67,7 @@ class SessionRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolverRecord:
-    """How the solution was found."""
+    """Solver, its settings and its result."""
 
     __pydantic_config__ = CLOSED
 
@@ -88,7 +87,7 @@ class SolverRecord:
 
     @property
     def tells_linearisation(self) -> bool:
-        """Whether what it found, less the linearised estimate, is what linearising costs.
+        """True if its estimate less the linearised one is the error of linearisation.
 
         Not with a robust loss: the linearised estimate is by squares.
         """
@@ -108,12 +107,15 @@ class ParameterEstimate(InUnit):
     linear: Number
     """Linearised estimate, [unit]."""
     std: SizeOrNaN
-    """Standard deviation, [unit]; NaN if nothing tells."""
+    """Standard deviation, [unit]: scatter of the readings, priors, mounting of the gauges, and
+    errors of the machine that were not identified. NaN if unknown."""
+    std_scatter: SizeOrNaN
+    """Part of `std` that is due to the noise of the readings, [unit]."""
     tolerance: PositiveInSI
     """One standard deviation before the calibration, [unit]."""
     free: bool
     identifiable: bool
-    """Whether the readings alone tell it better than its tolerance."""
+    """True if the readings alone determine it better than its tolerance."""
     start: Number
     """What the controller already corrects: the point of linearisation, [unit]."""
     prior: bool
@@ -132,10 +134,10 @@ class ParameterEstimate(InUnit):
 
     @property
     def data_share(self) -> float:
-        """How much the readings said: 1 − posterior/prior variance; NaN without a prior."""
-        if not (self.free and self.prior) or self.at_bound:
+        """Share of the prior variance that the readings removed, 0 to 1; NaN without a prior."""
+        if not (self.free and self.prior) or self.at_bound or math.isnan(self.std):
             return math.nan
-        return 1.0 - (self.std / self.tolerance) ** 2
+        return max(1.0 - (self.std / self.tolerance) ** 2, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,7 +168,7 @@ class GaugeRecord:
     range: tuple[Number, Number] | None
     """Lowest and highest reading, [m]."""
     noise: SizeOrNaN
-    """Standard deviation of a reading as found, [m]; NaN if nothing tells."""
+    """Estimated standard deviation of a reading, [m]; NaN if it is unknown."""
     readings: Count
     """Of it, differences taken apart."""
 
@@ -185,9 +187,11 @@ class SetupRecord:
     active: Many[Number] | None
     """Offsets active in the controller, [m, rad], where they were not those of the session."""
     zero: Number | None
-    """Estimated zero of the gauge, [m]; None where only differences were given."""
+    """Zero of the gauge, [m]; None where only differences were given."""
     aligned_at: str
     """Posture in which the operator aligned the gauge."""
+    zero_kind: GaugeZero = "free"
+    """Whether the zero was estimated or known to be 0."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -211,27 +215,26 @@ class CalibrationRecord:
     parameters: Annotated[Many[ParameterEstimate], Field(min_length=1)]
     """Free parameters, then those held at a known value."""
     sensors: Many[ParameterEstimate]
-    """What was not known of the sensors, estimated with them."""
-    sensor_bias: Sizes
-    """Standard deviations of what these take on of errors that were not free, (n,), [SI]."""
-    covariance: Matrix
-    """Of the free parameters, shape (n_free, n_free), [SI]."""
+    """Nuisance parameters of the sensors."""
+    model_covariance: Matrix
+    """Covariance of the free parameters by noise and priors, as if the machine had no other
+    errors, shape (n_free, n_free), [SI]."""
+    noise_covariance: Matrix
+    """Part of it that is due to the noise of the readings, shape (n_free, n_free), [SI]."""
     unmodelled: Unmodelled
     """What errors that were not free do to the estimate."""
     identifiability: Identifiability
-    """What the readings tell, and what they cannot tell apart."""
+    """Resolvable directions and groups of inseparable parameters."""
     base: bool
     """Whether free parameters are base parameters: each the value of a whole combination."""
     noise: Noise
     """Of one reading of the (first) gauge."""
     rows_are_differences: bool
     critical: SizeOrInf
-    """Studentised residuals beyond this are suspicious; infinite if nothing tells the noise."""
+    """Limit of studentised residuals for outliers; infinite if the noise is unknown."""
     residuals: Annotated[Many[ResidualRow], Field(min_length=1)]
-    turned: TurnedSetup | None
-    """The setup that seems to have been read with the wrong sign."""
     postures: Many[PostureRecord]
     setups: Many[SetupRecord]
     gauges: Many[GaugeRecord]
-    changes: Changes | None = None
-    """What has changed between the sessions; None for a single one."""
+    assessment: Assessment | None = None
+    """Verdict, findings, what to enter and the tool error; None if it was not assessed."""

@@ -1,4 +1,4 @@
-"""The same calibration made again: from another session, or from what its file keeps."""
+"""Refit of a calibration with another session, or with the readings of its file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.arguments import require_kind
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
 from orthocal.estimation.fit import Fit, fit_problem
@@ -21,7 +20,6 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.weighting import SMALLEST_SIGMA
-from orthocal.hypotheses.sessions.change_records import Changes
 from orthocal.io.fields import read_only
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.robot.model import Robot
@@ -32,7 +30,7 @@ Array = NDArray[np.float64]
 
 
 def repeat_calibration(calibration: Calibration, sessions: Given | Sequence[Given]) -> Calibration:
-    """The same parameters, with the same priors and bounds, identified from another session.
+    """Refit of the same parameters, priors and bounds with another session.
 
     Its rows' nominal values are those of the machine as it was calibrated before.
 
@@ -46,27 +44,6 @@ def repeat_calibration(calibration: Calibration, sessions: Given | Sequence[Give
     session = join_sessions(gather_sessions(sessions))
     nominal = np.array([p.value for p in calibration.free])
     return assemble_calibration(repeat_fit(calibration, session), nominal=nominal)
-
-
-def find_changes(calibration: Calibration) -> Changes | None:
-    """Whether the machine has changed between the sessions of a calibration, and what of it.
-
-    Args:
-        calibration: Of several sessions, in the order in which they were given.
-
-    Returns:
-        What was tested, from which size on it would have been seen, and what was found; None for
-        a calibration of a single session.
-
-    Raises:
-        RobotError, CalibrationFileError: If its file does not say and the robot cannot be loaded.
-        NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
-    """
-    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
-    if calibration.changes is not None or not calibration.session.parts:
-        return calibration.changes
-    again = repeat_calibration(calibration, restore_session(calibration))
-    return calibration.remember("changes", lambda: again.changes)
 
 
 def repeat_fit(calibration: Calibration, session: Session) -> Fit:
@@ -139,6 +116,7 @@ def restore_session(calibration: Calibration) -> Session:
                 s.gauge,
                 None if s.active is None else np.array(s.active),
                 s.aligned_at,
+                s.zero_kind,
             )
             for s in calibration.setups
         },
@@ -151,6 +129,7 @@ def restore_session(calibration: Calibration) -> Session:
                 r.measured,
                 r.line,
                 None if r.file is None else Path(r.file),
+                r.conditions,
             )
             for r in calibration.residuals
         ),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 from orthocal.calibration.calibration import Calibration
+from orthocal.session.session import Conditions
 
 Record = dict[str, str | float | int | bool | None]
 
@@ -15,8 +16,8 @@ Record = dict[str, str | float | int | bool | None]
 def parameter_table(calibration: Calibration) -> list[Record]:
     """A record for each parameter: free ones, held ones, then those of sensors.
 
-    `value`, `linearised`, `std` (of scatter), `low` and `high` (95 %, all that is not known) and
-    `tolerance` are in `unit`.
+    `value`, `linearised`, `std` (everything unknown included), `std_scatter` (the part that is due
+    to noise), `low` and `high` (value ± expanded uncertainty) and `tolerance` are in `unit`.
     """
     intervals = dict(
         zip((p.name for p in calibration.free), calibration.intervals, strict=True),
@@ -33,6 +34,7 @@ def parameter_table(calibration: Calibration) -> list[Record]:
                     "value": p.value,
                     "linearised": p.linear,
                     "std": _known(p.std),
+                    "std_scatter": _known(p.std_scatter),
                     "low": _known(low),
                     "high": _known(high),
                     "tolerance": p.tolerance,
@@ -45,7 +47,7 @@ def parameter_table(calibration: Calibration) -> list[Record]:
 
 
 def reading_table(calibration: Calibration) -> list[Record]:
-    """A record for each row of the readings, in metres but for `studentised`."""
+    """A record for each row of the readings, in metres but for `studentised` and conditions."""
     return [
         {
             "setup": r.setup,
@@ -62,9 +64,19 @@ def reading_table(calibration: Calibration) -> list[Record]:
             "studentised": _known(r.studentised),
             "file": r.file or calibration.session.readings_path,
             "line": r.line,
+            **_conditions(r.conditions or Conditions()),
         }
         for r in calibration.residuals
     ]
+
+
+def _conditions(conditions: Conditions) -> Record:
+    time = conditions.time
+    return {
+        "approach": conditions.approach,
+        "temperature_C": conditions.temperature,
+        "time": None if time is None else time.isoformat(),
+    }
 
 
 def _known(value: float) -> float | None:

@@ -1,11 +1,10 @@
-"""The command line. The only place that prints, and that turns errors into exit codes.
+"""The command line: the only place that prints and that turns errors into exit codes.
 
-Imports of anything slow stand inside the commands: help answers at once.
+Commands import slow modules when they are called, so that help appears at once.
 """
 
 from __future__ import annotations
 
-from orthocal.cli.options import app
-from orthocal.cli.run import main
+from orthocal.cli.run import main, make_program
 
-__all__ = ["app", "main"]
+__all__ = ["main", "make_program"]

@@ -1,4 +1,4 @@
-"""The same readings once more, after what was identified was entered: again."""
+"""The command `again`."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
-from orthocal.cli.options import CalibrationPath, app
+from orthocal.cli.files import require_new_files
+from orthocal.cli.options import Anyway, CalibrationPath, OutDirectory, app
 from orthocal.cli.printing import put_note, put_out
-from orthocal.cli.sheet import sheet_or_nothing
+from orthocal.cli.sheet import sheet_or_problem
 from orthocal.errors import ParameterError, SessionError
 
 if TYPE_CHECKING:
@@ -20,72 +21,71 @@ if TYPE_CHECKING:
 FILES = ("session.yaml", "readings.csv", "sheet.html")
 
 DIGITS = 7
-"""Decimals of an offset, [m, rad]: what is typed is told to 0.1 µm."""
+"""Decimals of an offset, [m, rad]: offsets to enter are printed to 0.1 µm."""
 
 
 @app.command()
 def again(
     calibration: CalibrationPath,
-    out: Annotated[Path, typer.Option(help="Folder for the new session; made if need be.")],
+    out: OutDirectory,
     session: Annotated[
         Path | None,
-        typer.Option(
-            help="Whose setups and postures are read again; by default those of the calibration.",
+        Option(
+            metavar="SESSION",
+            help="Session with the setups and postures; default: that of the calibration.",
         ),
     ] = None,
-    anyway: Annotated[
-        bool, typer.Option("--anyway", help="Also where the decision is not to enter it.")
-    ] = False,
+    anyway: Anyway = False,
 ) -> None:
-    """The same readings once more, with the offsets entered: session, empty readings, sheet.
+    """Plan the same readings again, with the identified offsets.
 
-    Exit code 3: the decision is not to enter them; nothing was written.
+    The directory receives session.yaml, an empty readings.csv and a measuring sheet.
+
+    Exit code 3: the verdict is not to enter the offsets; nothing is written.
     """
     from orthocal.calibration.file import load_calibration
     from orthocal.export.formats import require_entering
-    from orthocal.io.files import exists, require_writable
     from orthocal.measurement.files.write_session import write_session
 
-    require_writable(out)
-    for name in FILES:
-        if exists(out / name):
-            raise SessionError("is there already; expected a new folder", where=str(out / name))
+    require_new_files(out, FILES, remedy="expected a new directory")
     result = load_calibration(calibration)
     if not anyway:
         require_entering(result)
-    new = _read_again(result, session)
+    new = _plan_again(result, session)
     comment = (
-        "To be measured with these offsets entered: `orthocal record .` in this folder leads "
-        "through it,\nor fill in readings.csv; then hold it against the calibration by "
-        "`orthocal validate`."
+        "A plan: enter these offsets, then run `orthocal record .` in this directory, or fill in\n"
+        "readings.csv. Compare the readings with the calibration by `orthocal validate`."
     )
-    write_session(new, out, comment=comment, extra=sheet_or_nothing(new), blank=True)
-    told = ", ".join(
+    sheet, problem = sheet_or_problem(new)
+    if problem:
+        put_note(problem)
+    write_session(new, out, comment=comment, extra=sheet, blank=True)
+    offsets = ", ".join(
         f"{d.name} {v * d.edge_factor:+.4f} {d.edge_unit}"
         for d, v in zip(new.robot.drives, new.active_offsets.tolist(), strict=True)
     )
     put_out(
-        f"Enter these offsets, home, and measure again: {told}.\n"
+        f"Enter these offsets, home, and measure again: {offsets}.\n"
         f"  orthocal record {out}\n"
         f"  orthocal validate {calibration} {out}"
     )
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and a sheet")
 
 
-def _read_again(result: Calibration, given: Path | None) -> Session:
-    """The rows of a session, with what was identified active."""
+def _plan_again(calibration: Calibration, path: Path | None) -> Session:
+    """The rows of a session, with the offsets to enter as active offsets."""
     from orthocal.assessment.controller_entries import entered_offsets
     from orthocal.measurement.files.session_file import load_plan
 
-    file = result.session.path if given is None else str(given)
+    file = calibration.session.path if path is None else path
     if file is None:
         raise ParameterError(
-            "is missing: the calibration is of several sessions; which of them is read again?",
+            "is missing: the calibration is of several sessions; choose one of them",
             where="--session",
         )
-    found = load_plan(file)
-    if found.robot.sha256 != result.robot.sha256:
+    planned = load_plan(file)
+    if planned.robot.sha256 != calibration.robot.sha256:
         raise SessionError("is of another robot than the calibration", where=str(file))
-    offsets = entered_offsets(result).round(DIGITS) + 0.0
-    title = found.title.removeprefix("Simulated: ")
-    return replace(found.with_controller(offsets), title=title, source="")
+    offsets = entered_offsets(calibration).round(DIGITS) + 0.0
+    title = planned.title.removeprefix("Simulated: ")
+    return replace(planned.with_controller(offsets), title=title, source="")

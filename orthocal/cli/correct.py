@@ -1,21 +1,22 @@
-"""The command correct: G-code programs for a controller with nominal kinematics."""
+"""The command `correct`."""
 
 from __future__ import annotations
 
 import gc
 import io
 import os
+import re
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, BinaryIO
 
-import typer
+from typer import Argument, Option
 
-from orthocal.cli.options import CalibrationPath, app, read_vector
+from orthocal.cli.options import Anyway, CalibrationPath, ToolTip, app, read_vector
 from orthocal.cli.printing import put_note, put_part
 from orthocal.errors import GcodeError, OutputError, ParameterError
 from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
@@ -44,27 +45,27 @@ class Offsets(StrEnum):
 def correct(
     calibration: CalibrationPath,
     program: Annotated[
-        Path, typer.Argument(metavar="PROGRAM", help="G-code file; - for standard input.")
+        Path, Argument(metavar="PROGRAM", help="G-code file; - for standard input.")
     ],
     within_um: Annotated[
         float,
-        typer.Option(
+        Option(
             "--within",
             min=0.01,
             max=1000.0,
-            help="Largest distance of the written path from the corrected one, µm.",
+            help="Largest distance of the written path from the corrected path, µm.",
         ),
     ] = 1.0,
     offsets: Annotated[
         Offsets,
-        typer.Option(
+        Option(
             help="Offsets in the controller when the program runs: those that `calibrate` says to "
             "enter, or those that were active during the measurement."
         ),
     ] = Offsets.ENTERED,
     work_offset: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--work-offset-mm",
             metavar="[G54=]X,Y,Z",
             help="Zero of the program in machine coordinates; repeat for G55 ...",
@@ -72,40 +73,32 @@ def correct(
     ] = None,
     start: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--start-mm",
             metavar="X,Y,Z",
             help="Position that the controller displays before the program; needed if the first "
             "motion does not have X, Y and Z.",
         ),
     ] = None,
-    tool: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,Z",
-            help="Tip of the tool in the frame of the tool centre point, mm; 0,0,0 by default. "
-            "With it the program may use one tool only.",
-        ),
-    ] = None,
+    tool: ToolTip = None,
     out: Annotated[
-        Path | None, typer.Option(help="File for the corrected program; default: standard output.")
+        Path | None, Option(help="File for the corrected program; default: standard output.")
     ] = None,
-    anyway: Annotated[
-        bool, typer.Option("--anyway", help="Correct even if the decision is not to enter.")
-    ] = False,
+    anyway: Anyway = False,
 ) -> None:
-    """Correct a G-code program for a controller with nominal kinematics.
+    """Correct a G-code program for the errors of the machine.
 
-    Lines and arcs are divided into chords that stay near the corrected path. The feed along the
-    path and all other words are preserved. If a line cannot be corrected, its number and the
-    reason are reported, and nothing is written.
+    The program is for a controller with nominal kinematics. Lines and arcs are divided into chords
+    that stay near the corrected path. The feed along the path and all other words are preserved.
+    With --tool the program may use one tool only. If a line cannot be corrected, its number and
+    the reason are reported, and nothing is written.
 
-    Exit code 3: the decision is not to enter the calibration.
+    Exit code 3: the verdict is not to enter the calibration.
     """
     from orthocal.assessment.controller_entries import entered_offsets
     from orthocal.calibration.file import load_calibration
     from orthocal.export.correction_field import CorrectionField
-    from orthocal.export.formats import require_entering
+    from orthocal.export.formats import require_entering, warn_against_verdict
     from orthocal.export.linuxcnc.export import ExportOptions
     from orthocal.gcode.interpreter import Interpreter
     from orthocal.gcode.program import ProgramCorrector
@@ -119,6 +112,7 @@ def correct(
     result = load_calibration(calibration)
     if not anyway:
         require_entering(result)
+    warning = warn_against_verdict(result)
     active = offsets is Offsets.ACTIVE
     values = result.active_offsets if active else entered_offsets(result)
     within = within_um * UM
@@ -130,7 +124,8 @@ def correct(
     corrector = ProgramCorrector(interpreter, field, within=within)
     with tempfile.TemporaryFile() as spool:  # nothing is written before all lines are corrected
         with _frozen():
-            _spool(corrector.run(_lines(program, file)), spool)
+            texts = corrector.run(_lines(program, file))
+            _spool(_with_comment(texts, warning) if warning else texts, spool)
         if not corrector.summary.lines:
             raise GcodeError("is empty; expected a program", where=file)
         if out is not None:
@@ -143,22 +138,13 @@ def correct(
     notes = [
         _describe(corrector.summary, field, within),
         _describe_controller(result, values, active=active),
+        _describe_tool(tip, interpreter.tools.used),
+        warning,
+        "" if zeros else "The program's coordinates are read as machine coordinates.",
     ]
-    tools = interpreter.tools.used
-    if tip is not None:
-        notes.append(
-            f"For a tip at {', '.join(f'{v / MM:g}' for v in tip)} mm from the tool centre point."
-        )
-    elif len(tools) > 1:
-        notes.append(
-            f"Several tools ({', '.join(tools)}) and no --tool: corrected at the tool centre "
-            "point. The tilt of the platform moves their tips."
-        )
-    if not zeros:
-        notes.append("The program's coordinates are taken as machine coordinates.")
     if corrector.summary.unit_assumed:
-        notes.append("No G20 or G21 before the first coordinates: taken as mm.")
-    put_note("\n".join(notes))
+        notes.append("No G20 or G21 before the first coordinates: read as mm.")
+    put_note("\n".join(note for note in notes if note))
 
 
 @contextmanager
@@ -205,6 +191,21 @@ def _report_progress(parts: Iterable[bytes], source: Path) -> Iterator[bytes]:
         yield part
 
 
+def _with_comment(texts: Iterable[str], comment: str) -> Iterator[str]:
+    """A program with a comment as its first line, or after the % that begins it."""
+    commented = False
+    for text in texts:
+        if commented or not text:
+            yield text
+            continue
+        commented = True
+        mark = re.match(r"\s*%[^\n]*(\n|$)", text)
+        at = mark.end() if mark else 0
+        end = "\r\n" if "\r\n" in text else "\n"
+        head = text[:at] if text[:at].endswith("\n") or not at else text[:at] + end
+        yield f"{head}; {comment}{end}{text[at:]}"
+
+
 def _spool(texts: Iterable[str], spool: IO[bytes]) -> None:
     try:
         for text in texts:
@@ -244,6 +245,18 @@ def _describe(summary: Summary, field: CorrectionField, within: float) -> str:
         f"corrected path (requested: {within / UM:g} µm): chords {summary.deviation / UM:.3g} µm, "
         f"correction {field.error / UM:.2g} µm, rounding {ROUNDING * within / UM:.2g} µm. Feeds "
         f"changed by {low:+.2f} to {high:+.2f} % to preserve the speed of the tool."
+    )
+
+
+def _describe_tool(tip: Vector | None, tools: Sequence[str]) -> str:
+    if tip is not None:
+        at = ", ".join(f"{v / MM:g}" for v in tip)
+        return f"For a tip at {at} mm from the tool centre point."
+    if len(tools) < 2:
+        return ""
+    return (
+        f"Several tools ({', '.join(tools)}) and no --tool: corrected at the tool centre point. "
+        "The tilt of the platform moves their tips."
     )
 
 

@@ -1,54 +1,50 @@
-"""What a machine is like: from options, or asked for at a terminal."""
+"""Dimensions of a machine, from options or from answers at a terminal."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, TypeVar
 
+from orthocal.builder.machine_file import Counting, Dimensions, find_counting_problem, in_mm
+from orthocal.cli.options import read_number
 from orthocal.cli.printing import put_note
 from orthocal.errors import ParameterError
-from orthocal.io.documents import parse_number
-from orthocal.robot.builder.dimensions import Counting, Sizes, find_counting_problem, in_mm
 from orthocal.units import MM
 
 AXES = "xyz"
 
-USUALLY_OFF = "2"
-"""mm"""
+Box = tuple[tuple[float, float], ...]
+Answer = TypeVar("Answer")
 
-MOST_OFF = 50.0
-"""mm"""
+USUAL_OFFSET = "2"
+"""Proposed tolerance of the home switches, [mm]."""
+
+LARGEST_OFFSET = 50.0
+"""Largest tolerance of the home switches, [mm]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """What is known of a machine so far; sizes that nobody has said yet are harmless ones."""
+    """Answers so far; dimensions without an answer have values that cause no error message."""
 
-    sizes: Sizes
+    dimensions: Dimensions
     counting: tuple[Counting, Counting, Counting]
 
-
-@dataclass(frozen=True, slots=True)
-class Question:
-    """Something that a machine's files need."""
-
-    option: str
-    words: Callable[[Answers], str]
-    """What is asked at a terminal."""
-    answer: Callable[[Answers, str, str], Answers]
-    """What is known with an answer; takes the option's name for messages."""
-    field: str
-    """What `Sizes.find_problem` calls it."""
+    def with_dimensions(self, **changes: Any) -> Answers:  # noqa: ANN401 - dimensions, [m]
+        """The same answers with other dimensions."""
+        return replace(self, dimensions=replace(self.dimensions, **changes))
 
 
-def _number(text: str, option: str) -> float:
-    return parse_number(text.strip(), where=option, name="it", error=ParameterError) * MM
+def _length(text: str, option: str) -> float:
+    return read_number(text, option) * MM
 
 
-def _leg(known: Answers, text: str, option: str) -> Answers:
-    leg = _number(text, option)
-    harmless = Sizes(
+def _leg(answers: Answers, text: str, option: str) -> Answers:
+    leg = _length(text, option)
+    return answers.with_dimensions(
         leg=leg,
         lower=0.9 * leg,
         upper=1.1 * leg,
@@ -56,198 +52,205 @@ def _leg(known: Answers, text: str, option: str) -> Answers:
         rods_apart=0.3 * leg,
         rod_radius=0.01 * leg,
     )
-    return replace(known, sizes=harmless)
 
 
-def _travel(known: Answers, text: str, option: str) -> Answers:
+def _travel(answers: Answers, text: str, option: str) -> Answers:
     low, colon, high = text.partition(":")
     if not colon:
         raise ParameterError(
             f"found '{text}'; expected LEAST:LARGEST, in mm, such as 100:320", where=option
         )
-    ends = {"lower": _number(low, option), "upper": _number(high, option)}
-    return replace(known, sizes=replace(known.sizes, **ends))
+    return answers.with_dimensions(lower=_length(low, option), upper=_length(high, option))
 
 
-def _size(name: str) -> Callable[[Answers, str, str], Answers]:
-    def answer(known: Answers, text: str, option: str) -> Answers:
-        return replace(known, sizes=replace(known.sizes, **{name: _number(text, option)}))
-
-    return answer
+def _attachment(answers: Answers, text: str, option: str) -> Answers:
+    return answers.with_dimensions(attachment=_length(text, option))
 
 
-def _rods_apart(known: Answers, text: str, option: str) -> Answers:
-    apart = _number(text, option)
-    thin = min(known.sizes.rod_radius, 0.4 * apart) if apart > 0.0 else known.sizes.rod_radius
-    return replace(known, sizes=replace(known.sizes, rods_apart=apart, rod_radius=thin))
+def _rods_apart(answers: Answers, text: str, option: str) -> Answers:
+    apart, radius = _length(text, option), answers.dimensions.rod_radius
+    clear = min(radius, 0.4 * apart) if apart > 0.0 else radius
+    return answers.with_dimensions(rods_apart=apart, rod_radius=clear)
+
+
+def _rod_radius(answers: Answers, text: str, option: str) -> Answers:
+    return answers.with_dimensions(rod_radius=_length(text, option))
 
 
 def _each(text: str, option: str) -> list[str]:
-    """One for all, or one for each of x, y, z."""
+    """Parts of an answer: one for all of x, y, z, or one for each."""
     parts = [part.strip() for part in text.split(",")]
-    if len(parts) == 1:
-        return parts * len(AXES)
-    if len(parts) != len(AXES):
+    if len(parts) not in (1, len(AXES)):
         raise ParameterError(
             f"has {len(parts)} parts; expected one for all, or three: x,y,z", where=option
         )
-    return parts
+    return parts * len(AXES) if len(parts) == 1 else parts
 
 
-def _counts(known: Answers, text: str, option: str) -> Answers:
+def _counts(answers: Answers, text: str, option: str) -> Answers:
     words = [word.lower() for word in _each(text, option)]
     for word in words:
         if word not in ("up", "down"):
             raise ParameterError(f"found '{word}'; expected up or down", where=option)
-    x, y, z = (
-        replace(joint, up=word == "up") for joint, word in zip(known.counting, words, strict=True)
-    )
-    return replace(known, counting=(x, y, z))
+    x, y, z = (replace(j, up=w == "up") for j, w in zip(answers.counting, words, strict=True))
+    return replace(answers, counting=(x, y, z))
 
 
-def _at_zero(known: Answers, text: str, option: str) -> Answers:
-    x, y, z = (
-        replace(joint, at_zero=_number(part, option))
-        for joint, part in zip(known.counting, _each(text, option), strict=True)
-    )
+def _at_zero(answers: Answers, text: str, option: str) -> Answers:
+    parts = zip(answers.counting, _each(text, option), strict=True)
+    x, y, z = (replace(joint, at_zero=_length(part, option)) for joint, part in parts)
     problem = find_counting_problem((x, y, z))
     if problem:
         raise ParameterError(problem, where=option)
-    return replace(known, counting=(x, y, z))
+    return replace(answers, counting=(x, y, z))
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """Question about a machine, with the option that answers it."""
+
+    option: str
+    answer: Callable[[Answers, str, str], Answers]
+    """Answers so far, the new text and the option's name, to the answers with it."""
+    words: str
+    """Text at the terminal; {leg} is the leg length in mm."""
 
 
 QUESTIONS = (
-    Question("--leg-mm", lambda _: "Leg length, from hinge to hinge of a rod, mm", _leg, "leg"),
+    Question("--leg-mm", _leg, "Leg length, from hinge to hinge of a rod, mm"),
     Question(
         "--travel-mm",
-        lambda known: (
-            "Travel of a slider, LEAST:LARGEST, mm. Count "
-            f"{in_mm(known.sizes.leg)} (the leg) where the legs are parallel to their axes, and "
-            "more further out"
-        ),
         _travel,
-        "travel",
+        "Travel of a slider, LEAST:LARGEST, mm. Count {leg} (the leg) where the legs are parallel "
+        "to their axes, and more further out",
     ),
     Question(
         "--attachment-mm",
-        lambda _: "Attachment offset, from slider to hinge and from hinge to tool, mm",
-        _size("attachment"),
-        "attachment",
+        _attachment,
+        "Attachment offset, from slider to hinge and from hinge to tool, mm",
     ),
     Question(
-        "--rods-apart-mm",
-        lambda _: "Distance of the two rods of a leg, from axis to axis, mm",
-        _rods_apart,
-        "rods_apart",
+        "--rods-apart-mm", _rods_apart, "Distance of the two rods of a leg, from axis to axis, mm"
     ),
-    Question("--rod-radius-mm", lambda _: "Radius of a rod, mm", _size("rod_radius"), "rod_radius"),
+    Question("--rod-radius-mm", _rod_radius, "Radius of a rod, mm"),
     Question(
         "--counts",
-        lambda _: (
-            "Does the number of a joint go up or down as its slider moves outwards? up or down, "
-            "for all or as x,y,z"
-        ),
         _counts,
-        "",
+        "Does the number of a joint go up or down as its slider moves outwards? up or down, for "
+        "all or as x,y,z",
     ),
     Question(
         "--at-zero-mm",
-        lambda _: (
-            "What does the controller show where the legs are parallel to their axes, mm? One "
-            "number for all, or x,y,z"
-        ),
         _at_zero,
-        "",
+        "What does the controller show where the legs are parallel to their axes, mm? One number "
+        "for all, or x,y,z",
     ),
 )
 
-NOTHING_KNOWN = Answers(Sizes(), (Counting(), Counting(), Counting()))
+NO_ANSWERS = Answers(Dimensions(), (Counting(), Counting(), Counting()))
 
 
-def find_answers(given: Mapping[str, str | None]) -> Answers:
-    """What a machine is like: what was given, all else asked for where somebody can answer.
+def find_answers(options: Mapping[str, str | None]) -> Answers:
+    """Dimensions of a machine from its options; missing ones are asked for at a terminal.
 
     Args:
-        given: Option to what was given with it.
+        options: Option to its value; None where it is missing.
 
     Raises:
-        ParameterError: If an option makes no sense, makes no machine with the others, or is
-            missing where nobody can be asked.
+        ParameterError: If an option is invalid, contradicts the others, or is missing without a
+            terminal.
     """
-    asked = sys.stdin is not None and sys.stdin.isatty()
-    missing = [q.option for q in QUESTIONS if given.get(q.option) is None]
-    if missing and not asked:
+    missing = [q.option for q in QUESTIONS if options.get(q.option) is None]
+    if missing and not (sys.stdin is not None and sys.stdin.isatty()):
         raise ParameterError(
-            "missing, and nobody can be asked: this is no terminal"
-            if len(missing) > 1
-            else "is missing, and nobody can be asked: this is no terminal",
+            f"{'are' if len(missing) > 1 else 'is'} missing; without a terminal every dimension "
+            "must be an option",
             where=", ".join(missing),
         )
-    known = NOTHING_KNOWN
+    answers = NO_ANSWERS
     for question in QUESTIONS:
-        text = given.get(question.option)
-        known = _ask(question, known) if text is None else _take(question, known, text)
-    return known
+        text = options.get(question.option)
+        if text is not None:
+            answers = _add(question, answers, text)
+            continue
+        words = question.words.format(leg=in_mm(answers.dimensions.leg))
+        answers = _ask_until_valid(words, question.option, partial(_add, question, answers))
+    return answers
+
+
+def _add(question: Question, answers: Answers, text: str) -> Answers:
+    """Answers with one more.
+
+    Raises:
+        ParameterError: If the answer is missing or invalid, or contradicts earlier ones.
+    """
+    if not text:
+        raise ParameterError("found nothing; expected an answer", where=question.option)
+    added = question.answer(answers, text, question.option)
+    problem = added.dimensions.find_problem()
+    if problem:
+        in_metres = question.option == "--leg-mm" and 0.0 < added.dimensions.leg < 0.005
+        raise ParameterError(
+            problem[1] + (": mm, not m" if in_metres else ""), where=question.option
+        )
+    return added
 
 
 def ask_tolerance() -> list[str]:
-    """How far zeros of joints may be off, as the option --tolerance says it.
+    """Tolerance of the drives' offsets, as values of --tolerance.
+
+    Raises:
+        ParameterError: If the input ends.
+    """
+
+    def read(text: str) -> list[str]:
+        size = _length(text or USUAL_OFFSET, "--tolerance") / MM
+        if not 0.0 < size <= LARGEST_OFFSET:
+            raise ParameterError(
+                f"found {size:g} mm; expected more than 0, and at most {LARGEST_OFFSET:g} mm"
+            )
+        return [f"*.offset_mm={size:g}"]
+
+    return _ask_until_valid(
+        "How far may the zeros of the joints be off, one standard deviation, mm? Enter alone: "
+        f"{USUAL_OFFSET}, usual for home switches that were never measured",
+        "--tolerance",
+        read,
+    )
+
+
+def ask_workspace(usual: str, read: Callable[[str], Box]) -> Box | None:
+    """Workspace of a machine; None for the usual one.
+
+    Args:
+        usual: The usual one in words.
+        read: Box of a text; raises ParameterError for an invalid one.
+
+    Raises:
+        ParameterError: If the input ends.
+    """
+    return _ask_until_valid(
+        "Workspace around the mechanical zero, mm: half side of a cube, such as 80, or ranges of "
+        f"x,y,z, such as -80:80,-80:80,-100:60. Enter alone: {usual}",
+        "--workspace-mm",
+        lambda text: read(text) if text else None,
+    )
+
+
+def _ask_until_valid(question: str, option: str, read: Callable[[str], Answer]) -> Answer:
+    """Ask until there is a valid answer.
 
     Raises:
         ParameterError: If the input ends.
     """
     while True:
-        sys.stderr.write(
-            "How far may the joints' zeros be off, one standard deviation, mm? Enter alone: "
-            f"{USUALLY_OFF}, of home switches that nobody has measured: "
-        )
+        sys.stderr.write(f"{question}: ")
         sys.stderr.flush()
         text = sys.stdin.readline()
         if not text:
             put_note("")
-            raise ParameterError("was not answered: the input ended", where="--tolerance")
+            raise ParameterError("was not answered: the input ended", where=option)
         try:
-            size = _number(text.strip() or USUALLY_OFF, "--tolerance") / MM
-        except ParameterError as e:
-            put_note(f"  {e.problem}")
-            continue
-        if 0.0 < size <= MOST_OFF:
-            return [f"*.offset_mm={size:g}"]
-        put_note(f"  found {size:g} mm; expected more than 0, and at most {MOST_OFF:g} mm")
-
-
-def _take(question: Question, known: Answers, text: str) -> Answers:
-    """What is known with an answer.
-
-    Raises:
-        ParameterError: If the answer makes no sense, or no machine with what is known before.
-    """
-    found = question.answer(known, text, question.option)
-    problem = found.sizes.find_problem()
-    if problem:
-        hint = ""
-        if question.field == "leg" and 0.0 < found.sizes.leg < 0.005:
-            hint = ": mm, not m"
-        raise ParameterError(problem[1] + hint, where=question.option)
-    return found
-
-
-def _ask(question: Question, known: Answers) -> Answers:
-    """Ask until there is an answer that makes sense.
-
-    Raises:
-        ParameterError: If there is none, for the input ends.
-    """
-    while True:
-        sys.stderr.write(f"{question.words(known)}: ")
-        sys.stderr.flush()
-        text = sys.stdin.readline()
-        if not text:
-            put_note("")
-            raise ParameterError("was not answered: the input ended", where=question.option)
-        if not text.strip():
-            continue
-        try:
-            return _take(question, known, text.strip())
+            return read(text.strip())
         except ParameterError as e:
             put_note(f"  {e.problem}")

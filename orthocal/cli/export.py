@@ -1,14 +1,22 @@
-"""The command export: a calibration for controllers and other programs."""
+"""The command `export`."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
-from orthocal.cli.options import CalibrationPath, app, read_numbers, read_vector
-from orthocal.cli.printing import put_note
+from orthocal.cli.options import (
+    Anyway,
+    CalibrationPath,
+    HalfSideMm,
+    OutDirectory,
+    ToolTip,
+    app,
+    read_numbers,
+    read_vector,
+)
+from orthocal.cli.printing import write_results
 from orthocal.units import DRIVE_UNITS, MM, UM
 
 if TYPE_CHECKING:
@@ -20,65 +28,49 @@ def export(
     calibration: CalibrationPath,
     to: Annotated[
         str,
-        typer.Option(
+        Option(
             metavar="FORMAT",
             help="yaml: parameters with their units; table: corrections of the tool over a grid; "
             "urdf: the calibrated machine as a robot directory; linuxcnc: HOME_OFFSET, or a "
             "kinematics module if the calibration identified more than offsets.",
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Directory for the files; created if needed.")],
+    out: OutDirectory,
+    module: Annotated[
+        bool | None,
+        Option(
+            "--module/--offsets",
+            help="linuxcnc: write a module, or HOME_OFFSET only; default: by what was identified.",
+        ),
+    ] = None,
     within: Annotated[
         float | None,
-        typer.Option(
-            metavar="UM",
-            help="linuxcnc: largest error of a module at the tool, µm; default 0.1.",
+        Option(
+            metavar="UM", help="linuxcnc: largest error of a module at the tool, µm; default: 0.1."
         ),
     ] = None,
-    tool: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,Z",
-            help="linuxcnc: tip of the tool for a module, in the frame of the tool centre point, "
-            "mm; default 0,0,0.",
-        ),
-    ] = None,
+    half_side_mm: HalfSideMm = None,
+    tool: ToolTip = None,
     home_offset: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="VALUES",
             help="linuxcnc: HOME_OFFSET of each joint during the measurement, separated by commas, "
             "mm or degrees; without it the files contain changes only.",
         ),
     ] = None,
-    half_side_mm: Annotated[
-        float | None,
-        typer.Option(
-            metavar="MM",
-            help="linuxcnc: half the side of a module's region around the mechanical zero; default "
-            "the largest that the machine reaches, at most 60 mm.",
-        ),
-    ] = None,
-    module: Annotated[
-        bool | None,
-        typer.Option(
-            "--module/--offsets",
-            help="linuxcnc: write a module, or HOME_OFFSET only, whatever was identified.",
-        ),
-    ] = None,
-    anyway: Annotated[
-        bool, typer.Option("--anyway", help="Export even if the decision is not to enter.")
-    ] = False,
+    anyway: Anyway = False,
 ) -> None:
     """Write a calibration for a controller or another program.
 
-    Exit code 3: the decision is not to enter the calibration, or the machine does not reach the
+    --half-side-mm and --tool apply to a module for LinuxCNC.
+
+    Exit code 3: the verdict is not to enter the calibration, or the machine does not reach the
     requested region or tolerance. Nothing is written then.
     """
     from orthocal.calibration.file import load_calibration
     from orthocal.export.formats import export_calibration
     from orthocal.export.linuxcnc.export import ExportOptions
-    from orthocal.io.files import write_files
 
     result = load_calibration(calibration)
     options = ExportOptions(
@@ -88,9 +80,7 @@ def export(
         half_side=None if half_side_mm is None else half_side_mm * MM,
         module=module,
     )
-    files = export_calibration(result, to, anyway=anyway, options=options)
-    write_files(out, files)
-    put_note(f"Wrote {' and '.join(str(out / name) for name in files)}")
+    write_results(out, export_calibration(result, to, anyway=anyway, options=options))
 
 
 def _home_offsets(text: str, calibration: Calibration) -> tuple[float, ...]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
-from orthocal.cli.options import Json, app
-from orthocal.cli.printing import put_note, put_out
+from orthocal.cli.options import Json, SessionPath, app
+from orthocal.cli.printing import deliver, put_note, put_out
 from orthocal.errors import SessionError
 from orthocal.text import printable, shorten
 
@@ -17,50 +18,43 @@ from orthocal.text import printable, shorten
 def import_(
     table: Annotated[
         Path,
-        typer.Argument(
-            metavar="TABLE", help="CSV file of any spreadsheet program, or .xlsx workbook."
-        ),
+        Argument(metavar="TABLE", help="CSV file of any spreadsheet program, or .xlsx workbook."),
     ],
-    session: Annotated[
-        Path,
-        typer.Argument(metavar="SESSION", help="session.yaml, or its directory."),
-    ],
-    sheet: Annotated[str | None, typer.Option(help="Worksheet of a workbook.")] = None,
+    session: SessionPath,
+    sheet: Annotated[str | None, Option(help="Worksheet of a workbook.")] = None,
     decimal: Annotated[
-        str | None, typer.Option(metavar="comma|point", help="Decimal sign of the readings.")
+        str | None, Option(metavar="comma|point", help="Decimal sign of the readings.")
     ] = None,
     separator: Annotated[
-        str | None,
-        typer.Option(metavar="semicolon|tab|comma|pipe", help="Separator of the cells."),
+        str | None, Option(metavar="semicolon|tab|comma|pipe", help="Separator of the cells.")
     ] = None,
     unit: Annotated[
-        str | None,
-        typer.Option(metavar="mm|um|inch|cm|thou", help="Unit of readings without a unit."),
+        str | None, Option(metavar="mm|um|inch|cm|thou", help="Unit of readings without a unit.")
     ] = None,
     encoding: Annotated[
-        str | None,
-        typer.Option(help="Encoding of the file: utf-8, utf-16, cp1252, cp850, mac-roman ..."),
+        str | None, Option(help="Encoding of the file: utf-8, utf-16, cp1252, cp850, mac-roman ...")
     ] = None,
     column: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="ROLE=HEADING",
-            help="Role of a column: setup, posture, minus, cycle, reading, or 'reading 2' for "
-            "cycles side by side. The column is given by its heading, or by its number as #4.",
+            help="Role of a column: setup, posture, minus, cycle, approach, temperature, time, "
+            "reading, or 'reading 2' for cycles side by side; HEADING is its heading, or its "
+            "number such as #4.",
         ),
     ] = None,
     fill: Annotated[
-        bool, typer.Option("--fill", help="Copy an empty setup or posture from the row above.")
+        bool, Option("--fill", help="Copy an empty setup or posture from the row above.")
     ] = False,
     replace: Annotated[
-        bool, typer.Option("--replace", help="Overwrite existing readings that differ.")
+        bool, Option("--replace", help="Overwrite existing readings that differ.")
     ] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show the result without writing it.")
+        bool, Option("--dry-run", help="Show the result without writing it.")
     ] = False,
     json: Json = False,
 ) -> None:
-    """Import readings from a spreadsheet, and show how the table was interpreted.
+    """Import readings from a spreadsheet into a session.
 
     Encoding, separator, decimal sign and units are detected. An ambiguous table is refused with
     the option that decides. Rows match those of the session by setup, posture, minus and cycle.
@@ -85,10 +79,11 @@ def import_(
     written = result.changes and not dry_run
     if written:
         write_import(result)
-    if json:
-        put_out(format_import_json(result, written=written).removesuffix("\n"))
-    else:
-        put_out(printable(format_import(result), keep="\n"))
+    deliver(
+        partial(format_import_json, result, written=written),
+        lambda: put_out(printable(format_import(result), keep="\n")),
+        json=json,
+    )
     if written:
         put_note(f"Wrote {result.readings_path}")
     elif result.changes:

@@ -1,89 +1,103 @@
-"""A machine of one's own: new."""
+"""The command `new`."""
 
 from __future__ import annotations
 
+import json
 import tempfile
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
-from orthocal.cli.options import Tolerances, app, require_no_readings
+from orthocal.cli.files import require_new_files, require_no_readings
+from orthocal.cli.options import (
+    Force,
+    Gauge,
+    Hours,
+    Model,
+    Tolerances,
+    WorkspaceMm,
+    app,
+    read_workspace,
+)
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import OrthocalError, ParameterError, RobotError
 
 if TYPE_CHECKING:
-    from orthocal.planning.equipment import Means
+    from orthocal.builder.machine_file import Counting, Dimensions
+    from orthocal.planning.equipment import Equipment
     from orthocal.planning.plan import MeasuringPlan
     from orthocal.robot.model import Robot
     from orthocal.session.session import Session
 
 FIRST = "first"
-"""Folder of the first session, in that of the machine."""
+"""Directory of the first session, in that of the machine."""
 
 
 @app.command()
 def new(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the machine; it is made.")],
+    folder: Annotated[
+        Path, Argument(metavar="DIRECTORY", help="Directory of the machine; it is created.")
+    ],
     leg_mm: Annotated[
-        str | None, typer.Option("--leg-mm", help="Length of a leg, from hinge to hinge of a rod.")
+        str | None, Option(metavar="MM", help="Length of a leg, from hinge to hinge of a rod.")
     ] = None,
     travel_mm: Annotated[
         str | None,
-        typer.Option(
-            "--travel-mm",
+        Option(
             metavar="LEAST:LARGEST",
-            help="Of a slider: the leg's length where legs are parallel to their axes, more "
-            "further out.",
+            help="Travel of a slider; its coordinate is the leg length where the legs are parallel "
+            "to their axes, and more further out.",
         ),
     ] = None,
     attachment_mm: Annotated[
         str | None,
-        typer.Option("--attachment-mm", help="From slider to hinge, and from hinge to tool."),
+        Option(metavar="MM", help="Distance from slider to hinge, and from hinge to tool."),
     ] = None,
     rods_apart_mm: Annotated[
-        str | None, typer.Option("--rods-apart-mm", help="The two rods of a leg, axis to axis.")
+        str | None, Option(metavar="MM", help="Distance of the axes of a leg's two rods.")
     ] = None,
-    rod_radius_mm: Annotated[str | None, typer.Option("--rod-radius-mm", help="Of a rod.")] = None,
+    rod_radius_mm: Annotated[str | None, Option(metavar="MM", help="Radius of a rod.")] = None,
     counts: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="up|down[,...]",
-            help="How a joint's number goes as its slider moves outwards; for all, or x,y,z.",
+            help="Direction in which a joint of the controller counts as its slider moves "
+            "outwards: one for all, or x,y,z.",
         ),
     ] = None,
     at_zero_mm: Annotated[
         str | None,
-        typer.Option(
-            "--at-zero-mm",
+        Option(
             metavar="MM[,...]",
-            help="What a joint shows where legs are parallel to their axes; for all, or x,y,z.",
+            help="Coordinate that the controller shows where the legs are parallel to their axes: "
+            "one for all, or x,y,z.",
         ),
     ] = None,
+    workspace_mm: WorkspaceMm = None,
     paper: Annotated[
-        bool, typer.Option("--paper", help="The paper's seven postures and six setups, no search.")
+        bool, Option("--paper", help="Use the paper's seven postures and six setups; no search.")
     ] = False,
-    hours: Annotated[
-        float | None, typer.Option(help="How long there is to measure; 6 setups by default.")
-    ] = None,
-    gauge: Annotated[
-        Path | None,
-        typer.Option(help="dial.yaml: what the dial is like; else ±5 mm, 10 µm, a ball of 3 mm."),
-    ] = None,
-    model: Annotated[str, typer.Option(help="What will be identified.")] = "full",
+    hours: Hours = None,
+    gauge: Gauge = None,
+    model: Model = None,
     tolerance: Tolerances = None,
     again: Annotated[
         bool,
-        typer.Option("--again", help="Make URDF, YAML and sheets again from FOLDER/machine.yaml."),
+        Option("--again", help="Make URDF, YAML and sheets again from DIRECTORY/machine.yaml."),
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Write over what is there.")] = False,
+    force: Force = False,
 ) -> None:
-    """A machine of your own size, a plan for it, a measuring sheet and G-code.
+    """Make a machine of your dimensions, a first plan and its sheet.
 
-    What is not given is asked for at a terminal.
+    Missing dimensions are asked for at a terminal.
+
+    Exit code 3 with --again: a plan is old.
     """
-    given = {
+    dimensions = {
         "--leg-mm": leg_mm,
         "--travel-mm": travel_mm,
         "--attachment-mm": attachment_mm,
@@ -93,110 +107,146 @@ def new(
         "--at-zero-mm": at_zero_mm,
     }
     if again:
-        found = next((option for option, value in given.items() if value is not None), None)
-        if found:
-            raise ParameterError("found with --again, which takes machine.yaml's", where=found)
+        for option, value in {**dimensions, "--workspace-mm": workspace_mm}.items():
+            if value is not None:
+                raise ParameterError("found with --again, which reads machine.yaml", where=option)
         _make_again(folder)
         return
     if paper and hours is not None:
-        raise ParameterError("found with --paper, whose setups are given", where="--hours")
+        raise ParameterError("found with --paper, whose setups are fixed", where="--hours")
+    from orthocal.builder.build import describe_machine
     from orthocal.cli.dialogue import ask_tolerance, find_answers
+    from orthocal.effects.loading import load_robot
     from orthocal.io.files import write_files
-    from orthocal.robot.builder.build import describe_machine
-    from orthocal.robot.loading import load_robot
+    from orthocal.measurement.files.write_session import write_session
+    from orthocal.planning.equipment import Equipment, load_dial
 
     name = _require_new(folder, force=force)
-    means = _means(gauge)
-    answers = find_answers(given)
-    if tolerance is None and None in given.values():
+    equipment = Equipment() if gauge is None else load_dial(gauge, Equipment())
+    answers, asked = find_answers(dimensions), None in dimensions.values()
+    machine = answers.dimensions
+    if asked or workspace_mm is not None:
+        machine = _with_workspace(machine, answers.counting, workspace_mm)
+    if asked and tolerance is None:
         tolerance = ask_tolerance()
-    files = describe_machine(answers.sizes, name=name, counting=answers.counting, where=str(folder))
+
+    def describe(tolerances: Mapping[str, float] | None = None) -> dict[str, str]:
+        return describe_machine(
+            machine,
+            name=name,
+            counting=answers.counting,
+            where=str(folder),
+            tolerances=tolerances,
+        )
+
     with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
-        write_files(Path(trial) / name, files)
+        write_files(Path(trial) / name, describe())
         robot = load_robot(Path(trial) / name)
-        plan, session = _plan(robot, means, paper=paper, hours=hours, model=model, given=tolerance)
-        extra = _extra(plan, session)
+        plan, session = _plan(
+            robot, equipment, paper=paper, hours=hours, model=model, tolerance=tolerance
+        )
+        put_note("orthocal: drawing the measuring sheet")
+        files = _draw(plan, session)
     stated = session.robot.parameters.stated
-    files = describe_machine(
-        answers.sizes,
-        name=name,
-        counting=answers.counting,
-        where=str(folder),
-        tolerances=stated,
+    write_files(folder, describe(stated))
+    robot = load_robot(folder).with_tolerances(stated)
+    session = replace(session, robot=robot, robot_reference=str(folder.resolve()))
+    comment = (
+        "A plan. Print sheet.html and measure: run `orthocal record .` in this directory, or fill\n"
+        "in readings.csv in its order. Then\n"
+        "orthocal calibrate .\n"
+        "offsets_mm: those that are active in the controller during the measurement."
     )
-    write_files(folder, files)
-    own = load_robot(folder).with_tolerances(stated)
-    session = replace(session, robot=own, robot_reference=str(folder.resolve()))
-    _write(session, folder / FIRST, extra)
-    _tell(folder, answers.sizes.words, plan, session, extra)
+    write_session(session, folder / FIRST, comment=comment, extra=files, blank=True)
+    _report(folder, machine.words, plan, session, files)
 
 
 def _require_new(folder: Path, *, force: bool) -> str:
-    """Refuse a folder that holds such a machine, or cannot; its name."""
-    from orthocal.io.files import exists, require_plain_name, require_writable
-    from orthocal.robot.builder.machine_file import MACHINE
+    """Name of a directory; refuse one that is in use or cannot be written."""
+    from orthocal.builder.machine_file import MACHINE
+    from orthocal.io.files import require_plain_name
     from orthocal.robot.loading import packaged_robots
 
     name = folder.resolve().name
     if not name:
-        raise RobotError("has no name; expected a folder", where=str(folder))
+        raise RobotError("has no name; expected a directory", where=str(folder))
     require_plain_name(folder.resolve(), error=RobotError)
+    if f"{name}.yaml" == MACHINE:
+        raise RobotError(
+            f"'{name}' would name its YAML {MACHINE}, which contains the dimensions; choose "
+            "another name",
+            where=str(folder),
+        )
     if name in packaged_robots():
         raise RobotError(
-            f"'{name}' is a robot that comes with orthocal; name yours otherwise", where=str(folder)
+            f"'{name}' is a robot that comes with orthocal; choose another name", where=str(folder)
         )
-    require_writable(folder)
-    require_writable(folder / FIRST)
-    there = [MACHINE, f"{name}.yaml", f"{name}.urdf"]
-    there += [f"{FIRST}/{file}" for file in ("session.yaml", "readings.csv", "sheet.html")]
-    for file in there:
-        if exists(folder / file) and not force:
-            raise RobotError("is there already; --force writes over it", where=str(folder / file))
+    files = (MACHINE, f"{name}.yaml", f"{name}.urdf")
+    require_new_files(folder, files, force=force, error=RobotError)
+    files = ("session.yaml", "readings.csv", "sheet.html")
+    require_new_files(folder / FIRST, files, force=force, error=RobotError)
     require_no_readings(folder / FIRST)
     return name
 
 
-def _means(gauge: Path | None) -> Means:
-    from orthocal.planning.equipment import Means
-    from orthocal.planning.gauge_range import load_dial
+def _with_workspace(
+    dimensions: Dimensions, counting: tuple[Counting, Counting, Counting], option: str | None
+) -> Dimensions:
+    """Dimensions with the workspace of the option or of an answer.
 
-    return Means() if gauge is None else load_dial(gauge, Means())
+    Raises:
+        ParameterError: If the machine does not reach the workspace.
+    """
+    from orthocal.builder.build import make_robot
+    from orthocal.cli.dialogue import Box, ask_workspace
+    from orthocal.kinematics.workspace import describe_box, find_workspace
+
+    with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
+        robot = make_robot(dimensions, Path(trial) / "trial", counting=counting)
+
+        def read(text: str) -> Box:
+            return tuple((low, high) for low, high in read_workspace(text, robot).tolist())
+
+        if option is not None:
+            return replace(dimensions, workspace=read(option))
+        usual = describe_box(find_workspace(robot).limits)
+        return replace(dimensions, workspace=ask_workspace(usual, read))
 
 
 def _plan(
     robot: Robot,
-    means: Means,
+    equipment: Equipment,
     *,
     paper: bool,
     hours: float | None,
-    model: str,
-    given: list[str] | None,
+    model: str | None,
+    tolerance: list[str] | None,
 ) -> tuple[MeasuringPlan | None, Session]:
-    """The plan, and its session with no offsets active; no plan where it is the paper's."""
+    """Plan, and its session with no active offsets; no plan for the paper's readings."""
     from orthocal.estimation.choice import Choice
     from orthocal.estimation.selection import read_tolerances
-    from orthocal.planning.first_plan import first_means, paper_plan
-    from orthocal.planning.plan import plan_readings
+    from orthocal.planning.first_plan import first_equipment, paper_plan
+    from orthocal.planning.plan import MODEL, plan_readings
     from orthocal.session.session import Purpose
 
-    tolerances = read_tolerances(given or [], robot.parameters, where="--tolerance")
-    choice = Choice(model, tolerances=tolerances)
+    tolerances = read_tolerances(tolerance or [], robot.parameters, where="--tolerance")
+    choice = Choice(model or MODEL, tolerances=tolerances)
     choice.select(robot.parameters)
     zeros = [0.0] * len(robot.drives)
     if paper:
-        session = paper_plan(robot, means).with_tolerances(tolerances).with_controller(zeros)
-        return None, replace(session, purpose=Purpose(model))
-    found = plan_readings(
+        session = paper_plan(robot, equipment).with_tolerances(tolerances).with_controller(zeros)
+        return None, replace(session, purpose=Purpose(model or MODEL))
+    plan = plan_readings(
         robot,
         choice,
         hours=hours,
-        means=first_means(robot, means),
+        equipment=first_equipment(robot, equipment),
         report=lambda text: put_note(f"orthocal: {text}"),
     )
-    return found, found.session.with_controller(zeros)
+    return plan, plan.session.with_controller(zeros)
 
 
-def _extra(plan: MeasuringPlan | None, session: Session) -> dict[str, str]:
+def _draw(plan: MeasuringPlan | None, session: Session) -> dict[str, str]:
     """Files beside session.yaml and readings.csv."""
     from orthocal.output.sheet.page import sheet_files
     from orthocal.output.text.plan import draw_plan, plan_json
@@ -205,83 +255,115 @@ def _extra(plan: MeasuringPlan | None, session: Session) -> dict[str, str]:
     return {**sheet_files(session), **drawn}
 
 
-def _write(session: Session, folder: Path, extra: dict[str, str]) -> None:
-    from orthocal.measurement.files.write_session import write_session
-
-    comment = (
-        "A plan: print sheet.html and measure; `orthocal record .` in this folder leads through "
-        "it, or\nfill in readings.csv in its order. Then\n"
-        "orthocal calibrate .\n"
-        "offsets_mm: those that are active in the controller while it is measured."
-    )
-    write_session(session, folder, comment=comment, extra=extra, blank=True)
-
-
-def _tell(
+def _report(
     folder: Path,
-    sizes: str,
+    dimensions: str,
     plan: MeasuringPlan | None,
     session: Session,
-    extra: dict[str, str],
+    files: dict[str, str],
 ) -> None:
-    """What was made, what it is worth, and what to do with it."""
+    """Print the expected tool error, the files and the next commands."""
     from orthocal.output.text.layout import counted
-    from orthocal.output.text.plan import first_round_words
-    from orthocal.units import UM
+    from orthocal.output.text.plan import first_round_words, show_duration, show_um
 
-    readings = counted(len(session.readings), "reading")
-    setups = counted(len(session.setups), "setup")
-    worth = early = ""
+    size = f"{counted(len(session.readings), 'reading')} in {counted(len(session.setups), 'setup')}"
+    lines = [f"Plan: {size}."]
     if plan is not None:
-        after, before = (
-            f"{float(f'{e.headline.rms / UM:.3g}'):g}" for e in (plan.expected, plan.known)
-        )
-        worth = (
-            f", about {plan.minutes:.0f} min: {after} µm at the tool are to be expected, instead "
-            f"of {before} µm without them"
-        )
-        early = f"{first_round_words(plan)}\n" if first_round_words(plan) else ""
-    programs = sum(name.endswith(".ngc") for name in extra)
-    put_out(
-        f"{folder.resolve().name}: {sizes}.\n"
-        f"Plan: {readings} in {setups}{worth}.\n{early}"
-        f"Wrote {folder}: machine.yaml holds every size; after a change there run\n"
-        f"  orthocal new {folder} --again\n"
-        f"Wrote {folder / FIRST}: session.yaml, readings.csv to fill in, sheet.html to print, and\n"
-        f"{counted(programs, 'program')} in G-code, one a setup. Next: look at the machine, print "
-        "the sheet, measure\n(`record` leads through it and keeps the readings), and calibrate:\n"
-        f"  orthocal view {folder}\n"
-        f"  orthocal record {folder / FIRST}\n"
-        f"  orthocal calibrate {folder / FIRST}"
-    )
+        lines = [
+            f"Plan: {size}, about {show_duration(plan.minutes)}.",
+            f"Expected tool error: {show_um(plan.expected)} µm (now {show_um(plan.known)} µm), "
+            f"{plan.forecast.workspace.words.removeprefix('the ')}, workpiece aligned on the "
+            "machine.",
+            first_round_words(plan),
+        ]
+    programs = sum(name.endswith(".ngc") for name in files)
+    lines += [
+        f"Wrote {folder}: {dimensions}.",
+        f"To change a dimension, edit {folder / 'machine.yaml'}, then run",
+        f"  orthocal new {folder} --again",
+        f"Wrote {folder / FIRST}: session.yaml, readings.csv, sheet.html and "
+        f"{counted(programs, 'program')} in G-code.",
+        "Next: look at the machine, print the sheet, measure and calibrate:",
+        f"  orthocal view {folder}",
+        f"  orthocal record {folder / FIRST}",
+        f"  orthocal calibrate {folder / FIRST}",
+    ]
+    put_out("\n".join(line for line in lines if line))
 
 
 def _make_again(folder: Path) -> None:
-    """Robot and sheets of a machine, from its machine.yaml."""
-    from orthocal.io.files import exists, write_files
-    from orthocal.measurement.files.session_file import load_plan
-    from orthocal.output.sheet.page import SHEET, sheet_files
-    from orthocal.robot.builder.build import remake_robot
+    """Make robot and sheets of a machine again from its machine.yaml; name plans that are old.
 
-    robot = remake_robot(folder)
+    Raises:
+        RobotError: If the machine does not load or does not reach its workspace.
+        typer.Exit: With code 3 if a plan is old.
+    """
+    from orthocal.builder.build import remake_robot
+    from orthocal.io.files import exists
+    from orthocal.kinematics.workspace import find_unreached
+    from orthocal.output.sheet.page import SHEET
+
+    def check(robot: Robot) -> None:
+        problem = "" if robot.workspace is None else find_unreached(robot, robot.workspace)
+        if problem:
+            raise RobotError(problem, where=f"{folder / 'machine.yaml'}: workspace_mm")
+
+    robot = remake_robot(folder, check=check)
     put_out(f"Made {robot.yaml.name} and {robot.urdf.name} again from {folder / 'machine.yaml'}.")
-    refused = False
+    old = False
     for sheet in sorted(folder.glob(f"*/{SHEET}")):
-        if not exists(sheet.parent / "session.yaml"):
-            continue
-        try:
-            session = load_plan(sheet.parent)
-            if any(r.value for r in session.readings):
-                put_note(
-                    f"orthocal: {sheet.parent}: has readings, whose postures were other joint "
-                    "coordinates before; they belong to the sizes of that day"
-                )
-                continue
-            write_files(sheet.parent, sheet_files(session))
-            put_out(f"Made {sheet} and its programs again.")
-        except OrthocalError as e:
-            refused = True
-            put_note(f"orthocal: {e}")
-            put_note(f"orthocal: {sheet} is not for these sizes any more; plan again")
-    if refused:
+        changes = _remake_sheet(sheet, robot) if exists(sheet.parent / "session.yaml") else []
+        if changes:
+            old = True
+            put_note(
+                f"orthocal: {sheet.parent}: the plan is old ({'; '.join(changes)}); plan again:\n"
+                f"  orthocal plan {folder} --out {sheet.parent} --force"
+            )
+    if old:
         raise typer.Exit(3)
+
+
+def _remake_sheet(sheet: Path, robot: Robot) -> list[str]:
+    """Make the sheet of a plan without readings again; changes for which the plan is old."""
+    from orthocal.io.files import write_files
+    from orthocal.measurement.files.session_file import load_plan
+    from orthocal.output.sheet.page import sheet_files
+
+    try:
+        session = load_plan(sheet.parent)
+        if any(r.value for r in session.readings):
+            put_note(
+                f"orthocal: {sheet.parent}: has readings, which belong to the dimensions at that "
+                "time; its sheet is unchanged"
+            )
+            return []
+        write_files(sheet.parent, sheet_files(session))
+        put_out(f"Made {sheet} and its programs again.")
+        return _changes_since(sheet.parent, robot)
+    except OrthocalError as e:
+        put_note(f"orthocal: {e}")
+        return ["the machine does not reach its postures"]
+
+
+def _changes_since(folder: Path, robot: Robot) -> list[str]:
+    """Differences of travel and workspace from those for which a plan was made.
+
+    Raises:
+        OrthocalError: If plan.json cannot be read.
+    """
+    from orthocal.io.files import exists, read_file
+    from orthocal.output.text.plan import PLAN_BASIS, describe_basis
+
+    file = folder / "plan.json"
+    if not exists(file):  # the paper's plan depends on neither
+        return []
+    try:
+        before = json.loads(read_file(file, error=RobotError))
+    except ValueError:
+        raise RobotError("is not JSON", where=str(file)) from None
+    now = describe_basis(robot)
+    return [
+        f"{words} changed"
+        for key, words in PLAN_BASIS.items()
+        if key in before and before[key] != now[key]
+    ]

@@ -1,167 +1,194 @@
-"""The program, and what several of its commands take and do."""
+"""The program, the options that several commands share, and readers of their values."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
+from typer.core import TyperGroup
 
-from orthocal.errors import ClosureError, ParameterError, SessionError
+from orthocal.errors import ParameterError
 from orthocal.units import MM
 
 if TYPE_CHECKING:
-    from orthocal.kinematics.workspace import Workspace
+    import numpy as np
+    from numpy.typing import NDArray
+
     from orthocal.robot.model import Robot
-    from orthocal.session.session import Session
 
-SIMULATED = "Simulated"
-"""What the source of a session begins with that was not measured."""
+    Array = NDArray[np.float64]
 
-FEWEST_DIFFERENT = 4
-"""Numbers that differ from each other in sessions that can be told to be the same."""
+LARGEST_MM = 1e4
+"""Largest coordinate of a box, displacement and size of errors, [mm]."""
 
-app = typer.Typer(
+LONGEST_LINE = 100
+"""Number of characters of a line of help; lines that are too long are wrapped, not cut off."""
+
+
+class PanelGroup(TyperGroup):
+    """Group whose help lists the commands panel by panel."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401 - Click's types
+        """Write one section for each panel."""
+        panels: dict[str, list[tuple[str, str]]] = {}
+        names = self.list_commands(ctx)
+        width = max(map(len, names))
+        for name in names:
+            command: Any = self.get_command(ctx, name)
+            line = command.get_short_help_str(LONGEST_LINE)
+            panel = command.rich_help_panel or "Commands"
+            panels.setdefault(panel, []).append((name.ljust(width), line))
+        for panel, lines in panels.items():
+            with formatter.section(panel):
+                formatter.write_dl(lines)
+
+
+def make_group(description: str, **settings: Any) -> typer.Typer:  # noqa: ANN401 - Typer's settings
+    """A group of commands."""
+    return typer.Typer(
+        cls=PanelGroup,
+        no_args_is_help=True,
+        rich_markup_mode=None,  # its tables of options cut off long words
+        help=description,
+        **settings,
+    )
+
+
+app = make_group(
+    "Calibrate Orthoglide-type parallel robots from dial-indicator readings.",
     add_completion=False,
-    no_args_is_help=True,
-    rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    help="Calibrate Orthoglide-type parallel robots from dial-indicator readings.",
 )
 
+SessionPath = Annotated[
+    Path, Argument(metavar="SESSION", help="session.yaml, or the directory that contains it.")
+]
 SessionPaths = Annotated[
     list[Path],
-    typer.Argument(
+    Argument(
         metavar="SESSION...",
-        help="session.yaml, or the folder that holds it; several are fitted together.",
+        help="session.yaml, or the directory that contains it; several are fitted together.",
     ),
+]
+PlanPath = Annotated[
+    Path, Argument(metavar="PLAN", help="session.yaml of a plan or a session, or its directory.")
 ]
 CalibrationPath = Annotated[
     Path,
-    typer.Argument(metavar="CALIBRATION", help="calibration.json, or the folder that holds it."),
+    Argument(metavar="CALIBRATION", help="calibration.json, or the directory that contains it."),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
-Tolerances = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="GLOB=VALUE",
-        help="Another tolerance than the robot's, such as '*.offset_mm=2'.",
+Model = Annotated[
+    str | None,
+    Option(
+        help="Model to identify: full, offsets, lengths or another one of the robot; default: that "
+        "of the session, else full."
     ),
 ]
-AllRows = Annotated[
-    bool, typer.Option("--all", help="List every reading, parameter and group, however many.")
+Free = Annotated[
+    list[str] | None,
+    Option(
+        metavar="GLOBS",
+        help="Errors to identify by name or glob, with --model in addition to its errors; '!' "
+        "excludes: --model full --free '!*_fork.*'.",
+    ),
+]
+Tolerances = Annotated[
+    list[str] | None,
+    Option(metavar="GLOB=VALUE", help="Tolerance instead of the robot's, such as '*.offset_mm=2'."),
+]
+Error = Annotated[
+    list[str] | None,
+    Option(metavar="NAME=VALUE", help="Error of the machine, such as x_slide.offset_mm=1.2."),
+]
+Errors = Annotated[
+    Path | None, Option(help="YAML file with errors of the machine, such as a truth.yaml.")
+]
+Gauge = Annotated[
+    Path | None,
+    Option(help="dial.yaml with data of the gauge; default: ±5 mm, 10 µm, ball of 3 mm."),
+]
+Hours = Annotated[float | None, Option(help="Time available for measuring; default: 6 setups.")]
+WorkspaceMm = Annotated[
+    str | None,
+    Option(
+        "--workspace-mm",
+        metavar="HALF|LOW:HIGH,...",
+        help="Workspace around the mechanical zero: half the side of a cube, or a range for each "
+        "coordinate.",
+    ),
+]
+HalfSideMm = Annotated[
+    float | None,
+    Option(
+        "--half-side-mm",
+        metavar="MM",
+        help="Half the side of a cube around the mechanical zero, instead of the workspace.",
+    ),
+]
+ToolTip = Annotated[
+    str | None,
+    Option(
+        "--tool",
+        metavar="X,Y,Z",
+        help="Tip of the tool in the frame of the tool centre point, mm; default: 0,0,0.",
+    ),
+]
+Seed = Annotated[int, Option(min=0, help="Seed of the random numbers.")]
+Workers = Annotated[
+    int | None, Option(min=1, max=1024, help="Number of processes; default: all cores.")
+]
+OutDirectory = Annotated[
+    Path, Option("--out", help="Directory for the results; created if necessary.")
+]
+OptionalOutDirectory = Annotated[
+    Path | None, Option("--out", help="Directory for the results; created if necessary.")
+]
+Json = Annotated[bool, Option("--json", help="Print the result as JSON.")]
+Details = Annotated[
+    bool, Option("--details", help="Print the complete result, not the short answer.")
+]
+AllRows = Annotated[bool, Option("--all", help="List every reading, parameter and group.")]
+Force = Annotated[bool, Option("--force", help="Overwrite existing files.")]
+Anyway = Annotated[
+    bool, Option("--anyway", help="Continue against the verdict of the calibration.")
 ]
 
 
-def load_each_once(paths: Sequence[Path]) -> list[Session]:
-    """Sessions; one that is named twice would count twice.
-
-    Raises:
-        SessionError: If one is the same as another.
-    """
-    from orthocal.measurement.files.session_file import load_session
-
-    found: list[Session] = []
-    for path in paths:
-        session = load_session(path)
-        if any(session.sha256 == other.sha256 for other in found):
-            raise SessionError(
-                "is the same session as one before it; its readings would count twice",
-                where=str(path),
-            )
-        copied = next((other for other in found if _same_readings(session, other)), None)
-        if copied is not None:
-            raise SessionError(
-                f"holds the very readings of {copied.path}: a copy that was not measured anew?",
-                where=str(session.readings_path or path),
-            )
-        found.append(session)
-    return found
-
-
-def _same_readings(one: Session, other: Session) -> bool:
-    """Whether two sessions were filled with the same numbers, which no dial shows twice."""
-    rows = [
-        [(r.setup, r.posture, r.minus, r.cycle, r.value) for r in s.readings] for s in (one, other)
-    ]
-    return rows[0] == rows[1] and len({r[-1] for r in rows[0]}) >= FEWEST_DIFFERENT
-
-
-def split_globs(texts: list[str] | None) -> list[str]:
-    """Globs of repeated options, each with commas between."""
+def split_globs(texts: Sequence[str] | None) -> list[str]:
+    """Globs of repeated options, each with several separated by commas."""
     return [glob.strip() for text in texts or [] for glob in text.split(",") if glob.strip()]
 
 
-def require_no_readings(folder: Path) -> None:
-    """Refuse to write over readings that somebody took; a plan can be made again, they cannot.
+def read_number(text: str, option: str, name: str = "it") -> float:
+    """Number of an option.
 
     Raises:
-        SessionError: If there are any.
+        ParameterError: If the value is not a finite number.
     """
-    from orthocal.errors import OrthocalError
-    from orthocal.io.files import exists
-    from orthocal.measurement.files.session_file import SESSION, load_rows
+    from orthocal.io.documents import parse_number
 
-    if not exists(folder / SESSION):
-        return
-    try:
-        session, unread = load_rows(folder)
-    except OrthocalError:  # what does not load was no session
-        return
-    count = len(session.readings) - len(unread)
-    if count and not session.source.startswith(SIMULATED):
-        raise SessionError(
-            f"holds {count} readings, which --force does not write over; take them elsewhere first",
-            where=str(session.readings_path or folder),
-        )
+    return parse_number(text.strip(), where=option, name=name, error=ParameterError)
 
 
-def require_cube(robot: Robot, half_side_mm: float) -> Workspace:
-    """The cube of --half-side-mm, which the nominal machine must reach.
-
-    Raises:
-        ParameterError: If it is none, or not reached.
-    """
-    from orthocal.kinematics.loop_closure import nominal_assembly
-    from orthocal.kinematics.workspace import cube
-    from orthocal.units import MM
-
-    if not 0.1 <= half_side_mm <= 1e4:
-        raise ParameterError(
-            f"found {half_side_mm:g}; expected 0.1 mm to 10 m", where="--half-side-mm"
-        )
-    found = cube(robot, half_side=half_side_mm * MM)
-    try:
-        nominal_assembly(robot).inverse(found.points)
-    except ClosureError as e:
-        raise ParameterError(
-            f"the machine does not reach a cube of ±{half_side_mm:g} mm ({e.reason})",
-            where="--half-side-mm",
-        ) from None
-    return found
-
-
-def read_numbers(text: str, option: str, names: Sequence[str]) -> tuple[float, ...]:
+def read_numbers(text: str, option: str, names: Sequence[str] | None = None) -> tuple[float, ...]:
     """Numbers of an option, separated by commas.
 
     Args:
         text: Value of the option.
         option: Name of the option, for messages.
-        names: Names of the numbers.
+        names: Names of the numbers; default: any number of them.
 
     Raises:
-        ParameterError: If the number of values is another one, or a value is not finite.
+        ParameterError: If the number of values differs, or a value is not finite.
     """
-    from orthocal.io.documents import parse_number
-
     parts = text.split(",")
+    names = names or ["part"] * len(parts)
     if len(parts) != len(names):
         raise ParameterError(f"found '{text}'; expected {','.join(names)}", where=option)
-    return tuple(
-        parse_number(part.strip(), where=option, name=name, error=ParameterError)
-        for part, name in zip(parts, names, strict=True)
-    )
+    return tuple(read_number(p, option, name) for p, name in zip(parts, names, strict=True))
 
 
 def read_vector(text: str, option: str) -> tuple[float, float, float]:
@@ -172,3 +199,64 @@ def read_vector(text: str, option: str) -> tuple[float, float, float]:
     """
     x, y, z = read_numbers(text, option, "XYZ")
     return (x * MM, y * MM, z * MM)
+
+
+def read_box(text: str, letters: str, *, where: str) -> Array:
+    """Box of an option, shape (n, 2), [m].
+
+    Args:
+        text: Half the side of a cube, such as 80, or LOW:HIGH for each coordinate or all of them,
+            separated by commas, in mm.
+        letters: Names of the coordinates.
+        where: The option, for messages.
+
+    Raises:
+        ParameterError: If the text is not a box.
+    """
+    import numpy as np
+
+    rows = []
+    for part in text.split(","):
+        low, colon, high = part.partition(":")
+        end = read_number(high if colon else low, where)
+        start = read_number(low, where) if colon else -end
+        if not -LARGEST_MM <= start < end <= LARGEST_MM or (not colon and "," in text):
+            raise ParameterError(
+                f"found '{part}'; expected half the side of a cube, such as 80, or LOW:HIGH of "
+                f"{','.join(letters)}, such as {','.join(['-80:80'] * len(letters))}, in mm",
+                where=where,
+            )
+        rows.append((start, end))
+    if len(rows) not in (1, len(letters)):
+        raise ParameterError(
+            f"has {len(rows)} ranges; expected one for all, or one for each of {','.join(letters)}",
+            where=where,
+        )
+    return np.array(rows * (len(letters) if len(rows) == 1 else 1)) * MM
+
+
+def read_workspace(text: str, robot: Robot, *, where: str = "--workspace-mm") -> Array:
+    """Workspace of an option, which the nominal machine must reach, shape (n, 2), [m].
+
+    Raises:
+        ParameterError: If the text is not a box, or the machine does not reach it.
+    """
+    from orthocal.kinematics.workspace import coordinate_letters, find_unreached
+
+    box = read_box(text, coordinate_letters(robot), where=where)
+    problem = find_unreached(robot, box)
+    if problem:
+        raise ParameterError(problem, where=where)
+    return box
+
+
+def require_between(value: float, low: float, high: float, option: str) -> None:
+    """Refuse a value of an option outside an open range.
+
+    Raises:
+        ParameterError: Naming the option.
+    """
+    if not low < value < high:
+        raise ParameterError(
+            f"found {value:g}; expected a number between {low:g} and {high:g}", where=option
+        )

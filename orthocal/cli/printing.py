@@ -1,9 +1,10 @@
-"""What is printed: results on stdout, all else on stderr."""
+"""Output of commands: results on stdout, notes on stderr, files, and the exit code."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -13,66 +14,109 @@ from orthocal.text import printable
 
 if TYPE_CHECKING:
     from orthocal.assessment.tool_tables import Chunk
+    from orthocal.calibration.assessment_record import Decision
+    from orthocal.io.files import Content
 
 
 def put_out(text: str) -> None:
-    """A result, on stdout."""
+    """Print a result on stdout."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
 
 def put_part(text: str) -> None:
-    """A part of a long result, on stdout."""
+    """Print a part of a long result on stdout."""
     sys.stdout.write(text)
 
 
 def put_note(text: str) -> None:
-    """Anything else, on stderr."""
+    """Print a note on stderr."""
     sys.stderr.write(printable(text, keep="\n") + "\n")
 
 
+def deliver(
+    document: Callable[[], str],
+    show: Callable[[], object],
+    *,
+    json: bool,
+    out: Path | None = None,
+    files: Callable[[], Mapping[str, Content]] = dict,
+    decision: Decision | None = None,
+) -> None:
+    """Print a result, write its files, and exit with the code of its decision.
+
+    Args:
+        document: The result as JSON.
+        show: Prints the result as text.
+        json: True to print JSON instead of text.
+        out: Directory of the files; None to write none.
+        files: Names and contents of the files.
+        decision: Decision about the result, if there is one.
+
+    Raises:
+        typer.Exit: With the code of the decision if it is not 0.
+    """
+    if json:
+        put_out(document().rstrip("\n"))
+    else:
+        show()
+    if out is not None:
+        write_results(out, files())
+    if decision is not None and decision.exit_code:
+        raise typer.Exit(decision.exit_code)
+
+
+def write_results(directory: Path, files: Mapping[str, Content]) -> None:
+    """Write the files of a result, all or none, and name them on stderr."""
+    from orthocal.io.files import write_files
+
+    write_files(directory, files)
+    put_note(f"Wrote {' and '.join(str(directory / name) for name in files)}")
+
+
 MOST_HELD = 10_000
-"""Refused rows before the first that is served; the table begins after so many at the latest."""
+"""Number of refused rows before the first served one, after which a table begins all the same."""
 
 
 def print_rows(columns: Iterable[str], form: Callable[[Any], str], chunks: Iterable[Chunk]) -> None:
-    """Print a table as it is evaluated; rows that are refused are named, and their cells empty.
+    """Print a table block by block; refused rows are named on stderr, and their cells are empty.
+
+    Args:
+        columns: Names of the columns.
+        form: Lines of CSV of the values of a block.
+        chunks: Blocks of the table.
 
     Raises:
-        SessionError: If the machine can be at none of the rows; or as the chunks do, and how many
-            rows were served before.
-        typer.Exit: With code 3 if it cannot be at some.
+        SessionError: If the machine reaches none of the rows; or the error of a block, with the
+            number of rows before it.
+        typer.Exit: With code 3 if the machine does not reach some rows.
     """
-    refused: list[str] = []
-    count, served, begun, rest = 0, 0, False, ""
+    header = printable(",".join(columns)) + "\n"
+    held, notes = "", list[str]()
+    refused = served = 0
     first: tuple[str, str] | None = None
-    rows = iter(chunks)
-    while True:
-        try:
-            chunk = next(rows, None)
-        except SessionError as e:
-            if not begun:
-                raise
-            before = f"; the {served} rows in blocks before it were served"
-            raise SessionError(e.problem + before, where=e.where) from None
-        if chunk is None:
-            break
-        count += len(chunk.refused)
-        served += len(chunk.values)
-        for why in chunk.refused.values():
-            first = first or (why.posture, why.reason)
-            refused.append(f"orthocal: {why.posture}: {why.reason}")
-        rest += form(chunk.values)
-        if not begun and len(chunk.refused) == len(chunk.values) and count < MOST_HELD:
-            continue  # there may be none to be served at all
-        text, rest = rest if begun else printable(",".join(columns)) + "\n" + rest, ""
-        begun = True
-        put_out(text.removesuffix("\n"))
-        for line in refused:
-            put_note(line)
-        refused.clear()
-    if first is not None and not begun:
+    try:
+        for chunk in chunks:
+            refused += len(chunk.refused)
+            served += len(chunk.values)
+            for error in chunk.refused.values():
+                first = first or (error.posture, error.reason)
+                notes.append(f"orthocal: {error.posture}: {error.reason}")
+            held += form(chunk.values)
+            if header and len(chunk.refused) == len(chunk.values) and refused < MOST_HELD:
+                continue  # perhaps the machine reaches none of the rows
+            put_out((header + held).removesuffix("\n"))
+            for note in notes:
+                put_note(note)
+            header, held = "", ""
+            notes.clear()
+    except SessionError as e:
+        if header:
+            raise
+        before = f"; the {served} rows in blocks before it were served"
+        raise SessionError(e.problem + before, where=e.where) from None
+    if first is not None and header:
         raise SessionError(first[1], where=first[0])
-    if count:
-        put_note(f"orthocal: {count} of the rows cannot be reached; their cells are empty")
+    if refused:
+        put_note(f"orthocal: {refused} of the rows cannot be reached; their cells are empty")
         raise typer.Exit(3)

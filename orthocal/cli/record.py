@@ -1,4 +1,4 @@
-"""Measuring a session, reading by reading: record."""
+"""The command `record`: readings typed at the machine, one at a time."""
 
 from __future__ import annotations
 
@@ -7,23 +7,24 @@ import shutil
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from orthocal.cli.options import app
 from orthocal.cli.printing import put_out
-from orthocal.errors import SessionError
+from orthocal.errors import OrthocalError, SessionError
 from orthocal.runtime.interrupts import INTERRUPTED, raised_interrupt
 from orthocal.text import printable, shorten
 
 if TYPE_CHECKING:
-    from orthocal.hypotheses.prediction import Foresight
-    from orthocal.measurement.recording.anomalies import Oddity
-    from orthocal.measurement.recording.recording import Recording
+    from collections.abc import Sequence
+
+    from orthocal.calibration.assessment_record import Finding
+    from orthocal.measurement.recording import Key, Recording
 
 WIDEST = 100
-"""Columns of a line, however wide the terminal is."""
+"""Largest width of a line, [columns]."""
 
 LONGEST_LINE = 10_000
 """Characters of a line that are read at a time; a reading has ten."""
@@ -39,12 +40,13 @@ def record(
         ),
     ],
 ) -> None:
-    """Lead through measuring: where stand and machine go, and what is odd about a reading, at once.
+    """Record readings one at a time: position of stand and machine, and warnings of mistakes.
 
-    Every reading is on disk before the next one is asked for. Left at any time, it goes on at the
-    first reading that is missing. Over a pipe each line is what would be typed.
+    Every reading is on disk before the next one is asked for. An interrupted recording continues
+    at the first missing reading. From a pipe each line counts as typed. Warnings are those of
+    `check` for the readings so far.
     """
-    from orthocal.measurement.recording.recording import open_recording
+    from orthocal.measurement.recording import open_recording
 
     interrupted = False
     with open_recording(session) as recording:
@@ -59,8 +61,8 @@ def record(
         raise typer.Exit(INTERRUPTED)
 
 
-class _Leave(Exception):
-    """Whoever types has had enough."""
+class _EndOfDialogue(Exception):
+    """End of the input, or the command `quit`."""
 
 
 class _Dialogue:
@@ -72,80 +74,83 @@ class _Dialogue:
         self._recording = recording
         self._path = path
         self._guidance = guide(recording.session)
-        self._foresight: Foresight | None = None
-        self._skipped: set[tuple[Any, ...]] = set()
-        self._told: set[str] = set()
-        """Setups of which it was said that their dial is turned round."""
+        self._warnings: tuple[Finding, ...] = ()
+        """Findings about the readings so far."""
+        self._can_judge = True
+        """Whether readings are judged: the robot can be calibrated."""
+        self._skipped: set[Key] = set()
         self._shown: str | None = None
-        """Setup that was shown last."""
+        """Setup that was described last."""
         self._last: int | None = None
-        """Row that was read last."""
-        self._at: int | None = None
-        """Row that is asked for; None where all are there or left out."""
+        """Index of the row that was read last."""
+        self._asked: int | None = None
+        """Index of the row that is asked for; None where all are read or skipped."""
 
     @property
     def _width(self) -> int:
         return min(shutil.get_terminal_size((WIDEST, 24)).columns, WIDEST)
 
     def run(self) -> None:
-        """Ask for readings until there are no more, or whoever types leaves."""
-        from orthocal.hypotheses.prediction import build_foresight
+        """Ask for readings until none is missing and Enter is typed, or the input ends."""
         from orthocal.output.text.recording import describe_session
 
         recording = self._recording
         self._say(describe_session(recording, width=self._width))
-        self._go_on()
-        self._foresight = build_foresight(recording.session)  # while the first posture is read
-        with raised_interrupt(), suppress(_Leave):
+        with raised_interrupt(), suppress(_EndOfDialogue):
+            self._judge()
+            self._ask_for_next()
             while True:
-                self._answer(self._ask())
+                self._answer(self._read_line())
 
     def conclude(self) -> None:
-        """Say what is missing, and what comes next."""
+        """Print the missing rows and the next command."""
         from orthocal.output.text.recording import conclude
 
-        r = self._recording
-        self._say("", conclude(r.session, r.rows, self._path, width=self._width))
+        self._say("", conclude(self._recording, self._warnings, self._path, width=self._width))
 
-    def _go_on(self, at: int | None = None) -> None:
-        """Turn to a row; to the first that is not there by default."""
-        found = self._recording.next_empty(frozenset(self._skipped)) if at is None else at
-        self._at = found
+    def _ask_for(self, index: int | None) -> None:
+        """Ask for a row; None to ask for no more."""
+        self._asked = index
         self._show()
 
-    def _show(self) -> None:
-        from orthocal.output.text.recording import describe_row, describe_setup
+    def _ask_for_next(self) -> None:
+        self._ask_for(self._next)
 
-        r, at = self._recording, self._at
-        if at is None:
-            left = len(r.missing)
-            state = f"{left} left out." if left else "All readings are there."
-            self._say("", f"{state} Enter ends; `back` corrects.")
+    @property
+    def _next(self) -> int | None:
+        """Index of the first row that is neither read nor skipped."""
+        return self._recording.next_empty(frozenset(self._skipped))
+
+    def _show(self) -> None:
+        from orthocal.output.text.recording import describe_row, describe_setup, describe_state
+
+        r, index, width = self._recording, self._asked, self._width
+        if index is None:
+            self._say("", describe_state(r, self._warnings, width=width))
             return
-        setup = r.rows[at].setup
+        setup = r.rows[index].setup
         if setup != self._shown:
-            words = describe_setup(r.session, self._guidance, r.rows, setup, width=self._width)
+            words = describe_setup(r.session, self._guidance, r.rows, setup, width=width)
             self._say("", words)
             self._shown = setup
-        words = describe_row(r.session, self._guidance, r.rows, at, width=self._width)
-        self._say("", words)
+        self._say("", describe_row(r.session, self._guidance, r.rows, index, width=width))
 
-    def _ask(self) -> str:
+    def _read_line(self) -> str:
         """The next line that is typed.
 
         Raises:
-            _Leave: At the end of the input.
+            _EndOfDialogue: At the end of the input.
         """
-        at = self._at
         prompt = "> "
-        if at is not None:
-            row = self._recording.rows[at]
-            named = printable(f"{row.setup} {row.posture} [mm]> ")
-            prompt = named if len(named) <= self._width // 2 else f"row {at + 1} [mm]> "
+        if self._asked is not None:
+            row = self._recording.rows[self._asked]
+            prompt = printable(f"{row.setup} {row.posture} [mm]> ")
+            if len(prompt) > self._width // 2:
+                prompt = f"row {self._asked + 1} [mm]> "
         if sys.stdin is None:
-            raise _Leave
+            raise _EndOfDialogue
         if isinstance(sys.stdin, io.TextIOWrapper) and sys.stdin.errors != "replace":
-            sys.stdin.reconfigure(errors="replace")  # what is no text is no number either
+            sys.stdin.reconfigure(errors="replace")  # invalid bytes are no number either
         if sys.stdin.isatty() and sys.stdout.isatty():
             with suppress(ImportError):
                 import readline  # noqa: F401 - lines can be edited
@@ -153,71 +158,123 @@ class _Dialogue:
                 return input(prompt)
             except EOFError:
                 self._say("")
-                raise _Leave from None
+                raise _EndOfDialogue from None
         self._say(prompt.rstrip())
-        line = _read_line()
+        line = _read_piped_line()
         if line and not line.endswith("\n"):
-            self._say(self._wrap(f"Not taken: '{shorten(line)}', a line without an end."))
+            self._say(self._wrap(f"Not recorded: '{shorten(line)}', a line without an end."))
         if not line.endswith("\n"):
-            raise _Leave
+            raise _EndOfDialogue
         return line
 
     def _answer(self, line: str) -> None:
-        """Do what was typed; what cannot be done is said, and asked for again."""
+        """Execute a line; errors are printed, and the question is repeated."""
         from orthocal.io.tables.numerals import parse_typed_reading
 
-        word, *rest = line.split() or [""]
+        word, *arguments = line.split() or [""]
         try:
             if not word:
                 self._keep()
             elif word[0].isalpha() or word == "?":
-                self._command(word.lower(), rest)
-            elif self._at is None:
-                raise SessionError("no row is asked for; `back 3` goes to row 3")
+                self._command(word.lower(), arguments)
             else:
-                self._take(self._at, parse_typed_reading(line))
+                index = self._require_row()
+                self._record(index, parse_typed_reading(line))
         except SessionError as e:
-            self._say(self._wrap(f"Not taken: {e}."))
+            self._say(self._wrap(f"Not recorded: {e}."))
 
     def _keep(self) -> None:
-        """Enter alone."""
-        if self._at is None:
-            raise _Leave
-        if self._recording.rows[self._at].value is None:
-            raise SessionError("type what the dial shows, or `skip`, or `help`")
-        self._go_on()
+        """Keep the reading of the row that is asked for; end where none is."""
+        if self._asked is None:
+            raise _EndOfDialogue
+        if self._recording.rows[self._asked].value is None:
+            raise SessionError("type the reading of the dial, or `skip`, or `help`")
+        self._ask_for_next()
 
-    def _take(self, at: int, value: float) -> None:
-        from orthocal.measurement.recording.anomalies import find_oddities
-        from orthocal.output.text.recording import acknowledge, describe_oddity
+    def _record(self, index: int, value: float) -> None:
+        """Record a reading, compare it with its prediction, and judge the readings if necessary."""
+        from orthocal.output.text.recording import confirm_reading
 
         recording = self._recording
-        recording.read(at, value)
-        self._skipped.discard(recording.rows[at].key)
-        self._last = at
-        self._say(acknowledge(recording.rows, at, width=self._width))
-        found = find_oddities(recording.session, recording.rows, at)
-        if not any(o.kind in ("cycles", "drift") for o in found):
-            found += self._foreseen(at)
-        for oddity in found:
-            row = recording.rows[at]
-            self._say(describe_oddity(oddity, row, self._guidance, width=self._width))
-        self._go_on()
+        corrected = recording.rows[index].value is not None
+        recording.read(index, value)
+        row = recording.rows[index]
+        self._skipped.discard(row.key)
+        self._last = index
+        self._say(confirm_reading(recording.rows, index, width=self._width))
+        following = self._next
+        is_end_of_setup = following is None or recording.rows[following].setup != row.setup
+        if self._is_doubtful(index) or is_end_of_setup or corrected:
+            self._judge()
+        self._ask_for(following)
 
-    def _foreseen(self, at: int) -> tuple[Oddity, ...]:
-        """What is odd by what the other readings say; of a turned dial it is said once."""
-        if self._foresight is None:
-            return ()
-        found = self._foresight.find_oddities(self._recording.rows, at)
-        new = tuple(o for o in found if not (o.kind == "turned" and o.setup in self._told))
-        self._told |= {o.setup for o in new if o.kind == "turned"}
-        return new
+    def _is_doubtful(self, index: int) -> bool:
+        """Print the prediction of a reading; whether the reading contradicts it.
 
-    def _command(self, word: str, rest: list[str]) -> None:
-        """A word that is no reading.
+        Readings with a warning do not take part in the prediction.
+        """
+        import numpy as np
+
+        from orthocal.assessment.judgement import is_doubtful
+        from orthocal.hypotheses.linear_model import LinearModel
+        from orthocal.output.text.recording import describe_prediction, find_rows
+
+        if not self._can_judge:
+            return False
+        rows = self._recording.rows
+        doubted = {i for f in self._warnings for i in find_rows(f, rows)} - {index}
+        session = self._recording.measured(without=doubted)
+        position = sum(r.value is not None and i not in doubted for i, r in enumerate(rows[:index]))
+        try:
+            mean, std = LinearModel(session).predict_row(session.values, position)
+        except (OrthocalError, np.linalg.LinAlgError) as e:
+            self._stop_judging(e)
+            return False
+        if prediction := describe_prediction(mean, std, width=self._width):
+            self._say(prediction)
+        return is_doubtful(session, position, mean, std)
+
+    def _judge(self) -> None:
+        """Judge the readings so far; print new warnings and resolved ones.
+
+        A complete session is judged as by `check`, and its warnings are printed with its state.
+        """
+        import numpy as np
+
+        from orthocal.assessment.judgement import find_warnings, judge_session
+        from orthocal.output.text.recording import describe_resolved, describe_warning
+
+        recording = self._recording
+        if not self._can_judge or len(recording.missing) == len(recording.rows):
+            self._warnings = ()
+            return
+        try:
+            if recording.missing:
+                warnings = find_warnings(recording.measured())
+            else:
+                findings = judge_session(recording.measured()).findings
+                warnings = tuple(f for f in findings if f.severity != "note")
+        except (OrthocalError, np.linalg.LinAlgError) as e:
+            self._stop_judging(e)
+            return
+        new, resolved = _compare(self._warnings, warnings)
+        self._warnings = warnings
+        if recording.missing:
+            for finding in new:
+                self._say(describe_warning(finding, recording.rows, width=self._width))
+        if resolved:
+            self._say(describe_resolved(resolved, width=self._width))
+
+    def _stop_judging(self, error: Exception) -> None:
+        """Print once why readings cannot be judged; they are recorded all the same."""
+        self._can_judge = False
+        self._say(self._wrap(f"Readings are recorded without a check: {error}."))
+
+    def _command(self, word: str, arguments: list[str]) -> None:
+        """Execute a command.
 
         Raises:
-            SessionError: If it is not known, or cannot be done now.
+            SessionError: If it is unknown, or cannot be executed now.
         """
         from orthocal.output.text.recording import COMMANDS, list_commands, list_rows
 
@@ -225,19 +282,19 @@ class _Dialogue:
         names = [name for name in COMMANDS if name.startswith(word)]
         if len(names) != 1:
             which = f" ({' or '.join(names)}?)" if names else ""
-            raise SessionError(f"'{shorten(word)}' is no command{which}; `help` lists them")
+            raise SessionError(f"'{shorten(word)}' is not a command{which}; `help` lists them")
         name = names[0]
-        if rest and (name not in ("back", "again", "drop") or len(rest) > 1):
-            raise SessionError(f"`{name}` takes nothing after it that begins '{shorten(rest[0])}'")
-        given = self._row(rest[0]) if rest else None
+        if arguments and (name not in ("back", "again", "drop") or len(arguments) > 1):
+            raise SessionError(f"`{name}` has no argument '{shorten(arguments[0])}'")
+        index = self._parse_row(arguments[0]) if arguments else None
         if name == "back":
-            self._back(given)
+            self._back(index)
         elif name == "again":
-            self._again(given)
+            self._again(index)
+        elif name == "drop":
+            self._drop(index)
         elif name == "skip":
             self._skip()
-        elif name == "drop":
-            self._drop(given)
         elif name == "restart":
             self._restart()
         elif name == "list":
@@ -248,74 +305,83 @@ class _Dialogue:
             self._shown = None
             self._show()
         else:
-            raise _Leave
+            raise _EndOfDialogue
 
-    def _row(self, text: str) -> int:
-        """Index of a row that is named by its number."""
+    def _parse_row(self, text: str) -> int:
+        """Index of a row from its number."""
         count = len(self._recording.rows)
         if text.isascii() and text.isdigit() and len(text) < 7 and 1 <= int(text) <= count:
             return int(text) - 1
-        raise SessionError(f"'{shorten(text)}' is no row; expected 1 to {count}")
+        raise SessionError(f"'{shorten(text)}' is not a row; expected 1 to {count}")
 
-    def _current(self) -> int:
-        if self._at is None:
+    def _require_row(self) -> int:
+        if self._asked is None:
             raise SessionError("no row is asked for; `back 3` goes to row 3")
-        return self._at
+        return self._asked
 
-    def _back(self, given: int | None) -> None:
+    def _back(self, index: int | None) -> None:
         rows = self._recording.rows
-        at = (len(rows) if self._at is None else self._at) - 1 if given is None else given
-        if at < 0:
+        if index is None:
+            index = (len(rows) if self._asked is None else self._asked) - 1
+        if index < 0:
             raise SessionError("this is the first row")
-        stood = None if self._last is None else rows[self._last].setup
-        if stood is not None and rows[at].setup != stood and rows[at].value is not None:
+        setup = rows[index].setup
+        if (
+            self._last is not None
+            and rows[self._last].setup != setup
+            and rows[index].value is not None
+        ):
             self._say(
                 self._wrap(
-                    f"The stand has been elsewhere since {rows[at].setup} was read: correct only "
-                    "what was mistyped. To read there anew, `restart` the whole setup."
+                    f"The stand has been moved since {setup} was read: correct only what was "
+                    "mistyped. To read there again, `restart` the setup."
                 )
             )
-        self._go_on(at)
+        self._ask_for(index)
 
-    def _again(self, given: int | None) -> None:
+    def _again(self, index: int | None) -> None:
         rows = self._recording.rows
-        before = [i for i, r in enumerate(rows[: self._at]) if r.value is not None]
-        last = self._last if self._last is not None or not before else before[-1]
-        at = last if given is None else given
-        if at is None:
+        if index is None:
+            before = [i for i, r in enumerate(rows[: self._asked]) if r.value is not None]
+            index = self._last if self._last is not None or not before else before[-1]
+        if index is None:
             raise SessionError("nothing was read yet")
-        if rows[at].value is None:
-            raise SessionError(f"row {at + 1} was not read yet")
-        self._go_on(self._recording.repeat(at))
+        if rows[index].value is None:
+            raise SessionError(f"row {index + 1} was not read yet")
+        index = self._recording.repeat(index)
+        if self._warnings:  # their lines have changed
+            self._judge()
+        self._ask_for(index)
 
     def _skip(self) -> None:
-        at = self._current()
-        if self._recording.rows[at].value is None:
-            self._skipped.add(self._recording.rows[at].key)
-            self._say(f"  Left empty: row {at + 1}")
-        self._go_on()
+        index = self._require_row()
+        if self._recording.rows[index].value is None:
+            self._skipped.add(self._recording.rows[index].key)
+            self._say(f"  Skipped: row {index + 1}")
+        self._ask_for_next()
 
-    def _drop(self, given: int | None) -> None:
-        at = self._current() if given is None else given
-        label = self._recording.rows[at].label
-        self._recording.drop(at)
-        if self._last is not None and self._last >= at:
-            self._last = None if self._last == at else self._last - 1
-        self._say(self._wrap(f"Taken out: row {at + 1}, {label}"))
-        self._go_on()
+    def _drop(self, index: int | None) -> None:
+        index = self._require_row() if index is None else index
+        label = self._recording.rows[index].label
+        self._recording.drop(index)
+        if self._last is not None and self._last >= index:
+            self._last = None if self._last == index else self._last - 1
+        self._say(self._wrap(f"Deleted: row {index + 1}, {label}"))
+        self._judge()
+        self._ask_for_next()
 
     def _restart(self) -> None:
-        at = self._last if self._at is None else self._at
-        if at is None:
+        index = self._last if self._asked is None else self._asked
+        if index is None:
             raise SessionError("nothing was read yet")
         recording = self._recording
-        setup = recording.rows[at].setup
-        recording.empty(at)
+        setup = recording.rows[index].setup
+        recording.empty(index)
         self._skipped -= {r.key for r in recording.rows if r.setup == setup}
-        self._told.discard(setup)
         self._shown, self._last = None, None
-        self._say(self._wrap(f"Emptied: all readings of {setup}"))
-        self._go_on(next(i for i, r in enumerate(recording.rows) if r.setup == setup))
+        self._say(self._wrap(f"Deleted: all readings of {setup}"))
+        self._judge()
+        self._ask_for(next(i for i, r in enumerate(recording.rows) if r.setup == setup))
 
     def _wrap(self, text: str) -> str:
         from orthocal.output.text.recording import wrap
@@ -327,8 +393,24 @@ class _Dialogue:
             put_out(text)
 
 
-def _read_line() -> str:
-    """A line of the standard input that is no terminal; empty at its end."""
+def _compare(
+    before: Sequence[Finding], after: Sequence[Finding]
+) -> tuple[list[Finding], list[Finding]]:
+    """New findings, and resolved ones, whose setups have no finding any more."""
+
+    def identify(finding: Finding) -> tuple[object, ...]:  # lines shift where rows are added
+        places = [(p.setup, p.posture) for p in finding.places[:1]]
+        return finding.kind, *places, finding.numbers.get("cycle")
+
+    known, present = ({identify(f) for f in findings} for findings in (before, after))
+    setups = {p.setup for f in after for p in f.places}
+    new = [f for f in after if identify(f) not in known]
+    gone = [f for f in before if identify(f) not in present]
+    return new, [f for f in gone if not setups & {p.setup for p in f.places}]
+
+
+def _read_piped_line() -> str:
+    """A line of the standard input without a terminal; empty at its end."""
     line = sys.stdin.readline(LONGEST_LINE)
     while line and not line.endswith("\n"):
         more = sys.stdin.readline(LONGEST_LINE)

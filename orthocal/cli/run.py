@@ -1,34 +1,18 @@
-"""Running a command, and turning errors into exit codes."""
+"""Running of a command, and exit codes for errors."""
 
 from __future__ import annotations
 
 import copy
 import os
 import sys
-from collections.abc import Callable, Sequence
+from importlib import import_module
 from typing import Annotated
 
 import typer
+from typer import Option
+from typer.models import CommandInfo, TyperInfo
 
 import orthocal
-
-# what registers the commands, in the order in which help lists them
-from orthocal.cli import (  # noqa: F401
-    again,
-    calibrate,
-    check,
-    correct,
-    export,
-    import_,
-    machine,
-    new,
-    plan,
-    record,
-    sheet,
-    simulate,
-    study,
-    view,
-)
 from orthocal.cli.options import app
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import OrthocalError
@@ -36,37 +20,53 @@ from orthocal.runtime.interrupts import INTERRUPTED, ending_at_interrupt
 from orthocal.runtime.streams import ReaderGoneError, guarded_streams
 from orthocal.text import printable
 
+PANELS = {
+    "Prepare": ("new", "plan"),
+    "Measure": ("sheet", "record", "import", "simulate", "check"),
+    "Calibrate": ("calibrate", "compare", "report", "validate", "again"),
+    "Use": ("forward", "inverse", "accuracy", "correct", "export", "view"),
+    "Study": ("study",),
+}
+"""Panels of `orthocal --help` and their commands, in the order of work."""
+
+MODULES = {"import": "import_"}
+"""Modules of commands with other names, because Python reserves those of the commands."""
+
+LINES = {"record": "Record readings one at a time, with warnings of mistakes."}
+"""Lines of help that replace the first line of a command's docstring."""
+
 
 def main() -> None:
     """Run the command line; no traceback ever reaches a user.
 
     Exit codes: 0 done, 1 a solve did not converge or an output cannot be written, 2 bad input,
-    3 some rows of a table cannot be reached, or what was found is not to be entered, or is not
-    confirmed, 70 a bug of ours, 130 Ctrl-C; `compare` has more.
+    3 the verdict is to review or to reject the readings, a calibration is not confirmed, or some
+    rows of a table cannot be reached, 70 a bug of orthocal, 130 Ctrl-C.
     """
-    # small matrices only: more threads would but get in each other's way
+    # the matrices are small: more threads would only wait for each other
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # pydantic would look through all that is installed for plugins
+    # pydantic would search all installed packages for plugins
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     with guarded_streams(), ending_at_interrupt():
         code = _run()
     sys.exit(code)
 
 
-def _program(words: Sequence[str]) -> typer.Typer:
-    """The program with the one command that is called: Typer makes all of those that it has."""
-    called = words[0] if words else ""
-    commands = [c for c in app.registered_commands if called in (c.name, _name(c.callback))]
-    groups = [g for g in app.registered_groups if called == g.name]
-    if not commands and not groups:
-        return app
-    alone = copy.copy(app)
-    alone.registered_commands, alone.registered_groups = commands, groups
-    return alone
-
-
-def _name(callback: Callable[..., object] | None) -> str:
-    return getattr(callback, "__name__", "")
+def make_program(called: str = "") -> typer.Typer:
+    """The program with all commands in the order of work, or with the called command alone."""
+    panels = {name: panel for panel, names in PANELS.items() for name in names}
+    chosen = [called] if called in panels else list(panels)
+    for name in chosen:
+        import_module(f"orthocal.cli.{MODULES.get(name, name)}")
+    commands = {c.name or getattr(c.callback, "__name__", ""): c for c in app.registered_commands}
+    groups = {g.name: g for g in app.registered_groups}
+    for name in chosen:
+        info: CommandInfo | TyperInfo = commands.get(name) or groups[name]
+        info.rich_help_panel, info.short_help = panels[name], LINES.get(name)
+    program = copy.copy(app)
+    program.registered_commands = [commands[name] for name in chosen if name in commands]
+    program.registered_groups = [groups[name] for name in chosen if name in groups]
+    return program
 
 
 def _run() -> int | str | None:
@@ -74,7 +74,7 @@ def _run() -> int | str | None:
     code: int | str | None = 0
     try:
         try:
-            _program(sys.argv[1:])()
+            make_program(*sys.argv[1:2])()
         except SystemExit as e:
             code = e.code
         sys.stdout.flush()
@@ -94,7 +94,7 @@ def _run() -> int | str | None:
         put_note(
             "orthocal: this is a bug of orthocal, not of your input: "
             f"{printable(f'{type(e).__name__}: {e}')}\n"
-            "Set ORTHOCAL_DEBUG=1 to see where, and report it."
+            "Set ORTHOCAL_DEBUG=1 to print its traceback, and report it."
         )
         code = 70
     return code
@@ -102,9 +102,7 @@ def _run() -> int | str | None:
 
 @app.callback(invoke_without_command=True)
 def _version(
-    version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", is_eager=True)
-    ] = False,
+    version: Annotated[bool, Option("--version", help="Print the version.", is_eager=True)] = False,
 ) -> None:
     if version:
         put_out(orthocal.__version__)

@@ -1,69 +1,62 @@
-"""What readings would be: simulate."""
+"""The command `simulate`."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
+from orthocal.cli.files import require_new_files
 from orthocal.cli.options import (
+    Error,
+    Errors,
+    Force,
+    OutDirectory,
+    PlanPath,
+    Seed,
     Tolerances,
     app,
 )
 from orthocal.cli.printing import put_note
-from orthocal.errors import ParameterError, SessionError
+from orthocal.errors import ParameterError
+
+FILES = ("session.yaml", "readings.csv", "truth.yaml")
 
 
 @app.command()
 def simulate(
-    plan: Annotated[
-        Path,
-        typer.Argument(metavar="PLAN", help="A session.yaml without readings, or a session."),
-    ],
-    out: Annotated[Path, typer.Option(help="Folder for session.yaml, readings.csv, truth.yaml.")],
-    errors: Annotated[
-        Path | None, typer.Option(help="YAML file with the machine's errors (see a truth.yaml).")
-    ] = None,
-    error: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="One error, such as x_slide.offset_mm=1.2."),
-    ] = None,
+    plan: PlanPath,
+    out: OutDirectory,
+    error: Error = None,
+    errors: Errors = None,
     draw: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="MODEL|GLOBS",
-            help="Draw errors from the tolerances: a model, or names and globs with commas.",
+            help="Draw random errors within their tolerances: a model, or names and globs.",
         ),
     ] = None,
     tolerance: Tolerances = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of noise, gauge zeros and drawn errors.")] = 0,
     exact: Annotated[
-        bool, typer.Option("--exact", help="No noise, no gauge zeros, no rounding.")
+        bool, Option("--exact", help="Without noise, gauge zeros and rounding.")
     ] = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Write over a session that is there.")
-    ] = False,
+    seed: Seed = 0,
+    force: Force = False,
 ) -> None:
-    """Make a session of simulated readings of a machine whose errors are known."""
+    """Simulate the readings of a machine with known errors.
+
+    The directory receives session.yaml, readings.csv and truth.yaml.
+    """
     from orthocal.estimation.selection import read_tolerances
-    from orthocal.io.files import exists, require_writable
     from orthocal.measurement.files.session_file import load_plan
     from orthocal.measurement.files.write_session import write_session
-    from orthocal.observation.simulate import (
-        collect_errors,
-        simulate_session,
-        truth_document,
-    )
+    from orthocal.observation.simulate import collect_errors, simulate_session, truth_document
 
-    require_writable(out)
-    for name in ("session.yaml", "readings.csv", "truth.yaml"):
-        if exists(out / name) and not force:
-            raise SessionError("is there already; --force writes over it", where=str(out / name))
+    require_new_files(out, FILES, force=force)
     planned = load_plan(plan)
     tolerances = read_tolerances(tolerance or [], planned.robot.parameters, where="--tolerance")
     if tolerances and draw is None:
-        raise ParameterError("is of no use without --draw", where="--tolerance")
+        raise ParameterError("has no effect without --draw", where="--tolerance")
     true_errors = collect_errors(
         planned.robot,
         file=errors,
@@ -74,6 +67,6 @@ def simulate(
     )
     simulated = simulate_session(planned, true_errors, seed=seed, exact=exact)
     truth = {"truth.yaml": truth_document(simulated)}
-    comment = "Simulated readings, not measured. The truth behind them is in truth.yaml."
+    comment = "Simulated readings, not measured. The true errors are in truth.yaml."
     path = write_session(simulated.session, out, comment=comment, extra=truth)
     put_note(f"Wrote {path}, {len(simulated.session.readings)} simulated readings, and truth.yaml")

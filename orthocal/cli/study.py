@@ -1,18 +1,42 @@
-"""The commands `orthocal study accuracy|linearisation|sensitivity|bootstrap`."""
+"""The commands `study accuracy`, `study linearisation`, `study sensitivity`, `study bootstrap`."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
-from orthocal.cli.options import Json, Tolerances, app, require_cube, split_globs
-from orthocal.cli.printing import put_note, put_out
+from orthocal.cli.options import (
+    LARGEST_MM,
+    AllRows,
+    Error,
+    Errors,
+    Force,
+    Free,
+    HalfSideMm,
+    Json,
+    Model,
+    OptionalOutDirectory,
+    PlanPath,
+    Seed,
+    SessionPath,
+    Tolerances,
+    Workers,
+    app,
+    make_group,
+    read_numbers,
+    read_workspace,
+    require_between,
+    split_globs,
+)
+from orthocal.cli.printing import deliver, put_note
 from orthocal.errors import ParameterError
+from orthocal.units import MM
 
 if TYPE_CHECKING:
     from orthocal.robot.model import Robot
@@ -20,11 +44,7 @@ if TYPE_CHECKING:
     from orthocal.study.runner import Progress
     from orthocal.study.study import Study
 
-studies = typer.Typer(
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    help="Simulate many machines, or resample readings.",
-)
+studies = make_group("Simulate many machines, or resample readings.")
 app.add_typer(studies, name="study")
 
 FILES = ("study.json", "results.parquet", "study.svg")
@@ -33,89 +53,55 @@ FILES = ("study.json", "results.parquet", "study.svg")
 PROGRESS_STEP = 0.1
 """Share of a study between two lines of progress."""
 
-LEG_MM = 310.25
-"""Leg length for which the paper's displacements are 60 and -100 mm."""
-
-MOST_MM = 1e4
-
-Out = Annotated[
-    Path | None,
-    typer.Option(help="Directory for the results. A stopped study is resumed from there."),
-]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")]
-Workers = Annotated[
-    int | None, typer.Option(min=1, max=1024, help="Number of processes. Default: all cores.")
-]
 Dask = Annotated[
-    str | None,
-    typer.Option(metavar="ADDRESS", help="Run on a Dask cluster; address of its scheduler."),
-]
-Force = Annotated[bool, typer.Option("--force", help="Discard earlier results and start again.")]
-AllRows = Annotated[bool, typer.Option("--all", help="List all parameters.")]
-Model = Annotated[
-    str | None, typer.Option(help="Identified errors: a model. Default: the session's choice.")
-]
-Free = Annotated[
-    list[str] | None,
-    typer.Option(metavar="GLOBS", help="Identified errors: names or globs, added to the model."),
+    str | None, Option(metavar="ADDRESS", help="Run on a Dask cluster; address of its scheduler.")
 ]
 Subject = Annotated[
     str,
-    typer.Argument(
+    Argument(
         metavar="ROBOT|SESSION",
         help="An Orthoglide-type robot, measured by the paper's plan; or a session.",
     ),
 ]
-LegMm = Annotated[
-    float | None,
-    typer.Option("--leg-mm", help="Leg length of an Orthoglide of other dimensions, mm."),
-]
+LegMm = Annotated[float | None, Option(help="Leg length of an Orthoglide of other dimensions, mm.")]
 
 
 @studies.command()
 def accuracy(
-    plan: Annotated[
-        Path,
-        typer.Argument(metavar="PLAN", help="session.yaml; its readings are not used."),
-    ],
+    plan: PlanPath,
     model: Model = None,
     free: Free = None,
-    machines: Annotated[int, typer.Option(min=2, max=1_000_000, help="Number of machines.")] = 1000,
+    machines: Annotated[int, Option(min=2, max=1_000_000, help="Number of machines.")] = 1000,
     draw: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="MODEL|GLOBS",
-            help="Errors that are random, within their tolerances. Default: all.",
+            help="Errors that are random, within their tolerances; default: all.",
         ),
     ] = None,
-    error: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="An error that all machines have."),
-    ] = None,
-    errors: Annotated[
-        Path | None, typer.Option(help="YAML file of errors that all machines have (truth.yaml).")
-    ] = None,
+    error: Error = None,
+    errors: Errors = None,
     tolerance: Tolerances = None,
-    half_side_mm: Annotated[
-        float | None,
-        typer.Option("--half-side-mm", help="Half side of the cube for the tool error, mm."),
-    ] = None,
+    half_side_mm: HalfSideMm = None,
     seed: Seed = 0,
-    out: Out = None,
     workers: Workers = None,
     dask: Dask = None,
+    out: OptionalOutDirectory = None,
     json: Json = False,
     all_rows: AllRows = False,
     force: Force = False,
 ) -> None:
-    """Tool error after calibration of many simulated machines."""
+    """Predict the tool error of many machines after calibration.
+
+    A stopped study is resumed from its directory; --force starts again.
+    """
     from orthocal.estimation.choice import Choice
+    from orthocal.estimation.selection import read_tolerances
     from orthocal.io.files import exists
     from orthocal.measurement.files.session_file import load_plan
     from orthocal.observation.simulate import collect_errors
     from orthocal.robot.loading import packaged_robots
     from orthocal.study.accuracy import build_accuracy_study
-    from orthocal.units import MM
 
     if not exists(plan) and str(plan) in packaged_robots():
         raise ParameterError(
@@ -123,16 +109,17 @@ def accuracy(
             where=str(plan),
         )
     session = load_plan(plan)
-    fixed: dict[str, float] = {}
+    robot = session.robot
+    fixed = {}
     if error or errors is not None:
-        fixed = collect_errors(session.robot, file=errors, single=error or [])
-    tolerances = _tolerances(tolerance, session.robot)
+        fixed = collect_errors(robot, file=errors, single=error or [])
+    tolerances = read_tolerances(tolerance or [], robot.parameters, where="--tolerance")
     if half_side_mm is not None:
-        require_cube(session.robot, half_side_mm)
+        read_workspace(f"{half_side_mm:g}", robot, where="--half-side-mm")
     study = build_accuracy_study(
         session,
         Choice(model, free=split_globs(free), tolerances=tolerances),
-        drawn=_parameter_globs(draw, session.robot),
+        drawn=_parameter_globs(draw, robot),
         fixed=fixed,
         machines=machines,
         seed=seed,
@@ -145,84 +132,73 @@ def accuracy(
 def linearisation(
     subject: Subject = "orthoglide",
     free: Annotated[
-        list[str] | None,
-        typer.Option(metavar="GLOBS", help="Errors that grow. Default: offsets."),
+        list[str] | None, Option(metavar="GLOBS", help="Errors that grow; default: offsets.")
     ] = None,
-    largest_mm: Annotated[
-        float, typer.Option("--largest-mm", help="Largest size of the errors, mm or mrad.")
-    ] = 50.0,
-    sizes: Annotated[
-        int, typer.Option(min=1, max=10_000, help="Number of sizes, from 0.1 mm on.")
-    ] = 40,
+    largest_mm: Annotated[float, Option(help="Largest size of the errors, mm or mrad.")] = 50.0,
+    sizes: Annotated[int, Option(min=1, max=10_000, help="Number of sizes, from 0.1 mm on.")] = 40,
     directions: Annotated[
-        int, typer.Option(min=1, max=10_000, help="Number of random directions of the errors.")
+        int, Option(min=1, max=10_000, help="Number of random directions of the errors.")
     ] = 25,
     along: Annotated[
-        str | None,
-        typer.Option(metavar="A,B,...", help="One direction instead, such as 1,-0.6,0.3."),
+        str | None, Option(metavar="A,B,...", help="One direction instead, such as 1,-0.6,0.3.")
     ] = None,
     max_mm: Annotated[
         float | None,
-        typer.Option(
-            "--max-mm",
-            help="Displacement of the paper's maximum postures. Default: 60 mm, scaled with legs.",
+        Option(
+            help="Displacement of the paper's maximum postures; default: 60 mm, scaled with legs."
         ),
     ] = None,
     min_mm: Annotated[
         float | None,
-        typer.Option(
-            "--min-mm",
-            help="Displacement of its minimum postures. Default: -100 mm, scaled with legs.",
-        ),
+        Option(help="Displacement of its minimum postures; default: -100 mm, scaled with legs."),
     ] = None,
     leg_mm: LegMm = None,
     sigma_mm: Annotated[
         float | None,
-        typer.Option("--sigma-mm", help="Standard deviation of a reading. The paper's: 0.02."),
+        Option(help="Standard deviation of a reading; default: 0.02, as in the paper."),
     ] = None,
     resolution_mm: Annotated[
-        float | None,
-        typer.Option("--resolution-mm", help="Resolution of a reading. The paper's: 0.01."),
+        float | None, Option(help="Resolution of a reading; default: 0.01, as in the paper.")
     ] = None,
     seed: Seed = 0,
-    out: Out = None,
     workers: Workers = None,
     dask: Dask = None,
+    out: OptionalOutDirectory = None,
     json: Json = False,
     force: Force = False,
 ) -> None:
-    """Error of linearised identification as errors grow."""
+    """Compare linearised with exact identification as errors grow."""
+    from orthocal.builder.machine_file import Dimensions
     from orthocal.robot.model import Robot
     from orthocal.session.session import Gauge
     from orthocal.study.linearisation import build_linearisation_study
     from orthocal.study.paper_plan import PAPER_GAUGE, Displacements
-    from orthocal.units import MM
 
-    scale = leg_mm / LEG_MM if leg_mm is not None and leg_mm > 0.0 else 1.0
-    maximum = scale * 60.0 if max_mm is None else max_mm
-    minimum = scale * -100.0 if min_mm is None else min_mm
-    _require_between(largest_mm, 0.0, MOST_MM, "--largest-mm")
-    _require_between(maximum, 0.0, MOST_MM, "--max-mm")
-    _require_between(minimum, -MOST_MM, 0.0, "--min-mm")
+    scale = leg_mm * MM / Dimensions().leg if leg_mm is not None and leg_mm > 0.0 else 1.0
+    usual = Displacements()
+    maximum = scale * usual.maximum / MM if max_mm is None else max_mm
+    minimum = scale * usual.minimum / MM if min_mm is None else min_mm
+    require_between(largest_mm, 0.0, LARGEST_MM, "--largest-mm")
+    require_between(maximum, 0.0, LARGEST_MM, "--max-mm")
+    require_between(minimum, -LARGEST_MM, 0.0, "--min-mm")
     for name, value in (("--sigma-mm", sigma_mm), ("--resolution-mm", resolution_mm)):
         if value is not None:
-            _require_between(value, 0.0, 1e3, name)
+            require_between(value, 0.0, 1e3, name)
     with _robot_or_session(subject, leg_mm) as source:
-        usual = PAPER_GAUGE if isinstance(source, Robot) else source.gauge
-        gauge = Gauge(
-            usual.sigma if sigma_mm is None else sigma_mm * MM,
-            usual.resolution if resolution_mm is None else resolution_mm * MM,
-            None,
-        )
+        gauge = PAPER_GAUGE if isinstance(source, Robot) else source.gauge
         study = build_linearisation_study(
             source,
             free=split_globs(free) or ("*.offset",),
             largest=largest_mm,
             count=sizes,
             directions=directions,
-            along=None if along is None else _numbers(along, "--along"),
+            along=None if along is None else read_numbers(along, "--along"),
             displacements=Displacements(maximum * MM, minimum * MM),
-            gauge=gauge,
+            gauge=Gauge(
+                gauge.sigma if sigma_mm is None else sigma_mm * MM,
+                gauge.resolution if resolution_mm is None else resolution_mm * MM,
+                None,
+            ),
             seed=seed,
         )
     _run(study, out, workers, dask, json=json, all_rows=False, force=force)
@@ -233,34 +209,33 @@ def sensitivity(
     subject: Subject = "orthoglide",
     free: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="MODEL|GLOBS", help="Errors. Default: all that move a reading or the tool."
+        Option(
+            metavar="MODEL|GLOBS", help="Errors; default: all that change a reading or the tool."
         ),
     ] = None,
     at: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="X,Y,Z",
             help="Tool position, mm, at which every setup is read. Can be repeated.",
         ),
     ] = None,
     leg_mm: LegMm = None,
-    out: Out = None,
+    out: OptionalOutDirectory = None,
     json: Json = False,
     all_rows: AllRows = False,
     force: Force = False,
 ) -> None:
-    """Derivatives of readings and tool position by each error."""
+    """Print how each error changes readings and tool position."""
     from orthocal.robot.model import Robot
     from orthocal.study.sensitivity import build_sensitivity_study
-    from orthocal.units import MM
 
     with _robot_or_session(subject, leg_mm) as source:
         robot = source if isinstance(source, Robot) else source.robot
         count = 0 if robot.tcp is None else len(robot.tcp.coordinates)
         points = []
         for text in at or []:
-            point = _numbers(text, "--at")
+            point = read_numbers(text, "--at")
             if len(point) != count:
                 raise ParameterError(
                     f"'{text}' has {len(point)} numbers; expected {count}", where="--at"
@@ -274,35 +249,32 @@ def sensitivity(
 
 @studies.command()
 def bootstrap(
-    session: Annotated[
-        Path,
-        typer.Argument(metavar="SESSION", help="session.yaml, or the directory that contains it."),
-    ],
+    session: SessionPath,
     model: Model = None,
     free: Free = None,
     by: Annotated[
-        str,
-        typer.Option(metavar="residuals|cycles", help="Resample residuals or cycles of setups."),
+        str, Option(metavar="residuals|cycles", help="Resample residuals or cycles of setups.")
     ] = "residuals",
-    draws: Annotated[int, typer.Option(min=2, max=1_000_000, help="Number of draws.")] = 1000,
+    draws: Annotated[int, Option(min=2, max=1_000_000, help="Number of draws.")] = 1000,
     tolerance: Tolerances = None,
     seed: Seed = 0,
-    out: Out = None,
     workers: Workers = None,
     dask: Dask = None,
+    out: OptionalOutDirectory = None,
     json: Json = False,
     all_rows: AllRows = False,
     force: Force = False,
 ) -> None:
-    """Scatter of estimates implied by a session's readings."""
+    """Estimate the scatter of errors by resampling a session."""
     from orthocal.estimation.choice import Choice
+    from orthocal.estimation.selection import read_tolerances
     from orthocal.measurement.files.session_file import load_session
     from orthocal.study.bootstrap import build_bootstrap_study
 
     if by not in ("residuals", "cycles"):
         raise ParameterError(f"found '{by}'; expected residuals or cycles", where="--by")
     measured = load_session(session)
-    tolerances = _tolerances(tolerance, measured.robot)
+    tolerances = read_tolerances(tolerance or [], measured.robot.parameters, where="--tolerance")
     study = build_bootstrap_study(
         measured,
         Choice(model, free=split_globs(free), tolerances=tolerances),
@@ -324,13 +296,17 @@ def _run(
     force: bool,
 ) -> None:
     """Run a study, print its report and write its files."""
-    from orthocal.io.files import require_writable, write_files
+    from orthocal.io.files import Content, require_writable
     from orthocal.output.study.contents import report_study, study_json
     from orthocal.output.study.report import draw_figure, render_report
     from orthocal.output.text.layout import print_rich
     from orthocal.runtime.interrupts import message_at_interrupt
     from orthocal.runtime.worker_pool import available_cores, call_in_parallel, worker_budget
     from orthocal.study.runner import JOURNAL, run_study, to_parquet
+
+    def files() -> dict[str, Content]:
+        calls = [lambda: to_parquet(table), lambda: draw_figure(report.figure)]
+        return dict(zip(FILES, (document, *call_in_parallel(calls)), strict=True))
 
     if dask is not None and workers is not None:
         raise ParameterError(
@@ -348,16 +324,8 @@ def _run(
     with worker_budget(1 if dask is not None else count):
         report = report_study(table, all_rows=all_rows)
         document = study_json(table, report)
-        if json:
-            put_out(document.rstrip("\n"))
-        else:
-            print_rich(render_report(report))
-        if out is not None:
-            files = call_in_parallel(
-                [lambda: to_parquet(table), lambda: draw_figure(report.figure)]
-            )
-            write_files(out, dict(zip(FILES, (document, *files), strict=True)))
-            put_note(f"Wrote {', '.join(str(out / name) for name in FILES)}")
+        show = partial(print_rich, render_report(report))
+        deliver(lambda: document, show, json=json, out=out, files=files)
 
 
 def _progress_lines(study: Study) -> Callable[[Progress], None] | None:
@@ -376,8 +344,8 @@ def _progress_lines(study: Study) -> Callable[[Progress], None] | None:
         if share < min(next_share, 1.0):
             return
         next_share = share + PROGRESS_STEP
-        left = "" if share >= 1.0 else f", about {_duration(progress.seconds_left)} left"
-        put_note(f"orthocal: {progress.done} of {progress.total} {study.counted}{left}")
+        remaining = "" if share >= 1.0 else f", about {_duration(progress.seconds_left)} left"
+        put_note(f"orthocal: {progress.done} of {progress.total} {study.counted}{remaining}")
 
     return report
 
@@ -390,12 +358,12 @@ def _duration(seconds: float) -> str:
 
 @contextmanager
 def _robot_or_session(subject: str, leg_mm: float | None) -> Iterator[Robot | Session]:
-    """The robot, if asked for with legs of another length, or the session to study."""
+    """The session to study, or the robot, with another leg length if there is one."""
+    from orthocal.builder.build import make_robot
+    from orthocal.builder.machine_file import Dimensions
     from orthocal.output.text.subject import load_subject
-    from orthocal.robot.builder.build import Sizes, make_robot
     from orthocal.robot.model import Robot
     from orthocal.session.session import Session
-    from orthocal.units import MM
 
     source = load_subject(subject)
     if not isinstance(source, Robot | Session):
@@ -405,46 +373,19 @@ def _robot_or_session(subject: str, leg_mm: float | None) -> Iterator[Robot | Se
         return
     if not isinstance(source, Robot) or source.name != "orthoglide":
         raise ParameterError("applies to the robot orthoglide alone", where="--leg-mm")
-    usual, leg = Sizes(), leg_mm * MM
+    usual, leg = Dimensions(), leg_mm * MM
     scale = leg / usual.leg
-    sizes = Sizes(leg, scale * usual.lower, scale * usual.upper)
-    sizes.require_machine("--leg-mm")
+    dimensions = Dimensions(leg, scale * usual.lower, scale * usual.upper)
+    problem = dimensions.find_problem()
+    if problem:
+        raise ParameterError(problem[1], where="--leg-mm")
     with tempfile.TemporaryDirectory() as directory:
-        yield make_robot(sizes, Path(directory) / "orthoglide")
+        yield make_robot(dimensions, Path(directory) / "orthoglide")
 
 
 def _parameter_globs(texts: list[str] | None, robot: Robot) -> tuple[str, ...] | None:
-    """Globs of error parameters; the name of a model stands for those of the model."""
+    """Globs of error parameters; the name of a model selects those of the model."""
     models = robot.parameters.models
     globs = split_globs(texts)
     patterns = [robot.parameters.patterns(g) if g in models else (g,) for g in globs]
     return tuple(pattern for each in patterns for pattern in each) if texts else None
-
-
-def _tolerances(texts: list[str] | None, robot: Robot) -> dict[str, float]:
-    """Values of --tolerance such as '*.offset_mm=2', by name with unit."""
-    from orthocal.estimation.selection import read_tolerances
-    from orthocal.io.documents import parse_number
-
-    read_tolerances(texts or [], robot.parameters, where="--tolerance")
-    values = {}
-    for text in texts or []:
-        key, _, number = text.partition("=")
-        values[key] = parse_number(number, where="--tolerance", name=key, error=ParameterError)
-    return values
-
-
-def _numbers(text: str, option: str) -> list[float]:
-    from orthocal.io.documents import parse_number
-
-    return [
-        parse_number(part.strip(), where=option, name="part", error=ParameterError)
-        for part in text.split(",")
-    ]
-
-
-def _require_between(value: float, low: float, high: float, option: str) -> None:
-    if not low < value < high:
-        raise ParameterError(
-            f"found {value:g}; expected a number between {low:g} and {high:g}", where=option
-        )

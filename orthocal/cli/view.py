@@ -1,16 +1,13 @@
-"""The commands `report` and `view`."""
+"""The command `view`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
-from orthocal.cli.options import (
-    CalibrationPath,
-    app,
-)
+from orthocal.cli.options import app
 from orthocal.cli.printing import put_note, put_out
 
 if TYPE_CHECKING:
@@ -18,69 +15,43 @@ if TYPE_CHECKING:
 
 
 @app.command()
-def report(
-    calibration: CalibrationPath,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Page, or existing directory; default: report.html beside the calibration."
-        ),
-    ] = None,
-) -> None:
-    """Write the report of a calibration: what to enter, how accurate it is, and why."""
-    from orthocal.calibration.file import load_calibration
-    from orthocal.io.files import is_folder, require_writable_file
-    from orthocal.output.report.page import write_report
-
-    result = load_calibration(calibration)
-    target = out or (Path() if result.path is None else result.path.parent)
-    if is_folder(target):
-        target = target / "report.html"
-    require_writable_file(target, kinds=(".html", ".htm"))
-    put_note(f"Wrote {write_report(result, target)}")
-
-
-@app.command()
 def view(
     subject: Annotated[
         str,
-        typer.Argument(
+        Argument(
             metavar="SESSION|CALIBRATION|ROBOT",
-            help="session.yaml, calibration.json, a directory that holds one, or a robot.",
+            help="session.yaml, calibration.json, a directory that contains one, or a robot.",
         ),
     ],
-    html: Annotated[
-        Path | None, typer.Option(help="Write a page that needs neither network nor server.")
-    ] = None,
-    png: Annotated[
-        Path | None, typer.Option(help="Write a picture; needs an installed Chromium.")
-    ] = None,
-    size: Annotated[
-        str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the picture, in pixels.")
-    ] = "1400x900",
     posture: Annotated[
-        str | None,
-        typer.Option(help="Show this posture and its readings; default: the whole measurement."),
+        str | None, Option(help="Show this posture and its readings; default: all readings.")
     ] = None,
     exaggerate: Annotated[
         float | None,
-        typer.Option(
+        Option(
             metavar="FACTOR",
             help="Factor that enlarges the deviation of the machine; 1 for true scale.",
         ),
     ] = None,
     show: Annotated[
         str | None,
-        typer.Option(
-            metavar="readings|tool|all", help="What the scene of a calibration shows at first."
-        ),
+        Option(metavar="readings|tool|all", help="Layers that a calibration shows at first."),
     ] = None,
+    html: Annotated[
+        Path | None, Option(help="Write a page that needs neither network nor server.")
+    ] = None,
+    png: Annotated[
+        Path | None, Option(help="Write a picture; needs an installed Chromium.")
+    ] = None,
+    size: Annotated[
+        str, Option(metavar="WIDTHxHEIGHT", help="Size of the picture, in pixels.")
+    ] = "1400x900",
     port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Port to listen on; default: a free one.")
+        int | None, Option(min=1, max=65535, help="Port to listen on; default: a free one.")
     ] = None,
-    browse: Annotated[bool, typer.Option("--open", help="Open the page in a browser.")] = False,
+    browse: Annotated[bool, Option("--open", help="Open the page in a browser.")] = False,
 ) -> None:
-    """Show a machine, its measurement or its calibration in 3-D.
+    """Show a machine, a session or a calibration in 3-D.
 
     Without --html and --png, a server shows it to browsers on this machine until Ctrl-C.
     """

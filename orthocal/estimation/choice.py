@@ -8,7 +8,7 @@ from typing import Any
 
 from orthocal.arguments import require_kind, require_names, require_numbers
 from orthocal.errors import ParameterError
-from orthocal.estimation.selection import DEFAULT_MODEL, Known, Selection, select_parameters
+from orthocal.estimation.selection import Known, Selection, complete_model, select_parameters
 from orthocal.robot.parameters import ParameterSet
 from orthocal.session.session import Purpose, Session
 
@@ -22,7 +22,7 @@ class Choice:
 
     Args:
         model: A model of the robot's YAML: `offsets`, `lengths`, `full` or one's own; by default
-            that which a session is for, or `offsets`.
+            what the session states, otherwise the complete model.
         free: Names or globs that are free too, or instead where no model is named; '!' takes out.
         prior: Whether tolerances act as a prior; by default not where only offsets are free.
         known: Name with its unit to a known value, which is then held, or to a value and its
@@ -94,14 +94,14 @@ class Choice:
 
 
 def choose(
-    given: Choice | str | None, session: Session | None, *, usual: str = DEFAULT_MODEL
+    given: Choice | str | None, session: Session | None, *, usual: str | None = None
 ) -> Choice:
     """What is to be identified: as is said, else what a session is for, else as usual.
 
     Args:
         given: What is said: a choice, or the name of a model.
         session: That is measured, or joined of several that were.
-        usual: The model where nothing is said.
+        usual: The model if nothing is stated; by default the complete one.
 
     Raises:
         ParameterError: If sessions are for different models, and nothing is said.
@@ -116,6 +116,8 @@ def choose(
     if len(purposes) > 1:
         said = "; ".join(f"{_in_words(p)} in {s.path or s.title}" for p, s in purposes.items())
         raise ParameterError(f"sessions are for different models: {said}; say which", where="model")
+    if usual is None and session is not None:
+        usual = complete_model(session.robot.parameters)
     purpose = next(iter(purposes), Purpose(usual))
     return replace(choice, model=purpose.model, free=purpose.free)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,7 +112,7 @@ class Fit:
         """Independent readings: repeated ones once, less gauge zeros."""
         o = self.problem.observations
         _, repeated = estimate_repeatability(self.problem.values, o)
-        return o.size - o.n_zeros - repeated
+        return o.size - o.n_free_zeros - repeated
 
     @property
     def held(self) -> NDArray[np.bool_]:
@@ -120,7 +120,18 @@ class Fit:
         return np.asarray(self.solution.at_bound != 0)
 
     def covariance(self) -> Array:
-        """Covariance of the free parameters, shape (n_free, n_free), [SI]; NaN if unknown."""
+        """Covariance of the free parameters by noise and priors, (n_free, n_free), [SI].
+
+        NaN where nothing determines the noise.
+        """
+        return self._scaled(self.information.covariance)
+
+    def noise_covariance(self) -> Array:
+        """Part of `covariance` that is due to noise, shape (n_free, n_free), [SI]."""
+        return self._scaled(self.information.noise_covariance)
+
+    def _scaled(self, covariance: Callable[..., Array]) -> Array:
+        """A covariance of the scaled parameters, with the weights of this fit, in SI units."""
         scale = np.outer(self.problem.theta_scale, self.problem.theta_scale)
         if not math.isfinite(self.noise.sigma):
             return np.full_like(scale, np.nan)
@@ -129,7 +140,7 @@ class Fit:
             used = self.problem.observations.size - self.noise.residual_dof
             gain = self.loss.gain(self.residual / self.sigma, used=used)
             factors = (gain, self.loss.normal_square)
-        return scale * self.information.covariance(
+        return scale * covariance(
             sigma=self.sigma,  # some, also for readings without any scatter
             precision=self.problem.prior_precision,
             held=self.held,
@@ -322,7 +333,7 @@ def _few_are_free(linearisation: Linearisation, sigma: float) -> bool:
     used = linearisation.information.effective_parameters(
         sigma=sigma, precision=problem.prior_precision
     )
-    return o.size - o.n_zeros - used < SMALL_DOF
+    return o.size - o.n_free_zeros - used < SMALL_DOF
 
 
 def first_sigma(session: Session, repeatability: tuple[float, int]) -> float:
@@ -369,7 +380,7 @@ def _noise(
     used = information.effective_parameters(
         sigma=sigma, precision=problem.prior_precision, held=held
     )
-    dof = problem.observations.size - problem.observations.n_zeros - used
+    dof = problem.observations.size - problem.observations.n_free_zeros - used
     return estimate_noise(
         # cycles with a wrong reading among them would say that all scatter
         repeatability=(math.nan, 0) if loss.robust and dof > 1.0 else repeatability,

@@ -1,15 +1,16 @@
-"""Which solver, how it is run, and what a residual costs.
+"""Choice and options of a solver.
 
-- `ipopt`: the whole nonlinear program, passive coordinates and gauge zeros among its variables: the
-  reference.
-- `eliminated`: the same optimum with nothing left but the free parameters: for repetition and size.
-- `linearised`: readings to first order about what the controller already corrects, as the paper's.
+- `ipopt`: the complete nonlinear program, with passive coordinates and gauge zeros as variables;
+  the reference.
+- `eliminated`: the same optimum by variable projection, for repetition and large sessions.
+- `linearised`: one step with readings to first order about the active offsets, as in the paper.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from orthocal.arguments import require_kind
@@ -19,12 +20,14 @@ from orthocal.estimation.loss import SQUARES, Loss
 SolverKind = Literal["ipopt", "eliminated", "linearised"]
 Hessian = Literal["gauss-newton", "exact"]
 
+OptionValue = float | int | str | bool
+
 MOST_ITERATIONS = 10**6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolverOptions:
-    """Which solver, how it is run, and what a residual costs."""
+    """Choice and options of a solver."""
 
     solver: SolverKind = "ipopt"
     hessian: Hessian = "gauss-newton"
@@ -40,7 +43,10 @@ class SolverOptions:
     print_level: int = 0
     """Ipopt's own printing, 0 (none) to 12."""
     loss: Loss = SQUARES
-    """What a residual costs."""
+    """Cost of a residual."""
+    ipopt: Mapping[str, OptionValue] = field(default_factory=dict)
+    """Further options of Ipopt, by its own names, such as {"mu_strategy": "adaptive"}; they replace
+    those that orthocal sets. Other solvers ignore them."""
 
     def __post_init__(self) -> None:
         require_kind(self.loss, Loss, expected="Loss(...)")
@@ -52,6 +58,13 @@ class SolverOptions:
             value = getattr(self, name)
             if not (isinstance(value, int) and 0 <= value <= MOST_ITERATIONS):
                 raise ValueError(f"{name} is {value!r}; expected a whole number of at least 0")
+        if not isinstance(self.ipopt, Mapping):
+            raise ValueError(f"ipopt is {self.ipopt!r}; expected names and values of options")
+        for key, option in self.ipopt.items():
+            if not isinstance(key, str) or not isinstance(option, bool | int | float | str):
+                raise ValueError(
+                    f"ipopt has {key!r}: {option!r}; expected a name and a number, text or bool"
+                )
         _require_one_of(self.hessian, get_args(Hessian), "Hessian", ValueError)
         _require_one_of(self.solver, get_args(SolverKind), "solver", OrthocalError)
 

@@ -20,7 +20,17 @@ from orthocal.units import Unit
 Array = NDArray[np.float64]
 Known = float | tuple[float, float]
 
-DEFAULT_MODEL = "offsets"
+COMPLETE_MODELS = ("full", "complete")
+"""Names under which a robot has its complete model, the first of them that it has."""
+
+
+def complete_model(parameters: ParameterSet) -> str:
+    """Name of a robot's complete model; its largest if it names none so."""
+    for name in COMPLETE_MODELS:
+        if name in parameters.models:
+            return name
+    return max(parameters.models, key=lambda m: len(parameters.select_model(m)))
+
 
 LARGEST_KNOWN = 100.0
 """Tolerances beyond which a known value is taken for a length or an angle instead of an error."""
@@ -63,7 +73,7 @@ class Selection:
             parameters=(*self.parameters, *parameters),
             prior=np.append(self.prior, np.ones(n, dtype=bool)),
             mean=read_only(np.append(self.mean, np.zeros(n))),
-            lower=read_only(np.append(self.lower, np.full(n, -np.inf))),
+            lower=read_only(np.append(self.lower, [_lowest(p) for p in parameters])),
             upper=read_only(np.append(self.upper, np.full(n, np.inf))),
         )
 
@@ -94,7 +104,8 @@ def select_parameters(
 
     Args:
         parameters: Of the robot.
-        model: A model of the robot's YAML; `offsets` where neither a model nor `free` is given.
+        model: A model of the robot's YAML; the complete one if neither a model nor `free` is
+            given.
         free: Names or globs that are free too, after the model's; '!' takes out again.
         prior: Whether tolerances act as a prior; by default not where only offsets are free.
         known: Name to a known value, which is then held, or to a value and its standard
@@ -106,7 +117,7 @@ def select_parameters(
         ParameterError: If a name, glob or model is unknown, nothing is left free, two of the
             parameters are partly the same error, or a number makes no sense.
     """
-    base = DEFAULT_MODEL if model is None and not free else model
+    base = complete_model(parameters) if model is None and not free else model
     patterns: list[str] = []
     if base is not None:
         patterns += parameters.patterns(base)
@@ -136,13 +147,15 @@ def select_parameters(
             for name in _match_free(parameters, glob, names):
                 tolerance[name] = require_tolerance(value, parameters.own[name])
     tolerance.update({n: s for n, (_, s) in own_prior.items()})
-    lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    lower = np.array([_lowest(parameters[n]) for n in names])
+    upper = np.full(len(names), np.inf)
     for glob, (low, high) in (bounds or {}).items():
         with _named("bounds"):
             if not low < high:
                 raise ParameterError(f"those of '{glob}' leave nothing between them")
             for name in _match_free(parameters, glob, names):
-                lower[names.index(name)], upper[names.index(name)] = low, high
+                i = names.index(name)
+                lower[i], upper[i] = max(low, lower[i]), high
     only_offsets = all(parameters.are_offsets(n) for n in names if n not in own_prior)
     everywhere = not only_offsets if prior is None else prior
     return Selection(
@@ -268,6 +281,11 @@ def _refuse_overlap(parameters: ParameterSet, names: Sequence[str]) -> None:
                     f"{terms}; take one of them out, such as '!{term}'"
                 )
             owner[term] = name
+
+
+def _lowest(parameter: Parameter) -> float:
+    """Lower bound of a parameter for which none is stated."""
+    return 0.0 if parameter.positive else -math.inf
 
 
 def _label(model: str | None, free: Sequence[str]) -> str:

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from orthocal.calibration.calibration import Calibration
 from orthocal.export.polynomial import Polynomial, PolynomialFit, chebyshev_line
 from orthocal.export.tool_tip import ToolTip
-from orthocal.kinematics.continuation import Failures
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import Failures, nominal_assembly
 from orthocal.kinematics.workspace import grid_points
 
 Array = NDArray[np.float64]

@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 import yaml
 
+from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import entered_offsets, find_entries
-from orthocal.assessment.findings.calibration import decide
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ExportError, ParameterError
 from orthocal.export.linuxcnc.export import OPTIONS, ExportOptions, export_linuxcnc
@@ -59,8 +59,7 @@ def export_corrections(calibration: Calibration) -> dict[str, str]:
     tool, robot = find_tool(calibration), calibration.robot
     if tool is None or robot.tcp is None:
         raise ExportError("the machine has no tool that its drives command over a region")
-    half_side = tool.workspace.half_side or 0.0  # find_tool has a cube
-    points = even_grid(robot, half_side=half_side, points_a_side=POINTS_A_SIDE)
+    points = even_grid(robot, tool.workspace.limits, points_a_side=POINTS_A_SIDE)
     coordinates = list(robot.tcp.coordinates)
     try:
         drives = calibration.machine.inverse(points) + entered_offsets(calibration)
@@ -100,7 +99,7 @@ def export_calibration(
     Args:
         calibration: The calibration.
         to: Name of the format.
-        anyway: Whether to export it even if its decision is not to enter it.
+        anyway: Whether to export it against its verdict, which the files then state.
         options: Options of the format.
 
     Returns:
@@ -108,7 +107,7 @@ def export_calibration(
 
     Raises:
         ParameterError: If there is no such format, or it has no such option.
-        ExportError: If its decision is not to enter it, or the machine does not reach the region
+        ExportError: If its verdict is not to enter it, or the machine does not reach the region
             of the format.
     """
     if to not in FORMATS:
@@ -119,20 +118,39 @@ def export_calibration(
         require_entering(calibration)
     options = options or ExportOptions()
     if to not in EXPORTERS:
-        return export_linuxcnc(calibration, options)
-    if options.requested:
+        files = export_linuxcnc(calibration, options)
+    elif options.requested:
         raise ParameterError(
             "is an option of --to linuxcnc alone", where=OPTIONS[options.requested[0]]
         )
-    return EXPORTERS[to](calibration)
+    else:
+        files = EXPORTERS[to](calibration)
+    warning = warn_against_verdict(calibration)
+    return _warned(files, warning) if warning else files
 
 
 def require_entering(calibration: Calibration) -> None:
-    """Refuse a calibration that is not to be entered.
+    """Refuse a calibration whose verdict is to review or to reject the readings.
 
     Raises:
-        ExportError: If its decision is not to enter it.
+        ExportError: If its verdict is not to enter it.
     """
-    decision = decide(calibration)
-    if decision.answer == "do not enter":
+    decision = assessment_of(calibration).decision
+    if decision.verdict != "enter":
         raise ExportError(f"{decision.headline} {decision.reason} {decision.action}".strip())
+
+
+def warn_against_verdict(calibration: Calibration) -> str:
+    """What is written with a calibration whose verdict is review or reject; empty otherwise."""
+    verdict = assessment_of(calibration).decision.verdict
+    if verdict == "enter":
+        return ""
+    return f"Written against the verdict '{verdict}' of the calibration (--anyway)."
+
+
+def _warned(files: dict[str, str], warning: str) -> dict[str, str]:
+    """Files of which one begins with a warning: errors.yaml, or README.md."""
+    if "errors.yaml" in files:
+        return {**files, "errors.yaml": f"# {warning}\n{files['errors.yaml']}"}
+    page = files.get("README.md", "")
+    return {**files, "README.md": f"**{warning}**\n" + (f"\n{page}" if page else "")}

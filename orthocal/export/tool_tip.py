@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError, ParameterError
-from orthocal.kinematics.compiled import compiled_robot, zero_poses
-from orthocal.kinematics.continuation import Failures
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import Assembly, Failures
+from orthocal.kinematics.robot_functions import reference_poses, robot_functions
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
@@ -67,8 +66,8 @@ class ToolTip:
         self.coordinates = list(robot.tcp.coordinates)
         """Indices of the coordinates that the drives control."""
         self._assembly = Assembly(robot, fixed=calibration.errors)
-        self._pose = compiled_robot(robot).pose(robot.tcp.frame)
-        (zero,) = zero_poses(robot, [robot.tcp.frame])
+        self._pose = robot_functions(robot).pose(robot.tcp.frame)
+        (zero,) = reference_poses(robot, [robot.tcp.frame])
         self.level = np.array(zero[:3, :3])
         """Rotation of the nominal platform at the mechanical zero, shape (3, 3)."""
 
@@ -124,7 +123,7 @@ class ToolTip:
         raise ExportError("the platform turns too much for a tool this long; use a shorter one")
 
     def _poses(self, drives: Array, start: Array | None) -> Array:
-        machine = self._assembly.machine()
+        machine = self._assembly.geometry()
         passive = self._assembly.close(drives, start=start)
         (poses,) = self._pose(machine.drives(drives), passive, machine.placements)
         return np.asarray(poses)

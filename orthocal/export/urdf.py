@@ -73,6 +73,8 @@ def _find_twists(robot: Robot, errors: Mapping[str, float]) -> dict[str, list[Ar
         if e.kind == "offset":
             offsets[e.owner] = joint_axis(robot.model, robot.model.getJointId(e.owner)) * value
             continue
+        if e.axis < 0:
+            raise ExportError(f"{name} is no error of a placement: a URDF cannot express it")
         owner = mounts.get(e.owner) if e.of_frame else e.owner
         if owner is None:
             raise ExportError(

@@ -1,211 +1,291 @@
-"""How likely readings are on a machine of which the tolerances alone are known.
+"""Marginal likelihood of readings of a machine of which only the tolerances are known.
 
-    y = h(θ̂) + J (θ − θ̂) + z + n,  θ ~ N(θ₀, e² P),  n ~ N(0, s² σ²),  z flat
+    y = h(θ) + z + n,  h(θ) ≈ h(θ₁) + J (θ − θ₁),  θ ~ N(θ₀, e² P),  n ~ N(0, s² σ²),  z flat
 
-with all errors of the machine and all that is not known of its sensors in θ. How many times their
-tolerances those are, e, and how many times what is stated of it the noise is, s, are known to a
-factor only, and summed over. The covariance e² J P Jᵀ + s² σ² has the same directions for all e
-and s, so that any number of edited readings is weighed by three products of matrices.
+with all errors of the machine and all nuisance parameters of its sensors in θ. The tolerance scale
+e and the noise scale s are known to a factor only and are summed over on a grid. The covariance
+e² J P Jᵀ + s² σ² has the same r principal directions for all e and s, so that any number of edited
+readings is scored by products with these directions.
 
-What is wrong with readings by an unknown amount, b d, is integrated over b ~ N(0, τ²) for a range
-of τ: a likelihood again, which is the less the wider it is.
+An effect of unknown amount, b w with b ~ N(0, τ²), is integrated over b in closed form and averaged
+over a grid of τ. Rows that say nothing are effects with a flat prior.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-EXCESSES = np.geomspace(0.1, 16.0, 9)
-"""Times the tolerances that errors of the machine are tried at."""
+TOLERANCE_SCALES = np.geomspace(0.1, 16.0, 9)
+"""Grid of the tolerance scale e."""
 
-EXCESS_SPREAD = 0.5
-"""Standard deviation of the logarithm of how many times its tolerances a machine's errors are."""
+TOLERANCE_SCALE_SPREAD = 0.5
+"""Prior standard deviation of ln e."""
 
-NOISES = np.geomspace(0.25, 32.0, 15)
-"""Times what is stated of it that the noise is tried at."""
+NOISE_SCALES = np.geomspace(0.25, 32.0, 15)
+"""Grid of the noise scale s."""
 
-NOISE_SPREAD = 0.25
-"""Standard deviation of the logarithm of how many times what is stated of it the noise is."""
+NOISE_SCALE_SPREAD = 0.25
+"""Prior standard deviation of ln s where the gauge's noise is stated."""
 
-NOISE_UNKNOWN = 1.5
-"""The same where nothing is stated; and of what is stated wrongly."""
+UNSTATED_SPREAD = 1.5
+"""Prior standard deviation of ln s where it is not stated, or wrongly stated."""
 
-STATED_WRONGLY = 0.05
-"""Share of the sessions in which what is stated of the noise says next to nothing."""
+WRONGLY_STATED = 0.05
+"""Prior probability that the stated noise is wrong."""
 
 AMOUNTS = np.geomspace(6.0, 6000.0, 4)
-"""Standard deviations τ of what is wrong by an unknown amount, over the noise."""
+"""Grid of the standard deviation τ of an effect's amount, over the noise."""
 
 LEAST = 1e-9
-"""Singular values below this part of the largest one count as none."""
+"""Ratio to the largest singular value below which a singular value counts as 0."""
+
+MOST_SEPARATE = 2
+"""Groups of effects up to which each has a τ of its own; beyond, all share one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Products:
+    """Inner products of vectors over the entries, gauge zeros projected out."""
+
+    along: Array
+    """With the principal directions, shape (h, r), [m]."""
+    square: Array
+    """With themselves, shape (h,), [m²]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Score:
+    """Marginal likelihood of one hypothesis, and its most likely numbers."""
+
+    log_likelihood: float
+    tolerance_scale: float
+    noise_scale: float
+    amounts: Array
+    """Of all effects, silent rows last, shape (k,), [m]."""
+    stds: Array
+    """Standard deviations of the amounts, shape (k,), [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Likelihood:
-    """What readings are like, zeros eliminated, about one linearisation."""
+    """Marginal likelihood about one linearisation."""
 
     directions: Array
-    """Orthonormal rows that errors move readings along, shape (r, n)."""
+    """Orthonormal principal directions of the entries, shape (r, n_entries)."""
     variances: Array
-    """Of readings along each, with errors at their tolerances, shape (r,), [m²]."""
+    """Variance along each with errors at their tolerances, shape (r,), [m²]."""
     sigma: float
-    """Standard deviation of a reading as stated, [m]."""
+    """Stated standard deviation of a reading, [m]."""
     dof: int
-    """Readings less zeros."""
+    """Number of entries less that of gauge zeros."""
     weights: Array
-    """Logarithms of the weights of all pairs (e, s), shape (g,)."""
+    """Logarithms of the prior weights of all pairs (e, s), shape (g,)."""
 
     @property
-    def _noise(self) -> Array:
+    def noise(self) -> Array:
         """s² σ² of all pairs, shape (g,), [m²]."""
-        return np.asarray(np.tile((NOISES * self.sigma) ** 2, EXCESSES.size))
+        return np.asarray(np.tile((NOISE_SCALES * self.sigma) ** 2, TOLERANCE_SCALES.size))
 
     @property
-    def _variance(self) -> Array:
-        """Along each direction for all pairs, shape (r, g), [m²]."""
-        excess = np.repeat(EXCESSES**2, NOISES.size)
-        return np.asarray(self.variances[:, None] * excess + self._noise)
+    def variance(self) -> Array:
+        """Variance along each direction for all pairs, shape (r, g), [m²]."""
+        scale = np.repeat(TOLERANCE_SCALES**2, NOISE_SCALES.size)
+        return np.asarray(self.variances[:, None] * scale + self.noise)
 
-    def weigh(self, deviations: Array, wrong: Array | None = None) -> Array:
-        """Logarithms of how likely readings are, up to a constant that all share.
+    def products(self, vectors: Array) -> Products:
+        """Products of dense vectors, zeros projected out, shape (h, n_entries), [m]."""
+        return Products(vectors @ self.directions.T, (vectors**2).sum(axis=1))
+
+    def information(self, effects: Products) -> Array:
+        """Inverse variance of the amount of each effect, shape (h,), [1/m²].
+
+        With errors at their tolerances and the stated noise.
+        """
+        beside = np.maximum(effects.square - (effects.along**2).sum(axis=1), 0.0)
+        noise = self.sigma**2
+        return np.asarray(effects.along**2 @ (1.0 / (self.variances + noise)) + beside / noise)
+
+    def estimate_amount(self, deviation: Array, effect: Array) -> tuple[float, float]:
+        """Amount of an effect without prior, errors at their tolerances, noise as stated.
 
         Args:
-            deviations: Readings less those of the machine as expected, zeros eliminated, shape
-                (h, n), [m].
-            wrong: What each of them may be wrong by, up to an unknown amount, zeros eliminated,
-                shape (h, n); zeros where nothing is.
+            deviation: Readings less predictions, shape (n_entries,), zeros projected out, [m].
+            effect: Effect per unit, shape (n_entries,), zeros projected out.
+
+        Returns:
+            The amount and its standard deviation; 0 and infinity if the entries do not show it.
         """
-        logs, _ = self._weigh_pairs(deviations, wrong)
+        products = self.products(np.array([effect, deviation]))
+        information = float(self.information(products)[0])
+        if not information > 0.0:
+            return 0.0, np.inf
+        along, noise = products.along, self.sigma**2
+        beside = effect @ deviation - along[0] @ along[1]
+        slope = along[0] @ (along[1] / (self.variances + noise)) + beside / noise
+        return float(slope) / information, information**-0.5
+
+    def score(
+        self, deviations: Products, effects: Products | None = None, cross: Array | None = None
+    ) -> Array:
+        """Logarithm of the marginal likelihood of many hypotheses, up to a common constant.
+
+        Args:
+            deviations: Readings less predictions of each hypothesis.
+            effects: Effect of unknown amount of each hypothesis, per unit.
+            cross: Inner products of effect and deviation, shape (h,), [m²].
+
+        Returns:
+            Shape (h,).
+        """
+        logs = self._on_grid(deviations)
+        if effects is not None and cross is not None:
+            inverse, noise = 1.0 / self.variance, self.noise
+            beside = np.maximum(effects.square - (effects.along**2).sum(axis=1), 0.0)
+            remaining = cross - (effects.along * deviations.along).sum(axis=1)
+            information = effects.along**2 @ inverse + beside[:, None] / noise
+            slope = (effects.along * deviations.along) @ inverse + remaining[:, None] / noise
+            logs = logs + self._gain(information, slope)
         return np.asarray(log_of_sum(logs + self.weights, axis=1))
 
-    def settle(self, deviation: Array, wrong: Array | None = None) -> tuple[float, float, float]:
-        """Most likely excess and noise, as multiples, and amount of what is wrong, [m]."""
-        d = None if wrong is None else wrong[None]
-        logs, amounts = self._weigh_pairs(deviation[None], d)
-        best = int(np.argmax(logs[0] + self.weights))
-        e, s = divmod(best, NOISES.size)
-        return float(EXCESSES[e]), float(NOISES[s]), float(amounts[0, best])
+    def _gain(self, information: Array, slope: Array) -> Array:
+        gains = []
+        for tau in (AMOUNTS * self.sigma) ** 2:
+            widened = 1.0 + tau * information
+            gains.append(0.5 * (tau * slope**2 / widened - np.log(widened)))
+        return np.asarray(log_of_sum(np.array(gains), axis=0) - np.log(AMOUNTS.size))
 
-    def weigh_without(self, deviation: Array, rows: Array) -> float:
-        """Logarithm of how much likelier readings are where some of them may be anything.
-
-        That is of the density of the others over that of all, [m^k] for k rows.
-
-        Args:
-            deviation: As above, shape (n,), [m].
-            rows: What each of the k rows does to readings, zeros eliminated, shape (k, n).
-        """
-        known, square, slope = self._weigh_rows(deviation, rows)
-        logs = 0.5 * (_quadratic(square, slope) - np.linalg.slogdet(square)[1])
-        logs += 0.5 * len(rows) * np.log(2.0 * np.pi)
-        return float(log_of_sum(known + logs) - log_of_sum(known))
-
-    def weigh_loose(self, deviation: Array, rows: Array) -> tuple[float, Array]:
-        """Logarithm of how likely readings are where each of some may be off by its own amount.
-
-        Args:
-            deviation: As above, shape (n,), [m].
-            rows: What each of k unknown amounts does to readings, zeros eliminated, shape (k, n).
-
-        Returns:
-            That, as `weigh`; and the most likely amounts, shape (k,), [m].
-        """
-        known, square, slope = self._weigh_rows(deviation, rows)
-        logs = []
-        for amount in (AMOUNTS * self.sigma) ** 2:
-            widened = np.eye(len(rows)) + amount * square
-            gain = amount * _quadratic(widened, slope) - np.linalg.slogdet(widened)[1]
-            logs.append(0.5 * gain)
-        every = known + log_of_sum(np.array(logs), axis=0) - np.log(AMOUNTS.size)
-        best = int(np.argmax(every))
-        amounts = np.linalg.lstsq(square[best], slope[:, best], rcond=None)[0]
-        return float(log_of_sum(every)), amounts
-
-    def _weigh_rows(self, deviation: Array, rows: Array) -> tuple[Array, Array, Array]:
-        """Readings, and what k rows D do to them, for all pairs (e, s).
-
-        Returns:
-            Logarithms of how likely they are as they are, shape (g,); Dᵀ V⁻¹ D, (g, k, k); and
-            Dᵀ V⁻¹ y, (k, g).
-        """
-        (known,), _ = self._weigh_pairs(deviation[None], None)
-        inverse, rest = 1.0 / self._variance, 1.0 / self._noise
-        along, own = self.directions @ deviation, rows @ self.directions.T
-        beside = rows - own @ self.directions
-        square = np.einsum("kr,rg,lr->gkl", own, inverse, own)
-        square += rest[:, None, None] * (beside @ beside.T)
-        slope = (own * along) @ inverse + np.outer(beside @ deviation, rest)
-        return np.asarray(known + self.weights), square, np.asarray(slope)
-
-    def _weigh_pairs(self, deviations: Array, wrong: Array | None) -> tuple[Array, Array]:
-        """Logarithms for all pairs, shape (h, g); and most likely amounts, shape (h, g)."""
-        variance, noise = self._variance, self._noise
-        inverse = 1.0 / variance
-        along = deviations @ self.directions.T
-        beside = np.maximum((deviations**2).sum(axis=1) - (along**2).sum(axis=1), 0.0)
-        squares = along**2 @ inverse + beside[:, None] / noise
+    def _on_grid(self, deviations: Products) -> Array:
+        """Logarithms for all pairs (e, s), shape (h, g)."""
+        variance, noise = self.variance, self.noise
+        beside = np.maximum(deviations.square - (deviations.along**2).sum(axis=1), 0.0)
+        squares = deviations.along**2 @ (1.0 / variance) + beside[:, None] / noise
         logs = -0.5 * (squares + np.log(variance).sum(axis=0))
-        logs -= 0.5 * max(self.dof - len(variance), 0) * np.log(noise)
-        if wrong is None:
-            return logs, np.zeros_like(logs)
-        own = wrong @ self.directions.T
-        square = np.maximum((wrong**2).sum(axis=1) - (own**2).sum(axis=1), 0.0)
-        cross = (wrong * deviations).sum(axis=1) - (own * along).sum(axis=1)
-        information = own**2 @ inverse + square[:, None] / noise
-        slope = (own * along) @ inverse + cross[:, None] / noise
-        amounts = (AMOUNTS * self.sigma) ** 2
-        widened = 1.0 + amounts[:, None, None] * information
-        gains = 0.5 * (amounts[:, None, None] * slope**2 / widened - np.log(widened))
-        logs = logs + log_of_sum(gains, axis=0) - np.log(amounts.size)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return logs, np.nan_to_num(slope / information)
+        return np.asarray(logs - 0.5 * max(self.dof - len(variance), 0) * np.log(noise))
+
+    def score_set(
+        self, deviation: Array, groups: Sequence[Array] = (), silent: Array | None = None
+    ) -> Score:
+        """Marginal likelihood of one deviation with any number of effects.
+
+        Args:
+            deviation: Shape (n_entries,), zeros projected out, [m].
+            groups: Effects per unit, zeros projected out, (k, n_entries) each; the amounts of a
+                group share one prior standard deviation τ.
+            silent: Indicators of rows that say nothing, zeros projected out, (m, n_entries).
+        """
+        logs = self._on_grid(self.products(deviation[None]))[0] + self.weights
+        sizes = [len(g) for g in groups]
+        n_silent = 0 if silent is None else len(silent)
+        if not sum(sizes) + n_silent:
+            return self._best(logs, np.zeros((logs.size, 0)), np.zeros((logs.size, 0, 0)))
+        vectors = np.concatenate([*groups, *([] if silent is None else [silent])])
+        gram, slope = self._gram(deviation, vectors)
+        separate = len(sizes) <= MOST_SEPARATE
+        grid = (
+            list(product(AMOUNTS, repeat=len(sizes)))
+            if separate
+            else [(a,) * len(sizes) for a in AMOUNTS]
+        )
+        gains = []
+        for taus in grid:
+            precision = np.repeat(1.0 / (np.array(taus) * self.sigma) ** 2, sizes)
+            full = gram + np.diag(np.append(precision, np.zeros(n_silent)))
+            found = np.linalg.solve(full, slope[..., None])[..., 0]
+            gain = 0.5 * ((slope * found).sum(axis=1) - np.linalg.slogdet(full)[1])
+            gains.append(gain + 0.5 * np.log(precision).sum())
+        every = logs + log_of_sum(np.array(gains), axis=0) - np.log(len(grid))
+        every = every + 0.5 * n_silent * np.log(2.0 * np.pi)
+        floor = 1e-12 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(len(vectors))
+        gram = gram + floor
+        return self._best(every, np.linalg.solve(gram, slope[..., None])[..., 0], gram)
+
+    def _best(self, logs: Array, amounts: Array, gram: Array) -> Score:
+        best = int(np.argmax(logs))
+        e, s = divmod(best, NOISE_SCALES.size)
+        return Score(
+            float(log_of_sum(logs)),
+            float(TOLERANCE_SCALES[e]),
+            float(NOISE_SCALES[s]),
+            amounts[best],
+            np.sqrt(np.diag(np.linalg.inv(gram[best]))),
+        )
+
+    def _gram(self, deviation: Array, vectors: Array) -> tuple[Array, Array]:
+        """W V⁻¹ Wᵀ, shape (g, k, k), and W V⁻¹ d, shape (g, k), for all pairs (e, s)."""
+        inverse, rest = 1.0 / self.variance, 1.0 / self.noise
+        along, own = self.directions @ deviation, vectors @ self.directions.T
+        beside = vectors - own @ self.directions
+        gram = np.einsum("kr,rg,lr->gkl", own, inverse, own)
+        gram += rest[:, None, None] * (beside @ beside.T)
+        slope = ((own * along) @ inverse + np.outer(beside @ deviation, rest)).T
+        return gram, np.asarray(slope)
 
 
 def log_of_sum(logs: Array, axis: int | None = None) -> Array:
-    """Logarithm of the sum of numbers whose logarithms are given."""
+    """Logarithm of the sum of numbers given by their logarithms."""
     top = logs.max(axis=axis, keepdims=True)
     total = np.log(np.exp(logs - top).sum(axis=axis, keepdims=True)) + top
     return np.asarray(total.squeeze(axis))
 
 
-def _quadratic(square: Array, slope: Array) -> Array:
-    """bᵀ K⁻¹ b of all pairs, shape (g,), of K (g, k, k) and b (k, g)."""
-    found = np.linalg.solve(square, slope.T[..., None])[..., 0]
-    return np.asarray((slope.T * found).sum(axis=1))
-
-
-def likelihood_of(
-    slopes: Array, *, sigma: float, dof: int, stated: bool
+def build_likelihood(
+    jacobian: Array, *, sigma: float, dof: int, stated: bool
 ) -> tuple[Likelihood, Array, Array]:
-    """What readings are like about a linearisation; its errors along each direction, and sizes.
+    """Likelihood about a linearisation.
 
     Args:
-        slopes: ∂h of one tolerance of each error, zeros eliminated, shape (n, p), [m].
+        jacobian: ∂h per tolerance of each error, zeros projected out, (n_entries, n_free), [m].
         sigma: Standard deviation of a reading, [m].
-        dof: Readings less zeros.
-        stated: Whether anything is stated of that standard deviation.
+        dof: Number of entries less that of gauge zeros.
+        stated: Whether that standard deviation is stated.
+
+    Returns:
+        The likelihood; errors of the machine per principal direction, shape (n_free, r); and the
+        singular values, shape (r,), [m].
     """
-    errors, sizes, rows = np.linalg.svd(slopes.T, full_matrices=False)
-    kept = sizes > LEAST * max(float(sizes.max(initial=0.0)), sigma)
-    excess = -0.5 * (np.log(EXCESSES) / EXCESS_SPREAD) ** 2
-    noise = _normal(NOISES, NOISE_UNKNOWN)
-    if stated:
-        noise = np.logaddexp(
-            np.log1p(-STATED_WRONGLY) + _normal(NOISES, NOISE_SPREAD),
-            np.log(STATED_WRONGLY) + noise,
-        )
-    weights = np.repeat(excess - log_of_sum(excess), NOISES.size)
+    n, p = jacobian.shape
+    if n > 2 * p:  # principal directions of a tall matrix by its triangular factor
+        q, triangle = np.linalg.qr(jacobian)
+        left, sizes, errors = np.linalg.svd(triangle, full_matrices=False)
+        kept = sizes > LEAST * max(float(sizes.max(initial=0.0)), sigma)
+        directions = (q @ left[:, kept]).T
+    else:
+        left, sizes, errors = np.linalg.svd(jacobian, full_matrices=False)
+        kept = sizes > LEAST * max(float(sizes.max(initial=0.0)), sigma)
+        directions = left[:, kept].T
+    scale = -0.5 * (np.log(TOLERANCE_SCALES) / TOLERANCE_SCALE_SPREAD) ** 2
+    noise = noise_weights(stated=stated)
+    weights = np.repeat(scale - log_of_sum(scale), NOISE_SCALES.size)
     likelihood = Likelihood(
-        rows[kept], sizes[kept] ** 2, sigma, dof, weights + np.tile(noise, EXCESSES.size)
+        np.ascontiguousarray(directions),
+        sizes[kept] ** 2,
+        sigma,
+        dof,
+        weights + np.tile(noise, TOLERANCE_SCALES.size),
     )
-    return likelihood, errors[:, kept], sizes[kept]
+    return likelihood, errors[kept].T, sizes[kept]
 
 
-def _normal(values: Array, spread: float) -> Array:
+def noise_weights(*, stated: bool) -> Array:
+    """Log prior weights of NOISE_SCALES, shape (n_scales,).
+
+    Args:
+        stated: Whether the standard deviation of a reading is stated.
+    """
+    noise = _log_normal(NOISE_SCALES, UNSTATED_SPREAD)
+    if not stated:
+        return noise
+    known = np.log1p(-WRONGLY_STATED) + _log_normal(NOISE_SCALES, NOISE_SCALE_SPREAD)
+    return np.asarray(np.logaddexp(known, np.log(WRONGLY_STATED) + noise))
+
+
+def _log_normal(values: Array, spread: float) -> Array:
     logs = -0.5 * (np.log(values) / spread) ** 2
     return np.asarray(logs - log_of_sum(logs))

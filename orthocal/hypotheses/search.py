@@ -1,332 +1,558 @@
-"""Which mistakes the readings speak for: all that are known, weighed against each other.
+"""Search for anomalies: all hypotheses scored by one marginal likelihood, several at once.
 
-Each edit makes the readings more or less likely. All together, with equal weights for families and
-for the edits of each, they are one hypothesis against that of no mistake; its likelihood ratio
-exceeds e^c by chance once in e^c sound sessions at most (Markov's inequality), however many edits
-are tried. What is named must be far likelier than all other edits; else it is one of several.
+Families of hypotheses share the prior probability, and the hypotheses of each share that of their
+family. The Bayes factor of their mixture against no anomaly exceeds e^c by chance in at most one of
+e^c sound sessions (Markov's inequality), however many are tried. Anomalies are added one after the
+other (forward selection), in small sessions two at once as well (`pairs.py`), and taken out again
+where the others explain them (backward elimination). The best ones are linearised anew.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.hypotheses.edits import Edit, Family, Table
-from orthocal.hypotheses.families.displaced_gauge import find_moved
-from orthocal.hypotheses.families.inconsistent_group import find_loose
-from orthocal.hypotheses.families.row_offset import find_shifted
-from orthocal.hypotheses.families.single_reading import find_single
-from orthocal.hypotheses.families.swapped_rows import find_exchanged
-from orthocal.hypotheses.families.unit_and_sign import find_scaled
-from orthocal.hypotheses.likelihood import log_of_sum
-from orthocal.hypotheses.mistake import Mistake
-from orthocal.hypotheses.reading_model import Linearised, ReadingModel
+from orthocal.errors import ClosureError
+from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind
+from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
+from orthocal.hypotheses.families.inconsistent_group import inconsistent_groups
+from orthocal.hypotheses.families.row_offset import row_offsets
+from orthocal.hypotheses.families.sessions import MOST_DRIVES, changes_between_sessions
+from orthocal.hypotheses.families.single_reading import wrong_readings
+from orthocal.hypotheses.families.swapped_rows import swapped_rows
+from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
+from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, marks
+from orthocal.hypotheses.hypothesis_set import (
+    HypothesisSet,
+    Term,
+    correct_rows,
+    distinct_terms,
+    explain_with_amounts,
+    find_alternatives,
+    is_local,
+    is_same_place,
+    negative_log_posterior,
+    share_rows,
+    split_amounts,
+)
+from orthocal.hypotheses.likelihood import Products, log_of_sum
+from orthocal.hypotheses.linear_model import (
+    FURTHEST,
+    MOST_ROUNDS,
+    NEAR,
+    Linearisation,
+    LinearModel,
+)
+from orthocal.hypotheses.pairs import Singles, find_pairs
 from orthocal.session.session import Session
 
 Array = NDArray[np.float64]
 
 CLEARLY = 7.0
-"""Logarithm of the factor by which mistakes must make readings likelier: by chance once in e⁷ =
-1,100 sessions."""
+"""Logarithm of the Bayes factor from which on an anomaly is reported: by chance in at most one of
+e⁷ = 1,100 sessions."""
 
 NEARLY = 3.0
-"""Logarithm of the factor up to which another mistake is nearly as likely."""
+"""Logarithm of the Bayes factor up to which another explanation is nearly as likely."""
 
-FAMILIES = 24.0
-"""Families that share what is likely beforehand."""
+WORTH_REFITTING = 4.0
+"""Logarithm of the Bayes factor, to first order, from which on hypotheses are linearised anew."""
 
-MOST_ROUNDS = 4
-"""Mistakes that are sought one after the other."""
+FAMILIES = 28.0
+"""Families that share the prior probability."""
 
-MOST_REFITTED = 6
-"""Edits that are linearised where they lead."""
+MOST_ANOMALIES = 4
+"""Anomalies that are sought in a session."""
 
-LARGEST_EXCESS = 5.0
-"""Times its tolerances that no machine's errors are."""
+MOST_REFITTED = 8
+"""Single hypotheses that are linearised anew in each step."""
 
-LARGEST_NOISE = 2.5
-"""Times what is stated of it that no noise is, once mistakes are mended."""
+MOST_PAIRS_REFITTED = 12
+"""Pairs that are linearised anew."""
 
-IN_A_ROW = ("bumped stand", "shifted rows", "stuck dial")
-"""Kinds of mistake that begin somewhere and go on."""
+COARSE = 2.0
+"""Logarithm of the Bayes factor below 1 at which a pair is left out after the coarse grid: the sum
+over the full grid of scales may exceed its largest term by that and `WORTH_REFITTING`."""
 
-MOST_OTHERS = 3
-"""Others that are told where several are nearly as likely."""
+MOST_COMBINED = 5
+"""Most likely single hypotheses that are combined in pairs where none by itself leaves readings
+that a machine shows."""
 
-MOST_ROWS = 1500
-"""Rows of a session beyond which none is looked at by itself."""
+MOST_PAIRED = 60
+"""Rows of a session up to which pairs of hypotheses are considered."""
 
+LARGEST_TOLERANCE_SCALE = 5.0
+"""Tolerance scale that no machine reaches."""
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Weighed:
-    """An edit, and how much likelier it makes the readings."""
+LARGEST_NOISE_SCALE = 2.5
+"""Noise scale that no gauge with a stated noise reaches."""
 
-    edit: Edit
-    change: Array
-    wrong: Array | None
-    prior: float
-    """Logarithms of its weight, and of what it does to volumes."""
-    unknown: tuple[int, ...]
-    loose: Array | None
-    evidence: float
+LARGEST_VOLUME = float(np.log(1000.0))
+"""Logarithm of the factor on volumes beyond which a family is not considered in pairs."""
 
 
-def find_mistakes(session: Session, model: str | None = None) -> tuple[Mistake, ...]:
-    """Mistakes that the readings speak for, each once those before it were mended.
+LEAST_EFFECT = 1e-3
+"""Part of the noise by which a change of one tolerance must move the readings to be considered."""
 
-    None is told where what they leave is not what a machine shows: then something else is odd.
+CHUNK = 4096
+"""Hypotheses that are scored at a time, for their memory."""
+
+
+def find_anomalies(session: Session, model: str | None = None) -> Anomalies:
+    """Find what is wrong with a session, from its readings and its robot alone.
 
     Args:
-        session: The session.
-        model: Errors that the machine may have; all that change something by default.
+        session: A session, or several joined ones; rows that were not read are not in it.
+        model: Model of the errors that the machine may have; all by default.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
-        RobotError: If the closures of the robot depend on each other.
+        RobotError: If closures of the robot depend on each other.
         ParameterError: If the model is unknown.
     """
-    if len(session.readings) < 2:
-        return ()
-    readings = ReadingModel(session, model)
-    if readings.dof < 1:
-        return ()
-    found: list[Mistake] = []
-    about, plausible = readings.reference_machine(), True
-    for _ in range(MOST_ROUNDS):
-        step = _find_one(readings, Table(session), about)
-        if step is None:
-            break
-        found.append(step.mistake)
-        about, plausible = step.about, step.plausible
-        if step.mistake.others or step.mistake.kind == "stuck dial":
-            break
-        session = session.with_values(step.mended)
-    return tuple(found) if plausible else ()
+    linear = LinearModel(session, model)
+    if len(session.readings) < 2 or linear.dof < 1:
+        return Anomalies((), 0.0, True, 0.0, 0.0, 1.0, 1.0)
+    return _Search(session, linear).run()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Step:
-    """A mistake that was found, and what there is once it is mended."""
+class _Search:
+    """The search in one session."""
 
-    mistake: Mistake
-    mended: Array
-    """Rows, shape (n_rows,), [m]."""
-    about: Linearised
-    """The machine that they are of."""
-    plausible: bool
-    """Whether they are what a machine shows."""
+    def __init__(self, session: Session, model: LinearModel) -> None:
+        self.session = session
+        self.model = model
+        self.values = session.values
+        self.slopes = len(model.labels) > 1
+        start = model.linearise(np.zeros(model.problem.n_free), (), None, slopes=self.slopes)
+        self.sound = self.evaluate((), start)
 
+    def run(self) -> Anomalies:
+        """Forward selection, backward elimination and their result.
 
-def _find_one(readings: ReadingModel, table: Table, start: Linearised) -> _Step | None:
-    """The likeliest mistake, with others that are nearly as likely."""
-    values = table.values
-    about = readings.settle(values, None, start)
-    deviation = readings.deviations(values[None], about)[0]
-    sound = float(about.likelihood.weigh(deviation[None])[0])
-    known = list(_weigh(readings, table, about, deviation, sound, _families(readings, table)))
-    if not known or log_of_sum(np.concatenate([e for _, e in known])) < CLEARLY:
-        return None
-    if table.count <= MOST_ROWS:
-        known += _weigh(readings, table, about, deviation, sound, find_loose(table))
-    weighed = [w for family, evidence in known for w in _likeliest(family, evidence)]
-    tried = [_refit(readings, values, w, sound, about) for w in _shortlist(weighed)]
-    ranked = sorted(tried, key=lambda r: -r.weighed.evidence)
-    # of several mistakes at once a single one leaves readings that no machine shows
-    whole = [r for r in ranked if r.plausible]
-    single = [r for r in ranked if r.weighed.wrong is not None and len(r.weighed.edit.rows) == 1]
-    chosen = whole or single
-    if not chosen or chosen[0].weighed.evidence < CLEARLY:
-        return None
-    best, least = chosen[0], chosen[0].weighed.evidence - NEARLY
-    near = [r for r in chosen[1:] if r.weighed.evidence > least]
-    here = [r for r in near if _is_same_place(best.weighed.edit, r.weighed.edit)]
-    before = readings.left_at_first(values, about)
-    mistake = _told(readings, best, before, here)
-    others = [_told(readings, r, before, []) for r in near if r not in here][:MOST_OTHERS]
-    return _Step(replace(mistake, others=tuple(others)), best.mended, best.about, bool(whole))
+        A unit or a decimal point of many readings explains several gross errors a little: where one
+        is found, single readings are tried by themselves as well.
+        """
+        state, near = self._select(grouped=True)
+        if any(t.explanation.factor and len(t.explanation.rows) > 1 for t in state.terms):
+            other = self._select(grouped=False)
+            if other[0].log_posterior > state.log_posterior + NEARLY:
+                state, near = other
+        return self._result(state, near)
 
+    def _select(
+        self, *, grouped: bool
+    ) -> tuple[HypothesisSet, list[tuple[HypothesisSet, HypothesisSet]]]:
+        """A set of hypotheses, and others nearly as likely beside each step that led to it.
 
-def _is_same_place(one: Edit, other: Edit) -> bool:
-    """Whether two edits concern the same rows, or tails that begin a row apart."""
-    if set(one.rows) == set(other.rows):
-        return len(one.rows) == 1 or one.kind == other.kind or not (one.setups or other.setups)
-    apart = set(one.rows) ^ set(other.rows)
-    return one.kind == other.kind and one.kind in IN_A_ROW and len(apart) <= 1
+        Args:
+            grouped: Whether units and signs of groups of readings are considered.
+        """
+        state = self.sound
+        near: list[tuple[HypothesisSet, HypothesisSet]] = []
+        while len(state.terms) < MOST_ANOMALIES:
+            found, alternatives = self._step(state, grouped=grouped)
+            if found is None:
+                break
+            state = self._eliminate(found)
+            near += [(found, s) for s in alternatives]
+            if alternatives and not is_local(self.session, state, alternatives):
+                break
+        return state, near
 
-
-def _families(readings: ReadingModel, table: Table) -> Iterator[Family]:
-    yield from find_scaled(table, readings.sigma)
-    yield from find_moved(table)
-    if table.count <= MOST_ROWS:
-        yield from find_single(table)
-        yield from find_exchanged(table)
-        yield from find_shifted(table)
-
-
-def _weigh(
-    readings: ReadingModel,
-    table: Table,
-    about: Linearised,
-    deviation: Array,
-    sound: float,
-    families: Iterable[Family],
-) -> Iterator[tuple[Family, Array]]:
-    """Families, and how much likelier each of their edits makes the readings."""
-    for family in families:
-        if family.unknown:
-            logs = np.array(
-                [_weigh_unknown(readings, table, about, deviation, u) for u in family.unknown]
+    def evaluate(self, terms: Sequence[Term], start: Linearisation) -> HypothesisSet:
+        """Score a set of hypotheses, linearised where it leads."""
+        model = self.model
+        rows = self.values + sum((t.change for t in terms if t.change is not None), 0.0)
+        entries = model.entries(rows[None])[0]
+        known = [t.shift for t in terms if t.shift is not None and t.known]
+        free = [t.shift for t in terms if t.shift is not None and not t.known]
+        applied, about = np.zeros(len(free)), start
+        if known or free:
+            base = self.sound.about
+            about = model.linearise(base.theta, known, base.passive, slopes=True)
+        last = about.theta
+        for k in range(MOST_ROUNDS + 1):
+            groups, silent, steps = self._vectors(terms, about)
+            deviation = entries - about.expected + applied @ steps
+            score = about.likelihood.score_set(deviation, groups, silent)
+            every = [*groups, *([] if silent is None else [silent])]
+            remaining = deviation - (score.amounts @ np.concatenate(every) if every else 0.0)
+            errors = about.errors_for(
+                remaining, tolerance_scale=score.tolerance_scale, noise_scale=score.noise_scale
             )
-        elif family.loose:
-            of_each = [readings.entries(rows) for rows in family.loose]
-            logs = np.array([about.likelihood.weigh_loose(deviation, r)[0] for r in of_each])
-            logs -= sound
+            amounts, stds = (split_amounts(terms, a) for a in (score.amounts, score.stds))
+            if k == MOST_ROUNDS or np.abs(errors - last).max(initial=0.0) < NEAR:
+                break
+            if not np.abs(errors).max(initial=0.0) < FURTHEST:
+                break
+            step = np.array(
+                [a[0] for t, a in zip(terms, amounts, strict=True) if t.shift and not t.known]
+            )
+            shifts = [
+                replace(s, direction=s.direction * a) for s, a in zip(free, step, strict=True)
+            ]
+            try:
+                about = model.linearise(
+                    errors, [*known, *shifts], about.passive, slopes=self.slopes
+                )
+            except (ClosureError, np.linalg.LinAlgError):
+                break
+            last, applied = errors, step
+        return HypothesisSet(
+            tuple(terms), score, about, remaining, correct_rows(rows, terms, amounts), amounts, stds
+        )
+
+    def _vectors(
+        self, terms: Sequence[Term], about: Linearisation
+    ) -> tuple[list[Array], Array | None, Array]:
+        """Effects of each term on the entries, silent rows, and effects of unknown shifts."""
+        model, groups, silent, steps = self.model, [], [], []
+        for t in terms:
+            if t.effects is not None:
+                groups.append(model.entries(t.effects))
+            elif t.shift is not None and not t.known:
+                groups.append(model.shift_entries(about, t.shift)[None])
+                steps.append(groups[-1][0])
+            elif t.silent is not None:
+                silent.append(model.entries(_indicators(t.silent, self.values.size)))
+        return (
+            groups,
+            np.concatenate(silent) if silent else None,
+            np.array(steps).reshape(len(steps), -1 if steps else about.expected.size),
+        )
+
+    def _step(
+        self, state: HypothesisSet, *, grouped: bool
+    ) -> tuple[HypothesisSet | None, list[HypothesisSet]]:
+        """The best set with one or two hypotheses more, and others nearly as likely."""
+        rows = Rows(self.session, state.corrected)
+        scored = list(self._score(state, _families(self.model, rows, grouped=grouped)))
+        totals = [log_of_sum(evidence) for _, evidence in scored if evidence.size]
+        pairs, total = self._pairs(state, scored)
+        best = float(log_of_sum(np.array([*totals, total]))) if totals else -np.inf
+        if best < WORTH_REFITTING:
+            return None, []
+        scored += list(self._score(state, inconsistent_groups(rows)))
+        single = self._shortlist(scored, rows)
+        chosen = [*((t,) for t in single), *pairs, *self._moved_together(state, scored, rows)]
+        tried = [self.evaluate((*state.terms, *more), state.about) for more in chosen]
+        likeliest = min(tried, key=negative_log_posterior)
+        if not self.is_plausible(likeliest) and len(state.terms) + 2 <= MOST_ANOMALIES:
+            tried += self._combine(state, single)
+        ranked = sorted(tried, key=negative_log_posterior)
+        # of several anomalies at once a single one leaves readings that no machine shows
+        plausible = [s for s in ranked if self.is_plausible(s)]
+        if plausible and plausible[0].log_posterior > ranked[0].log_posterior - CLEARLY:
+            ranked = plausible
+        if ranked[0].log_posterior < state.log_posterior + CLEARLY:
+            return None, []
+        near = [s for s in ranked if s.log_posterior > ranked[0].log_posterior - NEARLY]
+        simplest = min(near, key=lambda s: s.size)
+        if is_same_place(simplest, near[0]):
+            simplest = near[0]
+        return simplest, [s for s in near if s is not simplest]
+
+    def _moved_together(
+        self, state: HypothesisSet, scored: list[tuple[Family, Array]], rows: Rows
+    ) -> Iterator[tuple[Term, ...]]:
+        """Changes of two or more drives between the same sessions: one alone explains little."""
+        before = {(t.explanation.drives, t.explanation.sessions) for t in state.terms}
+        since: dict[tuple[str, ...], list[Term]] = {}
+        for family, _ in scored:
+            for h in range(len(family.shifts) if not family.known else 0):
+                e = family.explain(h)
+                if e.drives and (e.drives, e.sessions) not in before:
+                    since.setdefault(e.sessions, []).append(self._term(family, h, rows))
+        for terms in since.values():
+            if len(terms) <= MOST_DRIVES:
+                for count in range(2, min(len(terms), MOST_ANOMALIES - len(state.terms)) + 1):
+                    yield from combinations(terms, count)
+
+    def _combine(self, state: HypothesisSet, single: list[Term]) -> list[HypothesisSet]:
+        """Sets with two of the most likely hypotheses, where neither suffices by itself."""
+        apart = combinations(distinct_terms(single)[:MOST_COMBINED], 2)
+        tried = [self.evaluate((*state.terms, *more), state.about) for more in apart]
+        if not tried:
+            return []
+        one, other = min(tried, key=negative_log_posterior).terms[-2:]
+        others = [
+            (t, kept)
+            for out, kept in ((one, other), (other, one))
+            for t in single
+            if t is not out and not share_rows(t, kept) and share_rows(t, out)
+        ]
+        return tried + [self.evaluate((*state.terms, *more), state.about) for more in others]
+
+    def is_plausible(self, state: HypothesisSet) -> bool:
+        """True if the corrected readings are those of a machine near its tolerances."""
+        score = state.score
+        quiet = score.noise_scale < LARGEST_NOISE_SCALE or not self.model.stated
+        return score.tolerance_scale < LARGEST_TOLERANCE_SCALE and quiet
+
+    def _eliminate(self, state: HypothesisSet) -> HypothesisSet:
+        """Take out hypotheses that the others make superfluous."""
+        while len(state.terms) > 1:
+            fewer = [
+                self.evaluate([t for t in state.terms if t is not out], self.sound.about)
+                for out in state.terms
+            ]
+            best = max(fewer, key=lambda s: s.log_posterior)
+            if best.log_posterior < state.log_posterior - NEARLY:
+                break
+            state = best
+        return state
+
+    def _score(
+        self, state: HypothesisSet, families: Iterable[Family]
+    ) -> Iterator[tuple[Family, Array]]:
+        """Log evidence of each hypothesis of families beside those of a state, to first order."""
+        likelihood = state.about.likelihood
+        deviation = state.remaining
+        base = likelihood.products(deviation[None])
+        sound = float(likelihood.score(base)[0])
+        for family in families:
+            if family.groups:
+                logs = np.array(
+                    [
+                        likelihood.score_set(
+                            deviation, [self.model.entries(_marks(g, self.values.size))]
+                        ).log_likelihood
+                        for g in family.groups
+                    ]
+                )
+            elif family.silent:
+                logs = np.array([self._score_silent(state, rows) for rows in family.silent])
+            elif family.shifts:
+                logs = self._score_shifts(state, family)
+            else:
+                logs = np.concatenate(
+                    [
+                        self._score_rows(state, family, slice(k, k + CHUNK), base)
+                        for k in range(0, family.count, CHUNK)
+                    ]
+                )
+            yield family, logs - sound + _prior(family)
+
+    def _score_rows(
+        self, state: HypothesisSet, family: Family, chosen: slice, base: Products
+    ) -> Array:
+        model, about, deviation = self.model, state.about, state.remaining
+        products, inner = base, np.zeros(1)
+        edits = None if family.edits is None else family.edits.select(chosen)
+        if edits is not None:
+            changed, cross = model.products(edits, about, deviation)
+            products = Products(
+                base.along + changed.along, base.square + 2.0 * cross + changed.square
+            )
+        if family.effects is None:
+            return about.likelihood.score(products)
+        effects = family.effects.select(chosen)
+        added, cross = model.products(effects, about, deviation)
+        if edits is not None:
+            inner = model.inner(edits, effects)
         else:
-            wrong = None if family.wrong is None else readings.entries(family.wrong)
-            edited = deviation + readings.entries(family.change)
-            logs = about.likelihood.weigh(edited, wrong) - sound
-        yield family, logs + _prior(family)
+            products = Products(
+                np.broadcast_to(base.along, added.along.shape),
+                np.broadcast_to(base.square, added.square.shape),
+            )
+        return about.likelihood.score(products, added, cross + inner)
 
+    def _score_silent(self, state: HypothesisSet, rows: NDArray[np.int64]) -> float:
+        vectors = self.model.entries(_indicators(rows, self.values.size))
+        return state.about.likelihood.score_set(state.remaining, (), vectors).log_likelihood - len(
+            rows
+        ) * float(np.log(self._resolution(int(rows[0]))))
 
-def _prior(family: Family) -> Array:
-    """Logarithms of the weights of edits, and of what they do to volumes."""
-    prior = np.full(len(family.edits), -np.log(family.size * FAMILIES))
-    return prior + family.log_volume if family.log_volume.size else prior
+    def _resolution(self, row: int) -> float:
+        """Step of the gauge of a row, or its noise, [m]."""
+        setup = self.session.setups[self.session.readings[row].setup]
+        return self.session.gauges[setup.gauge].resolution or self.model.sigma
 
+    def _score_shifts(self, state: HypothesisSet, family: Family) -> Array:
+        likelihood = state.about.likelihood
+        vectors = np.array([self.model.shift_entries(state.about, s) for s in family.shifts])
+        if family.known:
+            return likelihood.score(likelihood.products(state.remaining - vectors))
+        size = np.abs(vectors).max(axis=1, keepdims=True)
+        tolerances = np.array([np.abs(s.direction).max() for s in family.shifts])[:, None]
+        seen = size > LEAST_EFFECT * self.model.sigma * tolerances
+        vectors = np.where(seen, vectors, 0.0) / np.where(seen, size, 1.0)
+        base = likelihood.products(np.broadcast_to(state.remaining, vectors.shape))
+        return likelihood.score(base, likelihood.products(vectors), vectors @ state.remaining)
 
-def _likeliest(family: Family, evidence: Array) -> Iterator[_Weighed]:
-    prior = _prior(family)
-    for h in np.argsort(-evidence)[:MOST_REFITTED].tolist():
-        yield _Weighed(
-            family.edits[h](),
-            family.change[h],
-            None if family.wrong is None else family.wrong[h],
-            float(prior[h]),
-            family.unknown[h] if family.unknown else (),
-            family.loose[h] if family.loose else None,
-            float(evidence[h]),
+    def _term(self, family: Family, h: int, rows: Rows) -> Term:
+        prior = float(_prior(family)[h])
+        explanation = family.explain(h)
+        if family.groups:
+            return Term(explanation, prior, effects=_marks(family.groups[h], rows.count))
+        if family.silent:
+            silent = family.silent[h]
+            prior -= len(silent) * float(np.log(self._resolution(int(silent[0]))))
+            return Term(explanation, prior, silent=silent)
+        if family.shifts:
+            shift = family.shifts[h]
+            if not family.known:
+                size = float(np.abs(self.model.shift_entries(self.sound.about, shift)).max())
+                size = size or 1.0
+                shift = replace(shift, direction=shift.direction / size, unit=1.0 / size)
+            return Term(explanation, prior, shift=shift, known=family.known)
+        return Term(
+            explanation,
+            prior,
+            None if family.edits is None else family.edits.one(h),
+            None if family.effects is None else family.effects.one(h)[None],
+        )
+
+    def _shortlist(self, scored: list[tuple[Family, Array]], rows: Rows) -> list[Term]:
+        """The most likely single hypotheses, and the most likely one of each kind."""
+        ranked = sorted(
+            (
+                (float(evidence[h]), i, h)
+                for i, (_, evidence) in enumerate(scored)
+                for h in np.argsort(-evidence)[:MOST_REFITTED].tolist()
+            ),
+            reverse=True,
+        )
+        terms = [self._term(scored[i][0], h, rows) for _, i, h in ranked[: 3 * MOST_REFITTED]]
+        chosen = terms[: MOST_REFITTED // 2]
+        kinds = {(t.explanation.kind, t.explanation.scope) for t in chosen}
+        for (evidence, _, _), t in zip(ranked, terms, strict=False):
+            key = (t.explanation.kind, t.explanation.scope)
+            if evidence > 0.0 and key not in kinds:
+                kinds.add(key)
+                chosen.append(t)
+        return chosen[:MOST_REFITTED]
+
+    def _pairs(
+        self, state: HypothesisSet, scored: list[tuple[Family, Array]]
+    ) -> tuple[list[tuple[Term, Term]], float]:
+        """The most likely pairs of hypotheses, and the log evidence of all of them together."""
+        few = self.values.size <= MOST_PAIRED
+        rows = Rows(self.session, state.corrected)
+        families = [f for f, _ in scored if _is_paired(f)]
+        if not few or not families or len(state.terms) + 2 > MOST_ANOMALIES:
+            return [], -np.inf
+        likelihood = state.about.likelihood
+        sound = likelihood.score(likelihood.products(state.remaining[None]))[0]
+        perfect = likelihood.score(likelihood.products(np.zeros_like(state.remaining)[None]))[0]
+        prior = np.concatenate([_prior(f) for f in families])
+        if perfect - sound + 2.0 * prior.max() < WORTH_REFITTING:
+            return [], -np.inf
+        found = find_pairs(
+            likelihood,
+            state.remaining,
+            self._singles(families, prior),
+            least=float(sound) - COARSE,
+        )
+        evidence = found.log_posterior - sound
+        if not evidence.size:
+            return [], -np.inf
+        which = np.repeat(np.arange(len(families)), [f.count for f in families])
+        begin = np.cumsum([0, *(f.count for f in families)])
+
+        def term(m: int) -> Term:
+            i = int(which[m])
+            return self._term(families[i], m - int(begin[i]), rows)
+
+        chosen = [
+            m for m, e in zip(found.members, evidence, strict=True) if e > WORTH_REFITTING - NEARLY
+        ][:MOST_PAIRS_REFITTED]
+        return [(term(int(a)), term(int(b))) for a, b in chosen], float(log_of_sum(evidence))
+
+    def _singles(self, families: list[Family], prior: Array) -> Singles:
+        n = self.values.size
+
+        def dense(patterns: Patterns | None, count: int) -> Array:
+            return np.zeros((count, n)) if patterns is None else patterns.to_sparse().toarray()
+
+        edits = np.concatenate([dense(f.edits, f.count) for f in families])
+        effects = np.concatenate([dense(f.effects, f.count) for f in families])
+        entries = self.model.entries
+        return Singles(entries(edits), entries(effects), prior, (edits != 0.0) | (effects != 0.0))
+
+    def _result(
+        self, state: HypothesisSet, near: list[tuple[HypothesisSet, HypothesisSet]]
+    ) -> Anomalies:
+        """Records of the anomalies of a state, and of sets that are nearly as likely."""
+        sound = self.sound
+        named = []
+        for term, e in zip(state.terms, explain_with_amounts(state), strict=True):
+            without = [t for t in state.terms if t is not term]
+            fewer = self.evaluate(without, sound.about) if without else sound
+            causes, alternatives = find_alternatives(term, near)
+            row = e.rows[0] if len(e.rows) == 1 else None
+            if causes and e.rows:
+                causes = (e, *causes)
+                kind: AnomalyKind = "inconsistent posture" if row is None else "outlier"
+                e = replace(e, kind=kind, factor=None, amount=None)
+            named.append(
+                Anomaly(
+                    e,
+                    state.log_posterior - fewer.log_posterior,
+                    None if row is None else float(state.corrected[row]),
+                    causes,
+                    alternatives,
+                )
+            )
+        silent = any(t.silent is not None for t in state.terms)
+        return Anomalies(
+            tuple(named),
+            state.log_posterior - sound.log_posterior,
+            silent or self.is_plausible(state),
+            self.model.rms(self.values, sound.about),
+            _rms(self.model, state),
+            state.score.tolerance_scale,
+            state.score.noise_scale,
         )
 
 
-def _weigh_unknown(
-    readings: ReadingModel,
-    table: Table,
-    about: Linearised,
-    deviation: Array,
-    rows: tuple[int, ...],
-) -> float:
-    """Readings that repeat what the dial showed before, by a dial that shows steps."""
-    marks = np.zeros((len(rows), table.count))
-    marks[np.arange(len(rows)), list(rows)] = 1.0
-    setup = table.session.readings[rows[0]].setup
-    gauge = table.session.gauges[table.session.setups[setup].gauge]
-    step = gauge.resolution or readings.sigma
-    gain = about.likelihood.weigh_without(deviation, readings.entries(marks))
-    return gain - len(rows) * float(np.log(step))
+def _families(model: LinearModel, rows: Rows, *, grouped: bool = True) -> Iterator[Family]:
+    if grouped:
+        yield from wrong_units_and_signs(rows, model.sigma)
+    yield from displaced_gauges(rows)
+    yield from wrong_readings(rows)
+    yield from swapped_rows(rows)
+    yield from row_offsets(rows)
+    yield from changes_between_sessions(model)
 
 
-def _shortlist(weighed: list[_Weighed]) -> list[_Weighed]:
-    """The likeliest, and the likeliest of each kind that is not far behind."""
-    ranked = sorted(weighed, key=lambda w: -w.evidence)
-    kinds: dict[str, _Weighed] = {}
-    for w in ranked:
-        if w.evidence > 0.0:
-            kinds.setdefault(w.edit.kind, w)
-    chosen = ranked[: MOST_REFITTED // 2]
-    more = [w for w in kinds.values() if w not in chosen]
-    return [*chosen, *more][:MOST_REFITTED]
+def _is_paired(family: Family) -> bool:
+    """True if a family takes part in the search over pairs.
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Refitted:
-    """An edit, linearised where the readings are that it makes."""
-
-    weighed: _Weighed
-    about: Linearised
-    mended: Array
-    """Rows, shape (n_rows,), [m]."""
-    plausible: bool
-
-
-def _refit(
-    readings: ReadingModel, values: Array, w: _Weighed, sound: float, about: Linearised
-) -> _Refitted:
-    if w.unknown:
-        return _Refitted(w, about, values, plausible=True)
-    if w.loose is not None:
-        return _refit_loose(readings, values, w, w.loose, sound, about)
-    rows = values + w.change
-    own = readings.settle(rows, w.wrong, about)
-    wrong = None if w.wrong is None else readings.entries(w.wrong[None])
-    deviation = readings.deviations(rows[None], own)
-    logs = own.likelihood.weigh(deviation, wrong)
-    excess, noise, amount = own.likelihood.settle(deviation[0], None if wrong is None else wrong[0])
-    if w.wrong is not None:
-        rows = rows - amount * w.wrong
-    return _Refitted(
-        replace(w, evidence=float(logs[0]) - sound + w.prior),
-        own,
-        rows,
-        excess < LARGEST_EXCESS and (noise < LARGEST_NOISE or not readings.stated),
-    )
-
-
-def _refit_loose(
-    readings: ReadingModel,
-    values: Array,
-    w: _Weighed,
-    loose: Array,
-    sound: float,
-    about: Linearised,
-) -> _Refitted:
-    marks, own, rows = readings.entries(loose), about, values
-    for _ in range(2):
-        deviation = readings.deviations(values[None], own)[0]
-        logs, amounts = own.likelihood.weigh_loose(deviation, marks)
-        rows = values - amounts @ loose
-        own, last = readings.settle(rows, None, own), own
-    excess, noise, _ = last.likelihood.settle(readings.deviations(rows[None], last)[0])
-    return _Refitted(
-        replace(w, evidence=logs - sound + w.prior),
-        last,
-        rows,
-        excess < LARGEST_EXCESS and (noise < LARGEST_NOISE or not readings.stated),
-    )
-
-
-def _told(
-    readings: ReadingModel, found: _Refitted, before: float, here: list[_Refitted]
-) -> Mistake:
-    """A mistake as it is told.
-
-    Args:
-        readings: The readings.
-        found: The edit that mends it.
-        before: What is left before it is mended, r.m.s., [m].
-        here: Others of the same place that are nearly as likely.
+    Those that change the machine do not, nor those that scale a volume of many readings.
     """
-    w = found.weighed
-    edit = w.edit
-    after = before if w.unknown else readings.left_over(found.mended, found.about)
-    kind, mend = edit.kind, edit.mend
-    perhaps: tuple[str, ...] = ()
-    ways = [r.weighed.edit for r in here if set(r.weighed.edit.rows) == set(edit.rows)]
-    if any(way.kind != edit.kind for way in ways):
-        kind = "suspicious reading" if len(edit.rows) == 1 else "suspicious posture"
-        mend = "Read it again, or leave it out."
-        perhaps = tuple(way.text for way in (edit, *ways))
-    return Mistake(
-        kind,
-        edit.text,
-        mend,
-        edit.rows,
-        edit.setups,
-        w.evidence,
-        before,
-        after,
-        float(found.mended[edit.rows[0]]) if len(edit.rows) == 1 else None,
-        perhaps,
-    )
+    if family.edits is None and family.effects is None:
+        return False
+    if family.edits is not None and family.effects is not None:
+        return False
+    return family.log_volume is None or family.log_volume.max(initial=0.0) <= LARGEST_VOLUME
+
+
+def _prior(family: Family) -> Array:
+    """Logarithms of prior probabilities, with the factor on volumes, shape (h,)."""
+    prior = np.full(family.count, -np.log(family.size * FAMILIES))
+    return prior if family.log_volume is None else prior + family.log_volume
+
+
+def _indicators(rows: NDArray[np.int64], count: int) -> Array:
+    """One vector per row that is 1 there, shape (k, count)."""
+    return _marks(list(rows[:, None]), count)
+
+
+def _marks(groups: Sequence[NDArray[np.int64]], count: int) -> Array:
+    written: Array = marks(groups, count).rows.toarray()
+    return written
+
+
+def _rms(model: LinearModel, state: HypothesisSet) -> float:
+    """RMS of what remains of the corrected rows, [m]."""
+    errors = state.about.errors_for(state.remaining)
+    along = state.about.sizes * (state.about.errors.T @ errors)
+    left = state.remaining - along @ state.about.likelihood.directions
+    rows = model.problem.observations.rows(left * model.problem.noise)
+    return float(np.sqrt(np.mean(rows**2)))

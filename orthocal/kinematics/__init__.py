@@ -1,1 +1,1 @@
-"""How a machine with errors moves: functions compiled once a robot, and its loops closed."""
+"""Kinematics of a machine with errors: functions compiled once per robot, and loop closure."""

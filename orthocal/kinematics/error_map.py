@@ -1,97 +1,177 @@
-"""All errors of a robot as one vector, and the placements that they make: numbers, nothing built.
+"""Placements and actual drive coordinates of a machine as functions of its error parameters.
 
 A placement with errors is placement · exp6(δ). Its derivative by δ is a twist in its own frame,
+exp6(δ) [T(δ) dδ], with T the right Jacobian of SE(3). All effects on the kinematics pass through
+these twists and through the actual drive coordinates. `ErrorMap` computes them from the expressions
+of the effects for NumPy arrays, `SymbolicErrorMap` for CasADi expressions.
 
-    d exp6(δ) = exp6(δ) T(δ) dδ,  T(δ) = Σ (−ad δ)^k/(k + 1)!
-
-(Chirikjian, Stochastic Models, Information Theory, and Lie Groups, volume 2, 2012, section 10.8).
-Everything that errors do to a machine goes through these twists and through where its drives are.
+A command holds the commanded drive coordinates of a posture, followed by those conditions of its
+readings on which drives or placements depend (`ErrorMap.conditions`). Coordinates alone are a
+command under neutral conditions.
 """
 
 from __future__ import annotations
 
-import math
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.io.fields import read_only
-from orthocal.kinematics.symbolic import SERIES_BELOW, nominal_frame_placement
+from orthocal.effects.machine import express_machine
+from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
+from orthocal.kinematics.backend.batch_function import BatchFunction
+from orthocal.kinematics.se3 import exp6, right_jacobian
+from orthocal.kinematics.symbolic import Pose, nominal_placement
 from orthocal.robot.model import Robot
-from orthocal.robot.parameters import ElementaryError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-SERIES_TERMS = 40
-"""Terms of the series of T, at most: enough for a turn by π."""
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MachineGeometry:
+    """Geometry of one machine or of a batch of machines with errors.
 
-@dataclass(frozen=True, slots=True)
-class MovedPlacement:
-    """A joint or frame whose placement errors can move."""
+    Each row of a batch holds for as many successive points.
+    """
 
-    index: int
-    """Of the joint, or of the frame."""
-    of_frame: bool
+    map: ErrorMap
+    placements: Array
+    """Moved placements, shape (..., 12 n_moved), [1, m]."""
+    drive_errors: Array
+    """Errors on which the drives depend, shape (..., n_drive_errors), [m, rad, 1]."""
+
+    def drives(self, commands: Array) -> Array:
+        """Actual drive coordinates of all machines for the same commands.
+
+        Args:
+            commands: Shape (K, n_command), or (n_command,).
+
+        Returns:
+            Shape (..., K, n_drives): the machines' batch dimensions come first.
+        """
+        drives = self.map.actuate(*self._combine(commands))
+        return drives.reshape(*self._shape(commands), drives.shape[-1])
+
+    def drive_derivatives(self, commands: Array) -> tuple[Array, Array]:
+        """Derivatives of `drives` by the commanded coordinates and by `drive_errors`.
+
+        Returns:
+            Shapes (..., K, n_drives, n_drives) and (..., K, n_drives, n_drive_errors).
+        """
+        derivatives = self.map.differentiate_drives(*self._combine(commands))
+        by_commands, by_errors = (
+            v.reshape(*self._shape(commands), *v.shape[1:]) for v in derivatives
+        )
+        return by_commands, by_errors
+
+    def at(self, points: NDArray[np.intp], count: int) -> MachineGeometry:
+        """Geometry of some points out of `count`: a row for each, or one row for all."""
+        placements, drive_errors = (
+            rows if len(rows) == 1 else rows[points // (count // len(rows))]
+            for rows in (self.placements, self.drive_errors)
+        )
+        return MachineGeometry(self.map, placements, drive_errors)
+
+    def of_machines(self, part: slice, count: int) -> MachineGeometry:
+        """Geometry of some machines out of `count`."""
+
+        def rows_of(values: Array) -> Array:
+            each = len(values) // count
+            return values[part.start * each : part.stop * each]
+
+        return MachineGeometry(self.map, rows_of(self.placements), rows_of(self.drive_errors))
+
+    def _combine(self, commands: Array) -> tuple[Array, Array]:
+        """Commands of all machines, one a row, and drive errors, shape (n_machines, n)."""
+        errors = self.drive_errors.reshape(-1, self.drive_errors.shape[-1])
+        return np.tile(np.atleast_2d(commands), (len(errors), 1)), errors
+
+    def _shape(self, commands: Array) -> tuple[int, ...]:
+        return *self.drive_errors.shape[:-1], *commands.shape[:-1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Slopes:
-    """What errors do to placements and drives to first order, for a choice of n parameters."""
+class ErrorJacobian:
+    """Derivatives of placements and drives by n parameters."""
 
     twists: Array
-    """∂ξ of every moved placement in its own frame, shape (6 n_moved, n), [m, rad]."""
-    offsets: Array
-    """∂ of where the drives are, shape (n_drives, n), [m, rad]."""
-    gains: Array
-    """The same as a multiple of the commanded coordinates, shape (n_drives, n)."""
+    """∂ξ of every moved placement in its own frame, shape (..., 6 n_moved, n), [m, rad]."""
+    drive_errors: Array
+    """Derivative of the errors on which the drives depend, shape (n_drive_errors, n)."""
 
 
 class ErrorMap:
-    """The elementary errors of a robot in a fixed order, shape (n_errors,), [m, rad, 1].
+    """The elementary errors of a robot in a fixed order, shape (..., n_errors), [m, rad, 1].
 
     Args:
         robot: The nominal robot.
 
     Attributes:
-        names: Of the errors.
-        moved: Placements that they move.
+        names: Names of the errors.
+        moved: Placements that effects act on.
+        conditions: Conditions that follow the drive coordinates in a command.
+        placement_conditions: Those on which placements depend.
+        of_placements: Mask of these in a command, shape (n_command,).
+        drive_errors: Indices of the errors on which the drives depend, shape (n_drive_errors,).
+        drives: Function of a command and these errors: actual drive coordinates.
+        twists: Function of the conditions and of all errors: twists of the moved placements, and
+            their derivative by the errors.
     """
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
-        elementary = tuple(robot.parameters.elementary.values())
-        self.names = tuple(e.name for e in elementary)
+        self.names = tuple(robot.parameters.elementary)
         self._index = {name: i for i, name in enumerate(self.names)}
-        drives = {d.name: i for i, d in enumerate(robot.drives)}
-        moved: dict[MovedPlacement, int] = {}
-        twist = np.full(len(elementary), -1)
-        offset, scale = np.array(twist), np.array(twist)
-        for i, e in enumerate(elementary):
-            if e.kind == "offset":
-                offset[i] = drives[e.owner]
-            elif e.kind == "scale":
-                scale[i] = drives[e.owner]
-            else:
-                place = moved.setdefault(_placement_of(robot, e), len(moved))
-                twist[i] = 6 * place + e.axis
-        self.moved = tuple(moved)
-        self._twist, self._offset, self._scale = twist, offset, scale
-        nominal = [
-            nominal_frame_placement(robot.model, m.index)
-            if m.of_frame
-            else robot.model.jointPlacements[m.index]
-            for m in self.moved
-        ]
+        errors = ca.SX.sym("errors", len(self.names))
+        commanded = ca.SX.sym("commanded", len(robot.drives))
+        known = {c: ca.SX.sym(c, condition_size(robot, c)) for c in NEUTRAL}
+        machine = express_machine(
+            robot, commanded, {n: errors[i] for i, n in enumerate(self.names)}, known
+        )
+        moving = {p: ca.sparsify(t) for p, t in machine.twists.items()}
+        self.moved = tuple(p for p, t in moving.items() if t.nnz())
+        twists = ca.vertcat(ca.SX(0, 1), *(moving[p] for p in self.moved))
+        self.conditions = _conditions_in(ca.vertcat(twists, machine.actuated), known)
+        self.placement_conditions = _conditions_in(twists, known)
+        sizes = [condition_size(robot, c) for c in self.conditions]
+        of_placements = np.repeat([c in self.placement_conditions for c in self.conditions], sizes)
+        drives = np.zeros(len(robot.drives), dtype=np.bool_)
+        self.of_placements = np.concatenate([drives, of_placements.astype(np.bool_)])
+        self._neutral = np.repeat([NEUTRAL[c] for c in self.conditions], sizes).astype(np.float64)
+        conditions = ca.vertcat(ca.SX(0, 1), *(known[c] for c in self.conditions))
+        by_errors = ca.jacobian(machine.actuated, errors)
+        self.drive_errors = np.unique(np.array(by_errors.sparsity().get_triplet()[1], np.int64))
+        chosen = self.drive_errors.tolist()
+        inputs = [ca.vertcat(commanded, conditions), errors[chosen]]
+        self.drives = ca.Function("drives", inputs, [machine.actuated])
+        self._drives = BatchFunction(self.drives)
+        by_commands = ca.jacobian(machine.actuated, commanded)
+        labels = ["by_commands", "by_errors"]
+        self._drive_derivatives = BatchFunction(
+            ca.Function(
+                "derivatives", inputs, [by_commands, by_errors[:, chosen]], ["u", "e"], labels
+            ),
+            matrices=labels,
+        )
+        outputs = [twists, ca.jacobian(twists, errors)]
+        self.twists = ca.Function("twists", [conditions, errors], outputs)
+        self._twists = _Twists(self.twists)
+        nominal = [nominal_placement(robot.model, p) for p in self.moved]
         self._rotations = np.array([p.rotation for p in nominal]).reshape(-1, 3, 3)
         self._positions = np.array([p.translation for p in nominal]).reshape(-1, 3)
 
+    @property
+    def n_conditions(self) -> int:
+        """Numbers of a command beside the drive coordinates."""
+        return self._neutral.size
+
     def expand(self, values: Mapping[str, float]) -> Array:
-        """The vector of named parameters, which may be sums, shape (n_errors,), [SI].
+        """Elementary errors of named parameters, which may be sums, shape (n_errors,), [SI].
 
         Raises:
             ParameterError: If a name is unknown.
@@ -102,63 +182,110 @@ class ErrorMap:
         return result
 
     def columns(self, names: Sequence[str]) -> Array:
-        """What one unit of each named parameter adds to the vector, shape (n_errors, n)."""
+        """Elementary errors of one unit of each named parameter, shape (n_errors, n)."""
         result = np.zeros((len(self.names), len(names)))
         for column, name in enumerate(names):
             for term, coefficient in self.robot.parameters[name].terms:
                 result[self._index[term], column] += coefficient
         return result
 
-    def placements(self, errors: ArrayLike) -> Array:
+    def command(self, coordinates: Array) -> Array:
+        """Commands of drive coordinates, shape (..., n_command); commands stay what they are."""
+        missing = len(self.robot.drives) + self._neutral.size - coordinates.shape[-1]
+        if not missing:
+            return coordinates
+        neutral = np.broadcast_to(self._neutral, (*coordinates.shape[:-1], missing))
+        return np.concatenate([coordinates, neutral], axis=-1)
+
+    def split(self, conditions: ca.SX) -> dict[Condition, ca.SX]:
+        """Conditions of a command, shape (n_conditions,), by name."""
+        sizes = [condition_size(self.robot, c) for c in self.conditions]
+        parts = ca.vertsplit(conditions, np.cumsum([0, *sizes]).tolist()) if sizes else []
+        return dict(zip(self.conditions, parts, strict=True))
+
+    def geometry(self, errors: ArrayLike, commands: Array | None = None) -> MachineGeometry:
+        """Placements and drives of machines with errors.
+
+        Args:
+            errors: Shape (..., n_errors), [SI].
+            commands: If placements depend on conditions: a command, shape (n_command,), for all
+                machines, or K of them for each of S machines, shape (K, n_command), of which the
+                geometry has S K rows of placements; neutral conditions by default.
+        """
+        values = np.asarray(errors, dtype=np.float64)
+        drive_errors = values[..., self.drive_errors]
+        if commands is not None and commands.ndim > 1 and self.placement_conditions:
+            repeated = np.repeat(values, len(commands), axis=0)
+            tiled = np.tile(commands, (len(values), 1))
+            return MachineGeometry(self, self.placements(repeated, tiled), drive_errors)
+        command = commands if commands is not None and commands.ndim == 1 else None
+        return MachineGeometry(self, self.placements(values, command), drive_errors)
+
+    def placements(self, errors: ArrayLike, commands: Array | None = None) -> Array:
         """Moved placements: rotation by columns, then position.
 
         Args:
             errors: Shape (..., n_errors), [SI].
+            commands: Shape (n_command,), or that of `errors`; neutral conditions by default.
 
         Returns:
             Shape (..., 12 n_moved), [1, m].
         """
-        twists = self._twists(np.asarray(errors, dtype=np.float64))
-        turn, shift = exp6(twists)
-        rotations = self._rotations @ turn
-        positions = (self._rotations @ shift[..., None])[..., 0] + self._positions
+        rotation, position = exp6(self._shaped(self.twists_of(errors, commands)))
+        rotations = self._rotations @ rotation
+        positions = (self._rotations @ position[..., None])[..., 0] + self._positions
         columns = np.swapaxes(rotations, -1, -2).reshape(*rotations.shape[:-2], 9)
         values = np.concatenate([columns, positions], axis=-1)
         return values.reshape(*values.shape[:-2], -1)
 
-    def drives(self, errors: ArrayLike, commanded: ArrayLike) -> Array:
-        """Where the drives really are, gain · commanded + offset, shape (..., n_drives), [m, rad].
+    def actuate(self, commands: Array, drive_errors: Array) -> Array:
+        """Actual drive coordinates.
 
         Args:
-            errors: Shape (n_errors,) or (..., n_errors), [SI].
-            commanded: Shape (..., n_drives), [m, rad].
+            commands: Shape (n, n_command).
+            drive_errors: Shape (n, n_drive_errors), or fewer rows that hold for successive ones.
+
+        Returns:
+            Shape (n, n_drives), [m, rad].
         """
-        offset, gain = self.offsets(errors), self.gains(errors)
-        return np.asarray(gain * np.asarray(commanded, dtype=np.float64) + offset)
+        (actuated,) = self._drives(self.command(commands), drive_errors)
+        return actuated
 
-    def offsets(self, errors: ArrayLike) -> Array:
-        """Offsets of the drives, shape (..., n_drives), [m, rad]."""
-        return self._of_drives(np.asarray(errors, dtype=np.float64), self._offset)
+    def differentiate_drives(self, commands: Array, drive_errors: Array) -> tuple[Array, Array]:
+        """Derivatives of `actuate` by the commanded coordinates and by the errors.
 
-    def gains(self, errors: ArrayLike) -> Array:
-        """1 + scale error of the drives, shape (..., n_drives)."""
-        return np.asarray(self.robot.drive_gain + self.scales(errors))
+        Returns:
+            Shapes (n, n_drives, n_drives) and (n, n_drives, n_drive_errors).
+        """
+        by_commands, by_errors = self._drive_derivatives(self.command(commands), drive_errors)
+        return by_commands, by_errors
 
-    def scales(self, errors: ArrayLike) -> Array:
-        """Scale errors of the drives, shape (..., n_drives)."""
-        return self._of_drives(np.asarray(errors, dtype=np.float64), self._scale)
-
-    def slopes(self, errors: ArrayLike, columns: Array) -> Slopes:
+    def jacobian(
+        self,
+        errors: ArrayLike,
+        columns: Array,
+        *,
+        command: Array | None = None,
+        right: Array | None = None,
+    ) -> ErrorJacobian:
         """Derivatives of placements and drives by parameters.
 
         Args:
-            errors: Where, shape (n_errors,), [SI].
-            columns: What one unit of each parameter adds to them, shape (n_errors, n).
+            errors: Point of differentiation, shape (..., n_errors), [SI].
+            columns: Elementary errors of one unit of each parameter, shape (n_errors, n).
+            command: As for `placements`.
+            right: `right_jacobians` there, if known.
         """
-        at = right_jacobian(self._twists(np.asarray(errors, dtype=np.float64)))
+        right = self.right_jacobians(errors, command) if right is None else right
         n = columns.shape[1]
-        twists = at @ self.twists_of(columns.T).T.reshape(len(self.moved), 6, n)
-        return Slopes(twists.reshape(-1, n), self.offsets(columns.T).T, self.scales(columns.T).T)
+        inner = self.twist_columns(errors, columns, command)
+        twists = right @ inner.reshape(*inner.shape[:-2], len(self.moved), 6, n)
+        twists = twists.reshape(*twists.shape[:-3], 6 * len(self.moved), n)
+        return ErrorJacobian(twists, columns[self.drive_errors])
+
+    def right_jacobians(self, errors: ArrayLike, command: Array | None = None) -> Array:
+        """Right Jacobian T(δ) of every moved placement, shape (..., n_moved, 6, 6)."""
+        return right_jacobian(self._shaped(self.twists_of(errors, command)))
 
     @property
     def nominal(self) -> Array:
@@ -166,99 +293,180 @@ class ErrorMap:
         columns = np.swapaxes(self._rotations, 1, 2).reshape(-1, 9)
         return np.concatenate([columns, self._positions], axis=1)
 
-    def twists_of(self, errors: ArrayLike) -> Array:
-        """Twists δ of the moved placements, shape (..., 6 n_moved), [m, rad]."""
-        given = np.asarray(errors, dtype=np.float64)
-        result = np.zeros((*given.shape[:-1], 6 * len(self.moved)))
-        chosen = self._twist >= 0
-        result[..., self._twist[chosen]] = given[..., chosen]
+    def twists_of(self, errors: ArrayLike, commands: Array | None = None) -> Array:
+        """Twists δ of the moved placements, shape (..., 6 n_moved), [m, rad].
+
+        Args:
+            errors: Shape (..., n_errors), [SI].
+            commands: As for `placements`.
+        """
+        return self._twists(np.asarray(errors, dtype=np.float64), self._conditions(commands))
+
+    def twist_columns(
+        self, errors: ArrayLike, columns: Array, command: Array | None = None
+    ) -> Array:
+        """∂δ of the moved placements by parameters, shape (6 n_moved, n), [m, rad].
+
+        The shape begins with that of the machines if the derivatives differ among them.
+
+        Args:
+            errors: Point of differentiation, shape (..., n_errors), [SI].
+            columns: Elementary errors of one unit of each parameter, shape (n_errors, n).
+            command: As for `placements`.
+        """
+        at = np.asarray(errors, dtype=np.float64)
+        return self._twists.columns(at, columns, self._conditions(command))
+
+    def twists_moved_by(self, columns: Array) -> NDArray[np.bool_]:
+        """Mask of the twists that parameters change, shape (6 n_moved,).
+
+        Args:
+            columns: Elementary errors of one unit of each parameter, shape (n_errors, n).
+        """
+        return self._twists.moved_by(np.asarray(columns.any(axis=1)))
+
+    def _conditions(self, commands: Array | None) -> Array:
+        return self._neutral if commands is None else commands[..., len(self.robot.drives) :]
+
+    def _shaped(self, twists: Array) -> Array:
+        return twists.reshape(*twists.shape[:-1], len(self.moved), 6)
+
+
+class _Twists:
+    """Numbers of a function of conditions and errors: twists and their derivative by the errors.
+
+    Errors that alone move a twist, and linearly, are placed by index: those of the geometry.
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        conditions, errors = (function.sx_in(i) for i in range(2))
+        twists, jacobian = function(conditions, errors)
+        self._n = twists.numel()
+        rows, columns = (np.array(v, dtype=np.int64) for v in jacobian.sparsity().get_triplet())
+        self._rows, self._columns = rows, columns
+        nonzeros = [jacobian.nz[k] for k in range(rows.size)]
+        constant = np.array([v.is_constant() for v in nonzeros], dtype=np.bool_)
+        first = np.isin(np.arange(rows.size), np.unique(rows, return_index=True)[1])
+        varying = np.unique(columns[~(constant & first)])
+        linear = ~np.isin(columns, varying)
+        self._linear = rows[linear], columns[linear]
+        self._slopes = np.array([float(v) for v, ok in zip(nonzeros, linear, strict=True) if ok])
+        others = np.unique(self._linear[1]).tolist()
+        rest = ca.SX(twists)
+        if others:
+            rest = ca.substitute(rest, errors[others], ca.SX.zeros(len(others)))
+        self._varying = varying
+        chosen = errors[varying.tolist()]
+        self._is_linear = not ca.sparsify(rest).nnz()
+        self._rest = BatchFunction(
+            ca.Function("rest", [conditions, chosen], [rest, ca.jacobian(rest, chosen)]),
+            matrices=["o1"],
+        )
+
+    def __call__(self, errors: Array, conditions: Array) -> Array:
+        result = np.zeros((*errors.shape[:-1], self._n))
+        rows, columns = self._linear
+        result[..., rows] = self._slopes * errors[..., columns]
+        if not self._is_linear:
+            result += self._evaluate(errors, conditions)[0]
         return result
 
-    def _twists(self, errors: Array) -> Array:
-        return self.twists_of(errors).reshape(*errors.shape[:-1], len(self.moved), 6)
+    def columns(self, errors: Array, columns: Array, conditions: Array) -> Array:
+        """∂δ by parameters; arguments as for `ErrorMap.twist_columns`."""
+        rows, of = self._linear
+        result = np.zeros((self._n, columns.shape[1]))
+        result[rows] = self._slopes[:, None] * columns[of]
+        if self._is_linear:
+            return result
+        return np.asarray(result + self._evaluate(errors, conditions)[1] @ columns[self._varying])
 
-    def _of_drives(self, errors: Array, index: Indices) -> Array:
-        result = np.zeros((*errors.shape[:-1], len(self.robot.drives)))
-        chosen = index >= 0
-        result[..., index[chosen]] = errors[..., chosen]
+    def moved_by(self, errors: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Mask of the twists that some errors change."""
+        result = np.zeros(self._n, dtype=np.bool_)
+        result[self._rows[errors[self._columns]]] = True
         return result
+
+    def _evaluate(self, errors: Array, conditions: Array) -> tuple[Array, Array]:
+        at = errors.reshape(-1, errors.shape[-1])[:, self._varying]
+        given = np.broadcast_to(conditions, (*errors.shape[:-1], conditions.shape[-1]))
+        twists, jacobian = self._rest(given.reshape(len(at), -1), at)
+        shape = errors.shape[:-1]
+        return twists.reshape(*shape, -1), jacobian.reshape(*shape, *jacobian.shape[1:])
 
 
 @lru_cache(maxsize=8)
 def error_map(robot: Robot) -> ErrorMap:
-    """The error map of a robot, made once."""
+    """The error map of a robot, built once."""
     return ErrorMap(robot)
 
 
-def _placement_of(robot: Robot, error: ElementaryError) -> MovedPlacement:
-    if error.of_frame:
-        return MovedPlacement(robot.frame_id(error.owner), True)
-    return MovedPlacement(int(robot.model.getJointId(error.owner)), False)
+def _conditions_in(expression: ca.SX, known: Mapping[Condition, ca.SX]) -> tuple[Condition, ...]:
+    """Conditions on which an expression depends."""
+    return tuple(c for c, symbol in known.items() if ca.jacobian(expression, symbol).nnz())
 
 
-def exp6(twists: Array) -> tuple[Array, Array]:
-    """Exponentials of twists (translation v, rotation ω), as Pinocchio's exp6.
+class SymbolicErrorMap:
+    """Placements and drives of a machine as expressions of scaled parameters θ̂.
+
+    The choice of free parameters is a matrix of constants; the CasADi function of one placement is
+    mapped over all of them.
 
     Args:
-        twists: Shape (..., 6), [m, rad].
+        errors: The robot's error map.
+        fixed: Elementary errors at θ̂ = 0, shape (n_errors,), [SI].
+        columns: Elementary errors of one unit of each θ̂, shape (n_errors, n_free).
 
-    Returns:
-        Rotations, shape (..., 3, 3), and positions, shape (..., 3), [m].
+    Attributes:
+        placements: Symbol of the moved placements, shape (12 n_moved,).
+        symbols: θ̂, placements and the nonzeros of ∂ξ/∂θ̂: the inputs of posture and reading
+            functions.
+        function: θ̂ and conditions to the values of the symbols.
+        digest: Digest of the numbers that are constants here.
     """
-    v, w = twists[..., :3], twists[..., 3:]
-    square = (w * w).sum(axis=-1)[..., None]
-    near = square < SERIES_BELOW
-    safe = np.where(near, 1.0, square)
-    angle = np.sqrt(safe)
-    sine, cosine = np.sin(angle), np.cos(angle)
-    a, b, c = (
-        np.where(near, _alternating(square, first), far)
-        for first, far in (
-            (1, sine / angle),
-            (2, (1.0 - cosine) / safe),
-            (3, (angle - sine) / (safe * angle)),
+
+    def __init__(self, errors: ErrorMap, *, fixed: Array, columns: Array) -> None:
+        n_moved, n_free = len(errors.moved), columns.shape[1]
+        self.digest = hashlib.sha256(fixed.tobytes() + columns.tobytes()).hexdigest()
+        at, conditions = ca.MX.sym("theta", n_free), ca.MX.sym("conditions", errors.n_conditions)
+        by_theta = ca.MX(ca.sparsify(ca.DM(columns)))
+        twists, by_errors = errors.twists(conditions, ca.DM(fixed) + by_theta @ at)
+        values, right = ca.MX(12, 0), ca.MX(27, 0)
+        if n_moved:
+            mapped = _moved_placement().map(n_moved)
+            values, right = mapped(ca.reshape(twists, 6, n_moved), ca.DM(errors.nominal.T))
+        blocks = ca.diagcat(*[_right_jacobian_sparsity()] * n_moved)
+        by_twists = ca.MX(blocks, ca.vec(right)) @ (by_errors @ by_theta)
+        self.function = ca.Function(
+            "error_map", [at, conditions], [at, ca.densify(ca.vec(values)), by_twists.nz[:]]
         )
-    )
-    hat = _hat(w)
-    rotations = np.eye(3) + a[..., None] * hat + b[..., None] * (hat @ hat)
-    turned = hat @ v[..., None]
-    return rotations, v + b * turned[..., 0] + c * (hat @ turned)[..., 0]
+        theta = ca.SX.sym("theta", n_free)
+        twist_jacobian = ca.SX.sym("twist_jacobian", by_twists.sparsity())
+        self.placements = ca.SX.sym("placements", 12 * n_moved)
+        self.symbols = (theta, self.placements, twist_jacobian.nz[:])
+        self._twist_jacobian = twist_jacobian
+        chosen = errors.drive_errors
+        self._drives = errors.drives
+        self._drive_errors = ca.SX(fixed[chosen]) + ca.sparsify(ca.SX(columns[chosen])) @ theta
+
+    def actuated(self, command: ca.SX) -> ca.SX:
+        """Actual drive coordinates of a command, shape (n_drives,), [m, rad]."""
+        return self._drives(command, self._drive_errors)
+
+    def chain(self, by_twists: ca.SX, by_actuated: ca.SX, command: ca.SX) -> ca.SX:
+        """Derivative by θ̂ of rows with known derivatives by twists and actuated coordinates."""
+        by_theta = ca.jacobian(self.actuated(command), self.symbols[0])
+        return by_twists @ self._twist_jacobian + by_actuated @ by_theta
 
 
-def _alternating(square: Array, first: int) -> Array:
-    """Σ (−θ²)^k / (first + 2k)!, enough terms for double precision below SERIES_BELOW."""
-    total = np.zeros_like(square)
-    for k in reversed(range(7)):
-        total = total * -square + 1.0 / math.factorial(first + 2 * k)
-    return total
+def _right_jacobian_sparsity() -> ca.Sparsity:
+    """Nonzeros of T: rotations of a placement do not depend on translations."""
+    return right_jacobian(ca.SX.sym("twist", 6)).sparsity()
 
 
-def right_jacobian(twists: Array) -> Array:
-    """T with exp6(δ + dδ) = exp6(δ) exp6(T dδ) to first order, shape (..., 6, 6) of (..., 6)."""
-    ad = _small_adjoint(twists)
-    term = np.broadcast_to(np.eye(6), ad.shape)
-    total = np.array(term)
-    for k in range(1, SERIES_TERMS):
-        term = -(term @ ad) / (k + 1)
-        total += term
-        if not term.any() or np.abs(term).max() < 1e-18:
-            break
-    return read_only(total)
-
-
-def _small_adjoint(twists: Array) -> Array:
-    """Ad of twists (v, ω): [[ω, v], [0, ω]] of their cross products, shape (..., 6, 6)."""
-    result = np.zeros((*twists.shape, 6))
-    hat_v, hat_w = _hat(twists[..., :3]), _hat(twists[..., 3:])
-    result[..., :3, :3] = result[..., 3:, 3:] = hat_w
-    result[..., :3, 3:] = hat_v
-    return result
-
-
-def _hat(vectors: Array) -> Array:
-    result = np.zeros((*vectors.shape, 3))
-    x, y, z = (vectors[..., i] for i in range(3))
-    result[..., 0, 1], result[..., 0, 2] = -z, y
-    result[..., 1, 0], result[..., 1, 2] = z, -x
-    result[..., 2, 0], result[..., 2, 1] = -y, x
-    return result
+@lru_cache(maxsize=1)
+def _moved_placement() -> ca.Function:
+    """(twist, nominal placement) to placement · exp6(twist), and the nonzeros of T."""
+    twist, nominal = ca.SX.sym("twist", 6), ca.SX.sym("nominal", 12)
+    pose = Pose(ca.reshape(nominal[:9], 3, 3), nominal[9:]) * Pose(*exp6(twist))
+    values = ca.vertcat(ca.vec(pose.rotation), pose.position)
+    return ca.Function("moved_placement", [twist, nominal], [values, right_jacobian(twist).nz[:]])

@@ -1,13 +1,16 @@
-"""CasADi functions of a robot, built once, and kept on disk.
+"""Cache of a robot's CasADi functions, in memory and on disk.
 
-They are kept by all that they depend on: the robot as it was loaded, the code that builds them, and
-the versions of CasADi and Pinocchio.
+The key of a function holds everything it depends on: the robot as loaded, the code that builds
+functions, and the versions of CasADi and Pinocchio.
 """
 
 from __future__ import annotations
 
 import hashlib
+import sys
+import uuid
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import lru_cache, wraps
 from importlib.metadata import version
 from pathlib import Path
@@ -16,108 +19,119 @@ from typing import TypeVar
 import casadi as ca
 import numpy as np
 
+from orthocal.effects.loading import robot_effects
 from orthocal.robot.model import Robot
-from orthocal.runtime import disk_cache as cache
+from orthocal.runtime import disk_cache
 
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 
-MOST_RECENT = 256
-"""Functions that a process keeps; one takes up to 2 MB."""
+MAX_FUNCTIONS = 256
+"""Functions held in memory; one takes up to 2 MB."""
 
-_RECENT: dict[str, ca.Function] = {}
+_CODE_DIRECTORIES = (
+    "kinematics",
+    "sensors",
+    "robot",
+    "effects",
+    "estimation",
+    "estimation/solvers",
+)
+"""Directories with code that builds functions."""
 
-_BUILT_BY = ("kinematics", "sensors", "robot", "estimation", "estimation/solvers")
-"""Folders with the code that builds functions."""
+
+@dataclass(frozen=True, slots=True)
+class _Recipe:
+    """A function that is not built yet; recipes with the same key are equal."""
+
+    key: str
+    build: Callable[[], ca.Function] = field(compare=False)
 
 
-def kept_function(robot: Robot, name: str, build: Callable[[], ca.Function]) -> ca.Function:
-    """A function of a robot: as kept on disk, or built and kept.
+def function_key(robot: Robot, name: str) -> str:
+    """Key of a robot's function.
 
     Args:
         robot: The robot.
-        name: Of the function, and all that distinguishes it from others of the robot.
-        build: Builds it.
+        name: Name of the function, with everything that distinguishes it from the robot's others.
     """
-    key = f"function {name}\n{fingerprint(robot)}\n{_code()}"
-    if key not in _RECENT:
-        function = _recall(key)
-        if function is None:
-            function = build()
-            _keep(key, function)
-        if len(_RECENT) >= MOST_RECENT:
-            _RECENT.pop(next(iter(_RECENT)))
-        _RECENT[key] = function
-    return _RECENT[key]
+    return f"function {name}\n{fingerprint(robot)}\n{_code()}"
 
 
-def known_as(function: ca.Function) -> str | None:
-    """By what a function is kept in this process; None for others."""
-    same = (key for key, kept in _RECENT.items() if kept.__hash__() == function.__hash__())
-    return next(same, None)
+def cached_function(robot: Robot, name: str, build: Callable[[], ca.Function]) -> ca.Function:
+    """A function of a robot, from memory, from disk, or built now.
+
+    Args:
+        robot: The robot.
+        name: As for `function_key`.
+        build: Builds the function.
+    """
+    return _load_or_build(_Recipe(function_key(robot, name), build))
 
 
-def _recall(key: str) -> ca.Function | None:
-    content = cache.load(key)
+@lru_cache(maxsize=MAX_FUNCTIONS)
+def _load_or_build(recipe: _Recipe) -> ca.Function:
+    function = _load(recipe.key)
+    if function is None:
+        function = recipe.build()
+        _save(recipe.key, function)
+    return function
+
+
+def _load(key: str) -> ca.Function | None:
+    content = disk_cache.load(key)
     if content is None:
         return None
     try:
         return ca.Function.deserialize(content.decode("ascii"))
-    except (RuntimeError, ValueError):  # of a casadi that was built otherwise
+    except (RuntimeError, ValueError):  # written by another build of CasADi
         return None
 
 
-def _keep(key: str, function: ca.Function) -> None:
+def _save(key: str, function: ca.Function) -> None:
     try:
         text = function.serialize()
-    except RuntimeError:  # some cannot be written
+    except RuntimeError:  # some functions cannot be serialised
         return
-    cache.store(key, text.encode("ascii"))
+    disk_cache.store(key, text.encode("ascii"))
 
 
-class _Content:
-    """A robot that equals any other that moves, and is described, alike."""
+@dataclass(frozen=True, slots=True)
+class _RobotKey:
+    """A robot; robots with the same kinematics and the same files are equal."""
 
-    __slots__ = ("key", "robot")
-
-    def __init__(self, robot: Robot) -> None:
-        self.robot, self.key = robot, identify(robot)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Content) and self.key == other.key
-
-    def __hash__(self) -> int:
-        return hash(self.key)
+    identity: tuple[str, str]
+    robot: Robot = field(compare=False)
 
 
-def once_a_robot(
+def cached_per_robot(
     maxsize: int,
-) -> Callable[[Callable[[Robot], Made]], Callable[[Robot], Made]]:
-    """Decorate a function of a robot: robots that are the same share what it makes.
+) -> Callable[[Callable[[Robot], Result]], Callable[[Robot], Result]]:
+    """Decorator that caches a function of a robot; equal robots share the result.
 
     Args:
-        maxsize: Robots whose things are kept.
+        maxsize: Number of robots whose results are held.
     """
 
-    def decorate(make: Callable[[Robot], Made]) -> Callable[[Robot], Made]:
-        made = lru_cache(maxsize)(lambda content: make(content.robot))
+    def decorate(function: Callable[[Robot], Result]) -> Callable[[Robot], Result]:
+        cached = lru_cache(maxsize)(lambda key: function(key.robot))
 
-        @wraps(make)
-        def find(robot: Robot) -> Made:
-            return made(_Content(robot))
+        @wraps(function)
+        def look_up(robot: Robot) -> Result:
+            return cached(_RobotKey(identify(robot), robot))
 
-        return find
+        return look_up
 
     return decorate
 
 
 def identify(robot: Robot) -> tuple[str, str]:
-    """Equal for robots that move alike and are named alike in messages."""
+    """Identity of a robot: equal for the same kinematics and the same name in messages."""
     return fingerprint(robot), str(robot.yaml)
 
 
 @lru_cache(maxsize=16)
 def fingerprint(robot: Robot) -> str:
-    """A digest of all that a robot's functions depend on."""
+    """Digest of everything that a robot's functions depend on."""
     parts = [
         robot.model.saveToString(),
         repr(robot.closures),
@@ -134,19 +148,37 @@ def fingerprint(robot: Robot) -> str:
         repr(robot.passive_index.tolist()),
         repr([float(v).hex() for v in robot.drive_gain]),
         repr(tuple(robot.parameters.elementary.values())),
+        repr(sorted(robot.declared.effects.items())),
+        *(source_digest(type(e)) for e in robot_effects(robot)),  # type: ignore[arg-type] # hashable
         repr([(p.name, p.terms) for p in robot.parameters]),
         float(robot.characteristic_length).hex(),
     ]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
+@lru_cache(maxsize=64)
+def source_digest(kind: type) -> str:
+    """Digest of the code of a class from outside orthocal: functions built from it change with it.
+
+    A class without a file, as in a notebook, has functions of this process alone.
+    """
+    if kind.__module__.startswith("orthocal."):
+        return ""
+    file = getattr(sys.modules.get(kind.__module__), "__file__", None)
+    try:
+        content = Path(file or "").read_bytes()
+    except OSError:
+        return uuid.uuid4().hex
+    return hashlib.sha256(content).hexdigest()
+
+
 @lru_cache(maxsize=1)
 def _code() -> str:
-    """Versions, and a digest of the code that builds functions."""
+    """Versions of the libraries and a digest of the code that builds functions."""
     digest = hashlib.sha256()
     root = Path(__file__).parents[1]
-    for folder in _BUILT_BY:
-        for path in sorted((root / folder).glob("*.py")):
+    for directory in _CODE_DIRECTORIES:
+        for path in sorted((root / directory).glob("*.py")):
             digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     versions = f"casadi {version('casadi')} pinocchio {version('pin')}"
     return f"{versions} code {digest.hexdigest()}"

@@ -1,4 +1,4 @@
-"""How far the tool moves with an error of the machine, passive joints following the loops.
+"""Sensitivity of the tool's position to errors of the machine, with the loops closed.
 
     J = p_θ − p_q g_q⁻¹ g_θ
 
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import RobotError
-from orthocal.kinematics.compiled import compiled_robot
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
@@ -41,10 +41,10 @@ class ToolSensitivity:
         self.robot = robot
         self.free = tuple(free)
         self.theta = np.array([at.get(name, 0.0) for name in self.free])
-        self.assembly = Assembly(robot, fixed=at)
-        self._compiled = compiled_robot(robot)
-        errors = self._compiled.errors
-        self._slopes = errors.slopes(self.assembly.errors(), errors.columns(self.free))
+        self.assembly = LoopClosure(robot, fixed=at)
+        self._functions = robot_functions(robot)
+        errors = self._functions.errors
+        self._by_errors = errors.jacobian(self.assembly.errors(), errors.columns(self.free))
 
     def __call__(
         self,
@@ -70,29 +70,27 @@ class ToolSensitivity:
         d = np.atleast_2d(np.asarray(drives, dtype=np.float64))
         if passive is None:
             passive = self.assembly.close(d, names=names)
-        machine, slopes = self.assembly.machine(), self._slopes
-        arguments = machine.drives(d), passive, machine.placements
-        _, p_a, p_q, p_t = self._compiled.tool(*arguments)
-        _, g_a, g_q, nonzeros = self._compiled.slopes(*arguments)
+        geometry, by_errors = self.assembly.geometry(), self._by_errors
+        arguments = geometry.drives(d), passive, geometry.placements
+        _, p_a, p_q, p_t = self._functions.tool_jacobian(*arguments)
+        _, g_a, g_q, nonzeros = self._functions.closure_jacobian(*arguments)
         if g_q.shape[1] == g_q.shape[2]:
-            pull = np.swapaxes(
+            multiplier = np.swapaxes(
                 np.linalg.solve(np.swapaxes(g_q, 1, 2), np.swapaxes(p_q, 1, 2)), 1, 2
             )
         else:
-            pull = p_q @ np.linalg.pinv(g_q, rcond=1e-10)
-        twists = p_t - self._pull_twists(pull, nonzeros)
-        drives = p_a - pull @ g_a
-        commanded = drives * d[:, None, :]
-        return np.asarray(
-            twists @ slopes.twists + drives @ slopes.offsets + commanded @ slopes.gains
-        )
+            multiplier = p_q @ np.linalg.pinv(g_q, rcond=1e-10)
+        twists = p_t - self._times_twists(multiplier, nonzeros)
+        _, by_drive_errors = geometry.drive_derivatives(d)
+        drives = (p_a - multiplier @ g_a) @ by_drive_errors
+        return np.asarray(twists @ by_errors.twists + drives @ by_errors.drive_errors)
 
-    def _pull_twists(self, pull: Array, nonzeros: Array) -> Array:
-        """What rows make of ∂g by twists, shape (K, 3, n_twists) of (K, 3, n_rows) and (K, nnz)."""
-        rows, columns = self._compiled.twist_pattern
-        found = np.zeros((*pull.shape[:2], self._compiled.n_twists))
+    def _times_twists(self, multiplier: Array, nonzeros: Array) -> Array:
+        """Rows times ∂g by twists, shape (K, 3, n_twists) of (K, 3, n_rows) and (K, nnz)."""
+        rows, columns = self._functions.twist_pattern
+        result = np.zeros((*multiplier.shape[:2], self._functions.n_twists))
         if columns.size:
-            there, starts = np.unique(columns, return_index=True)
-            products = pull[:, :, rows] * nonzeros[:, None, :]
-            found[:, :, there] = np.add.reduceat(products, starts, axis=2)
-        return found
+            used, starts = np.unique(columns, return_index=True)
+            products = multiplier[:, :, rows] * nonzeros[:, None, :]
+            result[:, :, used] = np.add.reduceat(products, starts, axis=2)
+        return result

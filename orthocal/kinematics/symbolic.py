@@ -1,9 +1,9 @@
-"""Symbolic kinematics (CasADi) of any Pinocchio model, with errors on every placement.
+"""Symbolic kinematics (CasADi) of a Pinocchio model, with errors on every placement.
 
     oM_i = oM_parent · placement_i · exp6(δ_i) · M_i(q)
 
 A pose is a pair (R, p): rotation 3×3 and position 3, as CasADi expressions. All functions are safe
-to differentiate at zero errors and at closed loops: near the identity they take series.
+to differentiate at zero errors and at closed loops (see `se3`).
 """
 
 from __future__ import annotations
@@ -16,20 +16,17 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from orthocal.effects.machine import express_machine
+from orthocal.effects.protocol import Condition, Placement
 from orthocal.errors import RobotError
+from orthocal.kinematics.se3 import exp6, log6
 from orthocal.robot.frames import hangs_on
 from orthocal.robot.model import Closure, Robot, joint_axis
-
-SERIES_BELOW = 0.04
-"""Squared angle below which exponential coefficients come from their series, [rad²]."""
-
-SERIES_COSINE = 0.999
-"""Cosine above which logarithm coefficients come from their series."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """A rigid-body pose: maps coordinates of its own frame into the parent's."""
+    """A rigid-body pose: maps coordinates of its frame into the parent's."""
 
     rotation: ca.SX
     """Shape (3, 3)."""
@@ -52,78 +49,6 @@ def constant_pose(placement: pin.SE3) -> Pose:
     rotation[np.abs(rotation) < 1e-15] = 0.0
     position[np.abs(position) < 1e-15] = 0.0
     return Pose(ca.sparsify(ca.SX(rotation)), ca.sparsify(ca.SX(position)))
-
-
-def exp6(twist: ca.SX) -> Pose:
-    """Exponential of a twist (translation v, rotation ω), as Pinocchio's exp6.
-
-        R = I + a [ω] + b [ω]²,  p = v + b ω × v + c ω × (ω × v)
-        a = sin θ/θ,  b = (1 − cos θ)/θ²,  c = (θ − sin θ)/θ³,  θ = |ω|
-
-    Args:
-        twist: Shape (6,), [m, rad].
-    """
-    v, w = twist[:3], twist[3:]
-    if w.is_zero():
-        return Pose(ca.SX.eye(3), v)
-    square = ca.dot(w, w)
-    near = square < SERIES_BELOW
-    safe = ca.if_else(near, 1.0, square)
-    angle = ca.sqrt(safe)
-    # 1/1!, 1/3!, ... ; 1/2!, 1/4!, ... ; 1/3!, 1/5!, ... with alternating signs
-    a = ca.if_else(near, _alternating(square, 1), ca.sin(angle) / angle)
-    b = ca.if_else(near, _alternating(square, 2), (1.0 - ca.cos(angle)) / safe)
-    c = ca.if_else(near, _alternating(square, 3), (angle - ca.sin(angle)) / (safe * angle))
-    hat = ca.skew(w)
-    rotation = ca.SX.eye(3) + a * hat + b * (hat @ hat)
-    if v.is_zero():
-        return Pose(rotation, ca.SX(3, 1))
-    turned = ca.cross(w, v)
-    return Pose(rotation, v + b * turned + c * ca.cross(w, turned))
-
-
-def _alternating(square: ca.SX, first: int) -> ca.SX:
-    """Σ (−θ²)^k / (first + 2k)!, enough terms for double precision below SERIES_BELOW."""
-    from math import factorial
-
-    total = ca.SX(0.0)
-    for k in reversed(range(7)):
-        total = total * -square + 1.0 / factorial(first + 2 * k)
-    return total
-
-
-def log6(pose: Pose) -> ca.SX:
-    """Logarithm of a pose, as Pinocchio's log6: (translation, rotation), shape (6,).
-
-    ω = (θ/sin θ) ½ vee(R − Rᵀ)
-    v = p − ½ ω × p + (1/θ² − (1 + cos θ)/(2 θ sin θ)) ω × (ω × p)
-    """
-    rotation, p = pose.rotation, pose.position
-    half = 0.5 * ca.inv_skew(rotation - rotation.T)
-    cosine = 0.5 * (ca.trace(rotation) - 1.0)
-    sine2 = ca.dot(half, half)
-    near = cosine > SERIES_COSINE
-    safe_sine = ca.sqrt(ca.if_else(near, 1.0, sine2))
-    safe_cosine = ca.if_else(near, 0.0, cosine)
-    angle = ca.atan2(safe_sine, safe_cosine)
-    asin_series = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
-    w = ca.if_else(near, _horner(sine2, asin_series), angle / safe_sine) * half
-    square = ca.dot(w, w)
-    beta_series = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
-    beta = ca.if_else(
-        near,
-        _horner(square, beta_series),
-        1.0 / angle**2 - (1.0 + safe_cosine) / (2.0 * angle * safe_sine),
-    )
-    turned = ca.cross(w, p)
-    return ca.vertcat(p - 0.5 * turned + beta * ca.cross(w, turned), w)
-
-
-def _horner(x: ca.SX, coefficients: tuple[float, ...]) -> ca.SX:
-    total = ca.SX(0.0)
-    for coefficient in reversed(coefficients):
-        total = total * x + coefficient
-    return total
 
 
 def joint_motion(model: pin.Model, joint: int, coordinates: ca.SX) -> Pose:
@@ -170,10 +95,10 @@ class SymbolicTree:
     Args:
         model: The nominal model.
         coordinates: Joint coordinates, shape (nv,): one an unbounded revolute joint.
-        joint_placements: Joint to its placement in its parent's moving frame, where that is not
-            the model's own.
+        joint_placements: Joint to its placement in its parent's moving frame; the model's by
+            default.
         frame_placements: Index of a frame to its placement in the frame that it hangs on (see
-            `hangs_on`), where that is not the model's own.
+            `hangs_on`); the model's by default.
     """
 
     def __init__(
@@ -193,7 +118,7 @@ class SymbolicTree:
         self._frames: dict[int, Pose] = {}
 
     def joint_base(self, joint: int) -> Pose:
-        """Pose of a joint's frame in the world before its own motion: where its errors act."""
+        """Pose of a joint's frame in the world before its motion, in which its errors act."""
         if joint not in self._bases:
             m = self.model
             placement = self._joint_placements.get(joint)
@@ -216,7 +141,7 @@ class SymbolicTree:
             parent = hangs_on(self.model, frame)
             placement = self._frame_placements.get(frame)
             if placement is None:
-                placement = constant_pose(nominal_frame_placement(self.model, frame))
+                placement = constant_pose(nominal_placement(self.model, Placement(frame, True)))
             if parent is None:
                 pose = self.joint_pose(self.model.frames[frame].parentJoint) * placement
             else:
@@ -226,59 +151,19 @@ class SymbolicTree:
 
     def joints_to(self, frame: int) -> list[int]:
         """Joints that move a frame, from it to the base."""
-        joint, found = int(self.model.frames[frame].parentJoint), []
+        joint, joints = int(self.model.frames[frame].parentJoint), []
         while joint > 0:
-            found.append(joint)
+            joints.append(joint)
             joint = int(self.model.parents[joint])
-        return found
+        return joints
 
 
-def nominal_frame_placement(model: pin.Model, frame: int) -> pin.SE3:
-    """Placement of a frame in the frame that it hangs on, or else in its joint."""
-    parent = hangs_on(model, frame)
-    placement = model.frames[frame].placement
-    return placement if parent is None else model.frames[parent].placement.inverse() * placement
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ErrorExpressions:
-    """Errors of a robot as expressions: twists of placements, and what drives add."""
-
-    joint_twists: Mapping[int, ca.SX]
-    """Joint to its placement twist δ, shape (6,)."""
-    frame_twists: Mapping[int, ca.SX]
-    """Frame to its placement twist δ, shape (6,)."""
-    offset: ca.SX
-    """Offsets Δρ, shape (n_drives,)."""
-    gain: ca.SX
-    """1 + scale error, shape (n_drives,)."""
-
-
-def express_errors(
-    robot: Robot, errors: Mapping[str, ca.SX | float] | None = None
-) -> ErrorExpressions:
-    """Twists, offsets and gains of parameter values, which may be expressions."""
-    elementary: dict[str, ca.SX] = {}
-    for name, value in (errors or {}).items():
-        for term, coefficient in robot.parameters[name].terms:
-            elementary[term] = elementary.get(term, ca.SX(0.0)) + coefficient * value
-    joint_twists: dict[int, ca.SX] = {}
-    frame_twists: dict[int, ca.SX] = {}
-    offset = ca.SX(len(robot.drives), 1)
-    gain = ca.SX(robot.drive_gain)
-    index = {d.name: i for i, d in enumerate(robot.drives)}
-    for name, expression in elementary.items():
-        e = robot.parameters.elementary[name]
-        if e.kind == "offset":
-            offset[index[e.owner]] += expression
-        elif e.kind == "scale":
-            gain[index[e.owner]] += expression
-        elif e.of_frame:
-            frame_twists.setdefault(robot.frame_id(e.owner), ca.SX(6, 1))[e.axis] += expression
-        else:
-            joint = int(robot.model.getJointId(e.owner))
-            joint_twists.setdefault(joint, ca.SX(6, 1))[e.axis] += expression
-    return ErrorExpressions(joint_twists, frame_twists, offset, gain)
+def nominal_placement(model: pin.Model, placement: Placement) -> pin.SE3:
+    """Placement of a joint, or of a frame in the frame that it hangs on, or else in its joint."""
+    if not placement.of_frame:
+        return model.jointPlacements[placement.index]
+    parent, nominal = hangs_on(model, placement.index), model.frames[placement.index].placement
+    return nominal if parent is None else model.frames[parent].placement.inverse() * nominal
 
 
 class SymbolicRobot:
@@ -289,8 +174,7 @@ class SymbolicRobot:
         drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
         passive: Passive coordinates, shape (n_passive,), [m, rad].
         errors: Parameter name to expression or number, [unit of the parameter].
-        placements: Placements of joints and of frames (by index) to take instead of those that
-            the errors' twists make.
+        conditions: Conditions of the posture; neutral where absent.
     """
 
     def __init__(
@@ -300,18 +184,18 @@ class SymbolicRobot:
         drives: ca.SX,
         passive: ca.SX,
         errors: Mapping[str, ca.SX | float] | None = None,
-        placements: tuple[Mapping[int, Pose], Mapping[int, Pose]] | None = None,
+        conditions: Mapping[Condition, ca.SX] | None = None,
     ) -> None:
         self.robot = robot
-        expressions = express_errors(robot, errors)
-        self.actuated = expressions.gain * drives + expressions.offset
-        """Where the drives really are, shape (n_drives,), [m, rad]."""
+        machine = express_machine(robot, drives, errors or {}, conditions)
+        self.actuated = machine.actuated
+        """Actual drive coordinates, shape (n_drives,), [m, rad]."""
         coordinates = ca.SX(robot.model.nv, 1)
         for i, k in enumerate(robot.drive_index):
             coordinates[int(k)] = self.actuated[i]
         for i, k in enumerate(robot.passive_index):
             coordinates[int(k)] = passive[i]
-        joints, frames = placements or erroneous_placements(robot.model, expressions)
+        joints, frames = erroneous_placements(robot.model, machine.twists)
         self.tree = SymbolicTree(
             robot.model, coordinates, joint_placements=joints, frame_placements=frames
         )
@@ -321,10 +205,14 @@ class SymbolicRobot:
         return self.tree.frame_pose(self.robot.frame_id(name))
 
     def closure_error(self, closure: Closure) -> ca.SX:
-        """Pose error of one closure, rows that count: position of b in a, or log6, [m, rad]."""
+        """Constrained rows of a closure's pose error: position of b in a, or log6, [m, rad]."""
         a, b = self.frame_pose(closure.frame_a), self.frame_pose(closure.frame_b)
         relative = a.relative(b)
-        error = relative.position if closure.kind == "3d" else log6(relative)
+        error = (
+            relative.position
+            if closure.kind == "3d"
+            else log6(relative.rotation, relative.position)
+        )
         return error[list(closure.rows)]
 
     def closure_residual(self) -> ca.SX:
@@ -333,15 +221,14 @@ class SymbolicRobot:
 
 
 def erroneous_placements(
-    model: pin.Model, expressions: ErrorExpressions
+    model: pin.Model, twists: Mapping[Placement, ca.SX]
 ) -> tuple[dict[int, Pose], dict[int, Pose]]:
-    """Placement · exp6(δ) of every joint and frame that has an error."""
-    joints = {
-        i: constant_pose(model.jointPlacements[i]) * exp6(twist)
-        for i, twist in expressions.joint_twists.items()
-    }
-    frames = {
-        i: constant_pose(nominal_frame_placement(model, i)) * exp6(twist)
-        for i, twist in expressions.frame_twists.items()
-    }
+    """Placement · exp6(δ) of every joint and every frame that has a twist."""
+    joints: dict[int, Pose] = {}
+    frames: dict[int, Pose] = {}
+    for placement, twist in twists.items():
+        if ca.sparsify(twist).nnz():
+            nominal = constant_pose(nominal_placement(model, placement))
+            poses = frames if placement.of_frame else joints
+            poses[placement.index] = nominal * Pose(*exp6(twist))
     return joints, frames

@@ -42,7 +42,8 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     that of the last session: it is what the next offsets come on top of.
 
     Args:
-        sessions: In the order in which they were measured; one alone stays what it is.
+        sessions: In the order in which they were measured, joined ones among them or not; a single
+            one is returned unchanged.
 
     Raises:
         SessionError: If there are none, or of different robots.
@@ -61,8 +62,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
             )
     tolerances = _join_tolerances(sessions)
     purposes = {s.purpose for s in sessions} - {None}
-    labels = _labels(sessions)
-    parts = [_rename(session, label) for session, label in zip(sessions, labels, strict=True)]
+    parts = [_rename(s, labels) for s, labels in zip(sessions, _labels(sessions), strict=True)]
     return replace(
         last.with_tolerances(tolerances),
         title=" + ".join(dict.fromkeys(s.title for s in sessions if s.title)),
@@ -124,23 +124,40 @@ def _merged(mappings: Iterable[Mapping[str, Value]]) -> dict[str, Value]:
     return {name: value for mapping in mappings for name, value in mapping.items()}
 
 
-def _labels(sessions: Sequence[Session]) -> list[str]:
-    """A name for each session: its folder's, or its number; all different."""
-    names = []
-    for i, session in enumerate(sessions, start=1):
+def _labels(sessions: Sequence[Session]) -> list[dict[str, str]]:
+    """Names of the sessions in the joined one, all different.
+
+    Returns:
+        For each session its present label ("" unless it was joined before) and the new one: the
+        name of its directory, or its number.
+    """
+    names: list[tuple[int, str, str]] = []
+    for i, session in enumerate(sessions):
+        if session.joined:
+            old = dict.fromkeys(name.partition("/")[0] for name in session.setups)
+            names += [(i, label, label) for label in old]
+            continue
         folder = "" if session.path is None else session.path.resolve().parent.name
         plain = "".join("_" if c.isspace() or c in ',;"/' else c for c in composed(folder))
-        names.append(plain or f"session-{i}")
-    if len(set(names)) == len(names):
-        return names
-    return [f"{name}-{i}" for i, name in enumerate(names, start=1)]
+        names.append((i, "", plain or f"session-{len(names) + 1}"))
+    if len({new for _, _, new in names}) < len(names):
+        names = [(i, old, f"{new}-{k}") for k, (i, old, new) in enumerate(names, start=1)]
+    return [{old: new for k, old, new in names if k == i} for i in range(len(sessions))]
 
 
-def _rename(session: Session, label: str) -> Session:
-    """With setups, postures and gauges that carry the session's name, and its offsets with them."""
+def _rename(session: Session, labels: Mapping[str, str]) -> Session:
+    """The session with setups, postures and gauges that carry its labels, and with its offsets.
+
+    Args:
+        session: A session, joined before or not.
+        labels: Present labels to new ones, as of `_labels`.
+    """
 
     def named(name: str) -> str:
-        return f"{label}/{name}" if name else label
+        if not session.joined:
+            return f"{labels['']}/{name}" if name else labels[""]
+        old, slash, within = name.partition("/")
+        return f"{labels.get(old, old)}{slash}{within}"
 
     active, aligned_at = session.active_offsets, session.alignment_postures
 

@@ -1,25 +1,62 @@
-"""A session's readings as single ones with unknown zeros, and what a machine shows of them."""
+"""Entries of a session: its readings as single ones with gauge zeros, and their conditions."""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.session.session import Session
+from orthocal.effects.loading import robot_effects
+from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
+from orthocal.errors import SessionError
+from orthocal.kinematics.error_map import error_map
+from orthocal.robot.model import Robot
+from orthocal.session.session import Conditions, Session
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
+APPROACH = {"p": 1.0, "n": -1.0, "u": 0.0}
+"""Letter of an approach to the direction of the drive's last motion."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class States:
+    """Loop closures of a session.
+
+    A posture is one state, unless its readings differ in a condition on which drives or placements
+    depend: then it is one state for each value.
+    """
+
+    posture: Indices
+    """Posture of each state, in the order of the postures, shape (n_states,)."""
+    commands: Array
+    """Commands, shape (n_states, n_command); see `orthocal.kinematics.error_map`."""
+    variant: Indices
+    """Index of the conditions of its placements among all such conditions, shape (n_states,)."""
+    variant_commands: Array
+    """A command with the conditions of each variant, shape (n_variants, n_command)."""
+    names: tuple[str, ...]
+    """Posture of each state, with a number where it has several states."""
+
+    @property
+    def first_of_posture(self) -> Indices:
+        """First state of each posture, shape (n_postures,)."""
+        return np.unique(self.posture, return_index=True)[1]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """Readings as the gauge showed them, one an entry; differences taken apart.
+    """Readings as the gauge showed them, one an entry; differences are split.
 
-    Differences of one setup and cycle that share postures are the same as readings with one
-    unknown zero: their covariance, σ² [[2, 1], [1, 2]] for two differences from one posture, comes
-    out of eliminating it. So every reading here is a single one with standard deviation σ.
+    Differences of one setup and cycle that share postures are equivalent to readings with one free
+    zero: eliminating it gives their covariance, σ² [[2, 1], [1, 2]] for two differences from one
+    posture. So every entry is a single reading with standard deviation σ.
     """
 
     setup: Indices
@@ -27,16 +64,30 @@ class Observations:
     posture: Indices
     """Index of the posture, shape (n,)."""
     zero: Indices
-    """Index of the unknown zero, shape (n,)."""
+    """Index of the gauge zero, shape (n,)."""
     n_zeros: int
     zero_setup: tuple[str, ...]
     """Setup of each zero."""
     zero_real: tuple[bool, ...]
-    """Whether a zero is that of a gauge, not one that stands for differences."""
+    """True for the zero of a gauge, False for one that replaces differences."""
+    zero_known: NDArray[np.bool_]
+    """Mask of the zeros that are known to be 0, shape (n_zeros,)."""
     plus: Indices
     """Entry of each row of the session, shape (n_rows,)."""
     minus: Indices
     """Entry taken off, or -1, shape (n_rows,)."""
+    state: Indices
+    """Index of the loop closure, shape (n,)."""
+    place: Indices
+    """Index of setup, posture and approach: entries with the same place repeat each other, (n,)."""
+    conditions: Mapping[Condition, Array]
+    """Condition to its values, shape (n, size); neutral where not stated."""
+    states: States
+
+    @property
+    def n_free_zeros(self) -> int:
+        """Number of zeros that are estimated."""
+        return self.n_zeros - int(self.zero_known.sum())
 
     @property
     def size(self) -> int:
@@ -44,19 +95,22 @@ class Observations:
         return self.setup.size
 
     def only(self, chosen: NDArray[np.bool_]) -> Observations:
-        """Some of the entries: which setup, posture and zero they have; no rows."""
+        """Some of the entries, without rows."""
         none = np.empty(0, dtype=np.int64)
         return replace(
             self,
             setup=self.setup[chosen],
             posture=self.posture[chosen],
+            state=self.state[chosen],
+            place=self.place[chosen],
+            conditions={c: v[chosen] for c, v in self.conditions.items()},
             zero=self.zero[chosen],
             plus=none,
             minus=none,
         )
 
     def sum_by_zero(self, values: Array, weights: Array) -> Array:
-        """Weighted sums of those with the same zero, shape (n_zeros, m) of (n, m)."""
+        """Weighted sums of the values with the same zero, shape (n_zeros, m) of (n, m)."""
         order = np.argsort(self.zero, kind="stable")
         starts = np.searchsorted(self.zero[order], np.arange(self.n_zeros))
         result = np.zeros((self.n_zeros, values.shape[1]))
@@ -103,31 +157,24 @@ class Observations:
 
 
 def build_observations(session: Session) -> Observations:
-    """Take a session's readings apart into single ones with unknown zeros."""
+    """Split a session's readings into single ones with gauge zeros."""
     setups = {name: i for i, name in enumerate(session.setups)}
     postures = {name: i for i, name in enumerate(session.postures)}
     entries: list[tuple[int, int, int]] = []
-    zeros: dict[tuple[object, ...], int] = {}
-    zero_setup: list[str] = []
-    zero_real: list[bool] = []
+    conditions: list[Conditions | None] = []
+    # of a gauge by its setup, of a group of differences by setup, cycle and group
+    zeros: dict[tuple[str] | tuple[str, int, str], int] = {}
     nodes: dict[tuple[str, int, str], int] = {}
     plus, minus = [], []
     groups = _difference_groups(session)
-
-    def zero_index(key: tuple[object, ...], setup: str, real: bool) -> int:
-        if key not in zeros:
-            zeros[key] = len(zeros)
-            zero_setup.append(setup)
-            zero_real.append(real)
-        return zeros[key]
-
     for reading in session.readings:
         setup = setups[reading.setup]
         if reading.minus is None:
-            zero = zero_index((reading.setup,), reading.setup, True)
+            zero = zeros.setdefault((reading.setup,), len(zeros))
             plus.append(len(entries))
             minus.append(-1)
             entries.append((setup, postures[reading.posture], zero))
+            conditions.append(reading.conditions)
             continue
         ends = []
         for posture in (reading.posture, reading.minus):
@@ -135,25 +182,37 @@ def build_observations(session: Session) -> Observations:
             if node not in nodes:
                 key = (reading.setup, reading.cycle, groups[node])
                 nodes[node] = len(entries)
-                entries.append((setup, postures[posture], zero_index(key, reading.setup, False)))
+                zero = zeros.setdefault(key, len(zeros))
+                entries.append((setup, postures[posture], zero))
+                conditions.append(None)
             ends.append(nodes[node])
         plus.append(ends[0])
         minus.append(ends[1])
     table = np.array(entries, dtype=np.int64).reshape(-1, 3)
+    values = _condition_values(session.robot, conditions, table[:, 0])
+    states, state = _find_states(session, table[:, 1], values)
+    places = np.hstack([table[:, :2], values["approach"]])
+    zero_setup, zero_real = tuple(k[0] for k in zeros), tuple(len(k) == 1 for k in zeros)
+    known = [len(k) == 1 and session.setups[k[0]].zero == "known" for k in zeros]
     return Observations(
         setup=table[:, 0],
         posture=table[:, 1],
         zero=table[:, 2],
         n_zeros=len(zeros),
-        zero_setup=tuple(zero_setup),
-        zero_real=tuple(zero_real),
+        zero_setup=zero_setup,
+        zero_real=zero_real,
+        zero_known=np.array(known, dtype=np.bool_),
         plus=np.array(plus, dtype=np.int64),
         minus=np.array(minus, dtype=np.int64),
+        state=state,
+        place=np.unique(places, axis=0, return_inverse=True)[1].reshape(-1),
+        conditions=values,
+        states=states,
     )
 
 
 def _difference_groups(session: Session) -> dict[tuple[str, int, str], str]:
-    """Posture of a setup and cycle to a name for all postures that differences join it with."""
+    """Posture of a setup and cycle to a name of its group of differences."""
     leader: dict[tuple[str, int, str], tuple[str, int, str]] = {}
 
     def find(node: tuple[str, int, str]) -> tuple[str, int, str]:
@@ -168,6 +227,79 @@ def _difference_groups(session: Session) -> dict[tuple[str, int, str], str]:
     return {node: find(node)[2] for node in list(leader)}
 
 
+def _condition_values(
+    robot: Robot, conditions: Sequence[Conditions | None], setup: Indices
+) -> dict[Condition, Array]:
+    """Values of the conditions of entries, neutral where not stated, shape (n, size) each."""
+    n = len(conditions)
+    values = {c: np.full((n, condition_size(robot, c)), v) for c, v in NEUTRAL.items()}
+    began: dict[int, datetime] = {}
+    for i, stated in enumerate(conditions):
+        if stated is None:
+            continue
+        if stated.approach is not None:
+            values["approach"][i] = [APPROACH[letter] for letter in stated.approach]
+        if stated.temperature is not None:
+            values["temperature"][i] = stated.temperature
+        if stated.time is not None:
+            first = began.setdefault(int(setup[i]), stated.time)
+            values["time"][i] = (stated.time - first).total_seconds()
+    return values
+
+
+def _find_states(
+    session: Session, posture: Indices, conditions: Mapping[Condition, Array]
+) -> tuple[States, Indices]:
+    """Loop closures of a session, and the one of each entry."""
+    map_, drives, names = error_map(session.robot), drive_table(session), list(session.postures)
+    count = np.arange(len(names))
+    if not map_.conditions:
+        one = map_.command(session.robot.drive_zero)[None]
+        return States(count, drives, np.zeros_like(count), one, tuple(names)), posture
+    read = np.hstack([posture[:, None], *(conditions[c] for c in map_.conditions)])
+    unread = np.setdiff1d(count, posture)
+    others = np.column_stack([unread, map_.command(drives)[unread, drives.shape[1] :]])
+    rows, place = np.unique(np.vstack([read, others]), axis=0, return_inverse=True)
+    of_state = rows[:, 0].astype(np.int64)
+    commands = np.hstack([drives[of_state], rows[:, 1:]])
+    first, variant = np.zeros(1, dtype=np.int64), np.zeros(len(rows), dtype=np.int64)
+    if map_.of_placements.any():
+        values = commands[:, map_.of_placements]
+        _, first, variant = np.unique(values, axis=0, return_index=True, return_inverse=True)
+    number = np.arange(len(rows)) - np.searchsorted(of_state, of_state)
+    several = np.bincount(of_state)[of_state] > 1
+    labels = tuple(
+        f"{names[k]} #{i + 1}" if more else names[k]
+        for k, i, more in zip(of_state, number, several, strict=True)
+    )
+    states = States(of_state, commands, variant.reshape(-1), commands[first], labels)
+    return states, place.reshape(-1)[: posture.size]
+
+
 def drive_table(session: Session) -> Array:
     """Commanded drive coordinates of all postures, shape (n_postures, n_drives), [m, rad]."""
     return np.array([p.drives for p in session.postures.values()])
+
+
+def require_conditions(session: Session, free: Collection[str]) -> None:
+    """Refuse readings without a condition that the effect of a free parameter needs.
+
+    Args:
+        session: The session.
+        free: Names of the free parameters of the machine.
+
+    Raises:
+        SessionError: Naming the first such reading.
+    """
+    parameters = session.robot.parameters
+    errors = {term for name in free for term, _ in parameters[name].terms}
+    for effect in robot_effects(session.robot):
+        if errors.isdisjoint(e.name for e in effect.errors):
+            continue
+        for reading, condition in product(session.readings, effect.conditions):
+            if getattr(reading.conditions, condition, None) is None:
+                what = "a difference" if reading.minus else f"a reading without {condition}"
+                raise SessionError(
+                    f"is {what}; the effect '{effect.name}' needs the {condition} of each reading",
+                    where=session.where(reading),
+                )

@@ -1,13 +1,14 @@
-"""Sensors of a session, by the expressions that they have, and what is not known of them."""
+"""Sensors of a session by their expression, and their nuisance parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.effects.loading import reading_effects
 from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
 from orthocal.sensors.compiled import CompiledReading, compile_reading
@@ -20,52 +21,60 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorGroup:
-    """Entries whose sensors have one expression."""
+    """Entries whose sensors have the same expression."""
 
     reading: CompiledReading
     entries: Indices
     """Shape (n,)."""
     setups: Indices
-    """Their setups, shape (n,)."""
+    """Setup of each entry, shape (n,)."""
     constants: Array
-    """Of their setups, shape (n, n_constants)."""
-    unknowns: Indices
-    """Which of the session's unknowns are theirs, shape (n, n_unknowns)."""
-
-    def parts(self, size: int) -> Iterator[tuple[Indices, slice]]:
-        """Entries, and where they are in the group, not more than so many at a time."""
-        for first in range(0, self.entries.size, size):
-            part = slice(first, first + size)
-            yield self.entries[part], part
+    """Constants of each entry's sensor, then the conditions of the entry on which its reading
+    depends, shape (n, n_constants)."""
+    nuisance: Indices
+    """Indices of their nuisance parameters among the session's, shape (n, n_nuisance)."""
+    variant: int
+    """Index of the conditions of their placements (`States.variant`)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SensorUnknowns:
-    """What of a session's sensors is not known exactly."""
+class NuisanceParameters:
+    """Nuisance parameters of a session's sensors, and those of effects on each setup."""
 
     parameters: tuple[Parameter, ...]
-    """Named after their setups, or after what several share; they add to no error of a machine."""
+    """Named after their setup, or after what several setups share; no errors of the machine."""
     of_setup: tuple[tuple[int, ...], ...]
-    """Which of them each setup has, in the order of its sensor's."""
+    """Their indices by setup, those of the sensor first."""
 
 
-def sensor_unknowns(session: Session) -> SensorUnknowns:
-    """The unknowns of all setups that are read."""
-    found: dict[str, Parameter] = {}
-    places = []
+def nuisance_parameters(session: Session) -> NuisanceParameters:
+    """Nuisance parameters of all setups with readings."""
+    parameters: dict[str, Parameter] = {}
+    of_setup: list[tuple[int, ...]] = []
     read = {r.setup for r in session.readings}
     for setup in session.setups.values():
-        own = []
-        for unknown in setup.sensor.unknowns if setup.name in read else ():
-            name = f"{_owner(unknown, setup, session)}.{unknown.name}"
-            found.setdefault(name, Parameter(name, unknown.unit, unknown.tolerance, ()))
-            own.append(list(found).index(name))
-        places.append(tuple(own))
-    return SensorUnknowns(tuple(found.values()), tuple(places))
+        indices = []
+        if setup.name not in read:
+            of_setup.append(())
+            continue
+        own = [
+            Parameter(f"{_owner(u, setup, session)}.{u.name}", u.unit, u.tolerance, ())
+            for u in setup.sensor.unknowns
+        ]
+        own += [
+            Parameter(f"setup.{setup.name}.{e.name}", e.unit, e.tolerance, (), e.positive)
+            for effect in reading_effects(session.robot)
+            for e in effect.setup_errors
+        ]
+        for parameter in own:
+            parameters.setdefault(parameter.name, parameter)
+            indices.append(list(parameters).index(parameter.name))
+        of_setup.append(tuple(indices))
+    return NuisanceParameters(tuple(parameters.values()), tuple(of_setup))
 
 
 def _owner(unknown: Unknown, setup: Setup, session: Session) -> str:
-    """Whose it is: a gauge's of that name in every session, a session's, or the setup's own."""
+    """Owner of a nuisance parameter: a gauge, a session's shared object, or the setup itself."""
     label, joined, _ = setup.name.partition("/") if session.joined else ("", "", "")
     if unknown.of_gauge:
         gauge = setup.gauge if not label else setup.gauge.partition("/")[2]
@@ -76,21 +85,26 @@ def _owner(unknown: Unknown, setup: Setup, session: Session) -> str:
 
 
 def group_sensors(session: Session, observations: Observations) -> tuple[SensorGroup, ...]:
-    """Entries by the expression that they are readings of."""
+    """Entries by the expression of their sensors."""
     robot = session.robot
     setups = list(session.setups.values())
-    unknowns = sensor_unknowns(session).of_setup
-    found: dict[int, tuple[CompiledReading, list[int]]] = {}
+    nuisance = nuisance_parameters(session).of_setup
+    members_of: dict[int, tuple[CompiledReading, list[int]]] = {}
     for i in np.unique(observations.setup).tolist():
         reading = compile_reading(robot, setups[i].sensor)
-        found.setdefault(id(reading), (reading, []))[1].append(i)
+        members_of.setdefault(id(reading), (reading, []))[1].append(i)
     groups = []
-    for reading, members in found.values():
-        entries = np.flatnonzero(np.isin(observations.setup, members))
+    variant = observations.states.variant[observations.state]
+    for (reading, members), v in product(members_of.values(), np.unique(variant).tolist()):
+        entries = np.flatnonzero(np.isin(observations.setup, members) & (variant == v))
+        if not entries.size:
+            continue
         constants = {i: setups[i].sensor.constants(robot) for i in members}
         of_entry = observations.setup[entries]
         table = np.array([constants[i] for i in of_entry.tolist()])
-        own = np.array([unknowns[i] for i in of_entry.tolist()], dtype=np.int64)
-        own = own.reshape(entries.size, -1)
-        groups.append(SensorGroup(reading, entries, of_entry, table, own))
+        conditions = [observations.conditions[c][entries] for c in reading.conditions]
+        table = np.hstack([table.reshape(entries.size, -1), *conditions])
+        indices = np.array([nuisance[i] for i in of_entry.tolist()], dtype=np.int64)
+        indices = indices.reshape(entries.size, -1)
+        groups.append(SensorGroup(reading, entries, of_entry, table, indices, v))
     return tuple(groups)

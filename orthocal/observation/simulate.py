@@ -1,4 +1,4 @@
-"""Readings of a machine whose errors are known. Simulated data always says that it is simulated."""
+"""Simulated readings of a machine with known errors. Simulated data is always marked as such."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from orthocal.arguments import require_kind, require_names, require_numbers, require_seed
 from orthocal.errors import ParameterError, SessionError
 from orthocal.io.documents import Number, parse_number, read_yaml, validate
+from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import Observations, build_observations
-from orthocal.observation.sensor_frames import predict_entries
-from orthocal.observation.sensor_groups import sensor_unknowns
+from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.robot.model import Robot
 from orthocal.session.session import Reading, Session
 from orthocal.units import MM, to_mm
@@ -26,12 +26,12 @@ from orthocal.units import MM, to_mm
 Array = NDArray[np.float64]
 
 LARGEST_ZERO = 0.2e-3
-"""What a dial shows in the first posture of its setup is drawn from ± this, [m]."""
+"""Limit of the uniform distribution of a dial's first reading in a setup, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedSession:
-    """A session of simulated readings and what it was simulated from."""
+    """A session of simulated readings and the truth behind it."""
 
     session: Session
     errors: Mapping[str, float]
@@ -39,7 +39,7 @@ class SimulatedSession:
     zeros: Mapping[str, float]
     """Setup to the true zero of its gauge, [m]."""
     unknowns: Mapping[str, float] = field(default_factory=dict)
-    """What of the sensors is not known exactly: name to true value, [SI]."""
+    """Nuisance parameter to its true value, [SI]."""
 
 
 def draw_errors(
@@ -49,7 +49,7 @@ def draw_errors(
     seed: int,
     tolerances: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
-    """Errors drawn from the tolerances: independent, normal, with mean 0.
+    """Errors drawn from the tolerances: independent, normal with mean 0, or half-normal.
 
     Args:
         robot: The robot.
@@ -76,9 +76,8 @@ def draw_errors(
     )
     given = parameters.read_tolerances(tolerances or {})
     own = {n: value for g, value in given.items() for n in parameters.select([g])}
-    return {
-        name: float(rng.normal() * own.get(name, parameters[name].tolerance)) for name in chosen
-    }
+    drawn = {n: float(rng.normal() * own.get(n, parameters[n].tolerance)) for n in chosen}
+    return {n: abs(v) if parameters[n].positive else v for n, v in drawn.items()}
 
 
 def simulate_session(
@@ -110,13 +109,14 @@ def simulate_session(
         raise ValueError(f"sigma: found {sigma!r}; expected a number of at least 0")
     rng = np.random.default_rng(seed)
     observations = build_observations(plan)
-    unknown = sensor_unknowns(plan).parameters
+    unknown = nuisance_parameters(plan).parameters
     drawn = np.zeros(len(unknown))
     if unknown and not exact:
-        # their own, so that noise is the same whatever is not known of the gauges
-        own = np.random.default_rng((seed, 1)).normal(size=len(unknown))
-        drawn = own * [p.tolerance for p in unknown]
-    entries = predict_entries(plan, observations, errors, unknowns=drawn)
+        # a separate generator: the noise does not depend on the nuisance parameters
+        normal = np.random.default_rng((seed, 1)).normal(size=len(unknown))
+        drawn = normal * [p.tolerance for p in unknown]
+        drawn = np.where([p.positive for p in unknown], np.abs(drawn), drawn)
+    entries = predict_readings(plan, errors, observations=observations, nuisance=drawn)
     entries, zeros = show_readings(plan, observations, entries, rng=rng, sigma=sigma, exact=exact)
     rows = observations.rows(entries)
     for reading, value in zip(plan.readings, rows, strict=True):
@@ -156,12 +156,12 @@ def show_readings(
     sigma: float | None = None,
     exact: bool = False,
 ) -> tuple[Array, dict[str, float]]:
-    """What dials show of what there is to read: with their zeros, noise and rounding.
+    """Dial readings of exact entries: with gauge zeros, noise and rounding.
 
     Args:
         plan: What is read where.
-        observations: Its readings as single ones.
-        entries: What there is to read, gauge zeros at 0, shape (n_entries,), [m].
+        observations: The entries of the plan.
+        entries: Exact readings, gauge zeros at 0, shape (n_entries,), [m].
         rng: Draws zeros and noise.
         sigma: Standard deviation of a reading, [m]; the plan's gauge by default.
         exact: No noise, no rounding to the gauge's resolution; dials show 0 where they begin.
@@ -174,9 +174,11 @@ def show_readings(
     """
     gauges = [plan.gauges[s.gauge] for s in plan.setups.values()]
     deviation = np.array([_noise_of(plan, s.gauge, sigma, exact) for s in plan.setups.values()])
-    # the dial is set where its setup begins
+    # the operator sets the dial in the first posture of its setup
     zeros = dict.fromkeys(plan.setups, 0.0)
-    for i, name in enumerate(zeros):
+    for i, (name, setup) in enumerate(plan.setups.items()):
+        if setup.zero == "known":
+            continue
         zeros[name] = -float(entries[observations.setup == i][:1].sum())
         if not exact:
             zeros[name] += round(float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO)), 6)
@@ -191,7 +193,7 @@ def show_readings(
 
 
 def limits_of(plan: Session, reading: Reading) -> tuple[float, float] | None:
-    """Lowest and highest value that a reading can have, [m]; None where the gauge says none."""
+    """Lowest and highest possible value of a reading, [m]; None without a stated range."""
     found = plan.gauges[plan.setups[reading.setup].gauge].range
     if found is None or reading.minus is None:
         return found
@@ -199,7 +201,7 @@ def limits_of(plan: Session, reading: Reading) -> tuple[float, float] | None:
 
 
 def _noise_of(plan: Session, gauge: str, sigma: float | None, exact: bool) -> float:
-    """Standard deviation that a gauge's readings are simulated with, [m]."""
+    """Standard deviation of a gauge's simulated readings, [m]."""
     deviation = plan.gauges[gauge].sigma if sigma is None else sigma
     if deviation is None and not exact:
         raise SessionError(
@@ -315,7 +317,7 @@ def truth_document(simulated: SimulatedSession) -> str:
         "zeros_mm": {name: to_mm(value) for name, value in simulated.zeros.items()},
     }
     if simulated.unknowns:
-        of_sensors = {p.name: p for p in sensor_unknowns(simulated.session).parameters}
+        of_sensors = {p.name: p for p in nuisance_parameters(simulated.session).parameters}
         document["sensors"] = {
             f"{name}_{of_sensors[name].edge_unit}": float(
                 f"{value * of_sensors[name].edge_factor:.9g}"

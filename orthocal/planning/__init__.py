@@ -1,1 +1,1 @@
-"""Which readings to take: candidates, a choice among them, and what it will be worth."""
+"""Measuring plans: candidate readings, a choice among them, and the expected tool error."""

@@ -1,7 +1,7 @@
-"""Readings to choose from: each setup that could stand, in each posture in which it could be read.
+"""Candidate readings of a plan: every possible setup in every posture in which it can be read.
 
-They are a session like any other, whatever its sensors are, so that all that is known of readings
-holds for them: where they touch, what they show, how they answer to what is not known.
+Candidates are a session like any other, for all sensors: contacts, predicted readings and
+Jacobians come from the same functions.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.observation.manual_alignment import slopes_by_errors
+from orthocal.observation.contacts import locate_contacts
+from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_frames import locate_contacts
-from orthocal.planning.equipment import Means, choose_box, reachable
+from orthocal.planning.equipment import Equipment, choose_box, reachable
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.leg_indicator import Direction, LegIndicator, Section
 from orthocal.sensors.protocol import Sensor
@@ -34,133 +34,130 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 PLACES_ACROSS = 5
-"""Places to the side of a leg's own way, and in it."""
+"""Number of positions across a leg's direction."""
 
 STEEPEST = 0.43
-"""Of the radii that touch: how far aside a ball may be, for then the rod pushes it 25° aside."""
+"""Largest lateral distance of ball and rod, as a fraction of the sum of their radii: 25°."""
 
 ON_BLADE = 0.4
-"""Of a blade's width: how far from its middle it may touch."""
+"""Largest distance of the contact from the centre of a blade, as a fraction of its width."""
 
 WHOLE = 5e-3
-"""Places are at multiples of this, [m]."""
+"""Step of the positions, [m]."""
 
 OVERLAP = 1.0
-"""Half widths from one place beside a rod to the next."""
+"""Distance of neighbouring lateral positions of a tip, in half widths."""
 
 ON_AXIS = 0.999
-"""Cosine above which a leg lies along an axis of the world."""
+"""Cosine above which a leg is parallel to an axis of the world."""
 
 ZERO_PRIOR = 0.01
-"""Standard deviation of a gauge's zero, [m]: nothing is known of it."""
+"""Prior standard deviation of a gauge zero, [m]: large beside any reading."""
 
 FEWEST = 2
-"""Readings of a setup: one says nothing beside its own zero."""
+"""Fewest readings of a setup: one alone only determines the gauge zero."""
 
 MOST_CANDIDATES = 60_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HandSet:
-    """Something of a gauge that a hand sets by the machine, where the setup begins."""
+class AlignedParameter:
+    """Nuisance parameter that the operator aligns to the machine in a setup's first posture."""
 
-    answers: Array
-    """How readings answer to it, shape (m,), [m/SI]."""
-    slopes: Array
-    """How it answers to the state in each posture, less the mean, shape (m, n_state), [SI]."""
+    sensitivity: Array
+    """Sensitivity of the readings to it, shape (m,), [m/SI]."""
+    jacobian: Array
+    """Its sensitivity to the state in each posture, less the mean, shape (m, n_state), [SI]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Kind:
-    """A setup that could stand, and the readings that it could take."""
+class CandidateSetup:
+    """Possible setup, with the readings that it could have."""
 
     name: str
-    """Of the setup, in the session of candidates."""
+    """Name in the session of candidates."""
     rows: Indices
-    """Its candidates, shape (m,)."""
-    slopes: Array
-    """How they answer to the state, shape (m, n_state), [m per tolerance]; where a hand sets the
-    gauge by the machine, as on the mean of their postures."""
-    own: Array
-    """Covariance that the setup's own unknowns and its zero give them, shape (m, m), [m²]."""
-    together: NDArray[np.bool_]
-    """Whether the gauge that begins in one (row) reaches another (column), shape (m, m)."""
-    by_hand: tuple[HandSet, ...] = ()
+    """Rows of its readings, shape (m,)."""
+    jacobian: Array
+    """Sensitivity of the readings to the state, shape (m, n_state), [m per tolerance]; with the
+    gauge aligned on the mean of the postures."""
+    covariance: Array
+    """Covariance of the readings from the setup's nuisance parameters and zero, (m, m), [m²]."""
+    reachable: NDArray[np.bool_]
+    """Whether a gauge that begins in one reading (row) has another (column) in its range,
+    shape (m, m)."""
+    aligned: tuple[AlignedParameter, ...] = ()
 
-    def begun(self, first: int) -> Kind:
-        """The same with its gauge set in the posture of one of them."""
-        if not self.by_hand:
+    def begun(self, first: int) -> CandidateSetup:
+        """The setup with its gauge aligned in the posture of one reading."""
+        if not self.aligned:
             return self
-        slopes = self.slopes
-        for hand in self.by_hand:
-            slopes = slopes + np.outer(hand.answers, hand.slopes[first])
-        return replace(self, slopes=slopes, by_hand=())
+        jacobian = self.jacobian
+        for a in self.aligned:
+            jacobian = jacobian + np.outer(a.sensitivity, a.jacobian[first])
+        return replace(self, jacobian=jacobian, aligned=())
 
-    def only(self, chosen: Sequence[int]) -> Kind:
-        """Some of its readings alone."""
+    def only(self, chosen: Sequence[int]) -> CandidateSetup:
+        """The setup with some of its readings."""
         at = np.array(chosen)
         square = np.ix_(at, at)
-        return Kind(
+        return CandidateSetup(
             self.name,
             self.rows[at],
-            self.slopes[at],
-            self.own[square],
-            self.together[square],
-            tuple(HandSet(h.answers[at], h.slopes[at]) for h in self.by_hand),
+            self.jacobian[at],
+            self.covariance[square],
+            self.reachable[square],
+            tuple(AlignedParameter(a.sensitivity[at], a.jacobian[at]) for a in self.aligned),
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """Readings to choose from, on a nominal machine."""
+    """Candidate setups and readings on a nominal machine."""
 
     session: Session
     problem: CalibrationProblem
-    kinds: tuple[Kind, ...]
+    setups: tuple[CandidateSetup, ...]
     sigma: float
     """Standard deviation of a reading, [m]."""
     state: tuple[str, ...]
-    """Parameters that more than one setup tells: the machine's, and what setups share."""
-    taken_range: float
-    """What machines within their tolerances may take of the gauge's range to either side, [m]."""
+    """Parameters on which more than one setup depends."""
+    spare_range: float
+    """Part of the gauge's range to either side that the tolerances of the machine need, [m]."""
 
     @property
     def count(self) -> int:
-        """How many readings there are to choose from."""
-        return sum(len(k.rows) for k in self.kinds)
+        """Number of candidate readings."""
+        return sum(len(s.rows) for s in self.setups)
 
     @property
-    def bare(self) -> Candidates:
-        """What a choice needs of them, without the session and its problem: what can be pickled."""
+    def without_session(self) -> Candidates:
+        """Candidates without the session and its problem, which cannot be pickled."""
         nothing: Any = None
         return replace(self, session=nothing, problem=nothing)
 
-    def readings(self, kind: int, chosen: Indices) -> list[Reading]:
-        """Candidates of a kind."""
-        return [self.session.readings[i] for i in self.kinds[kind].rows[chosen]]
 
-
-def list_candidates(robot: Robot, means: Means, *, reference: str = "") -> Session:
-    """Every setup that could stand and posture that it could be read in, as a session.
+def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") -> Session:
+    """Session of every possible setup in every posture in which it can be read.
 
     Args:
         robot: The robot.
-        means: What one has.
-        reference: How the session names the robot; its name by default.
+        equipment: Gauge, tip and region of the postures.
+        reference: Name of the robot in the session; by default its own.
 
     Raises:
-        ParameterError: If there is nothing to choose from, or too much.
+        ParameterError: If there are no candidates, or too many.
     """
     if not robot.legs:
         raise ParameterError(
-            f"'{robot.name}' has no legs for a gauge to touch; add orthocal.legs", where="plan"
+            f"'{robot.name}' has no legs for a gauge; add orthocal.legs", where="plan"
         )
     postures: dict[str, Posture] = {}
     setups: dict[str, Setup] = {}
     readings: list[Reading] = []
     for leg in robot.legs.values():
-        names = _postures(robot, leg, means, postures)
-        for name, sensor in _sensors(leg, means):
+        names = _add_postures(robot, leg, equipment, postures)
+        for name, sensor in _sensors(leg, equipment):
             setups[name] = Setup(name, sensor)
             readings += [Reading(name, p, None, 1, 0.0, None) for p in names]
             if len(readings) > MOST_CANDIDATES * 10:
@@ -170,7 +167,7 @@ def list_candidates(robot: Robot, means: Means, *, reference: str = "") -> Sessi
         robot_reference=reference or robot.name,
         title="",
         source="",
-        gauges={"": means.gauge},
+        gauges={"": equipment.gauge},
         postures=postures,
         setups=setups,
         readings=tuple(readings),
@@ -179,19 +176,19 @@ def list_candidates(robot: Robot, means: Means, *, reference: str = "") -> Sessi
         readings_path=None,
         sha256="",
     )
-    session = _with_places_beside(session)
+    session = _with_lateral_positions(session)
     return _touching(session)
 
 
 def measure_candidates(
     session: Session, problem: CalibrationProblem, *, spare_range: float
 ) -> Candidates:
-    """How candidates answer to what is not known, and which of them one setup can take.
+    """Jacobians and covariances of candidate readings, and which of them fit a gauge's range.
 
     Args:
-        session: Of the candidates.
-        problem: Theirs, with priors for all that is free.
-        spare_range: As of `Means`.
+        session: Session of the candidates.
+        problem: Its calibration problem, with priors for all free parameters.
+        spare_range: As in `Equipment`.
     """
     sigma = noise_floor(session.gauge.sigma, session.gauge.resolution)
     h, jacobian = problem.linearise(problem.reference)
@@ -199,94 +196,96 @@ def measure_candidates(
     private = {f"setup.{name}" for name in session.setups}
     owners = [name.rpartition(".")[0] for name in problem.free]
     common = [i for i, owner in enumerate(owners) if i < n or owner not in private]
-    kinds, taken, set_by = [], [], _list_set_by(session, problem)
+    setups, needed, aligned_of = [], [], _list_aligned(session, problem)
     aligned_at = session.alignment_postures
     for k, name in enumerate(session.setups):
         rows = np.flatnonzero(o.setup == k)
         if rows.size < FEWEST:
             continue
         own = [i for i in range(n, len(owners)) if owners[i] == f"setup.{name}"]
-        slopes, mine = jacobian[rows][:, common], jacobian[rows][:, own]
-        by_hand = []
-        for index, seen in set_by.get(name, ()):
-            answers = jacobian[rows, index] / problem.theta_scale[index]
-            moves = np.zeros_like(slopes)
-            moves[:, :n] = seen - seen.mean(axis=0)
+        shared, mine = jacobian[rows][:, common], jacobian[rows][:, own]
+        aligned = []
+        for index, seen in aligned_of.get(name, ()):
+            sensitivity = jacobian[rows, index] / problem.theta_scale[index]
+            moved = np.zeros_like(shared)
+            moved[:, :n] = seen - seen.mean(axis=0)
             at = [session.readings[i].posture for i in rows].index(aligned_at[name])
-            slopes -= np.outer(answers, moves[at])  # that is where the session aligns it
-            by_hand.append(HandSet(answers, moves))
+            shared -= np.outer(sensitivity, moved[at])  # the session aligns the gauge there
+            aligned.append(AlignedParameter(sensitivity, moved))
         spread = mine @ mine.T
-        unknown = spare_range * _unknown_differences(slopes, spread)
-        taken.append(float(unknown.max()))
-        reaches = _reach_each_other(session, h[rows], unknown)
-        own_spread = spread + ZERO_PRIOR**2
-        kinds.append(Kind(name, rows, slopes, own_spread, reaches, tuple(by_hand)))
+        unknown = spare_range * _difference_std(shared, spread)
+        needed.append(float(unknown.max()))
+        reachable = _find_reachable(session, h[rows], unknown)
+        covariance = spread + ZERO_PRIOR**2
+        setups.append(CandidateSetup(name, rows, shared, covariance, reachable, tuple(aligned)))
     state = tuple(problem.free[i] for i in common)
-    typical = float(np.median(taken)) if taken else 0.0
-    return Candidates(session, problem, tuple(kinds), sigma, state, typical)
+    typical = float(np.median(needed)) if needed else 0.0
+    return Candidates(session, problem, tuple(setups), sigma, state, typical)
 
 
-def _list_set_by(
+def _list_aligned(
     session: Session, problem: CalibrationProblem
 ) -> dict[str, list[tuple[int, Array]]]:
-    """Setup to what of its gauge a hand sets by the machine.
+    """Nuisance parameters that are aligned to the machine, by setup.
 
-    That is which free parameter it is, and how it answers to the machine's in each of the setup's
-    candidates, shape (m, n_machine), [SI per tolerance].
+    Each has its index among the free parameters, and its sensitivity to the machine's parameters
+    in each of the setup's readings, shape (m, n_machine), [SI per tolerance].
     """
-    seen: dict[str, dict[str, Setup]] = {}
+    aligned: dict[str, dict[str, Setup]] = {}
     for name, setup in session.setups.items():
         for unknown, sensor in setup.sensor.set_by(session.robot).items():
             if unknown in {u.name for u in setup.sensor.unknowns}:
-                seen.setdefault(unknown, {})[name] = replace(setup, sensor=sensor)
-    found: dict[str, list[tuple[int, Array]]] = {}
-    for unknown, setups in seen.items():
+                aligned.setdefault(unknown, {})[name] = replace(setup, sensor=sensor)
+    listed: dict[str, list[tuple[int, Array]]] = {}
+    for unknown, setups in aligned.items():
         readings = tuple(r for r in session.readings if r.setup in setups)
-        looks = replace(session, setups=setups, readings=readings)
-        slopes = slopes_by_errors(looks) @ problem.columns
-        setup_of = build_observations(looks).setup
+        views = replace(session, setups=setups, readings=readings)
+        jacobian = nominal_sensitivity(views) @ problem.columns
+        setup_of = build_observations(views).setup
         for k, name in enumerate(setups):
             index = problem.free.index(f"setup.{name}.{unknown}")
-            found.setdefault(name, []).append((index, slopes[setup_of == k]))
-    return found
+            listed.setdefault(name, []).append((index, jacobian[setup_of == k]))
+    return listed
 
 
-def _unknown_differences(slopes: Array, spread: Array) -> Array:
-    """Standard deviations of differences of readings before anything is known, (m, m), [m]."""
-    covariance = slopes @ slopes.T + spread
+def _difference_std(jacobian: Array, spread: Array) -> Array:
+    """Prior standard deviations of differences of readings, shape (m, m), [m]."""
+    covariance = jacobian @ jacobian.T + spread
     variance = np.diag(covariance)
     square = variance[:, None] + variance[None] - 2.0 * covariance
     return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
 
-def _reach_each_other(session: Session, h: Array, unknown: Array) -> NDArray[np.bool_]:
-    """Whether a gauge that is set to the middle of its range in one posture reaches in another."""
+def _find_reachable(session: Session, h: Array, unknown: Array) -> NDArray[np.bool_]:
+    """Whether a gauge with the middle of its range in one posture has another in its range."""
     if session.gauge.range is None:
         return np.ones((h.size, h.size), dtype=np.bool_)
     half = 0.5 * (session.gauge.range[1] - session.gauge.range[0])
     return np.asarray(np.abs(h[:, None] - h[None]) <= half - unknown)
 
 
-def _postures(robot: Robot, leg: Leg, means: Means, postures: dict[str, Posture]) -> list[str]:
-    """Names of the postures that a leg could be read in; they are added to those there are."""
-    box = choose_box(robot, means.box)
+def _add_postures(
+    robot: Robot, leg: Leg, equipment: Equipment, postures: dict[str, Posture]
+) -> list[str]:
+    """Add the postures in which a leg can be read; their names."""
+    box = choose_box(robot, equipment.box)
     middle = tool_at_zero(robot)
     coordinates = () if robot.tcp is None else robot.tcp.coordinates
     own = [k for k, c in enumerate(coordinates) if abs(leg.axis[c]) > ON_AXIS]
     lines = []
     for k, (low, high) in enumerate(box):
         if own and k not in own:
-            side = middle[k] + np.linspace(-means.across, means.across, PLACES_ACROSS)
+            side = middle[k] + np.linspace(-equipment.across, equipment.across, PLACES_ACROSS)
             lines.append(np.unique(np.clip(side, low, high)))
         else:
-            line = np.linspace(low, high, means.along if own else PLACES_ACROSS)
+            line = np.linspace(low, high, equipment.along if own else PLACES_ACROSS)
             whole = np.round(line / WHOLE) * WHOLE
             lines.append(np.unique(np.clip(whole, low, high).round(9)))
     points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))
     points = np.unique(np.vstack([np.clip(middle, box[:, 0], box[:, 1]), points.round(9)]), axis=0)
     points = points[reachable(robot, points)]
     if len(points) < FEWEST:
-        raise ParameterError("the machine reaches none of its postures", where="plan: box")
+        raise ParameterError("the machine reaches no posture in it", where="plan: box")
     names = [_name(p, robot, middle) for p in points]
     drives = nominal_assembly(robot).inverse(points)
     for name, point, drive in zip(names, points, drives, strict=True):
@@ -295,7 +294,7 @@ def _postures(robot: Robot, leg: Leg, means: Means, postures: dict[str, Posture]
 
 
 def _name(point: Array, robot: Robot, middle: Array) -> str:
-    """A posture's name: how far the tool is from the mechanical zero, such as x+60_y-10."""
+    """Name of a posture: displacement from the mechanical zero, such as x+60_y-10."""
     letters = "" if robot.tcp is None else ["xyz"[c] for c in robot.tcp.coordinates]
     parts = [
         f"{letter}{round(v / MM, 3):+g}"
@@ -305,31 +304,31 @@ def _name(point: Array, robot: Robot, middle: Array) -> str:
     return "_".join(parts) or "zero"
 
 
-def _sensors(leg: Leg, means: Means) -> Iterator[tuple[str, Sensor]]:
-    """Indicators that could stand at a leg, by a name."""
+def _sensors(leg: Leg, equipment: Equipment) -> Iterator[tuple[str, Sensor]]:
+    """Possible indicators at a leg, with names."""
     for direction in _directions(leg):
         word = direction if isinstance(direction, str) else "d"
-        for part in means.sections:
+        for part in equipment.sections:
             section = Section("fraction", part)
-            if means.tip is None or not (leg.rods or means.rods):
+            if equipment.tip is None or not (leg.rods or equipment.rods):
                 yield (
                     f"{word}{leg.name}_{part:g}",
-                    LegIndicator(leg.name, direction, section, means.standing),
+                    LegIndicator(leg.name, direction, section, equipment.mounting),
                 )
                 continue
-            for rod in means.rods or tuple(leg.rods)[:1]:
+            for rod in equipment.rods or tuple(leg.rods)[:1]:
                 if rod not in leg.rods:
                     known = ", ".join(leg.rods) or "none"
                     raise ParameterError(
                         f"'{rod}' is not a rod of leg {leg.name}; rods: {known}", where="touches"
                     )
-                kind = RodByBall if means.tip.form == "ball" else RodByBlade
-                sensor = kind(leg.name, rod, direction, section, means.tip, means.standing)
+                kind = RodByBall if equipment.tip.form == "ball" else RodByBlade
+                sensor = kind(leg.name, rod, direction, section, equipment.tip, equipment.mounting)
                 yield f"{word}{leg.name}_{rod}_{part:g}", sensor
 
 
 def _directions(leg: Leg) -> list[Direction]:
-    """Two directions across a leg, along the world's axes where these are square to it."""
+    """Two directions across a leg, along axes of the world that are perpendicular to it."""
     found: list[Direction] = [
         name for name, axis in zip("xyz", np.eye(3), strict=True) if abs(axis @ leg.axis) < 1e-6
     ]
@@ -343,8 +342,8 @@ def _directions(leg: Leg) -> list[Direction]:
     return [(float(a), float(b), float(c)) for a, b, c in (first, second)]
 
 
-def _with_places_beside(session: Session) -> Session:
-    """The candidates with gauges that stand where the rod is in displaced postures, too."""
+def _with_lateral_positions(session: Session) -> Session:
+    """Candidates with further gauges where the rod is in displaced postures."""
     wide = Tip("blade", 0.0, 10.0)
     reads: dict[str, list[Reading]] = {name: [] for name in session.setups}
     for reading in session.readings:
@@ -372,7 +371,7 @@ def _with_places_beside(session: Session) -> Session:
         side = sensor.constants(session.robot)[8:11]
         start = sensor.constants(session.robot)[11:14]
         aside = dict(zip(postures, ((contact.points - start) @ side).tolist(), strict=True))
-        half = _room_beside(sensor, session.robot)
+        half = _lateral_room(sensor, session.robot)
         step = max(round(OVERLAP * half / MM), 1) * MM
         lowest, highest = (round(f(aside.values()) / step) for f in (min, max))
         for k in range(int(lowest), int(highest) + 1):
@@ -384,29 +383,29 @@ def _with_places_beside(session: Session) -> Session:
     return replace(session, setups=setups, readings=tuple(readings))
 
 
-def distance_beside(sensor: Sensor) -> float:
-    """How far from where the rod lies in the mechanical zero a sensor's tip begins, [m]."""
+def lateral_distance(sensor: Sensor) -> float:
+    """Distance of a sensor's tip from the rod in the mechanical zero, [m]."""
     if isinstance(sensor, RodByBall | RodByBlade):
         return float(np.linalg.norm(sensor.beside))
     return 0.0
 
 
-def replace_beside(sensor: Sensor) -> Sensor:
-    """A sensor with its tip where the rod lies in the mechanical zero."""
+def without_lateral(sensor: Sensor) -> Sensor:
+    """Sensor with its tip on the rod in the mechanical zero."""
     if isinstance(sensor, RodByBall | RodByBlade):
         return replace(sensor, beside=(0.0, 0.0, 0.0))
     return sensor
 
 
-def _room_beside(sensor: RodByBall | RodByBlade, robot: Robot) -> float:
-    """How far aside a rod may be from where a tip is placed, [m]."""
+def _lateral_room(sensor: RodByBall | RodByBlade, robot: Robot) -> float:
+    """Largest lateral distance of a rod from a tip, [m]."""
     if sensor.tip.form == "ball":
         return STEEPEST * (robot.legs[sensor.leg].rods[sensor.rod].radius + sensor.tip.radius)
     return ON_BLADE * sensor.tip.width
 
 
 def _touching(session: Session) -> Session:
-    """The candidates that touch what they read, on the nominal machine."""
+    """Candidates whose tip touches the rod on the nominal machine."""
     good = {
         (setup, posture)
         for setup, (postures, contact) in locate_contacts(session).items()
@@ -415,11 +414,11 @@ def _touching(session: Session) -> Session:
     }
     readings = tuple(r for r in session.readings if (r.setup, r.posture) in good)
     if not readings:
-        raise ParameterError("no gauge touches anything in any posture", where="plan")
+        raise ParameterError("no gauge touches a rod in any posture", where="plan")
     if len(readings) > MOST_CANDIDATES:
         raise ParameterError(
-            f"{len(readings)} readings to choose from; expected at most {MOST_CANDIDATES}: give "
-            "fewer sections or places",
+            f"{len(readings)} candidate readings; expected at most {MOST_CANDIDATES}: choose fewer "
+            "sections or positions",
             where="plan",
         )
     return replace(session, readings=readings).select(readings)

@@ -1,41 +1,48 @@
-"""What one has to measure with, and where the machine may stand meanwhile."""
+"""Equipment of a plan: the gauge, the places where it may be mounted, and the postures."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.errors import ClosureError, ParameterError
+from orthocal.errors import ClosureError, SessionError
+from orthocal.io.documents import read_yaml, validate
 from orthocal.io.fields import read_only
-from orthocal.kinematics.function_cache import once_a_robot
+from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_assembly
-from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.kinematics.workspace import require_commanded_tool, tool_at_zero
+from orthocal.measurement.files.schema import GaugeKeys
+from orthocal.planning.expected_error import state_noise
 from orthocal.robot.model import Robot
-from orthocal.sensors.mounting import USUAL, Standing
+from orthocal.sensors.leg_indicator import LegIndicator
+from orthocal.sensors.mounting import USUAL, Standing, StandingKeys
+from orthocal.sensors.rod_indicator import RodIndicator
 from orthocal.sensors.tips import Tip
-from orthocal.session.session import Gauge
+from orthocal.session.session import Gauge, Session
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
 
 REACH = 0.1
-"""How far from the mechanical zero the tool goes by default, where it gets so far, [m]."""
+"""Largest default distance of the tool from the mechanical zero, along each coordinate, [m]."""
 
 ROOM = 0.005
-"""What is left of the way to where the tool still gets: the machine's offsets take some, [m]."""
+"""Distance kept from the end of the reach, because offsets of the machine reduce it, [m]."""
 
 STEP = 0.01
-"""Ends of the default box are multiples of this, [m]."""
+"""Step of the ends of the default box, [m]."""
 
 SECTIONS = (0.25, 0.5, 0.75)
-"""Where along a leg a gauge may touch by default, from its root, as a part of its length."""
+"""Default sections, as fractions of a leg's length from its root."""
 
 ACROSS = 0.02
-"""How far from a leg's own way the tool goes by default, [m]."""
+"""Default displacement of the tool across a leg's direction, [m]."""
 
 SPARE_RANGE = 3.0
 
@@ -43,55 +50,54 @@ MINUTES_A_SETUP = 10.0
 MINUTES_A_READING = 0.5
 
 USUAL_DIAL = Gauge(5e-6, 10e-6, (-5e-3, 5e-3))
-"""Of ±5 mm, read to 10 µm."""
+"""Dial indicator of ±5 mm with a resolution of 10 µm."""
 
 USUAL_BALL = Tip("ball", 1.5e-3)
 
+MOUNTING_KEYS = ("direction_tolerance_mrad", "section_tolerance_mm", "lateral_tolerance_mm")
+"""Keys of dial.yaml that describe the mounting."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Means:
-    """What one has to measure with, and how far one goes."""
+class Equipment:
+    """Gauge, tip and time that are available, and the region in which readings are possible."""
 
     gauge: Gauge = USUAL_DIAL
     tip: Tip | None = USUAL_BALL
-    """What touches; None for readings of the line between a leg's rods, as in the paper."""
-    standing: Standing = USUAL
+    """Tip of the gauge; None for readings of the line between a leg's rods, as in the paper."""
+    mounting: Standing = USUAL
+    """Mounting uncertainty of the gauge."""
     rods: tuple[str, ...] = ()
-    """Rods of each leg that can be touched; its first by default."""
+    """Rods of each leg that the gauge can touch; by default the first one."""
     sections: tuple[float, ...] = SECTIONS
-    """As parts of a leg's length, from its root."""
+    """Fractions of a leg's length, from its root."""
     box: Array | None = None
-    """Least and largest tool coordinates, shape (n_coordinates, 2), [m]; `choose_box` cuts it off
-    where the tool does not get, and has one of its own where none is given."""
+    """Limits of the tool's coordinates, shape (n_coordinates, 2), [m]; by default `find_box`."""
     along: int = 9
-    """Places on a leg's way."""
+    """Number of positions along a leg's direction."""
     across: float = ACROSS
-    """How far from it the tool goes to either side, [m]."""
+    """Displacement of the tool across a leg's direction, to either side, [m]."""
     spare_range: float = SPARE_RANGE
-    """Standard deviations of a machine within its tolerances for which the gauge's range is kept
-    free."""
+    """Standard deviations of readings, before the machine is calibrated, for which the gauge's
+    range has room."""
     minutes_a_setup: float = MINUTES_A_SETUP
     minutes_a_reading: float = MINUTES_A_READING
 
     def minutes(self, setups: int, readings: int) -> float:
-        """How long a plan takes."""
+        """Duration of setups and their readings."""
         return setups * self.minutes_a_setup + readings * self.minutes_a_reading
 
 
-@once_a_robot(maxsize=8)
+@cached_per_robot(maxsize=8)
 def find_box(robot: Robot) -> Array:
-    """How far the tool gets from the mechanical zero along each coordinate, at most 100 mm.
+    """Reach of the tool along each coordinate through the mechanical zero, at most 100 mm.
 
     Shape (n_coordinates, 2), [m].
 
     Raises:
-        ParameterError: If the robot's drives do not command its tool.
+        RobotError: If the robot's drives do not command its tool.
     """
-    if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
-        raise ParameterError(
-            "the drives do not command the tool: there are no postures to choose from",
-            where=str(robot.yaml),
-        )
+    require_commanded_tool(robot)
     middle = tool_at_zero(robot)
     return read_only(
         [
@@ -102,20 +108,19 @@ def find_box(robot: Robot) -> Array:
 
 
 def choose_box(robot: Robot, asked: Array | None) -> Array:
-    """The box of the tool to choose postures from: `find_box`, or what is reached of another.
+    """Box of the postures to choose from: `find_box`, or the reachable part of another one.
 
-    Postures lie evenly between its ends: ends that the tool never gets to would leave few of them.
+    Postures are evenly spaced in it, so that limits out of reach would leave few of them.
 
     Args:
         robot: The robot.
-        asked: Least and largest tool coordinates, shape (n_coordinates, 2), [m].
+        asked: Limits of the tool's coordinates, shape (n_coordinates, 2), [m].
 
     Returns:
-        The same, its ends no farther than the tool gets from the mechanical zero along each
-        coordinate, in whole steps.
+        The same with limits in reach, in whole steps from the mechanical zero.
 
     Raises:
-        ParameterError: If the robot's drives do not command its tool.
+        RobotError: If the robot's drives do not command its tool.
     """
     if asked is None:
         return find_box(robot)
@@ -133,13 +138,13 @@ def choose_box(robot: Robot, asked: Array | None) -> Array:
             near, far = (0.5 * (near + far), far) if reached else (near, 0.5 * (near + far))
         steps = math.floor(max(near - ROOM, 0.0) / STEP + 1e-9)
         found[k, end] = middle[k] + way * STEP * steps
-    beyond = found[:, 0] > found[:, 1]  # all of it: there will be no postures
+    beyond = found[:, 0] > found[:, 1]  # nothing is in reach, and there will be no postures
     found[beyond] = asked[beyond]
     return read_only(found)
 
 
 def _reach(robot: Robot, middle: Array, coordinate: int, way: float) -> float:
-    """How far the tool gets along a coordinate, in whole steps, [m]."""
+    """Reach of the tool along a coordinate, in whole steps, [m]."""
     steps = np.arange(1, round((REACH + ROOM) / ROOM) + 1)
     points = np.repeat(middle[None], steps.size, axis=0)
     points[:, coordinate] += way * ROOM * steps
@@ -149,7 +154,7 @@ def _reach(robot: Robot, middle: Array, coordinate: int, way: float) -> float:
 
 
 def reachable(robot: Robot, points: Array) -> NDArray[np.bool_]:
-    """Whether the nominal machine gets to tool positions within the travel of its drives, (n,)."""
+    """Mask of tool positions that the nominal machine reaches, shape (n,)."""
     assembly = nominal_assembly(robot)
     try:
         drives = assembly.inverse(points)
@@ -163,6 +168,64 @@ def reachable(robot: Robot, points: Array) -> NDArray[np.bool_]:
     return np.asarray(((drives >= lower) & (drives <= upper)).all(axis=1))
 
 
-def describe_box(box: Array) -> str:
-    """A box in words, in mm."""
-    return " × ".join(f"{low / MM:g} … {high / MM:g}" for low, high in box)
+def load_dial(path: str | Path, equipment: Equipment) -> Equipment:
+    """Equipment with the dial indicator that a file describes.
+
+    Args:
+        path: YAML with `sigma_mm`, `resolution_mm`, `range_mm`, `tip` and `scale_tolerance` as
+            under `gauge` in a session.yaml, and `direction_tolerance_mrad`, `section_tolerance_mm`
+            and `lateral_tolerance_mm` as in its setups. Without `tip` a line is read.
+        equipment: The other equipment.
+
+    Raises:
+        SessionError: Naming file and key.
+    """
+    file = Path(path)
+    found = read_yaml(file, error=SessionError)
+    if not isinstance(found, dict):
+        raise SessionError("expected keys and values, such as sigma_mm: 0.005", where=str(file))
+    data: dict[str, Any] = dict(found)
+    own = {k: data.pop(k) for k in MOUNTING_KEYS if k in data}
+    gauge = validate(GaugeKeys, data, where=str(file), error=SessionError)
+    if gauge.scale_tolerance is not None:
+        own["scale_tolerance"] = gauge.scale_tolerance
+    mounting = Standing.from_keys(validate(StandingKeys, own, where=str(file), error=SessionError))
+    if gauge.sigma_mm is None and gauge.resolution_mm is None:
+        raise SessionError(
+            "is missing; a plan needs the repeatability of the readings",
+            where=f"{file}: sigma_mm",
+        )
+    return replace(
+        equipment,
+        gauge=Gauge(
+            None if gauge.sigma_mm is None else gauge.sigma_mm * MM,
+            None if gauge.resolution_mm is None else gauge.resolution_mm * MM,
+            None if gauge.range_mm is None else (gauge.range_mm[0] * MM, gauge.range_mm[1] * MM),
+        ),
+        tip=None if gauge.tip is None else Tip.from_keys(gauge.tip),
+        mounting=mounting,
+    )
+
+
+def equipment_of(session: Session, equipment: Equipment) -> Equipment:
+    """Equipment with the gauge of a session, its tip and its rods.
+
+    Args:
+        session: The session; the first of several gauges and sensors is used.
+        equipment: The other equipment.
+
+    Raises:
+        SessionError: If the repeatability of the readings is unknown.
+    """
+    session = state_noise(session)
+    sensors = [s.sensor for s in session.setups.values()]
+    on_rods = [s for s in sensors if isinstance(s, RodIndicator)]
+    on_lines = [s for s in sensors if isinstance(s, LegIndicator)]
+    if on_rods:
+        rods = equipment.rods or tuple(dict.fromkeys(s.rod for s in on_rods))
+        mounting = replace(on_rods[0].standing, stand=None)
+        return replace(
+            equipment, gauge=session.gauge, tip=on_rods[0].tip, mounting=mounting, rods=rods
+        )
+    mounting = replace(on_lines[0].standing, stand=None) if on_lines else equipment.mounting
+    return replace(equipment, gauge=session.gauge, tip=None, mounting=mounting)

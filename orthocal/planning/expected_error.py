@@ -1,8 +1,7 @@
-"""What readings will leave unknown at the tool, before any is taken.
+"""Expected tool error after a calibration from planned readings.
 
-Of a machine within its tolerances, to first order about the nominal one: the posterior of what is
-identified, and what errors that are not identified do to it and by themselves (as
-`assess.accuracy` has it of a calibration).
+It is the mean over machines within their tolerances, each to first order: the posterior covariance
+of the identified parameters, the errors that are not identified, and their effect on the former.
 """
 
 from __future__ import annotations
@@ -21,20 +20,17 @@ from orthocal.assessment.tool_error import (
     ToolUncertainty,
     measure_uncertainty,
 )
-from orthocal.errors import ClosureError, RobotError, SessionError
+from orthocal.errors import ClosureError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.selection import Selection
-from orthocal.estimation.solvers.machine_readings import Fleet
 from orthocal.estimation.weighting import split_by_gauge
-from orthocal.kinematics.function_cache import once_a_robot
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import (
     FEWEST_ALIGNED,
     Workspace,
-    largest_cube,
-    tool_at_zero,
+    find_workspace,
 )
 from orthocal.observation.observations import build_observations
 from orthocal.robot.model import Robot
@@ -47,71 +43,63 @@ from orthocal.statistics.zeros import project_out_zeros
 Array = NDArray[np.float64]
 
 Criterion = Literal["aligned", "relative", "absolute", "worst", "A", "D", "E"]
-"""What a plan makes small: the r.m.s. error at the tool in its three forms, the error at the worst
-point (shift and rotation out), or the covariance of the parameters in their tolerances: its trace,
-determinant or largest eigenvalue."""
+"""Criterion of a plan: the RMS tool error in its three forms, the error at the worst point with
+translation and rotation removed, or the trace (A), determinant (D) or largest eigenvalue (E) of the
+covariance of the parameters, in their tolerances."""
 
 CRITERIA: tuple[Criterion, ...] = ("aligned", "relative", "absolute", "worst", "A", "D", "E")
 
 WORST_POWER = 8.0
-"""The mean of this power of the points' variances stands for the largest of them."""
+"""Power of the mean by which the largest variance of the points is approximated."""
 
 MACHINES = 12
-"""Machines that are drawn to foretell what is left."""
+"""Number of machines over which the expected error is averaged."""
 
 ENTERED = 0.1
-"""Of their tolerances: what offsets are off by once they were entered."""
-
-ROOM = 1.08
-"""How much further a machine gets than to the corners of the cube that it is judged by."""
-
-NEARLY_SINGULAR = 10.0
-"""What moves the tool most over what moves it least, by drives, where nothing is promised."""
+"""Standard deviation of offsets after they were entered, in tolerances."""
 
 VAGUE = 1e-8
-"""Inverse variance of a parameter without a prior, [1 per tolerance²]: nothing is known of it."""
+"""Inverse variance of a parameter without a prior, [1 per tolerance²]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expected:
-    """What readings would leave unknown."""
+    """Expected tool error after a calibration."""
 
     tool: ToolUncertainty
     names: tuple[str, ...]
-    """Free parameters of the machine, then those that are not identified."""
+    """Identified parameters of the machine, then those that are not identified."""
     tolerances: Array
     """[SI]."""
     covariance: Array
-    """Of what the estimate has wrong, shape (n, n), [SI]."""
-
+    """Covariance of the errors of the estimate, shape (n, n), [SI]."""
     lost: float = 0.0
-    """Share of the readings that do not exist on machines within their tolerances: the tip passes
-    what it should touch."""
+    """Fraction of the readings that machines within their tolerances do not allow, because the tip
+    misses the rod."""
 
     @property
     def sizes(self) -> ErrorSizes:
-        """Of the error at the tool."""
+        """Tool error in its three forms."""
         return self.tool.sizes
 
     @property
     def headline(self) -> ErrorSize:
-        """The one that decides."""
+        """Tool error in the form that decides."""
         return self.tool.sizes.headline
 
 
 class ToolForecast:
-    """Errors at the tool of machines within their tolerances, by what is read of them.
+    """Expected tool errors of machines within their tolerances.
 
     Args:
         robot: The robot.
-        selection: What is identified.
-        others: Errors that are not identified, and by how much they may be off, [SI]; by default
-            all of the machine's, by their tolerances.
-        workspace: Where the tool's error counts; by default the largest cube around the zero that
-            the machine reaches, of ±60 mm at most.
+        selection: Parameters that are identified.
+        others: Parameters that are not identified, with their tolerances, [SI]; by default all
+            others of the machine.
+        workspace: Region over which the tool error is computed; by default the robot's.
 
     Raises:
-        RobotError: If the robot has no tool centre point.
+        RobotError: If the drives do not command the tool.
         ClosureError: If the machine cannot reach the workspace.
     """
 
@@ -124,14 +112,14 @@ class ToolForecast:
         others: Mapping[str, float] | None = None,
     ) -> None:
         self.robot, self.selection = robot, selection
-        self.workspace = default_workspace(robot) if workspace is None else workspace
+        self.workspace = find_workspace(robot) if workspace is None else workspace
         parameters = robot.parameters
         free = selection.names
-        taken = {parameters[n].terms[0][0] for n in (*free, *selection.fixed)}
+        determined = {parameters[n].terms[0][0] for n in (*free, *selection.fixed)}
         self.others = tuple(
             n
             for n in (machine_errors(robot) if others is None else others)
-            if not taken & {term for term, _ in parameters[n].terms}
+            if not determined & {term for term, _ in parameters[n].terms}
         )
         self.names = (*free, *self.others)
         own = {**(others or {}), **{p.name: p.tolerance for p in selection.parameters}}
@@ -145,17 +133,17 @@ class ToolForecast:
 
     @property
     def before(self) -> Expected:
-        """What is unknown of a machine of which nothing was read."""
+        """Expected tool error of a machine without calibration."""
         return self._expected(np.diag(self.tolerances**2))
 
     def align(self, field: Array) -> Array:
-        """Tool errors with shift and rotation taken out, shape (K, 3, ...)."""
+        """Tool errors with translation and rotation removed, shape (K, 3, ...)."""
         if len(self.positions) < FEWEST_ALIGNED:
             return self.workspace.remove_shift(field)
         return self.workspace.remove_motion(field, self.positions)
 
     def problem(self, session: Session) -> CalibrationProblem:
-        """The calibration that a session's readings will be for."""
+        """Calibration problem of a session's readings."""
         return weigh_readings(CalibrationProblem(session, self.selection))
 
     def after(
@@ -167,30 +155,32 @@ class ToolForecast:
         entered: bool = True,
         machines: Sequence[Array] | None = None,
     ) -> Expected:
-        """What a session's readings leave unknown, whatever they will be.
+        """Expected tool error after a calibration from a session's readings.
 
-        The mean of machines drawn from the tolerances, with gauges as they may stand, each to first
-        order about itself: a ball beside the crest of its rod tells less than one on top of it.
+        The mean of machines drawn from the tolerances, with mounting errors of their gauges. Each
+        is linearised about itself, because a ball beside the crest of its rod is less sensitive.
 
         Args:
-            session: What is read where; its readings do not matter.
-            sigma: Standard deviation of a reading, [m]; what is stated of the gauge by default.
-            weight: The one that readings are taken to have when they are weighed, [m]: more than
-                sigma where the model leaves errors out; the same by default.
-            entered: Whether the drives' offsets are near what the controller corrects already, as
-                they are once they were entered; else they are drawn from their tolerances, too.
-            machines: Others than those that are drawn: free parameters of the session's problem,
+            session: Setups and postures; the values of the readings are not used.
+            sigma: Standard deviation of a reading, [m]; by default as stated of the gauge.
+            weight: Standard deviation with which readings are weighted, [m]: more than sigma if
+                the model omits errors; by default the same.
+            entered: Whether the identified offsets have been entered before, so that those of the
+                drives are small; else they are drawn from their tolerances.
+            machines: Machines instead of drawn ones: free parameters of the session's problem,
                 shape (n_free,) each, [SI].
+
+        Raises:
+            ClosureError: If no machine allows enough readings.
         """
         problem = self.problem(session)
-        others = self._slopes_of_others(session)
+        others = self._jacobian_of_others(session)
         noise = noise_of(session) if sigma is None else sigma
         drawn = list(self._draw(problem, entered=entered)) if machines is None else machines
-        fleet = Fleet(problem, np.array(drawn) / problem.theta_scale)
-        closed = fleet.close()
+        _, closed, reached = problem.simulate(np.array(drawn))
 
         def posteriors(part: Iterable[int]) -> list[tuple[Array | None, float]]:
-            passive = [fleet.passive[i] if closed[i] else None for i in range(len(drawn))]
+            passive = [closed[i] if reached[i] else None for i in range(len(drawn))]
             return [
                 self._posterior(problem, others, drawn[i], noise, weight, passive[i]) for i in part
             ]
@@ -208,17 +198,17 @@ class ToolForecast:
         return replace(self._expected(np.mean(found, axis=0)), lost=lost)
 
     def about_nominal(self, session: Session, *, sigma: float | None = None) -> Expected:
-        """The same to first order about the nominal machine: what a search makes small."""
+        """Expected tool error to first order about the nominal machine, as in the search."""
         problem = self.problem(session)
-        others = self._slopes_of_others(session)
+        others = self._jacobian_of_others(session)
         noise = noise_of(session) if sigma is None else sigma
         covariance, _ = self._posterior(problem, others, problem.reference, noise)
         if covariance is None:
             raise ClosureError("cannot be read", posture="the planned ones")
         return self._expected(covariance)
 
-    def _slopes_of_others(self, session: Session) -> Array | None:
-        """How one tolerance of what is not identified moves a session's readings, [m]."""
+    def _jacobian_of_others(self, session: Session) -> Array | None:
+        """Change of a session's readings by one tolerance of what is not identified, [m]."""
         if not self.others:
             return None
         n = len(self.selection.names)
@@ -229,13 +219,13 @@ class ToolForecast:
         return slopes[:, : len(self.others)]
 
     def _draw(self, problem: CalibrationProblem, *, entered: bool) -> Iterator[Array]:
-        """Machines within their tolerances, and how their gauges stand, [SI]."""
+        """Machines within their tolerances, with mounting errors of their gauges, [SI]."""
         offsets = [i for i, name in enumerate(problem.free) if name.endswith(".offset")]
         for seed in range(MACHINES):
             drawn = np.random.default_rng(seed).normal(size=problem.n_free) * problem.theta_scale
             if entered:
                 drawn[offsets] *= ENTERED
-            # without a prior nothing is known: a tolerance is what it is taken to be
+            # parameters without a prior are drawn from their tolerances, too
             yield problem.reference + drawn
 
     def _posterior(
@@ -247,9 +237,9 @@ class ToolForecast:
         weight: float | None = None,
         passive: Array | None = None,
     ) -> tuple[Array | None, float]:
-        """Covariance of what the estimate has wrong about a machine, (n_names, n_names), [SI].
+        """Covariance of the errors of the estimate about a machine, (n_names, n_names), [SI].
 
-        And the share of readings that do not exist there; None where too few do.
+        None where too few readings are possible; with the fraction of impossible ones.
         """
         o, n = problem.observations, problem.n_machine
         try:
@@ -267,7 +257,7 @@ class ToolForecast:
         inverse = posterior_covariance(slopes, sigma=weight, precision=precision)
         scale = problem.theta_scale[:n]
         spread = inverse
-        if weight != noise:  # they scatter by less than they are weighed by
+        if weight != noise:  # readings scatter less than their weight implies
             gain = inverse @ slopes.T
             spread = inverse - (weight**2 - noise**2) / weight**4 * (gain @ gain.T)
         known = spread[:n, :n] * np.outer(scale, scale)
@@ -275,16 +265,16 @@ class ToolForecast:
             return known, lost
         other = project_out_zeros(others[good], part)
         leak = (inverse @ (slopes.T @ other) / weight**2)[:n] * scale[:, None]
-        left = np.diag(self.tolerances[n:] ** 2)
-        taken = leak * self.tolerances[n:]
-        return np.block([[known + leak @ leak.T, -taken], [-taken.T, left]]), lost
+        variance = np.diag(self.tolerances[n:] ** 2)
+        across = leak * self.tolerances[n:]
+        return np.block([[known + leak @ leak.T, -across], [-across.T, variance]]), lost
 
     def _expected(self, covariance: Array) -> Expected:
         tool = measure_uncertainty(self.jacobian, covariance, self.workspace, self.positions)
         return Expected(tool, self.names, self.tolerances, covariance)
 
     def weigh(self, criterion: Criterion, n_state: int) -> Weigher:
-        """What a criterion makes of the covariance of a state that begins with what is free."""
+        """Weight of a criterion for a state that begins with the identified parameters."""
         n = len(self.selection.names)
         scaled = self.jacobian[:, :, :n] * self.tolerances[:n]
         if criterion in ("aligned", "worst"):
@@ -299,13 +289,13 @@ class ToolForecast:
 
 
 class Weigher:
-    """R with tr(Rᵀ C R) the square of what a criterion makes small.
+    """Weight of the state R, with tr(Rᵀ C R) the square of a criterion.
 
     Args:
-        criterion: Which.
+        criterion: The criterion.
         field: Tool errors by the state, shape (K, 3, n_state), [m per tolerance].
-        weights: Of the points, shape (K,).
-        n: Parameters of the machine, the first of the state.
+        weights: Weights of the points, shape (K,).
+        n: Number of parameters of the machine, which are the first of the state.
     """
 
     def __init__(self, criterion: Criterion, field: Array, weights: Array, n: int) -> None:
@@ -324,7 +314,7 @@ class Weigher:
             values, vectors = np.linalg.eigh(covariance[:n, :n])
             root[:n, 0] = vectors[:, -1] if values.size else 0.0
             return root
-        # of the determinant's n-th root the slope is itself times the inverse, over n
+        # the derivative of the determinant's n-th root is itself times the inverse, over n
         values, vectors = np.linalg.eigh(covariance[:n, :n])
         mean = float(np.exp(np.mean(np.log(np.maximum(values, 1e-300)))))
         root[:n] = vectors * np.sqrt(mean / (n * np.maximum(values, 1e-300)))
@@ -347,19 +337,19 @@ class Weigher:
 
 
 def _root(rows: Array) -> Array:
-    """R with R Rᵀ = rowsᵀ rows, of as few columns as it takes, shape (n, p)."""
+    """R with R Rᵀ = rowsᵀ rows and as few columns as possible, shape (n, p)."""
     values, vectors = np.linalg.eigh(rows.T @ rows)
     kept = values > values[-1] * 1e-14
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
 
 
 def noise_of(session: Session) -> float:
-    """Standard deviation of a reading, as stated of the (first) gauge, [m]."""
+    """Standard deviation of a reading of the first gauge, [m]."""
     return noise_floor(session.gauge.sigma, session.gauge.resolution)
 
 
 def weigh_readings(problem: CalibrationProblem) -> CalibrationProblem:
-    """The same problem with readings that count by what is stated of their gauges."""
+    """Problem with readings weighted by the stated repeatability of their gauges."""
     session = problem.session
     groups = split_by_gauge(session, problem.observations)
     if len(groups) < 2:
@@ -372,10 +362,10 @@ def weigh_readings(problem: CalibrationProblem) -> CalibrationProblem:
 
 
 def state_noise(session: Session) -> Session:
-    """A session whose gauges all state their sigma; from repeated cycles where they do not.
+    """Session whose gauges all state their sigma, which is estimated from repeats if necessary.
 
     Raises:
-        SessionError: If nothing tells the noise of a gauge.
+        SessionError: If the repeatability of a gauge is unknown.
     """
     o = build_observations(session)
     gauges = dict(session.gauges)
@@ -387,42 +377,8 @@ def state_noise(session: Session) -> Session:
         if not (dof and sigma > 0.0):
             key = f"gauges.{group.name}.sigma_mm" if group.name else "gauge.sigma_mm"
             raise SessionError(
-                "is missing: without the scatter of its readings no plan can say what they are "
-                "worth",
+                "is missing; a plan needs the repeatability of the readings",
                 where=key if session.path is None else f"{session.path}: {key}",
             )
         gauges[group.name] = replace(group.gauge, sigma=sigma)
     return replace(session, gauges=gauges)
-
-
-@once_a_robot(maxsize=8)
-def default_workspace(robot: Robot) -> Workspace:
-    """The largest cube around the zero that the nominal machine reaches, of ±60 mm at most.
-
-    With some room: where a machine just gets to it is singular, or another one does not.
-
-    Raises:
-        RobotError: If the drives do not command the tool.
-        ClosureError: If the tool hardly moves.
-    """
-    if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
-        raise RobotError(
-            "the drives do not command the tool: nothing can be said of it", where=str(robot.yaml)
-        )
-    lower = np.array([d.lower for d in robot.drives])
-    upper = np.array([d.upper for d in robot.drives])
-
-    middle, moved = tool_at_zero(robot), list(robot.tcp.coordinates)
-    sensitivity = ToolSensitivity(robot, free=[f"{d.name}.offset" for d in robot.drives])
-
-    def reach(points: Array) -> None:
-        drives, passive = nominal_assembly(robot).reach(middle + ROOM * (points - middle))
-        if (drives < lower).any() or (drives > upper).any():
-            raise ClosureError("is beyond the travel of a drive", posture="a corner")
-        if (np.linalg.cond(sensitivity(drives, passive=passive)[:, moved]) > NEARLY_SINGULAR).any():
-            raise ClosureError("is nearly singular", posture="a corner")
-
-    found = largest_cube(robot, reach)
-    if found is None:
-        raise ClosureError("cannot be reached: the tool hardly moves", posture="mechanical zero")
-    return found

@@ -1,4 +1,4 @@
-"""What a machine is read by first: a gauge that stays clear of hinges, and the paper's own plan."""
+"""First plan of a machine: sections clear of the hinges, and the paper's plan."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from orthocal.errors import RobotError
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.planning.equipment import Means, choose_box
+from orthocal.planning.equipment import Equipment, choose_box
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.leg_indicator import LegIndicator, Section
 from orthocal.sensors.protocol import Sensor
@@ -22,35 +22,35 @@ from orthocal.units import MM
 Array = NDArray[np.float64]
 
 CLEAR = 0.02
-"""From a hinge to where a tip may touch, at least, [m]; less on legs below five times that."""
+"""Least distance of a tip from a hinge, [m]; less on legs shorter than five times that."""
 
 STEP = 5e-3
-"""Postures are at multiples of this, [m]."""
+"""Step of the postures, [m]."""
 
 SECTIONS = (0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65)
-"""Where along a leg a first plan may touch, if that stays clear of its hinges."""
+"""Possible sections of a first plan, as fractions of the leg."""
 
 LEAST = 0.01
-"""A tool that moves less than this to either side of the zero is no machine's, [m]."""
+"""Least reach of the tool to either side of the mechanical zero, [m]."""
 
 PAPER = (-0.1, 0.06)
-"""The paper's least and largest displacement along an axis, as the project has found them, [m]."""
+"""Least and largest displacement along an axis in the paper, [m]; the project inferred them."""
 
 
-def first_means(robot: Robot, means: Means) -> Means:
-    """Means whose tip stays clear of the hinges wherever the tool goes.
+def first_equipment(robot: Robot, equipment: Equipment) -> Equipment:
+    """Equipment with sections and postures in which the tip stays clear of the hinges.
 
     Raises:
         RobotError: If the tool of the machine hardly moves.
     """
-    box = choose_box(robot, means.box)
+    box = choose_box(robot, equipment.box)
     middle = tool_at_zero(robot)
     low, high = (box - middle[:, None]).T
     if low.max() > -LEAST or high.min() < LEAST:
         reach = " × ".join(f"{a / MM:g} … {b / MM:g}" for a, b in box)
         raise RobotError(
             f"the tool reaches {reach} mm; expected {LEAST / MM:g} mm to either side of the "
-            "mechanical zero, at least: is the travel right?",
+            "mechanical zero, at least; check the travel",
             where=robot.name,
         )
     least = min(leg.length for leg in robot.legs.values())
@@ -63,25 +63,27 @@ def first_means(robot: Robot, means: Means) -> Means:
         if s * least + high.max() <= least - clear + 1e-9 and s * least + low.min() >= clear - 1e-9
     )
     some = dict.fromkeys((sections[0], sections[len(sections) // 2], sections[-1]))
-    return replace(means, box=middle[:, None] + np.stack([low, high], axis=1), sections=tuple(some))
+    return replace(
+        equipment, box=middle[:, None] + np.stack([low, high], axis=1), sections=tuple(some)
+    )
 
 
-def paper_plan(robot: Robot, means: Means, *, reference: str = "") -> Session:
-    """The paper's plan: zero, largest and least along each leg's axis, read across it in two ways.
+def paper_plan(robot: Robot, equipment: Equipment, *, reference: str = "") -> Session:
+    """The paper's plan: each leg in the mechanical zero and at both ends, in two directions.
 
-    Six setups at mid-leg and seven postures on an Orthoglide; +60 and −100 mm, or as far as a
-    machine of other sizes gets. Each setup ends in the zero, where it began.
+    Six setups at mid-leg and seven postures on an Orthoglide: +60 and −100 mm, or the reach of a
+    machine of other dimensions. Each setup ends with the zero, where it began.
 
     Args:
         robot: The robot.
-        means: What one has; its box says how far the tool goes.
-        reference: How the session names the robot; its name by default.
+        equipment: Gauge and tip; its box limits the postures.
+        reference: Name of the robot in the session; by default its own.
 
     Raises:
         RobotError: If the tool of the machine hardly moves.
     """
-    means = first_means(robot, means)
-    middle, box = tool_at_zero(robot), means.box
+    equipment = first_equipment(robot, equipment)
+    middle, box = tool_at_zero(robot), equipment.box
     low, high = (np.zeros_like(middle), np.zeros_like(middle)) if box is None else box.T - middle
     points, setups, readings = {"zero": middle}, {}, []
     for leg in robot.legs.values():
@@ -95,7 +97,7 @@ def paper_plan(robot: Robot, means: Means, *, reference: str = "") -> Session:
             names.append(name)
         for k in (k for k in range(3) if k != own):
             setup = f"{'xyz'[k]}{leg.name}"
-            setups[setup] = Setup(setup, _sensor(leg, "xyz"[k], means))
+            setups[setup] = Setup(setup, _sensor(leg, "xyz"[k], equipment))
             readings += [Reading(setup, p, None, 1, 0.0, None) for p in names]
             readings.append(Reading(setup, "zero", None, 2, 0.0, None))
     drives = nominal_assembly(robot).inverse(np.array(list(points.values())), names=list(points))
@@ -104,7 +106,7 @@ def paper_plan(robot: Robot, means: Means, *, reference: str = "") -> Session:
         robot_reference=reference or robot.name,
         title="Zero, largest and least of each leg",
         source="",
-        gauges={"": means.gauge},
+        gauges={"": equipment.gauge},
         postures={
             n: Posture(n, "tcp_mm", p, d) for (n, p), d in zip(points.items(), drives, strict=True)
         },
@@ -117,17 +119,17 @@ def paper_plan(robot: Robot, means: Means, *, reference: str = "") -> Session:
     )
 
 
-def _sensor(leg: Leg, direction: str, means: Means) -> Sensor:
-    """An indicator at mid-leg, on the leg's first rod where there is a tip."""
+def _sensor(leg: Leg, direction: str, equipment: Equipment) -> Sensor:
+    """Indicator at mid-leg, on the leg's first rod if it has a tip."""
     section = Section("fraction", 0.5)
-    if means.tip is None or not leg.rods:
-        return LegIndicator(leg.name, direction, section, means.standing)
-    rod = next((r for r in means.rods if r in leg.rods), next(iter(leg.rods)))
-    kind = RodByBall if means.tip.form == "ball" else RodByBlade
-    return kind(leg.name, rod, direction, section, means.tip, means.standing)
+    if equipment.tip is None or not leg.rods:
+        return LegIndicator(leg.name, direction, section, equipment.mounting)
+    rod = next((r for r in equipment.rods if r in leg.rods), next(iter(leg.rods)))
+    kind = RodByBall if equipment.tip.form == "ball" else RodByBlade
+    return kind(leg.name, rod, direction, section, equipment.tip, equipment.mounting)
 
 
 def _whole(values: Array) -> Array:
-    """Towards the zero, to whole steps, [m]."""
+    """Values rounded towards zero to whole steps, [m]."""
     steps = np.array([math.floor(abs(v) / STEP + 1e-9) for v in values])
     return np.asarray(np.sign(values) * steps * STEP)

@@ -1,22 +1,22 @@
-"""What readings take beside what others say, a kind of setup at a time.
+"""Reduction of the expected tool error by the readings of one setup.
 
-Beside covariance C of the state, readings S of a setup take
+With covariance C of the state without this setup, readings S of the setup reduce tr(T C), T being
+the weight of the state at the tool, by
 
     tr[(V_SS + σ² I)⁻¹ Q_SS],  V = A C Aᵀ + D,  Q = A C T C Aᵀ
 
-off tr(T C), T being what the errors do at the tool (`choosing`).
+with A the Jacobian of the readings and D the covariance from the setup's nuisance parameters.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.planning.candidates import Kind
+from orthocal.planning.candidates import CandidateSetup
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -24,25 +24,35 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Pairs of a kind's readings that a setup can begin with; the gauge is set in the first."""
+    """Pairs of readings with which a setup can begin; the gauge is aligned in the first one."""
 
     first: Indices
     """Shape (n_pairs,)."""
     second: Indices
     flat: Indices
-    """Where a pair is in a matrix of all readings by all, in rows."""
+    """Index of a pair in a flattened matrix of all readings by all."""
+
+    @staticmethod
+    def of(setup: CandidateSetup, count: int) -> Pairs:
+        """Pairs whose first reading allows a number of readings within the gauge's range."""
+        enough = setup.reachable.sum(axis=1) >= count
+        allowed = setup.reachable & enough[:, None]
+        np.fill_diagonal(allowed, False)
+        flat = np.flatnonzero(allowed)
+        first, second = np.divmod(flat, len(allowed))
+        return Pairs(first, second, flat)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Set:
-    """Something that a hand sets where a setup begins, beside what others say.
+class _AlignedTerms:
+    """Terms of a nuisance parameter that is aligned in the first posture of a setup.
 
-    S is how it answers to the state in each posture that a setup could begin in.
+    S is its sensitivity to the state, for each posture in which a setup could begin.
     """
 
-    answers: Array
-    """How readings answer to it, shape (m,)."""
-    slopes: Array
+    sensitivity: Array
+    """Sensitivity of the readings to the parameter, shape (m,)."""
+    jacobian: Array
     """S, shape (m, n_state)."""
     known: Array
     """S C, shape (m, n_state)."""
@@ -51,112 +61,111 @@ class _Set:
     effect: Array
     """S C R, shape (m, p)."""
 
-    def beside(self, other: _Set) -> Array:
-        """S C S'ᵀ of it and another one where setups begin, shape (m,)."""
-        return np.asarray(np.vecdot(self.known, other.slopes))
+    def product(self, other: _AlignedTerms) -> Array:
+        """Diagonal of S C S'ᵀ with another parameter, shape (m,)."""
+        return np.asarray(np.vecdot(self.known, other.jacobian))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Taking:
-    """Candidates of a kind beside what others say, none of which is taken."""
+class SetupGain:
+    """Gain of readings of one candidate setup, given all other information."""
 
-    kind: Kind
+    setup: CandidateSetup
     spread: Array
     """V, shape (m, m), [m²]."""
     effect: Array
     """A C R, shape (m, p)."""
     variance: Array
-    """V's diagonal, shape (m,)."""
+    """Diagonal of V, shape (m,)."""
     noise: float
     """σ²."""
-    by_hand: tuple[_Set, ...] = ()
+    aligned: tuple[_AlignedTerms, ...] = ()
 
     @staticmethod
-    def beside(kind: Kind, covariance: Array, worth: Array, sigma: float) -> Taking:
-        """Candidates beside others that leave such a covariance of the state.
+    def of(setup: CandidateSetup, covariance: Array, root: Array, sigma: float) -> SetupGain:
+        """Gain of readings for a covariance of the state without them.
 
         Args:
-            kind: The setup that could stand.
+            setup: The candidate setup.
             covariance: C, shape (n_state, n_state).
-            worth: C R with T = R Rᵀ, shape (n_state, p).
+            root: C R with T = R Rᵀ, shape (n_state, p).
             sigma: Standard deviation of a reading, [m].
         """
-        known = kind.slopes @ covariance
-        spread = known @ kind.slopes.T
-        spread += kind.own
-        by_hand = []
-        for hand in kind.by_hand:
-            moved = hand.slopes @ covariance
-            across, does = moved @ kind.slopes.T, hand.slopes @ worth
-            by_hand.append(_Set(hand.answers, hand.slopes, moved, across, does))
+        known = setup.jacobian @ covariance
+        spread = known @ setup.jacobian.T
+        spread += setup.covariance
+        aligned = []
+        for a in setup.aligned:
+            moved = a.jacobian @ covariance
+            across, effect = moved @ setup.jacobian.T, a.jacobian @ root
+            aligned.append(_AlignedTerms(a.sensitivity, a.jacobian, moved, across, effect))
         variance = spread.diagonal().copy()
-        return Taking(kind, spread, kind.slopes @ worth, variance, sigma**2, tuple(by_hand))
+        return SetupGain(setup, spread, setup.jacobian @ root, variance, sigma**2, tuple(aligned))
 
-    def begun(self, first: int) -> Taking:
-        """The same with the gauge set in the posture of one of them."""
-        if not self.by_hand:
+    def begun(self, first: int) -> SetupGain:
+        """Gain with the gauge aligned in the posture of one reading."""
+        if not self.aligned:
             return self
         spread, effect = self.spread.copy(), self.effect.copy()
-        for hand in self.by_hand:
-            across = np.outer(hand.answers, hand.spread[first])
+        for a in self.aligned:
+            across = np.outer(a.sensitivity, a.spread[first])
             spread += across + across.T
-            effect += np.outer(hand.answers, hand.effect[first])
-            for other in self.by_hand:
-                both = hand.known[first] @ other.slopes[first]
-                spread += both * np.outer(hand.answers, other.answers)
-        return Taking(self.kind, spread, effect, spread.diagonal().copy(), self.noise)
+            effect += np.outer(a.sensitivity, a.effect[first])
+            for other in self.aligned:
+                both = a.known[first] @ other.jacobian[first]
+                spread += both * np.outer(a.sensitivity, other.sensitivity)
+        return SetupGain(self.setup, spread, effect, spread.diagonal().copy(), self.noise)
 
     def gain(self, rows: list[int]) -> float:
-        """What readings take together."""
+        """Gain of several readings together."""
         effect = self.effect[rows]
         return float(
-            np.vdot(effect, np.linalg.solve(self._between(self.spread[rows], rows), effect))
+            np.vdot(effect, np.linalg.solve(self._covariance(self.spread[rows], rows), effect))
         )
 
     def gains(self, sets: Indices) -> Array:
-        """What sets of readings take, the gauge set in the first of each, shape (n_sets,).
+        """Gains of sets of readings, the gauge aligned in the first of each, shape (n_sets,).
 
         Args:
-            sets: Readings of each, shape (n_sets, k).
+            sets: Readings of each set, shape (n_sets, k).
         """
         first, effect = sets[:, 0], self.effect[sets]
         spread = self.spread[sets[:, :, None], sets[:, None, :]]
         spread += self.noise * np.eye(sets.shape[1])
-        for hand in self.by_hand:
-            own = hand.answers[sets]
-            effect += own[:, :, None] * hand.effect[first][:, None, :]
-            across = own[:, :, None] * hand.spread[first[:, None], sets][:, None, :]
+        for a in self.aligned:
+            own = a.sensitivity[sets]
+            effect += own[:, :, None] * a.effect[first][:, None, :]
+            across = own[:, :, None] * a.spread[first[:, None], sets][:, None, :]
             spread += across + np.swapaxes(across, 1, 2)
-            for other in self.by_hand:
-                both = hand.beside(other)[first]
-                outer = own[:, :, None] * other.answers[sets][:, None, :]
+            for other in self.aligned:
+                both = a.product(other)[first]
+                outer = own[:, :, None] * other.sensitivity[sets][:, None, :]
                 spread += both[:, None, None] * outer
         return np.asarray((effect * np.linalg.solve(spread, effect)).sum(axis=(1, 2)))
 
-    def gains_beside(self, rows: list[int]) -> Array:
-        """What one more reading would take where these are taken, shape (m,)."""
+    def further_gains(self, rows: list[int]) -> Array:
+        """Gain of each further reading, given some readings of this setup, shape (m,)."""
         rest = self.spread[rows]
-        solved = np.linalg.solve(self._between(rest, rows), rest)
+        solved = np.linalg.solve(self._covariance(rest, rows), rest)
         effect = solved.T @ self.effect[rows]
         np.subtract(self.effect, effect, out=effect)
         rest *= solved
-        return self._gains(effect, self.variance - rest.sum(axis=0))
+        return self._single_gains(effect, self.variance - rest.sum(axis=0))
 
-    def pairs(self, count: int, most: int) -> list[tuple[float, tuple[int, int]]]:
-        """What two readings take that take most together, and which; the gauge is set in the first.
+    def best_pairs(self, pairs: Pairs, most: int) -> list[tuple[float, tuple[int, int]]]:
+        """Best pairs of readings with their gains; the gauge is aligned in the first reading.
 
-        And the next best, each of which shares no reading with those before it, or begins
-        elsewhere where a hand sets the gauge by the machine.
+        Each further pair shares no reading with those before it, or, with an aligned nuisance
+        parameter, begins with another reading.
 
         Args:
-            count: Readings that the setup is to take.
-            most: How many pairs.
+            pairs: Possible pairs.
+            most: Number of pairs.
         """
-        pairs = beginnings(self.kind, count)
-        i, j, flat = pairs.first, pairs.second, pairs.flat
-        if not flat.size:
+        i, j = pairs.first, pairs.second
+        if not i.size:
             return []
-        gains = self._differences()[i, j] if self.by_hand else self._differences_at(pairs)
+        gains = self._begun_differences()[i, j] if self.aligned else self._differences(pairs)
         found: list[tuple[float, tuple[int, int]]] = []
         while True:
             best = int(gains.argmax())
@@ -166,17 +175,14 @@ class Taking:
             found.append((gain, pair))
             if len(found) == most:
                 return found
-            if self.by_hand:  # where it begins is what makes the difference
+            if self.aligned:  # the first reading makes the difference
                 gains[i == pair[0]] = -1.0
                 continue
             for row in pair:
                 gains[(i == row) | (j == row)] = -1.0
 
-    def _differences_at(self, pairs: Pairs) -> Array:
-        """What two readings take, shape (n_pairs,).
-
-        Beside a zero of which nothing is known they are worth their difference.
-        """
+    def _differences(self, pairs: Pairs) -> Array:
+        """Gains of pairs, shape (n_pairs,): with a free zero, those of their differences."""
         i, j, flat = pairs.first, pairs.second, pairs.flat
         product = self.effect @ self.effect.T
         q, v = product.diagonal(), self.variance
@@ -184,37 +190,37 @@ class Taking:
         gains /= v[i] + (v + 2.0 * self.noise)[j] - 2.0 * self.spread.reshape(-1)[flat]
         return np.asarray(gains)
 
-    def _differences(self) -> Array:
-        """The same of all, the gauge set in the first (row), shape (m, m)."""
-        taken, spread = self.effect @ self.effect.T, self.spread
+    def _begun_differences(self) -> Array:
+        """Gains of all pairs, the gauge aligned in the first (row), shape (m, m)."""
+        product, spread = self.effect @ self.effect.T, self.spread
         gains, spreads = (
-            np.add.outer(s.diagonal(), s.diagonal()) - 2.0 * s for s in (taken, spread)
+            np.add.outer(s.diagonal(), s.diagonal()) - 2.0 * s for s in (product, spread)
         )
         spreads += 2.0 * self.noise
-        for hand in self.by_hand:
-            change = hand.answers - hand.answers[:, None]
-            for total, own in ((gains, hand.effect @ self.effect.T), (spreads, hand.spread)):
+        for a in self.aligned:
+            change = a.sensitivity - a.sensitivity[:, None]
+            for total, own in ((gains, a.effect @ self.effect.T), (spreads, a.spread)):
                 total += 2.0 * change * (own - own.diagonal()[:, None])
-            for other in self.by_hand:
-                both = change * (other.answers - other.answers[:, None])
-                gains += both * np.vecdot(hand.effect, other.effect)[:, None]
-                spreads += both * hand.beside(other)[:, None]
+            for other in self.aligned:
+                both = change * (other.sensitivity - other.sensitivity[:, None])
+                gains += both * np.vecdot(a.effect, other.effect)[:, None]
+                spreads += both * a.product(other)[:, None]
         return np.asarray(gains / spreads)
 
     def complete(self, pair: tuple[int, int], count: int) -> tuple[float, tuple[int, ...]]:
-        """Readings greedily on top of two, and what all of them take.
+        """Add readings greedily to a pair, with the gain of all of them.
 
-        A reading that is taken leaves the others what it does not say of them: a column of V's
-        Cholesky factor after the other.
+        Each reading that is added conditions the others: one more column of the Cholesky factor
+        of V.
         """
         spread, effect, variance = self.spread, self.effect, self.variance
-        steps, taken = np.empty((count, len(variance))), np.empty_like(effect)
+        steps, shared = np.empty((count, len(variance))), np.empty_like(effect)
         chosen, gain = list(pair), 0.0
-        refused = ~self.kind.together[pair[0]]
+        refused = ~self.setup.reachable[pair[0]]
         for k in range(count):
             if k >= len(chosen):
                 refused[chosen] = True
-                gains = self._gains(effect, variance)
+                gains = self._single_gains(effect, variance)
                 np.putmask(gains, refused, -1.0)
                 chosen.append(int(gains.argmax()))
             row, column = chosen[k], spread[chosen[k]]
@@ -223,28 +229,18 @@ class Taking:
             size = math.sqrt(column[row] + self.noise)
             step, share = np.divide(column, size, out=steps[k]), effect[row] / size
             gain += float(share @ share)
-            np.multiply(step[:, None], share, out=taken)
-            effect = np.subtract(effect, taken, out=effect if k else None)
+            np.multiply(step[:, None], share, out=shared)
+            effect = np.subtract(effect, shared, out=effect if k else None)
             variance = variance - step**2
         return gain, tuple(chosen)
 
-    def _between(self, rest: Array, rows: list[int]) -> Array:
-        """V_SS + σ² I of readings, of their rows of V."""
+    def _covariance(self, rest: Array, rows: list[int]) -> Array:
+        """V_SS + σ² I of readings, from their rows of V."""
         own = rest[:, rows]
         own[np.diag_indices(len(rows))] += self.noise
         return own
 
-    def _gains(self, effect: Array, variance: Array) -> Array:
+    def _single_gains(self, effect: Array, variance: Array) -> Array:
         scale = np.maximum(variance, 0.0)
         scale += self.noise
         return np.asarray(np.vecdot(effect, effect) / scale)
-
-
-@lru_cache(maxsize=8192)
-def beginnings(kind: Kind, count: int) -> Pairs:
-    """Pairs the first of which is one from which the gauge reaches so many readings."""
-    able = kind.together & (kind.together.sum(axis=1) >= count)[:, None]
-    np.fill_diagonal(able, False)
-    flat = np.flatnonzero(able)
-    first, second = np.divmod(flat, len(able))
-    return Pairs(first, second, flat)

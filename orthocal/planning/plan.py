@@ -1,4 +1,4 @@
-"""A plan: which setups to take, in which postures to read them, and what that will be worth."""
+"""Measuring plan: the setups, their postures, and the expected tool error after the calibration."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +16,25 @@ from orthocal.assessment.remaining_errors import RemainingError, rank_errors
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, choose
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.kinematics.backend.lanes import expect_many
 from orthocal.kinematics.workspace import Workspace
 from orthocal.measurement.joining import join_sessions
 from orthocal.planning.candidates import (
     FEWEST,
     Candidates,
-    distance_beside,
+    lateral_distance,
     list_candidates,
     measure_candidates,
-    replace_beside,
+    without_lateral,
 )
-from orthocal.planning.equipment import Means
+from orthocal.planning.cost_curve import (
+    HOUR,
+    MOST_SETUPS,
+    Stage,
+    compute_curve,
+    find_enough,
+    scale_curve,
+)
+from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import (
     VAGUE,
     Criterion,
@@ -35,25 +43,8 @@ from orthocal.planning.expected_error import (
     noise_of,
     state_noise,
 )
-from orthocal.planning.marginal_gain import (
-    HOUR,
-    Stage,
-    add_rest,
-    find_curve,
-    find_enough,
-    order_by_worth,
-)
-from orthocal.planning.ordering import order_postures
-from orthocal.planning.plan_comparison import Alternative, list_alternatives, list_usual_plans
-from orthocal.planning.selection import (
-    KILLED,
-    Chosen,
-    Opened,
-    Weigh,
-    choose_setups,
-    error_left,
-    information_of,
-)
+from orthocal.planning.plan_comparison import Alternative, Comparison
+from orthocal.planning.selection import KILLED, PlannedSetup, PlannedSetups, SetupSearch
 from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, run_in_parallel, worker_budget
 from orthocal.session.session import Posture, Purpose, Reading, Session, Setup
@@ -62,45 +53,50 @@ from orthocal.units import UM
 
 Array = NDArray[np.float64]
 
-READINGS_A_SETUP = (3, 5, 9, 16)
-"""What is tried where hours are given instead of numbers."""
+MODEL = "full"
+"""Model that a plan identifies by default: the complete machine with priors."""
 
-MOST_SETUPS = 40
+READINGS_A_SETUP = (3, 5, 9, 16)
+"""Numbers of readings of a setup that are tried for a given time."""
+
+USUAL_SETUPS = 6
 
 SIMPLER = 3e-2
-"""Part of the error that may be lost in all for tips that stand on the crests of their rods."""
+"""Relative increase of the error, in total, for tips on the crests of their rods."""
 
-TOLD = 1e-3
-"""Part of the error by which a start must better it to be told."""
+REPORTED = 1e-3
+"""Relative improvement by a start that is reported."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuringPlan:
-    """Which readings to take, in the order of measuring, and what they will be worth."""
+    """Readings in the order of measuring, and the expected tool error after the calibration."""
 
     session: Session
-    """Setups, postures and readings; each setup ends where it began. Readings are 0."""
+    """Setups, postures and readings; each setup ends with its first posture. Readings are 0."""
     forecast: ToolForecast
     criterion: Criterion
     minutes: float
     known: Expected
-    """What is unknown before: of the machine's tolerances, or beside what was measured."""
+    """Expected error before: from the tolerances of the machine, and from measured readings."""
     expected: Expected
-    """What is unknown after, with offsets that are near what the controller corrects."""
+    """Expected error after, with offsets that are near those that the controller corrects."""
     first_round: Expected
     """The same with offsets anywhere within their tolerances."""
     compared: tuple[Alternative, ...]
     """Usual plans at equal cost."""
     helps: tuple[Alternative, ...]
-    """The same readings with other means."""
+    """The same readings by other gauges."""
+    stage: Stage
+    """This plan, without the readings that close its setups."""
     curve: tuple[Stage, ...]
-    """What is left after each setup, and after more of them."""
-    means: Means
+    """Expected error with setups added one after the other."""
+    equipment: Equipment
     candidates: int
-    """Readings that were chosen from."""
+    """Number of candidate readings."""
 
     def find_remaining(self, *, count: int = 3) -> tuple[RemainingError, ...]:
-        """The combinations of errors that matter most at the tool after these readings."""
+        """Combinations of errors with the largest effect at the tool after these readings."""
         forecast = self.forecast
         return rank_errors(
             forecast.align(forecast.jacobian),
@@ -113,7 +109,7 @@ class MeasuringPlan:
 
     @property
     def enough(self) -> Stage | None:
-        """From when on another hour takes less than 5 % off; None where it goes on doing so."""
+        """Stage after which another hour gains less than 5 %; None if there is none."""
         return find_enough(self.curve)
 
 
@@ -124,7 +120,7 @@ def plan_readings(
     setups: int | None = None,
     readings: int | None = None,
     hours: float | None = None,
-    means: Means | None = None,
+    equipment: Equipment | None = None,
     measured: Session | None = None,
     workspace: Workspace | None = None,
     criterion: Criterion = "aligned",
@@ -134,132 +130,168 @@ def plan_readings(
     workers: int = 1,
     report: Callable[[str], None] | None = None,
 ) -> MeasuringPlan:
-    """Choose setups and readings that leave the least unknown at the tool.
+    """Choose the setups and readings with the smallest expected tool error.
 
     Args:
         robot: The robot.
-        choice: What will be identified, or the name of a model; by default what the session that
-            was measured is for, or `full`. The plan says it in its file.
-        setups: How many to take; by default 6, or what `hours` allow.
-        readings: In all of them together, at least 2 a setup; by default 3 a setup, or what `hours`
-            allow. Each setup's first posture is read again at its end, on top of these.
-        hours: How long one has; not with numbers.
-        means: What one has to measure with.
-        measured: Readings that there are already: the plan comes on top of them.
-        workspace: Where the tool's error counts; by default the largest cube that is reached.
-        criterion: What is made small.
-        seed: Of random starts; the same plan comes from the same seed.
-        starts: How often the search begins anew; by default 3 times, or more for a small choice.
-        reference: How the session names the robot; its name by default.
-        workers: Processes; the same plan comes from any number of them.
-        report: Told how the search goes on.
+        choice: Parameters to identify, or the name of a model; by default those of the measured
+            session, or `MODEL`. The plan's session states it.
+        setups: Number of setups; by default 6, or as many as `hours` allow.
+        readings: Number of readings, at least 2 per setup; by default 3 per setup, or as many as
+            `hours` allow. The first posture of each setup is read again at its end in addition.
+        hours: Available time; not with numbers.
+        equipment: Available gauge, tip and region.
+        measured: Existing readings, which the plan complements.
+        workspace: Region over which the tool error is computed; by default the robot's.
+        criterion: Criterion to minimise.
+        seed: Seed of the random starts; the plan depends on nothing else that is random.
+        starts: Number of starts of the search; by default 3, or more for few candidates.
+        reference: Name of the robot in the session; by default its own.
+        workers: Number of processes; the plan does not depend on it.
+        report: Called with a line of text as the work proceeds.
 
     Raises:
-        ParameterError: If numbers do not fit each other, or nothing can be chosen from.
-        RobotError: If the drives do not command a tool.
-        SessionError: If nothing tells the noise of the readings that there are.
+        ParameterError: If numbers contradict each other, or there are no candidates.
+        RobotError: If the drives do not command the tool.
+        SessionError: If the repeatability of the existing readings is unknown.
     """
-    expect_many()
+    say = report or (lambda text: None)
     measured = None if measured is None else state_noise(measured)
-    means = means or Means()
-    chosen = choose(choice, measured, usual="full")
+    equipment = equipment or Equipment()
+    chosen = choose(choice, measured, usual=MODEL)
     robot = (robot if measured is None else measured.robot).with_tolerances(chosen.tolerances)
     measured = None if measured is None else measured.with_tolerances(chosen.tolerances)
     forecast = ToolForecast(robot, chosen.select(robot.parameters), workspace)
-    session = list_candidates(robot, means, reference=reference)
+    session = list_candidates(robot, equipment, reference=reference)
+    say(f"computing {len(session.readings)} candidate readings")
     candidates = measure_candidates(
-        session, forecast.problem(session), spare_range=means.spare_range
+        session, forecast.problem(session), spare_range=equipment.spare_range
     )
-    prior = _prior(candidates, forecast, measured)
-    weigh = forecast.weigh(criterion, len(candidates.state))
-    counts = _counts(
-        setups,
-        readings,
-        hours,
-        means,
-        _Trials(candidates.bare, prior, weigh, seed, workers),
-    )
-
-    in_metres, least = criterion not in ("A", "D", "E"), math.inf
-
-    def told(start: int, left: float) -> None:
-        nonlocal least
-        if report is not None and left < (1.0 - TOLD) * least:
-            least = left
-            size = f"{left / UM:.4g} µm" if in_metres else f"{left:.4g}"
-            report(f"start {start}: {size}")
-
-    found = choose_setups(
+    search = SetupSearch.of(
         candidates,
-        counts,
-        prior=prior,
-        weigh=weigh,
-        seed=seed,
-        starts=starts,
-        workers=workers,
-        report=told,
+        _prior(candidates, forecast, measured),
+        forecast.weigh(criterion, len(candidates.state)),
     )
-    found = _simplify(candidates, found, weigh)
-    found = replace(found, setups=order_by_worth(candidates, found, prior, weigh))
-    plan = build_session(candidates, found.setups, measured)
+    counts = _counts(
+        setups, readings, hours, equipment, partial(_choose_counts, search, seed, workers)
+    )
+    say(f"choosing readings of {len(counts)} setups")
+    planned = search.choose(
+        counts, seed=seed, starts=starts, workers=workers, report=_reporter(say, criterion)
+    )
+    planned = _simplify(candidates, planned, search)
+    plan = build_session(candidates, planned.setups, measured)
     plan = replace(plan, purpose=Purpose(chosen.model, tuple(chosen.free)))
+    say("comparing the plan with others")
+    comparison = Comparison(candidates, plan, equipment, forecast, measured)
+    return _evaluate(search, planned, comparison, criterion, workers)
+
+
+def _evaluate(
+    search: SetupSearch,
+    planned: PlannedSetups,
+    comparison: Comparison,
+    criterion: Criterion,
+    workers: int,
+) -> MeasuringPlan:
+    """Plan with its expected errors, and those of others."""
+    plan, measured, forecast = comparison.plan, comparison.measured, comparison.forecast
     whole = plan if measured is None else join_sessions([measured, plan])
-    calls = (
-        lambda: find_curve(candidates, found, counts, means, prior, weigh),
-        lambda: list_alternatives(plan, means, forecast, measured),
-        lambda: list_usual_plans(candidates, plan, means, forecast, measured),
-        lambda: forecast.after(whole),
-        lambda: forecast.after(whole, entered=False),
-        lambda: forecast.about_nominal(whole),
-        lambda: forecast.before if measured is None else forecast.after(measured),
-    )
+    setups, readings = len(planned.setups), sum(len(s.chosen) for s in planned.setups)
+    minutes = comparison.equipment.minutes(setups, len(plan.readings))
+    each = round(readings / setups)
     with worker_budget(workers):
-        found_out = call_in_parallel(calls, killed=KILLED)
-    curve, helps, compared, expected, first_round, here, known = found_out
+        curve, helps, compared, expected, first_round, nominal, known = call_in_parallel(
+            (
+                lambda: compute_curve(search, each, setups, comparison.equipment),
+                comparison.list_alternatives,
+                comparison.list_usual_plans,
+                lambda: forecast.after(whole),
+                lambda: forecast.after(whole, entered=False),
+                lambda: forecast.about_nominal(whole),
+                lambda: forecast.before if measured is None else forecast.after(measured),
+            ),
+            killed=KILLED,
+        )
+    own = Stage(setups, readings, minutes, planned.error)
+    factor, rest = _scale(own, expected, nominal, criterion)
     return MeasuringPlan(
         session=plan,
         forecast=forecast,
         criterion=criterion,
-        minutes=means.minutes(len(plan.setups), len(plan.readings)),
+        minutes=minutes,
         known=known,
         expected=expected,
         first_round=first_round,
         compared=compared,
         helps=helps,
-        curve=add_rest(curve, len(found.setups), expected, here, criterion),
-        means=means,
-        candidates=len(candidates.session.readings),
+        stage=scale_curve([own], factor, rest)[0],
+        curve=scale_curve(curve, factor, rest),
+        equipment=comparison.equipment,
+        candidates=len(comparison.candidates.session.readings),
     )
 
 
-def build_session(
-    candidates: Candidates, chosen: Sequence[Opened], measured: Session | None = None
-) -> Session:
-    """The session of setups that were chosen: named, in the order of measuring.
+def _reporter(say: Callable[[str], None], criterion: Criterion) -> Callable[[int, float], None]:
+    """Report of the starts that improve the plan."""
+    in_metres, least = criterion not in ("A", "D", "E"), math.inf
 
-    Each setup begins where its gauge is set, goes on with little movement, and ends where it began.
+    def report_start(start: int, error: float) -> None:
+        nonlocal least
+        if error < (1.0 - REPORTED) * least:
+            least = error
+            say(f"start {start}: " + (f"{error / UM:.4g} µm" if in_metres else f"{error:.4g}"))
+
+    return report_start
+
+
+def _scale(
+    own: Stage, expected: Expected, nominal: Expected, criterion: Criterion
+) -> tuple[float, float]:
+    """Factor and additional error with which the search's error becomes the expected one.
+
+    Gauges on machines within their tolerances are less sensitive than on the nominal one, errors
+    that are not identified remain, and the search omits the readings that close a setup.
+    """
+    if criterion not in ("aligned", "relative", "absolute"):
+        return 1.0, 0.0
+
+    def rms(found: Expected) -> float:
+        sizes = found.sizes
+        size = {"aligned": sizes.headline, "relative": sizes.relative, "absolute": sizes.absolute}
+        return size[criterion].rms
+
+    rest = math.sqrt(max(rms(nominal) ** 2 - own.error**2, 0.0))
+    return rms(expected) / math.hypot(own.error, rest), rest
+
+
+def build_session(
+    candidates: Candidates, planned: Sequence[PlannedSetup], measured: Session | None = None
+) -> Session:
+    """Session of planned setups, named, in the order of measuring.
+
+    Each setup begins with the posture in which its gauge is aligned, continues with short motions,
+    and ends with the first posture.
     """
     source = candidates.session
-    taken = set() if measured is None else set(measured.setups)
+    used_names = set() if measured is None else set(measured.setups)
     setups: dict[str, Setup] = {}
     readings: list[Reading] = []
     used: dict[str, Posture] = {}
     legs = list(source.robot.legs)
 
-    def place(opened: Opened) -> tuple[int, str]:
-        sensor = source.setups[candidates.kinds[opened.kind].name].sensor
-        leg = sensor.place[1]
-        return (legs.index(leg) if leg in legs else len(legs), candidates.kinds[opened.kind].name)
+    def place(own: PlannedSetup) -> tuple[int, str]:
+        name = candidates.setups[own.candidate].name
+        leg = source.setups[name].sensor.place[1]
+        return (legs.index(leg) if leg in legs else len(legs), name)
 
-    for opened in sorted(chosen, key=place):
-        kind = candidates.kinds[opened.kind]
-        old = source.setups[kind.name]
-        name = _setup_name(kind.name, {*taken, *setups})
-        rows = [source.readings[i] for i in kind.rows[list(opened.chosen)]]
+    for own in sorted(planned, key=place):
+        candidate = candidates.setups[own.candidate]
+        name = _setup_name(candidate.name, {*used_names, *setups})
+        rows = [source.readings[i] for i in candidate.rows[list(own.chosen)]]
         points = np.array([source.postures[r.posture].values for r in rows])
-        order = order_postures(points)
-        setups[name] = replace(old, name=name, aligned_at=rows[0].posture)
-        readings += [replace(rows[i], setup=name) for i in order]
+        setups[name] = replace(source.setups[candidate.name], name=name, aligned_at=rows[0].posture)
+        readings += [replace(rows[i], setup=name) for i in order_postures(points)]
         readings.append(replace(rows[0], setup=name, cycle=2))
         used.update((r.posture, source.postures[r.posture]) for r in rows)
     plan = replace(
@@ -274,39 +306,71 @@ def build_session(
     return plan.with_controller(measured.controller_offsets)
 
 
-def _setup_name(kind: str, taken: set[str]) -> str:
-    """A short name for a setup: direction and leg, with a number where there are several."""
-    short = kind.partition("_")[0]
-    if short not in taken:
+def order_postures(points: Array) -> list[int]:
+    """Order of points on a short closed path that begins with the first one.
+
+    The nearest point next, then parts are reversed while that shortens the path (2-opt).
+
+    Args:
+        points: Tool positions, shape (n, n_coordinates), [m].
+    """
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+
+    def length(order: list[int]) -> float:
+        return float(sum(distance[a, b] for a, b in pairwise([*order, order[0]])))
+
+    order, rest = [0], set(range(1, len(points)))
+    while rest:
+        nearest = min(rest, key=lambda i: (distance[order[-1], i], i))
+        order.append(nearest)
+        rest.remove(nearest)
+    shorter = True
+    while shorter:
+        shorter = False
+        for i in range(1, len(order) - 1):
+            for j in range(i + 1, len(order)):
+                other = order[:i] + order[i : j + 1][::-1] + order[j + 1 :]
+                if length(other) < length(order) - 1e-12:
+                    order, shorter = other, True
+    return order
+
+
+def _setup_name(candidate: str, used_names: set[str]) -> str:
+    """Short name of a setup: direction and leg, with a number where there are several."""
+    short = candidate.partition("_")[0]
+    if short not in used_names:
         return short
-    return next(f"{short}_{i}" for i in range(2, len(taken) + 3) if f"{short}_{i}" not in taken)
+    return next(
+        f"{short}_{i}" for i in range(2, len(used_names) + 3) if f"{short}_{i}" not in used_names
+    )
 
 
 def _prior(candidates: Candidates, forecast: ToolForecast, measured: Session | None) -> Array:
-    """What is known of the state before: its tolerances, and what was measured."""
+    """Inverse covariance of the state before: from tolerances, and from measured readings."""
     problem = candidates.problem
     index = [problem.free.index(name) for name in candidates.state]
     prior = np.diag(np.maximum(problem.prior_precision[index], VAGUE))
     if measured is None:
         return np.asarray(prior)
-    return np.asarray(prior + _said(forecast.problem(measured), candidates.state, measured))
+    measured_problem = forecast.problem(measured)
+    return np.asarray(prior + _information(measured_problem, candidates.state, measured))
 
 
-def _said(problem: CalibrationProblem, state: Sequence[str], measured: Session) -> Array:
-    """What a session says of the state, all else that it does not know taken out."""
+def _information(problem: CalibrationProblem, state: Sequence[str], measured: Session) -> Array:
+    """Information of a session about the state, its other parameters marginalised."""
     _, jacobian = problem.linearise(problem.reference)
-    slopes = project_out_zeros(jacobian, problem.observations)
-    whole = slopes.T @ slopes / noise_of(measured) ** 2
+    jacobian = project_out_zeros(jacobian, problem.observations)
+    whole = jacobian.T @ jacobian / noise_of(measured) ** 2
     rest = [i for i, name in enumerate(problem.free) if name not in state]
     own = [problem.free.index(name) for name in state if name in problem.free]
     where = [i for i, name in enumerate(state) if name in problem.free]
     inner = whole[np.ix_(rest, rest)] + np.diag(np.maximum(problem.prior_precision[rest], VAGUE))
     cross = whole[np.ix_(own, rest)]
-    told = whole[np.ix_(own, own)]
+    shared = whole[np.ix_(own, own)]
     if rest:
-        told = told - cross @ np.linalg.solve(inner, cross.T)
+        shared = shared - cross @ np.linalg.solve(inner, cross.T)
     result = np.zeros((len(state), len(state)))
-    result[np.ix_(where, where)] = told
+    result[np.ix_(where, where)] = shared
     return result
 
 
@@ -314,8 +378,8 @@ def _counts(
     setups: int | None,
     readings: int | None,
     hours: float | None,
-    means: Means,
-    trials: _Trials,
+    equipment: Equipment,
+    choose_counts: Callable[[Sequence[list[int]]], list[int]],
 ) -> list[int]:
     """Readings of each setup."""
     if hours is not None:
@@ -323,87 +387,74 @@ def _counts(
             raise ParameterError("found with --setups or --readings; expected one", where="--hours")
         options = []
         for each in READINGS_A_SETUP:
-            count = int(hours * HOUR / means.minutes(1, each + 1))
+            count = int(hours * HOUR / equipment.minutes(1, each + 1))
             if 1 <= count <= MOST_SETUPS:
                 options.append([each] * count)
         if not options:
-            least = means.minutes(1, READINGS_A_SETUP[0] + 1) / HOUR
+            least = equipment.minutes(1, READINGS_A_SETUP[0] + 1) / HOUR
             raise ParameterError(
                 f"found {hours:g}; expected at least {least:.2g}, a setup of "
                 f"{READINGS_A_SETUP[0]} readings, and at most {MOST_SETUPS} setups",
                 where="--hours",
             )
-        return trials.best(options)
-    count = 6 if setups is None else setups
-    total = 3 * count if readings is None else readings
+        return choose_counts(options)
+    count = USUAL_SETUPS if setups is None else setups
+    total = READINGS_A_SETUP[0] * count if readings is None else readings
     if not 1 <= count <= MOST_SETUPS:
         raise ParameterError(f"found {count}; expected 1 to {MOST_SETUPS}", where="--setups")
     if total < FEWEST * count:
         raise ParameterError(
             f"found {total}; expected at least {FEWEST * count}, {FEWEST} for each of {count} "
-            "setups: one alone says nothing beside its gauge's zero",
+            "setups: the first one only determines the gauge zero",
             where="--readings",
         )
     return [total // count + (i < total % count) for i in range(count)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Trials:
-    """Quick plans."""
-
-    candidates: Candidates
-    prior: Array
-    weigh: Weigh
-    seed: int
-    workers: int
-
-    def best(self, options: Sequence[list[int]]) -> list[int]:
-        """The numbers of readings of each setup that leave least."""
-        work = partial(self.left, options)
-        left = dict(run_in_parallel(work, range(len(options)), self.workers, killed=KILLED))
-        return options[min(range(len(options)), key=left.__getitem__)]
-
-    def left(self, options: Sequence[list[int]], which: int) -> float:
-        """What a plan with so many readings leaves; infinite where none can be."""
-        with suppress(ParameterError):
-            return choose_setups(
-                self.candidates,
-                options[which],
-                prior=self.prior,
-                weigh=self.weigh,
-                seed=self.seed,
-                starts=1,
-            ).left
-        return math.inf
+def _choose_counts(
+    search: SetupSearch, seed: int, workers: int, options: Sequence[list[int]]
+) -> list[int]:
+    """Numbers of readings of each setup with the smallest error after one start."""
+    work = partial(_quick_error, search, seed, options)
+    errors = dict(run_in_parallel(work, range(len(options)), workers, killed=KILLED))
+    return options[min(range(len(options)), key=errors.__getitem__)]
 
 
-def _simplify(candidates: Candidates, found: Chosen, weigh: Weigh) -> Chosen:
-    """The same readings with tips nearer to where rods lie in the zero, where that costs little."""
-    session, kinds = candidates.session, candidates.kinds
+def _quick_error(search: SetupSearch, seed: int, options: Sequence[list[int]], which: int) -> float:
+    """Error after one start; infinite where there is no plan."""
+    with suppress(ParameterError):
+        return search.choose(options[which], seed=seed, starts=1).error
+    return math.inf
 
-    def beside(kind: int) -> float:
-        return distance_beside(session.setups[kinds[kind].name].sensor)
 
-    most = (1.0 + SIMPLER) * found.left
-    for k, old in enumerate(found.setups):
-        postures = [session.readings[i].posture for i in kinds[old.kind].rows[list(old.chosen)]]
-        base = replace_beside(session.setups[kinds[old.kind].name].sensor)
-        others = found.information - information_of(candidates, [old])
-        for which in sorted(range(len(kinds)), key=beside):
-            if beside(which) >= beside(old.kind):
+def _simplify(candidates: Candidates, planned: PlannedSetups, search: SetupSearch) -> PlannedSetups:
+    """The same readings with tips nearer to the rods in the mechanical zero, at little cost."""
+    session, setups = candidates.session, candidates.setups
+
+    def distance(which: int) -> float:
+        return lateral_distance(session.setups[setups[which].name].sensor)
+
+    most = (1.0 + SIMPLER) * planned.error
+    for k, old in enumerate(planned.setups):
+        candidate = setups[old.candidate]
+        postures = [session.readings[i].posture for i in candidate.rows[list(old.chosen)]]
+        base = without_lateral(session.setups[candidate.name].sensor)
+        others = planned.information - search.information_of(old)
+        for which in sorted(range(len(setups)), key=distance):
+            if distance(which) >= distance(old.candidate):
                 break
-            if replace_beside(session.setups[kinds[which].name].sensor) != base:
+            if without_lateral(session.setups[setups[which].name].sensor) != base:
                 continue
-            rows = {session.readings[r].posture: i for i, r in enumerate(kinds[which].rows)}
+            rows = {session.readings[r].posture: i for i, r in enumerate(setups[which].rows)}
             if not set(postures) <= set(rows):
                 continue
-            new = Opened(which, tuple(rows[p] for p in postures))
-            if not kinds[which].together[new.chosen[0], list(new.chosen)].all():
+            new = PlannedSetup(which, tuple(rows[p] for p in postures))
+            if not setups[which].reachable[new.chosen[0], list(new.chosen)].all():
                 continue
-            information = others + information_of(candidates, [new])
-            left = error_left(information, weigh)
-            if left <= most:
-                setups = (*found.setups[:k], new, *found.setups[k + 1 :])
-                found = Chosen(setups, information, left)
+            information = others + search.information_of(new)
+            error = search.error_of(information)
+            if error <= most:
+                changed = (*planned.setups[:k], new, *planned.setups[k + 1 :])
+                planned = PlannedSetups(changed, information, error)
                 break
-    return found
+    return planned

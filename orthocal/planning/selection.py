@@ -1,13 +1,7 @@
-"""The choice among candidates: setups and readings that leave least unknown at the tool.
+"""Choice of the setups and readings that make the expected tool error small.
 
-What the readings of one setup say of the state θ̂ is Aᵀ (D + σ² I)⁻¹ A, with D the covariance that
-the setup's own unknowns give them. Beside what all others say, with covariance C of θ̂, readings S
-of a setup take
-
-    tr[(V_SS + σ² I)⁻¹ Q_SS],  V = A C Aᵀ + D,  Q = A C T C Aᵀ
-
-off tr(T C), T being what the errors do at the tool. Setups are opened one after the other, each
-with the readings that take most, then exchanged one by one for better ones until there are none.
+Setups are added one after the other, each with the readings of largest gain (`information_gain`).
+Then each setup, and each of its readings, is exchanged for a better one until little is gained.
 """
 
 from __future__ import annotations
@@ -15,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -23,395 +17,393 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from orthocal.errors import ParameterError
-from orthocal.planning.candidates import FEWEST, Candidates, HandSet, Kind
-from orthocal.planning.information_gain import Taking, beginnings
+from orthocal.planning.candidates import FEWEST, AlignedParameter, Candidates, CandidateSetup
+from orthocal.planning.information_gain import Pairs, SetupGain
 from orthocal.runtime.worker_pool import run_in_parallel
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
 
-WORTH = 1e-3
-"""Part of the r.m.s. error by which a round of exchanges must better it for another one."""
+LEAST_IMPROVEMENT = 1e-3
+"""Relative improvement by one round of exchanges that justifies another round."""
 
 MOST_ROUNDS = 8
 
 MOST_REFINED = 4
-"""Kinds of setup whose readings are exchanged for better ones, to find the best of them."""
+"""Candidate setups whose readings are exchanged, to find the best of them."""
 
 MOST_COMPLETED = 12
-"""Kinds of setup of which more than the best pair of readings is looked at."""
+"""Candidate setups for which more than the best pair of readings is computed."""
 
 MOST_PAIRS = 3
-"""Pairs of readings that a setup is begun with, to find the best of them."""
+"""Pairs of readings from which the readings of a setup are completed."""
 
 MOST_PASSES = 4
-"""Through the readings of a setup, exchanging them."""
+"""Passes through the readings of a setup that exchange them."""
 
 FEWEST_STARTS, MOST_STARTS = 3, 30
 
 CANDIDATES_A_START = 20_000
-"""A small choice is begun more often: candidates times starts are no fewer, up to MOST_STARTS."""
+"""Product of candidates and starts, at least, up to MOST_STARTS: few candidates, many starts."""
 
 KILLED = "a process that chose readings was killed"
 
 ROUGH = 1e-6
-"""Part of the error by which it may be off where it is found without an inverse."""
+"""Relative rounding error of an error that is computed without an inverse."""
 
 FEW = 2_000
-"""Candidates up to which kinds are ranked with their gauges set where each pair begins."""
+"""Number of candidates up to which setups are ranked with the gauge aligned in each posture."""
 
-UNTOLD = 1e-12
-"""How much of the state a direction tells that tells nothing, beside the one that tells most."""
+UNSEEN = 1e-12
+"""Relative singular value below which no reading depends on a direction of the state."""
 
 Weigh = Callable[[Array], Array]
-"""R with T = R Rᵀ for a covariance of the state, shape (n_state, p): constant for mean squares."""
+"""R with T = R Rᵀ for a covariance of the state, shape (n_state, p); constant for mean squares."""
 
 
 @dataclass(frozen=True, slots=True)
-class Opened:
-    """A setup that was chosen."""
+class PlannedSetup:
+    """Setup of a plan."""
 
-    kind: int
-    """Among the candidates'."""
+    candidate: int
+    """Index of the candidate setup."""
     chosen: tuple[int, ...]
-    """Readings among its candidates; the first is where the gauge is set."""
+    """Indices of its readings; the gauge is aligned in the first one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chosen:
-    """Setups that were chosen together."""
+class PlannedSetups:
+    """Setups of a plan."""
 
-    setups: tuple[Opened, ...]
+    setups: tuple[PlannedSetup, ...]
     information: Array
-    """What they and the prior say of the state, shape (n_state, n_state)."""
-    left: float
-    """The criterion, as large as an error: √tr(T C)."""
-
-
-def choose_setups(
-    candidates: Candidates,
-    counts: Sequence[int],
-    *,
-    prior: Array,
-    weigh: Weigh,
-    seed: int = 0,
-    starts: int | None = None,
-    workers: int = 1,
-    report: Callable[[int, float], None] | None = None,
-) -> Chosen:
-    """Setups with so many readings each that leave the least.
-
-    Args:
-        candidates: What there is to choose from.
-        counts: Readings of each setup, at least 2, shape (n_setups,).
-        prior: What is known of the state beforehand: an inverse covariance.
-        weigh: What the state does where it matters.
-        seed: Of the setups that starts but the first begin with.
-        starts: How often to begin anew; the best is taken. By default 3 times, and more often where
-            there is little to choose from.
-        workers: Processes; they choose the same, however many there are.
-        report: Told after each start: how many there were, and the least error left.
-    """
-    if starts is None:
-        wanted = CANDIDATES_A_START // candidates.count
-        starts = int(np.clip(wanted, FEWEST_STARTS, MOST_STARTS))
-    if starts < 1:
-        raise ValueError("expected at least one start")
-    search = _Search(candidates.bare, prior, weigh, _draw_starts(candidates, counts, seed, starts))
-    found: dict[int, Chosen] = {}
-    told, best = 0, None
-    for start, chosen in run_in_parallel(search, range(starts), workers, killed=KILLED):
-        found[start] = chosen
-        while told in found:
-            if best is None or found[told].left < best.left:
-                best = found[told]
-            told += 1
-            if report is not None:
-                report(told, best.left)
-    return cast(Chosen, best)
-
-
-def open_setups(
-    candidates: Candidates, counts: Sequence[int], *, prior: Array, weigh: Weigh
-) -> Iterator[tuple[Opened, float]]:
-    """Setups one after the other, each the best beside those before it, and what each leaves."""
-    information = np.array(prior)
-    for count in counts:
-        opened = _open_best(candidates, information, count, weigh)
-        information = information + _says(candidates, opened)
-        yield opened, error_left(information, weigh)
-
-
-def information_of(candidates: Candidates, setups: Sequence[Opened]) -> Array:
-    """What readings say of the state, shape (n_state, n_state)."""
-    return np.asarray(np.sum([_says(candidates, s) for s in setups], axis=0))
+    """Inverse covariance of the state from the setups and the prior, shape (n_state, n_state)."""
+    error: float
+    """Criterion as an error: √tr(T C)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Start:
-    """What a start begins with."""
+    """Beginning of a search."""
 
     counts: tuple[int, ...]
     """Readings of each setup."""
-    begun: tuple[Opened | None, ...]
-    """The first setups, drawn at random; None where the best is taken, as for all others."""
+    setups: tuple[PlannedSetup | None, ...]
+    """First setups, drawn at random; None where the best one is added."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Search:
-    """A search from each of some starts, none of which depends on another."""
+class SetupSearch:
+    """Search among candidates for the setups with the smallest expected error."""
 
     candidates: Candidates
     prior: Array
+    """Inverse prior covariance of the state, shape (n_state, n_state)."""
     weigh: Weigh
-    starts: tuple[_Start, ...]
+    basis: Array
+    """B, orthogonal directions of the state on which readings depend, shape (n_seen, n_state)."""
+    reduced: tuple[CandidateSetup, ...]
+    """Candidate setups with Jacobians by these directions, A Bᵀ."""
+    pairs: dict[tuple[int, int], Pairs] = field(default_factory=dict)
+    """Possible first pairs, by candidate setup and number of readings; filled by the search."""
 
-    def __call__(self, start: int) -> Chosen:
-        """Setups opened one after the other, then exchanged."""
-        with threadpool_limits(1):  # on several threads sums may come out otherwise
-            own = self.starts[start]
-            found = _open_all(self.candidates, own, self.prior, self.weigh)
-            return _exchange(self.candidates, found, self.weigh)
+    @staticmethod
+    def of(candidates: Candidates, prior: Array, weigh: Weigh) -> SetupSearch:
+        """Search among candidates.
 
-
-def _draw_starts(
-    candidates: Candidates, counts: Sequence[int], seed: int, starts: int
-) -> tuple[_Start, ...]:
-    """The first start without random numbers; of all others the first half of setups anywhere."""
-    rng, found = np.random.default_rng(seed), [_Start(tuple(counts), ())]
-    for _ in range(1, starts):
-        own = tuple(counts[i] for i in rng.permutation(len(counts)))
-        half = own[: (len(own) + 1) // 2]
-        found.append(_Start(own, tuple(_open_anywhere(candidates, n, rng) for n in half)))
-    return tuple(found)
-
-
-def _open_all(candidates: Candidates, start: _Start, prior: Array, weigh: Weigh) -> Chosen:
-    """Setups opened one after the other."""
-    information, setups = np.array(prior), []
-    for k, count in enumerate(start.counts):
-        opened = start.begun[k] if k < len(start.begun) else None
-        if opened is None:
-            opened = _open_best(candidates, information, count, weigh)
-        setups.append(opened)
-        information = information + _says(candidates, opened)
-    return Chosen(tuple(setups), information, error_left(information, weigh))
-
-
-def _exchange(candidates: Candidates, chosen: Chosen, weigh: Weigh) -> Chosen:
-    """Each setup in turn for a better one, and each of its readings, until little is gained."""
-    for _ in range(MOST_ROUNDS):
-        before = chosen.left
-        for k in range(len(chosen.setups)):
-            chosen = _exchange_one(candidates, chosen, k, weigh)
-        if chosen.left > before * (1.0 - WORTH):
-            break
-    return chosen
-
-
-def _exchange_one(candidates: Candidates, chosen: Chosen, k: int, weigh: Weigh) -> Chosen:
-    old, best = chosen.setups[k], chosen
-    others = chosen.information - _says(candidates, old)
-    beside = _Beside.of(candidates, others, weigh)
-    ranked = beside.rank(len(old.chosen))[:MOST_REFINED]
-    others_begun = (s for r in ranked for s in beside.begun_otherwise(r))
-    for new in dict.fromkeys(beside.better_readings(s) for s in (old, *others_begun)):
-        new = beside.begun_best(new)
-        if beside.left_roughly(new) > best.left * (1.0 + ROUGH):
-            continue
-        information = others + _says(candidates, new)
-        left = error_left(information, weigh)
-        if left < best.left:
-            setups = (*chosen.setups[:k], new, *chosen.setups[k + 1 :])
-            best = Chosen(setups, information, left)
-    return best
-
-
-def _open_anywhere(candidates: Candidates, count: int, rng: np.random.Generator) -> Opened | None:
-    """Any setup with so many readings; None where the one that was drawn cannot take them."""
-    which = int(rng.integers(len(candidates.kinds)))
-    together = candidates.kinds[which].together
-    able = np.flatnonzero(together.sum(axis=1) >= count)
-    if not able.size:
-        return None
-    first = int(rng.choice(able))
-    others = np.flatnonzero(together[first])
-    rest = rng.choice(others[others != first], size=count - 1, replace=False)
-    return Opened(which, (first, *(int(i) for i in rest)))
-
-
-def _open_best(candidates: Candidates, information: Array, count: int, weigh: Weigh) -> Opened:
-    """The setup, with so many readings, that takes most off what others leave."""
-    ranked = _Beside.of(candidates, information, weigh).rank(count)
-    if not ranked:
-        raise ParameterError(
-            f"no setup can take {count} readings within the gauge's range, of which machines "
-            f"within their tolerances may take {candidates.taken_range / MM:.2g} mm to either "
-            "side; expected fewer readings a setup, a larger range, smaller tolerances such as "
-            "--tolerance '*.offset_mm=1', or more postures",
-            where="plan",
+        Args:
+            candidates: Candidate setups and readings.
+            prior: Inverse prior covariance of the state.
+            weigh: Weight of the state.
+        """
+        jacobians = [
+            s for k in candidates.setups for s in (k.jacobian, *(a.jacobian for a in k.aligned))
+        ]
+        triangle = np.linalg.qr(np.vstack(jacobians), mode="r")  # half the time of a single SVD
+        _, sizes, directions = np.linalg.svd(triangle, full_matrices=False)
+        basis = directions[sizes > UNSEEN * sizes.max(initial=0.0)]
+        reduced = tuple(
+            replace(
+                k,
+                jacobian=k.jacobian @ basis.T,
+                aligned=tuple(
+                    AlignedParameter(a.sensitivity, a.jacobian @ basis.T) for a in k.aligned
+                ),
+            )
+            for k in candidates.setups
         )
-    return ranked[0]
+        return SetupSearch(candidates.without_session, np.array(prior), weigh, basis, reduced)
+
+    def choose(
+        self,
+        counts: Sequence[int],
+        *,
+        seed: int = 0,
+        starts: int | None = None,
+        workers: int = 1,
+        report: Callable[[int, float], None] | None = None,
+    ) -> PlannedSetups:
+        """Setups with given numbers of readings and the smallest expected error.
+
+        Args:
+            counts: Readings of each setup, at least 2, shape (n_setups,).
+            seed: Seed of the setups with which all starts but the first begin.
+            starts: Number of starts, of which the best is returned. By default 3, and more for few
+                candidates.
+            workers: Number of processes; the result does not depend on it.
+            report: Called after each start with its number and the smallest error so far.
+        """
+        if starts is None:
+            wanted = CANDIDATES_A_START // self.candidates.count
+            starts = int(np.clip(wanted, FEWEST_STARTS, MOST_STARTS))
+        if starts < 1:
+            raise ValueError("expected at least one start")
+        drawn = self._draw_starts(counts, seed, starts)
+        done: dict[int, PlannedSetups] = {}
+        reported, best = 0, None
+        work = partial(_run, self, drawn)
+        for start, setups in run_in_parallel(work, range(starts), workers, killed=KILLED):
+            done[start] = setups
+            while reported in done:
+                if best is None or done[reported].error < best.error:
+                    best = done[reported]
+                reported += 1
+                if report is not None:
+                    report(reported, best.error)
+        return cast(PlannedSetups, best)
+
+    def grow(self, counts: Sequence[int]) -> Iterator[PlannedSetups]:
+        """Plans with one setup more each, nearly as good as those of `choose`.
+
+        After each addition one of the setups is exchanged in turn: the first ones were chosen
+        without the others.
+        """
+        information = np.array(self.prior)
+        plan = PlannedSetups((), information, self.error_of(information))
+        for n, count in enumerate(counts):
+            added = self._find_best(plan.information, count)
+            information = plan.information + self.information_of(added)
+            plan = PlannedSetups((*plan.setups, added), information, self.error_of(information))
+            if n:
+                plan = self._exchange(plan, (n - 1) % (n + 1))
+            yield plan
+
+    def run(self, start: _Start) -> PlannedSetups:
+        """Setups of one start: added one after the other, then exchanged."""
+        with threadpool_limits(1):  # on several threads sums may be rounded differently
+            information, setups = np.array(self.prior), []
+            for k, count in enumerate(start.counts):
+                added = start.setups[k] if k < len(start.setups) else None
+                if added is None:
+                    added = self._find_best(information, count)
+                setups.append(added)
+                information = information + self.information_of(added)
+            found = PlannedSetups(tuple(setups), information, self.error_of(information))
+            for _ in range(MOST_ROUNDS):
+                before = found.error
+                for k in range(len(found.setups)):
+                    found = self._exchange(found, k)
+                if found.error > before * (1.0 - LEAST_IMPROVEMENT):
+                    break
+            return found
+
+    def information_of(self, *setups: PlannedSetup) -> Array:
+        """Inverse covariance of the state from the readings of setups, (n_state, n_state)."""
+        total = np.zeros_like(self.prior)
+        for planned in setups:
+            if len(planned.chosen) < FEWEST:
+                raise ValueError(f"found {len(planned.chosen)} readings; expected {FEWEST} or more")
+            own = self.candidates.setups[planned.candidate].only(planned.chosen).begun(0)
+            spread = own.covariance + self.candidates.sigma**2 * np.eye(len(own.rows))
+            total += own.jacobian.T @ np.linalg.solve(spread, own.jacobian)
+        return total
+
+    def error_of(self, information: Array) -> float:
+        """Criterion as an error, for an inverse covariance of the state."""
+        covariance = _inverse(information)
+        root = self.weigh(covariance)
+        return float(np.sqrt(np.vdot(root, covariance @ root)))
+
+    def _draw_starts(self, counts: Sequence[int], seed: int, starts: int) -> tuple[_Start, ...]:
+        """First start without random numbers; in the others the first half of setups is random."""
+        rng, drawn = np.random.default_rng(seed), [_Start(tuple(counts), ())]
+        for _ in range(1, starts):
+            own = tuple(counts[i] for i in rng.permutation(len(counts)))
+            half = own[: (len(own) + 1) // 2]
+            drawn.append(_Start(own, tuple(self._draw_setup(n, rng) for n in half)))
+        return tuple(drawn)
+
+    def _draw_setup(self, count: int, rng: np.random.Generator) -> PlannedSetup | None:
+        """Random setup; None where the drawn one cannot have that many readings."""
+        which = int(rng.integers(len(self.candidates.setups)))
+        reachable = self.candidates.setups[which].reachable
+        able = np.flatnonzero(reachable.sum(axis=1) >= count)
+        if not able.size:
+            return None
+        first = int(rng.choice(able))
+        others = np.flatnonzero(reachable[first])
+        rest = rng.choice(others[others != first], size=count - 1, replace=False)
+        return PlannedSetup(which, (first, *(int(i) for i in rest)))
+
+    def _find_best(self, information: Array, count: int) -> PlannedSetup:
+        """Setup with the largest gain, given the information of others."""
+        ranked = Gains.of(self, information).rank(count)
+        if not ranked:
+            raise ParameterError(
+                f"no setup can have {count} readings within the gauge's range, of which the "
+                f"tolerances of the machine need {self.candidates.spare_range / MM:.2g} mm to "
+                "either side; expected fewer readings a setup, a larger range, smaller tolerances "
+                "such as --tolerance '*.offset_mm=1', or more postures",
+                where="plan",
+            )
+        return ranked[0]
+
+    def _exchange(self, plan: PlannedSetups, k: int) -> PlannedSetups:
+        """Plan with one setup exchanged for the best one beside the others."""
+        old, best = plan.setups[k], plan
+        others = plan.information - self.information_of(old)
+        gains = Gains.of(self, others)
+        ranked = gains.rank(len(old.chosen))[:MOST_REFINED]
+        restarted = (s for r in ranked for s in gains.restart(r))
+        for new in dict.fromkeys(gains.exchange_readings(s) for s in (old, *restarted)):
+            new = gains.exchange_first(new)
+            if gains.rough_error(new) > best.error * (1.0 + ROUGH):
+                continue
+            information = others + self.information_of(new)
+            error = self.error_of(information)
+            if error < best.error:
+                setups = (*plan.setups[:k], new, *plan.setups[k + 1 :])
+                best = PlannedSetups(setups, information, error)
+        return best
+
+
+def _run(search: SetupSearch, starts: tuple[_Start, ...], which: int) -> PlannedSetups:
+    return search.run(starts[which])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Beside:
-    """What candidates are worth beside all that others say."""
+class Gains:
+    """Gains of all candidate setups, given the information of others."""
 
-    candidates: Candidates
+    search: SetupSearch
     covariance: Array
-    """B C Bᵀ, B being what candidates tell of the state, shape (n_told, n_told)."""
-    worth: Array
-    """B C R, shape (n_told, p)."""
-    whole: float | None
+    """B C Bᵀ, shape (n_seen, n_seen)."""
+    root: Array
+    """B C R, shape (n_seen, p)."""
+    total: float | None
     """tr(T C); None where T depends on C."""
-    many: bool
-    """Whether there are too many to rank each pair with its gauge set where it begins."""
-    seen: dict[tuple[int, int | None], Taking] = field(default_factory=dict)
-    """What was looked at, by kind and where it is begun."""
-    on_mean: dict[int, Taking] = field(default_factory=dict)
-    """The same with gauges that are set on the mean of all postures."""
+    averaged: bool
+    """Whether setups are ranked with the alignment averaged over all postures."""
+    computed: dict[tuple[int, int | None, bool], SetupGain] = field(default_factory=dict)
+    """Gains so far, by candidate setup, first reading, and whether alignment is averaged."""
 
     @staticmethod
-    def of(candidates: Candidates, information: Array, weigh: Weigh) -> _Beside:
+    def of(search: SetupSearch, information: Array) -> Gains:
+        """Gains beside an inverse covariance of the state."""
         covariance = _inverse(information)
-        root = weigh(covariance)
-        steady = weigh(covariance) is root
-        whole = float(np.vdot(root, covariance @ root)) if steady else None
-        told, _, _ = _narrow(candidates)
-        known = told @ covariance
-        many = candidates.count > FEW
-        return _Beside(candidates, known @ told.T, known @ root, whole, many)
+        root = search.weigh(covariance)
+        constant = search.weigh(covariance) is root
+        total = float(np.vdot(root, covariance @ root)) if constant else None
+        known = search.basis @ covariance
+        averaged = search.candidates.count > FEW
+        return Gains(search, known @ search.basis.T, known @ root, total, averaged)
 
-    def taking(self, which: int, first: int | None = None) -> Taking:
-        """The candidates of a kind, begun with one of them, or on the mean of them."""
-        kind = self.candidates.kinds[which]
-        key = which, first if kind.by_hand else None
-        if key not in self.seen and key[1] is not None:
-            self.seen[key] = self.taking(which).begun(key[1])
-        elif key not in self.seen:
-            own, sigma = _narrow(self.candidates)[1][which], self.candidates.sigma
-            self.seen[key] = Taking.beside(own, self.covariance, self.worth, sigma)
-        return self.seen[key]
+    def setup(self, which: int, first: int | None = None) -> SetupGain:
+        """Gain of a candidate setup, begun with one of its readings."""
+        key = which, first if self.search.reduced[which].aligned else None, False
+        if key not in self.computed:
+            own = self.search.reduced[which]
+            self.computed[key] = (
+                self._compute(own) if key[1] is None else self.setup(which).begun(key[1])
+            )
+        return self.computed[key]
 
-    def taking_on_mean(self, which: int) -> Taking:
-        """The candidates of a kind, its gauge set on the mean of all postures: half the work.
+    def _ranking_setup(self, which: int) -> SetupGain:
+        """Gain for ranking: of many candidates with the alignment averaged over all postures.
 
-        Where there are few, as they are.
+        That takes half the time.
         """
-        if not self.many:
-            return self.taking(which)
-        if which not in self.on_mean:
-            own = _narrow(self.candidates)[2][which]
-            found = Taking.beside(own, self.covariance, self.worth, self.candidates.sigma)
-            self.on_mean[which] = found
-        return self.on_mean[which]
+        own = self.search.reduced[which]
+        if not (own.aligned and self.averaged):
+            return self.setup(which)
+        key = which, None, True
+        if key not in self.computed:
+            self.computed[key] = self._compute(replace(own, aligned=()))
+        return self.computed[key]
 
-    def left_roughly(self, opened: Opened) -> float:
-        """What a setup leaves, but for rounding; 0 where that cannot be said at once."""
-        if self.whole is None:
+    def _compute(self, setup: CandidateSetup) -> SetupGain:
+        return SetupGain.of(setup, self.covariance, self.root, self.search.candidates.sigma)
+
+    def _pairs(self, which: int, count: int) -> Pairs:
+        key, pairs = (which, count), self.search.pairs
+        if key not in pairs:
+            pairs[key] = Pairs.of(self.search.reduced[which], count)
+        return pairs[key]
+
+    def rough_error(self, planned: PlannedSetup) -> float:
+        """Error with a setup, without an inverse; 0 where the weight depends on the covariance."""
+        if self.total is None:
             return 0.0
-        gain = self.taking(opened.kind, opened.chosen[0]).gain(list(opened.chosen))
-        return math.sqrt(max(self.whole - gain, 0.0))
+        gain = self.setup(planned.candidate, planned.chosen[0]).gain(list(planned.chosen))
+        return math.sqrt(max(self.total - gain, 0.0))
 
-    def begun_best(self, opened: Opened) -> Opened:
-        """The same setup begun with another reading, of its own or not, if that takes more."""
-        kind, chosen = self.candidates.kinds[opened.kind], opened.chosen
-        if not kind.by_hand:
-            return opened
+    def exchange_first(self, planned: PlannedSetup) -> PlannedSetup:
+        """The same setup begun with another reading, of its own or not, if that gains more."""
+        setup, chosen = self.search.reduced[planned.candidate], planned.chosen
+        if not setup.aligned:
+            return planned
         own = [(first, *(i for i in chosen if i != first)) for first in chosen]
-        first = np.setdiff1d(np.arange(len(kind.rows)), chosen)
+        first = np.setdiff1d(np.arange(len(setup.rows)), chosen)
         rest = np.broadcast_to(chosen[1:], (len(first), len(chosen) - 1))
         sets = np.vstack([own, np.column_stack([first, rest])])
-        able = sets[kind.together[sets[:, :1], sets].all(axis=1)]
-        best = int(self.taking(opened.kind).gains(able).argmax())
-        return Opened(opened.kind, tuple(able[best].tolist()))
+        able = sets[setup.reachable[sets[:, :1], sets].all(axis=1)]
+        best = int(self.setup(planned.candidate).gains(able).argmax())
+        return PlannedSetup(planned.candidate, tuple(able[best].tolist()))
 
-    def rank(self, count: int) -> list[Opened]:
-        """Setups with so many readings, one of a kind, greedily; those first that take most.
+    def rank(self, count: int) -> list[PlannedSetup]:
+        """Best readings of each candidate setup, completed greedily; largest gain first.
 
-        Of many kinds only those are looked at whose best pair of readings takes most.
+        Only setups whose best pair of readings gains most are completed.
         """
         begun = [
             (gain, which, pair)
-            for which, kind in enumerate(self.candidates.kinds)
-            if beginnings(kind, count).flat.size
-            for gain, pair in self.taking_on_mean(which).pairs(count, 1)
+            for which in range(len(self.search.reduced))
+            if self._pairs(which, count).flat.size
+            for gain, pair in self._ranking_setup(which).best_pairs(self._pairs(which, count), 1)
         ]
-        begun.sort(key=lambda f: -f[0])
-        found = []
+        begun.sort(key=lambda b: -b[0])
+        completed = []
         for _, which, pair in begun[:MOST_COMPLETED]:
-            gain, chosen = self.taking(which, pair[0]).complete(pair, count)
-            found.append((gain, Opened(which, chosen)))
-        return [opened for _, opened in sorted(found, key=lambda f: -f[0])]
+            gain, chosen = self.setup(which, pair[0]).complete(pair, count)
+            completed.append((gain, PlannedSetup(which, chosen)))
+        return [planned for _, planned in sorted(completed, key=lambda c: -c[0])]
 
-    def begun_otherwise(self, opened: Opened) -> list[Opened]:
-        """The same setup, its readings greedily from each of the best pairs."""
-        which, count = opened.kind, len(opened.chosen)
+    def restart(self, planned: PlannedSetup) -> list[PlannedSetup]:
+        """The same setup with readings completed greedily from each of the best pairs."""
+        which, count = planned.candidate, len(planned.chosen)
         return [
-            Opened(which, self.taking(which, pair[0]).complete(pair, count)[1])
-            for _, pair in self.taking(which).pairs(count, MOST_PAIRS)
+            PlannedSetup(which, self.setup(which, pair[0]).complete(pair, count)[1])
+            for _, pair in self.setup(which).best_pairs(self._pairs(which, count), MOST_PAIRS)
         ]
 
-    def better_readings(self, opened: Opened) -> Opened:
+    def exchange_readings(self, planned: PlannedSetup) -> PlannedSetup:
         """The same setup with each reading in turn exchanged for the best beside its others."""
-        kind, chosen = self.candidates.kinds[opened.kind], list(opened.chosen)
+        setup, chosen = self.search.reduced[planned.candidate], list(planned.chosen)
         for _ in range(MOST_PASSES):
             before = list(chosen)
-            whole = self.taking(opened.kind, chosen[0])
+            gain = self.setup(planned.candidate, chosen[0])
             for place in range(len(chosen)):
                 others = chosen[:place] + chosen[place + 1 :]
-                # another first reading must be one from which the gauge reaches all others
-                reached = (
-                    kind.together[chosen[0]] if place else kind.together[:, others].all(axis=1)
+                # from another first reading the gauge must reach all others
+                allowed = np.array(
+                    setup.reachable[chosen[0]] if place else setup.reachable[:, others].all(axis=1)
                 )
-                allowed = np.array(reached)
                 allowed[others] = False
-                gains = whole.gains_beside(others)
+                gains = gain.further_gains(others)
                 chosen[place] = int(np.where(allowed, gains, -1.0).argmax())
             if chosen == before:
                 break
-        return Opened(opened.kind, tuple(chosen))
-
-
-@lru_cache(maxsize=4)
-def _narrow(candidates: Candidates) -> tuple[Array, tuple[Kind, ...], tuple[Kind, ...]]:
-    """What candidates tell of the state at all, and how they answer to that.
-
-    The state has directions that none of them tells of, often as many as the others.
-
-    Returns:
-        B, directions that are square to each other, shape (n_told, n_state); the kinds with slopes
-        by these, A Bᵀ; and the same with gauges that are set on the mean of all postures.
-    """
-    slopes = [s for k in candidates.kinds for s in (k.slopes, *(h.slopes for h in k.by_hand))]
-    _, sizes, directions = np.linalg.svd(np.vstack(slopes), full_matrices=False)
-    told = directions[sizes > UNTOLD * sizes.max(initial=0.0)]
-    kinds = tuple(
-        replace(
-            k,
-            slopes=k.slopes @ told.T,
-            by_hand=tuple(HandSet(h.answers, h.slopes @ told.T) for h in k.by_hand),
-        )
-        for k in candidates.kinds
-    )
-    return told, kinds, tuple(replace(k, by_hand=()) if k.by_hand else k for k in kinds)
-
-
-def _says(candidates: Candidates, opened: Opened) -> Array:
-    """What the readings of a setup say of the state."""
-    if len(opened.chosen) < FEWEST:
-        raise ValueError(f"found {len(opened.chosen)} readings; expected at least {FEWEST}")
-    kind = candidates.kinds[opened.kind].only(opened.chosen).begun(0)
-    spread = kind.own + candidates.sigma**2 * np.eye(len(kind.rows))
-    return np.asarray(kind.slopes.T @ np.linalg.solve(spread, kind.slopes))
-
-
-def error_left(information: Array, weigh: Weigh) -> float:
-    """What the criterion makes small, as large as an error, where so much is said of the state."""
-    covariance = _inverse(information)
-    root = weigh(covariance)
-    return float(np.sqrt(np.vdot(root, covariance @ root)))
+        return PlannedSetup(planned.candidate, tuple(chosen))
 
 
 def _inverse(information: Array) -> Array:

@@ -1,1 +1,1 @@
-"""What the machine is: description, model, error parameters, symbolic kinematics, assembly."""
+"""The machine: description, Pinocchio model, error parameters, reference posture."""

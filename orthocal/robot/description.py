@@ -6,7 +6,7 @@ The keys at the top are those of the Gepetto "extended URDF"; all else stands un
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
@@ -31,6 +31,8 @@ ClosureKind = Annotated[Literal["3d", "6d"], BeforeValidator(_in_small_letters)]
 THICKEST_ROD_MM = 500.0
 """No rod that a gauge touches is thicker: it is a wrong unit."""
 
+LARGEST_WORKSPACE_MM = 1e4
+
 MOST_PARTS = 100
 """Legs, closures and named sums of a robot, of each."""
 
@@ -40,7 +42,7 @@ class _Keys(BaseModel):
 
 
 class ClosureKeys(_Keys):
-    """What orthocal adds to one pair of `closed_loop`."""
+    """Keys that orthocal adds to one pair of `closed_loop`."""
 
     rows: list[Row] | None = None
     """Rows that count, in the axes of the pair's first frame; all by default."""
@@ -59,7 +61,7 @@ class JointKeys(_Keys):
 
 
 class DriveKeys(_Keys):
-    """What orthocal adds to one motor."""
+    """Keys that orthocal adds to one motor."""
 
     zero_mm: Number | None = None
     """Commanded coordinate of the mechanical zero, for a prismatic drive."""
@@ -100,16 +102,31 @@ class TcpKeys(_Keys):
     commanded by the tool."""
 
 
-class ToleranceKeys(_Keys):
-    """One standard deviation of each kind of error, and of single parameters."""
+def _require_ascending(limits: list[float]) -> list[float]:
+    low, high = limits
+    if not -LARGEST_WORKSPACE_MM <= low < high <= LARGEST_WORKSPACE_MM:
+        raise ValueError(
+            f"found [{low:g}, {high:g}]; expected [least, largest], in mm, within "
+            f"±{LARGEST_WORKSPACE_MM:g}"
+        )
+    return limits
 
-    offset_mm: PositiveNumber = 5.0
-    offset_mrad: PositiveNumber = 10.0
-    translation_mm: PositiveNumber = 0.1
-    rotation_mrad: PositiveNumber = 1.0
-    scale_ppm: PositiveNumber = 100.0
-    overrides: dict[str, PositiveNumber] = {}
-    """Parameter name or glob, with the unit as suffix, to value; later ones win."""
+
+WorkspaceBox = Annotated[
+    list[
+        Annotated[
+            list[Number], Field(min_length=2, max_length=2), AfterValidator(_require_ascending)
+        ]
+    ],
+    Field(min_length=1, max_length=3),
+]
+"""Limits of each coordinate of the tool, relative to the mechanical zero, [mm]."""
+
+
+class WorkspaceKeys(_Keys):
+    """Workspace: the region over which errors at the tool are reported."""
+
+    box_mm: WorkspaceBox
 
 
 class OrthocalKeys(_Keys):
@@ -122,11 +139,15 @@ class OrthocalKeys(_Keys):
     closed; 0 where absent."""
     legs: Annotated[dict[Name, LegKeys], Field(max_length=MOST_PARTS)] = {}
     tcp: TcpKeys | None = None
+    workspace: WorkspaceKeys | None = None
     parameters: Annotated[
         dict[Name, Annotated[list[Name], Field(min_length=1)]], Field(max_length=MOST_PARTS)
     ] = {}
     """Named sums of elementary errors; a leading '-' subtracts."""
-    tolerances: ToleranceKeys = ToleranceKeys()
+    tolerances: dict[str, Any] = {}
+    """Tolerances of the errors that every machine has, read by `orthocal.effects`."""
+    effects: Annotated[dict[Name, dict[str, Any]], Field(max_length=MOST_PARTS)] = {}
+    """Further effects by name, with keys that each reads itself."""
     models: dict[Name, Annotated[list[Name], Field(min_length=1)] | Literal["complete"]] = {}
     """Patterns of names; or every error that changes something."""
 

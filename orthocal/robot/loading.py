@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from orthocal.robot.description import (
     RodKeys,
     load_description,
 )
-from orthocal.robot.frames import find_frame, hangs_on
+from orthocal.robot.frames import find_frame
 from orthocal.robot.model import (
     Closure,
     Drive,
@@ -35,19 +34,10 @@ from orthocal.robot.model import (
     build_constraints,
     joint_axis,
 )
-from orthocal.robot.parameters import (
-    AXES,
-    COMPLETE,
-    ElementaryError,
-    Kind,
-    ParameterSet,
-    build_parameters,
-    split_unit,
-)
-from orthocal.robot.redundant import find_idle_errors
+from orthocal.robot.parameters import AXES, DeclaredErrors, ParameterSet, split_unit
 from orthocal.robot.reference_posture import stand_at_zero
 from orthocal.robot.urdf import load_urdf
-from orthocal.units import DEG, DRIVE_UNITS, MM, MRAD, PPM, Unit
+from orthocal.units import DEG, DRIVE_UNITS, MM, Unit
 
 Array = NDArray[np.float64]
 
@@ -67,10 +57,11 @@ def packaged_robots() -> dict[str, Path]:
     return {}
 
 
-def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
-    """Load a robot: URDF and YAML, checked against each other, with its loops closed.
+def load_bare_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
+    """Load a robot without its error parameters, which `orthocal.effects.loading` adds.
 
-    A robot is never changed: the same files give the same one again.
+    URDF and YAML are checked against each other, and the loops are closed. A robot is never
+    changed: the same files give the same one again.
 
     Args:
         robot: Name of a robot that comes with orthocal, or path to a robot folder.
@@ -114,10 +105,6 @@ def _build_robot(
     drive_index = [model.joints[model.getJointId(d.name)].idx_v for d in drives]
     passive_index = [i for i in range(model.nv) if i not in drive_index]
     closures = _build_closures(model, keys, where)
-    try:
-        parameters = _build_parameter_set(model, keys, drives, closures, where)
-    except ParameterError as e:
-        raise RobotError(e.problem, where=f"{where}: orthocal") from None
     robot = Robot(
         name=name,
         folder=folder,
@@ -130,7 +117,14 @@ def _build_robot(
         closures=closures,
         legs={},
         tcp=_build_tcp(model, keys, where),
-        parameters=parameters,
+        workspace=_read_workspace(keys, where),
+        declared=DeclaredErrors(
+            tolerances=keys.orthocal.tolerances,
+            effects=keys.orthocal.effects,
+            sums=keys.orthocal.parameters,
+            models=keys.orthocal.models,
+        ),
+        parameters=ParameterSet(),
         drive_index=np.array(drive_index, dtype=np.int64),
         passive_index=np.array(passive_index, dtype=np.int64),
         zero=read_only(np.zeros(model.nv)),
@@ -138,9 +132,7 @@ def _build_robot(
     )
     given = [_is_zero_given(keys, d.name) for d in drives]
     robot = stand_at_zero(robot, _passive_start(robot, keys, where), given=given)
-    robot = replace(robot, legs=_build_legs(robot, keys, where))
-    parameters.find_idle = partial(find_idle_errors, robot)
-    return robot
+    return replace(robot, legs=_build_legs(robot, keys, where))
 
 
 def _find_files(folder: Path) -> tuple[Path, Path]:
@@ -255,87 +247,19 @@ def _build_tcp(model: pin.Model, keys: RobotKeys, where: str) -> Tcp | None:
     return Tcp(tcp.frame, tuple(sorted("xyz".index(c) for c in set(tcp.coordinates))))
 
 
-def _build_parameter_set(
-    model: pin.Model,
-    keys: RobotKeys,
-    drives: Sequence[Drive],
-    closures: Sequence[Closure],
-    where: str,
-) -> ParameterSet:
-    """All elementary errors: drives, then joints, then the frames that are used.
-
-    The component of a motor's placement along or about its own axis is left out: the offset is the
-    same error.
-    """
-    elementary: list[ElementaryError] = []
-    units: tuple[Unit, ...] = ("m", "m", "m", "rad", "rad", "rad")
-
-    def add_twist(owner: str, prefix: str, *, of_frame: bool, leave_out: int | None) -> None:
-        for axis, letter in enumerate(AXES):
-            if axis != leave_out:
-                kind: Kind = "translation" if axis < 3 else "rotation"
-                elementary.append(
-                    ElementaryError(
-                        f"{prefix}{owner}.{letter}", kind, owner, of_frame, axis, units[axis]
-                    )
-                )
-
-    for drive in drives:
-        elementary.append(
-            ElementaryError(f"{drive.name}.offset", "offset", drive.name, False, -1, drive.unit)
+def _read_workspace(keys: RobotKeys, where: str) -> NDArray[np.float64] | None:
+    """Box of the workspace, shape (n_coordinates, 2), [m]."""
+    tcp, workspace = keys.orthocal.tcp, keys.orthocal.workspace
+    if workspace is None:
+        return None
+    names = sorted(set(tcp.coordinates)) if tcp else []
+    if len(workspace.box_mm) != len(names):
+        raise RobotError(
+            f"has {len(workspace.box_mm)} ranges; expected one for each coordinate of "
+            f"orthocal.tcp: {', '.join(names) or 'none'}",
+            where=f"{where}: orthocal.workspace.box_mm",
         )
-    for drive in drives:
-        elementary.append(
-            ElementaryError(f"{drive.name}.scale", "scale", drive.name, False, -1, "1")
-        )
-    motors = {d.name for d in drives}
-    for i in range(1, model.njoints):
-        own = int(np.abs(joint_axis(model, i)).argmax()) if model.names[i] in motors else None
-        add_twist(model.names[i], "", of_frame=False, leave_out=own)
-    extra = keys.orthocal
-    frames = [f for c in closures for f in (c.frame_a, c.frame_b)]
-    frames += [f for leg in extra.legs.values() for f in (leg.root, leg.tip)]
-    frames += [extra.tcp.frame] if extra.tcp else []
-    for frame in dict.fromkeys(frames):
-        add_twist(frame, "frame.", of_frame=True, leave_out=None)
-
-    t = extra.tolerances
-    models = dict(extra.models)
-    models.setdefault("offsets", ["*.offset"])
-    models.setdefault("full", COMPLETE)
-    return build_parameters(
-        elementary,
-        sums=extra.parameters,
-        tolerances={
-            "offset:m": t.offset_mm * MM,
-            "offset:rad": t.offset_mrad * MRAD,
-            "translation": t.translation_mm * MM,
-            "rotation": t.rotation_mrad * MRAD,
-            "scale": t.scale_ppm * PPM,
-        },
-        overrides=t.overrides,
-        models=models,
-        parts=_find_parts(model, keys, closures, where),
-    )
-
-
-def _find_parts(
-    model: pin.Model, keys: RobotKeys, closures: Sequence[Closure], where: str
-) -> frozenset[str]:
-    """Frames that are parts of a machine: where its loops end.
-
-    An error of a frame that the tool hangs on moves the tool alone: it says where on the platform
-    that is. The ends of legs' lines are drawn in the air.
-    """
-    tool: set[int] = set()
-    if keys.orthocal.tcp is not None:
-        tcp = keys.orthocal.tcp.frame
-        current: int | None = find_frame(model, tcp, where=f"{where}: orthocal.tcp.frame")
-        while current is not None:
-            tool.add(current)
-            current = hangs_on(model, current)
-    ends = {frame for closure in closures for frame in (closure.frame_a, closure.frame_b)}
-    return frozenset(frame for frame in ends if find_frame(model, frame, where=where) not in tool)
+    return read_only(np.array(workspace.box_mm) * MM)
 
 
 def _passive_start(robot: Robot, keys: RobotKeys, where: str) -> Array:

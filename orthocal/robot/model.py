@@ -10,13 +10,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.errors import ClosureError
+from orthocal.errors import ClosureError, ParameterError
 from orthocal.io.fields import read_only
 from orthocal.robot.frames import find_frame, place_frames
 from orthocal.robot.nominal_closure import close_loops, describe_opening
-from orthocal.robot.parameters import (
-    ParameterSet,
-)
+from orthocal.robot.parameters import DeclaredErrors, ParameterSet
 from orthocal.units import InUnit, Unit
 
 Array = NDArray[np.float64]
@@ -43,7 +41,7 @@ class Drive(InUnit):
     """What the controller's joint shows in the mechanical zero, [unit]; None: the coordinate."""
 
     def to_joint(self, coordinate: ArrayLike) -> Array:
-        """What the controller's joint shows at coordinates, of any shape, [unit]."""
+        """Coordinates of the controller's joint for drive coordinates of any shape, [unit]."""
         shown = self.zero if self.joint_zero is None else self.joint_zero
         return shown + self.direction * (np.asarray(coordinate, dtype=np.float64) - self.zero)
 
@@ -142,7 +140,13 @@ class Robot:
     closures: tuple[Closure, ...]
     legs: Mapping[str, Leg]
     tcp: Tcp | None
+    workspace: Array | None
+    """Box over which errors at the tool are reported, relative to the mechanical zero, shape
+    (n_coordinates, 2), [m]; None where the YAML states none."""
+    declared: DeclaredErrors
+    """What the YAML says of the machine's errors, for `orthocal.effects`."""
     parameters: ParameterSet
+    """Error parameters, from `orthocal.effects.loading`."""
     drive_index: NDArray[np.int64]
     """Indices of the actuated coordinates, shape (n_drives,)."""
     passive_index: NDArray[np.int64]
@@ -268,7 +272,7 @@ class Robot:
     def evaluate_constraints_at(
         self, coordinates: ArrayLike, *, data: pin.Data | None = None
     ) -> tuple[Array, Array]:
-        """The same at joint coordinates, shape (nv,), [m, rad]; Pinocchio's data may be reused."""
+        """Closure residual and derivative at joint coordinates, shape (nv,); `data` is reused."""
         data = self.model.createData() if data is None else data
         pin.computeJointJacobians(self.model, data, self.configuration(coordinates))
         residuals, jacobians = [np.zeros(0)], [np.zeros((0, self.model.nv))]
@@ -305,7 +309,7 @@ class Robot:
             values: Parameter name to value, [unit of the parameter].
 
         Raises:
-            ParameterError: If a name is unknown.
+            ParameterError: If a name is unknown, or of an effect that placements cannot express.
         """
         errors = self.parameters.expand(values)
         model = self.model.copy()
@@ -319,6 +323,8 @@ class Robot:
                 gain[[d.name for d in self.drives].index(e.owner)] += value
             elif e.kind == "offset":
                 offsets[e.owner] = value
+            elif e.axis < 0:
+                raise ParameterError(f"'{name}' cannot be written into placements")
             else:
                 twists = frame_twists if e.of_frame else joint_twists
                 twists.setdefault(e.owner, np.zeros(6))[e.axis] += value
@@ -347,7 +353,7 @@ def joint_axis(model: pin.Model, joint: int) -> Array:
 
 
 def closure_turns(robot: Robot) -> NDArray[np.bool_]:
-    """Which closure rows are rotations, shape (closure_rows,)."""
+    """Mask of the closure rows that are rotations, shape (closure_rows,)."""
     return np.array([row >= 3 for c in robot.closures for row in c.rows], dtype=np.bool_)
 
 
@@ -384,7 +390,7 @@ def coordinate_limits(robot: Robot) -> tuple[Array, Array]:
 
 
 def joint_turns(model: pin.Model, joint: int) -> bool:
-    """Whether a joint turns, and does not slide: revolute, bounded or not."""
+    """True for a revolute joint, bounded or not."""
     axis = joint_axis(model, joint) if model.joints[joint].nv == 1 else np.zeros(6)
     return bool(np.any(axis[3:]) and not np.any(axis[:3]))
 

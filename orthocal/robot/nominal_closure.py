@@ -33,14 +33,14 @@ _FIRST_DAMPING = 1e-3
 """Of the squared residual: the damping vanishes with it, so that the end is Newton's."""
 _PATIENCE = 12
 _LEAST_GAIN = 0.1
-"""Share of the residual that so many steps have to take off while it is far from closed."""
+"""Share of the residual that these steps must remove while the loops are far from closed."""
 _RANK = 1e-10
 """Singular values below this share of the largest are none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Closing:
-    """Where a search ended."""
+    """Result of a search."""
 
     coordinates: Array
     """Shape (n,), [m, rad]."""
@@ -49,7 +49,7 @@ class Closing:
 
     @property
     def closed(self) -> bool:
-        """Whether the loops are closed."""
+        """True if the loops are closed."""
         return largest(self.residual) < CLOSED
 
 

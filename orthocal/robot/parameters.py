@@ -1,26 +1,20 @@
-"""Error parameters of a robot: names, units, tolerances, and the elementary errors they stand for.
+"""Error parameters of a robot: names, units, tolerances, and the elementary errors they consist of.
 
-An elementary error is one component of the twist δ = (translation, rotation) by which a placement
-is off, placement · exp6(δ), or a drive's offset or scale error:
-
-    x_slide.offset    ρ commanded, ρ + Δρ in truth (paper, equation 1)
-    x_slide.scale     ρ (1 + s) in truth
-    x_coupler.rx      rotation of the placement of joint x_coupler about its own x axis
-    frame.tcp.z       translation of frame tcp along its own z axis
-
-A parameter is one elementary error or a named sum of several. All are 0 for the nominal machine.
+Effects say which elementary errors a machine has and how these act (`orthocal.effects`). A
+parameter is one elementary error or a named sum of several. All are 0 for the nominal machine.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from glob import escape, has_magic
-from typing import Literal
+from types import MappingProxyType
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +23,6 @@ from orthocal.arguments import require_numbers
 from orthocal.errors import ParameterError
 from orthocal.text import composed
 from orthocal.units import UNIT_SUFFIXES, InUnit, Unit
-
-Kind = Literal["offset", "scale", "translation", "rotation"]
 
 COMPLETE: Literal["complete"] = "complete"
 """A model of every error that changes something."""
@@ -47,17 +39,39 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 @dataclass(frozen=True, slots=True)
 class ElementaryError:
-    """One component by which one drive, joint placement or frame placement is off."""
+    """One parameter of an effect."""
 
     name: str
-    kind: Kind
+    kind: str
+    """"offset" or "scale" of a drive, "translation" or "rotation" of a placement; for other
+    effects the name of the effect."""
     owner: str
-    """Name of the drive, joint or frame."""
-    of_frame: bool
-    """Whether the owner is a frame, not a joint."""
-    axis: int
-    """Component of the twist, 0 to 5; -1 for offset and scale."""
+    """Name of the drive, joint or frame; of the leg, rod or setup for other effects."""
     unit: Unit
+    tolerance: float
+    """One standard deviation, [unit]."""
+    of_frame: bool = False
+    """Whether the owner is a frame, not a joint."""
+    axis: int = -1
+    """Component of the twist of a placement, 0 to 5; -1 for errors of other kinds."""
+    complete: bool = False
+    """Whether the complete model of a machine holds it, unless it changes nothing."""
+    positive: bool = False
+    """Whether it is never negative; its prior is half-normal then."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeclaredErrors:
+    """Errors of a machine as its YAML declares them, in plain data for `orthocal.effects`."""
+
+    tolerances: Mapping[str, Any]
+    """Key `orthocal.tolerances`."""
+    effects: Mapping[str, Mapping[str, Any]]
+    """Key `orthocal.effects`: effect to its own keys."""
+    sums: Mapping[str, Sequence[str]]
+    """Key `orthocal.parameters`: name of a sum to names of elementary errors; '-' subtracts."""
+    models: Mapping[str, Sequence[str]]
+    """Key `orthocal.models`: name of a model to patterns, or to COMPLETE."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,25 +84,32 @@ class Parameter(InUnit):
     """One standard deviation, [unit]."""
     terms: tuple[tuple[str, float], ...]
     """Elementary errors it adds to, with coefficients."""
+    positive: bool = False
+    """Whether it is never negative; its prior is half-normal then."""
 
 
 class ParameterSet:
-    """All error parameters of a robot, by name, in a fixed order."""
+    """All error parameters of a robot, by name, in a fixed order.
+
+    Args:
+        elementary: All elementary errors.
+        parameters: The errors and named sums of them.
+        models: Model to patterns of names, or to COMPLETE.
+        find_idle: Finds the elementary errors that change nothing; called once, if needed.
+    """
 
     def __init__(
         self,
-        elementary: Iterable[ElementaryError],
-        parameters: Iterable[Parameter],
-        models: Mapping[str, Sequence[str]],
+        elementary: Iterable[ElementaryError] = (),
+        parameters: Iterable[Parameter] = (),
+        models: Mapping[str, Sequence[str]] = MappingProxyType({}),
         *,
-        parts: Collection[str] = (),
+        find_idle: Callable[[], frozenset[str]] = frozenset,
     ) -> None:
         self.elementary = {e.name: e for e in elementary}
         self._parameters = {p.name: p for p in parameters}
         self._models = dict(models)
-        self._parts = frozenset(parts)
-        self.find_idle: Callable[[], frozenset[str]] = frozenset
-        """Finds the elementary errors that change nothing; asked once, and only when needed."""
+        self._find_idle = find_idle
         self.own: ParameterSet = self
         """The same with the tolerances of the robot's YAML."""
         self.stated: Mapping[str, float] = {}
@@ -122,7 +143,7 @@ class ParameterSet:
         return tuple(self._models)
 
     def patterns(self, model: str) -> tuple[str, ...]:
-        """What a model frees: names and globs, as for `select`.
+        """Names and globs that a model frees, as for `select`.
 
         Raises:
             ParameterError: If there is no such model.
@@ -136,27 +157,24 @@ class ParameterSet:
 
     @cached_property
     def complete(self) -> tuple[str, ...]:
-        """Elementary errors of the machine's parts that change something, in order.
+        """Elementary errors of the complete model, in order: those that change something.
 
-        What changes something is found by rank (`find_idle`), not by a list. Sums of errors are no
-        further ones.
+        What changes something is found by rank, not by a list. Sums of errors are no further ones.
         """
         return tuple(n for n in self.of_parts if n not in self.idle)
 
     @cached_property
     def of_parts(self) -> tuple[str, ...]:
-        """Elementary errors of drives, joints and where loops end, in order."""
-        return tuple(
-            e.name for e in self.elementary.values() if not e.of_frame or e.owner in self._parts
-        )
+        """Elementary errors of drives, joints and ends of loops, in order."""
+        return tuple(e.name for e in self.elementary.values() if e.complete)
 
     @cached_property
     def idle(self) -> frozenset[str]:
         """Elementary errors that change neither the tool nor what a gauge touches."""
-        return self.find_idle()
+        return self._find_idle()
 
     def coefficients(self, errors: Sequence[str], names: Sequence[str]) -> NDArray[np.float64]:
-        """What one unit of each named parameter adds to each error, (n_errors, n_names).
+        """Contribution of one unit of each named parameter to each error, (n_errors, n_names).
 
         Raises:
             ParameterError: If a name is unknown.
@@ -169,12 +187,21 @@ class ParameterSet:
         return result
 
     def are_offsets(self, name: str) -> bool:
-        """Whether a parameter is an offset of a drive, or of several.
+        """True if a parameter is an offset of a drive, or of several.
 
         Raises:
             ParameterError: If the name is unknown.
         """
         return all(self.elementary[term].kind == "offset" for term, _ in self[name].terms)
+
+    def are_rigid(self, name: str) -> bool:
+        """Whether placements and drives with offset and scale express a parameter.
+
+        Raises:
+            ParameterError: If the name is unknown.
+        """
+        errors = (self.elementary[term] for term, _ in self[name].terms)
+        return all(e.axis >= 0 or e.kind in ("offset", "scale") for e in errors)
 
     def select(self, patterns: Iterable[str]) -> tuple[str, ...]:
         """Names that a list of globs leaves, in the order of the set.
@@ -210,7 +237,7 @@ class ParameterSet:
         return self.select(self.patterns(model))
 
     def with_tolerances(self, given: Mapping[str, float]) -> ParameterSet:
-        """The same errors, some with other tolerances.
+        """Errors with some tolerances replaced.
 
         Args:
             given: Name or glob with its unit, such as `*.offset_mm`, to one standard deviation in
@@ -227,9 +254,9 @@ class ParameterSet:
             for name in self.own.select([glob]):
                 size = require_tolerance(value, self.own[name])
                 parameters[name] = replace(parameters[name], tolerance=size)
-        elementary = self.elementary.values()
-        found = ParameterSet(elementary, parameters.values(), self._models, parts=self._parts)
-        found.find_idle = lambda: self.idle
+        found = ParameterSet(
+            self.elementary.values(), parameters.values(), self._models, find_idle=lambda: self.idle
+        )
         found.own, found.stated = self.own, stated
         return found
 
@@ -338,56 +365,31 @@ def build_parameters(
     elementary: Sequence[ElementaryError],
     *,
     sums: Mapping[str, Sequence[str]],
-    tolerances: Mapping[str, float],
     overrides: Mapping[str, float],
     models: Mapping[str, Sequence[str]],
-    parts: Collection[str] = (),
+    find_idle: Callable[[], frozenset[str]],
 ) -> ParameterSet:
     """The parameter set of a robot.
 
     Args:
         elementary: All elementary errors, in order.
         sums: Name of a sum to names of elementary errors; a leading '-' subtracts.
-        tolerances: Keys `offset:m`, `offset:rad`, `translation`, `rotation`, `scale` to one
-            standard deviation, [m, rad, m, rad, 1].
         overrides: Parameter name or glob with its unit as suffix to a tolerance; later ones win.
         models: Model name to patterns, or to COMPLETE.
-        parts: Frames that are parts of the machine.
+        find_idle: As for `ParameterSet`.
 
     Raises:
-        ParameterError: If a name is unknown, taken twice, or of another unit than its sum.
+        ParameterError: If a name is unknown, stated twice, or of another unit than its sum.
     """
     by_name = {e.name: e for e in elementary}
-
-    def tolerance(error: ElementaryError) -> float:
-        key = f"offset:{error.unit}" if error.kind == "offset" else error.kind
-        return tolerances[key]
-
     parameters = {
-        e.name: Parameter(e.name, e.unit, tolerance(e), ((e.name, 1.0),)) for e in elementary
+        e.name: Parameter(e.name, e.unit, e.tolerance, ((e.name, 1.0),), e.positive)
+        for e in elementary
     }
     for name, members in sums.items():
         if name in parameters:
             raise ParameterError(f"parameters.{name}: this name is taken by an elementary error")
-        terms: dict[str, float] = {}
-        for member in members:
-            plain = member.removeprefix("-")
-            if plain not in by_name:
-                raise ParameterError(
-                    f"parameters.{name}: '{plain}' is not an elementary error"
-                    f"{_suggest(plain, by_name)}"
-                )
-            if plain in terms:
-                raise ParameterError(f"parameters.{name}: '{plain}' stands twice")
-            terms[plain] = -1.0 if plain != member else 1.0
-        first = by_name[next(iter(terms))]
-        for plain in terms:
-            if by_name[plain].unit != first.unit:
-                raise ParameterError(
-                    f"parameters.{name}: '{plain}' is in {by_name[plain].unit}, "
-                    f"'{first.name}' in {first.unit}; a sum needs one unit"
-                )
-        parameters[name] = Parameter(name, first.unit, tolerance(first), tuple(terms.items()))
+        parameters[name] = _sum_errors(name, members, by_name)
     for key, value in overrides.items():
         glob, unit, factor = split_unit(key)
         found = [name for name in parameters if fnmatchcase(name, glob)]
@@ -397,10 +399,9 @@ def build_parameters(
                 f"{_suggest(glob, parameters)}"
             )
         for name in found:
-            old = parameters[name]
-            _check_unit(key, unit, old)
-            parameters[name] = Parameter(name, old.unit, value * factor, old.terms)
-    result = ParameterSet(elementary, parameters.values(), models, parts=parts)
+            _check_unit(key, unit, parameters[name])
+            parameters[name] = replace(parameters[name], tolerance=value * factor)
+    result = ParameterSet(elementary, parameters.values(), models, find_idle=find_idle)
     for model, patterns in models.items():
         if patterns == COMPLETE:
             continue
@@ -411,6 +412,30 @@ def build_parameters(
         if not chosen:
             raise ParameterError(f"models.{model}: leaves no error parameter free")
     return result
+
+
+def _sum_errors(
+    name: str, members: Sequence[str], errors: Mapping[str, ElementaryError]
+) -> Parameter:
+    """A named sum of elementary errors, with the tolerance of the first."""
+    terms: dict[str, float] = {}
+    for member in members:
+        plain = member.removeprefix("-")
+        if plain not in errors:
+            raise ParameterError(
+                f"parameters.{name}: '{plain}' is not an elementary error{_suggest(plain, errors)}"
+            )
+        if plain in terms:
+            raise ParameterError(f"parameters.{name}: '{plain}' stands twice")
+        terms[plain] = -1.0 if plain != member else 1.0
+    first = errors[next(iter(terms))]
+    for plain in terms:
+        if errors[plain].unit != first.unit:
+            raise ParameterError(
+                f"parameters.{name}: '{plain}' is in {errors[plain].unit}, "
+                f"'{first.name}' in {first.unit}; a sum needs one unit"
+            )
+    return Parameter(name, first.unit, first.tolerance, tuple(terms.items()))
 
 
 def _check_unit(key: str, unit: Unit, parameter: Parameter) -> None:

@@ -7,7 +7,7 @@ error about a hinge's own axis.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from orthocal.errors import ClosureError
 from orthocal.robot.frames import hangs_on
 from orthocal.robot.model import Robot, joint_axis
+from orthocal.robot.parameters import ElementaryError
 
 Array = NDArray[np.float64]
 
@@ -30,13 +31,13 @@ NOTHING = 1e-9
 """Of the largest effect of an error of its kind."""
 
 
-def find_idle_errors(robot: Robot) -> frozenset[str]:
-    """Names of the elementary errors that change nothing.
+def find_idle_errors(robot: Robot, elementary: Sequence[ElementaryError]) -> frozenset[str]:
+    """Names of the elementary errors of placements that change nothing.
 
-    Offsets and scales of drives are never idle. A robot without tool and legs has no idle errors
-    that anyone could tell.
+    Errors of other kinds are never idle. A robot without tool and legs has no idle errors that
+    anyone could tell.
     """
-    errors = [e for e in robot.parameters.elementary.values() if e.axis >= 0]
+    errors = [e for e in elementary if e.axis >= 0]
     if robot.tcp is None and not robot.legs:
         return frozenset()
     owners = list(dict.fromkeys((e.owner, e.of_frame) for e in errors))
@@ -110,7 +111,7 @@ class _Parts:
             self._carried[frame] = np.array([m in carriers for m in moved], dtype=np.float64)
 
     def effects(self, coordinates: Array) -> Array:
-        """How what is seen moves, passive joints following, (n, n_owners, 6), [m/m, m/rad]."""
+        """Sensitivity of observed points along the closed loops, (n, n_owners, 6), [m/m, m/rad]."""
         robot, model = self._robot, self._robot.model
         data = model.createData()
         pin.framesForwardKinematics(model, data, robot.configuration(coordinates))

@@ -91,7 +91,7 @@ def stand_at_zero(robot: Robot, passive_start: ArrayLike, *, given: ArrayLike) -
 
 
 def count_free_motions(robot: Robot) -> int:
-    """How many passive motions the loops leave free in the mechanical zero, drives at rest."""
+    """Number of passive motions that the loops leave free in the reference posture."""
     _, jacobian = robot.evaluate_constraints_at(robot.zero)
     scaled = closure_row_units(robot)[:, None] * jacobian / coordinate_units(robot)
     return int(_null_space(scaled[:, robot.passive_index]).shape[1])
@@ -230,7 +230,7 @@ def _return_drives(robot: Robot, found: Closing, movable: Indices, wanted: Array
 
 
 def _singular_values(robot: Robot, closing: Closing) -> Array:
-    """Of the closures by the passive motions, in metres, relative to the largest."""
+    """Singular values of the closures by the passive motions, relative to the largest."""
     _, jacobian = robot.evaluate_constraints_at(closing.coordinates)
     scaled = closure_row_units(robot)[:, None] * jacobian / coordinate_units(robot)
     values = np.linalg.svd(scaled[:, robot.passive_index], compute_uv=False)
@@ -238,7 +238,7 @@ def _singular_values(robot: Robot, closing: Closing) -> Array:
 
 
 def _reach(robot: Robot) -> Array:
-    """What a large motion of each coordinate is, shape (nv,): 1 rad or characteristic length."""
+    """Scale of each coordinate, shape (nv,): 1 rad or the characteristic length."""
     units = coordinate_units(robot)
     return np.where(units == 1.0, robot.characteristic_length, 1.0)
 

@@ -406,7 +406,7 @@ def captured_stderr() -> Iterator[Any]:
 
 
 def _sink() -> IO[bytes]:
-    """Where to catch it: without a folder for temporary files nowhere."""
+    """Temporary file for captured output, or a device that discards it."""
     try:
         return tempfile.TemporaryFile()
     except OSError:

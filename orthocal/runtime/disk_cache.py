@@ -115,9 +115,10 @@ def _read(folder: int, key: str) -> bytes | None:
     )
     with open(descriptor, "rb") as stream:
         status = os.fstat(descriptor)
-        if not (stat.S_ISREG(status.st_mode) and _is_own(status)):
+        small = status.st_size <= len(_MAGIC) + _DIGEST + LARGEST_ENTRY
+        if not (stat.S_ISREG(status.st_mode) and small and _is_own(status)):
             return None
-        data = stream.read(len(_MAGIC) + _DIGEST + LARGEST_ENTRY + 1)
+        data = stream.read(status.st_size)
     head, content = data[: len(_MAGIC) + _DIGEST], data[len(_MAGIC) + _DIGEST :]
     return content if head == _MAGIC + _digest(key, content) else None
 

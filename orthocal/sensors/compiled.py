@@ -1,30 +1,33 @@
-"""Readings of sensors as functions: built once for each kind of sensor and the frames it looks at.
+"""Compiled functions of a sensor's reading, one build for each kind of sensor and its frames.
 
-The derivatives by the poses of the frames are those of the sensor's own expression; those of the
-poses follow the geometry of the machine: a frame on which the reading pulls with force f and moment
-m is moved by whatever carries it.
+The derivatives by the poses of the frames are those of the sensor's expression. They act on a frame
+like a force f and a moment m; the derivatives of the poses follow the geometry of the machine.
 """
 
 from __future__ import annotations
 
-import hashlib
-import sys
-import uuid
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.effects.loading import reading_effects
+from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
 from orthocal.errors import OrthocalError
 from orthocal.kinematics.backend.batch_function import BatchFunction
-from orthocal.kinematics.compiled import compiled_robot
-from orthocal.kinematics.function_cache import identify, kept_function
+from orthocal.kinematics.function_cache import (
+    cached_function,
+    function_key,
+    identify,
+    source_digest,
+)
+from orthocal.kinematics.robot_functions import RobotFunctions, robot_functions
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import Frames, Sensor, View
+from orthocal.sensors.protocol import Frames, Sensor, View, sensor_conditions
 
 Array = NDArray[np.float64]
 
@@ -33,60 +36,67 @@ INPUTS = ["actuated", "passive", "placements", "zero", "constants", "unknowns"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompiledReading:
-    """What a kind of sensor shows, and what moves it.
+    """Functions of the reading of one kind of sensor.
 
-    All functions take: actuated and passive coordinates, placements, the drives in the zero
-    posture, constants and unknowns.
+    Their inputs: actuated and passive coordinates, placements, drives in the reference posture,
+    constants and nuisance parameters.
     """
 
     value: BatchFunction
     """h, [m]."""
-    slopes: BatchFunction
-    """h; ∂h by actuated, passive, twists, zero drives and unknowns, each of one row; of that by
-    twists the nonzeros alone."""
+    jacobian: BatchFunction
+    """h; ∂h by actuated, passive, twists, reference drives and nuisance parameters, one row each;
+    the one by twists as nonzeros."""
     expression: ca.Function
-    """The same with sparse rows, to be put into other expressions."""
-    words: str
-    """What distinguishes it from other readings of the robot."""
+    """The same with sparse rows, for use in other expressions."""
+    name: str
+    """Distinguishes it from other readings of the robot."""
+    conditions: tuple[Condition, ...]
+    """Conditions that follow the constants of the sensor among its inputs."""
     probe: float | None
-    """The expression of a sensor that is not orthocal's own, at some values."""
+    """Value of the expression of a sensor from outside orthocal, at some arguments."""
 
 
 def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
-    """The functions of a sensor; one build for all of its kind that look at the same frames.
+    """The functions of a sensor; one build for all of its kind with the same frames.
 
     Raises:
-        OrthocalError: If its expression is not that of another one of its kind.
+        OrthocalError: If its expression differs from that of another one of its kind.
     """
     pattern = _Pattern(robot, sensor, sensor.frames(robot))
-    found = _compile(pattern)
-    if found.probe is not None and _probe(pattern) != found.probe:
+    reading = _compile(pattern)
+    if reading.probe is not None and _probe(pattern) != reading.probe:
         raise OrthocalError(
             f"the expression of a sensor '{sensor.kind}' depends on more than its frames, "
             "constants and unknowns: what differs between setups belongs into `constants`"
         )
-    return found
+    return reading
 
 
 class _Pattern:
-    """Equal for sensors that have one expression."""
+    """A sensor's expression; equal for sensors with the same one."""
 
     def __init__(self, robot: Robot, sensor: Sensor, frames: Frames) -> None:
         self.robot, self.sensor, self.frames = robot, sensor, frames
-        self.n_constants = sensor.constants(robot).size
+        self.conditions = reading_conditions(robot, sensor)
+        sizes = (condition_size(robot, c) for c in self.conditions)
+        self.n_constants = sensor.constants(robot).size + sum(sizes)
+        of_effects = (e.name for effect in reading_effects(robot) for e in effect.setup_errors)
+        self.unknowns = (*(u.name for u in sensor.unknowns), *of_effects)
         self._key = (
             identify(robot),
             type(sensor),
             (sensor.kind, type(sensor).__qualname__),
             frames,
             self.n_constants,
-            tuple(u.name for u in sensor.unknowns),
-            _source(type(sensor)),
+            self.unknowns,
+            self.conditions,
+            source_digest(type(sensor)),
         )
 
     @property
-    def words(self) -> str:
-        """What distinguishes it from other patterns of the robot."""
+    def name(self) -> str:
+        """Distinguishes it from other patterns of the robot."""
         return repr(self._key[2:])
 
     @cached_property
@@ -101,35 +111,26 @@ class _Pattern:
         return hash(self._key)
 
 
-@lru_cache(maxsize=64)
-def _source(kind: type[Sensor]) -> str:
-    """A digest of the code of a kind that is not orthocal's own: with it its functions change.
-
-    One whose code is in no file, as in a notebook, has functions of this process alone.
-    """
-    if kind.__module__.startswith("orthocal."):
-        return ""
-    file = getattr(sys.modules.get(kind.__module__), "__file__", None)
-    try:
-        content = Path(file or "").read_bytes()
-    except OSError:
-        return uuid.uuid4().hex
-    return hashlib.sha256(content).hexdigest()
-
-
 @lru_cache(maxsize=256)
 def _compile(pattern: _Pattern) -> CompiledReading:
-    value, slopes = (
-        kept_function(pattern.robot, f"{name} {pattern.words}", partial(build, pattern))
-        for name, build in (("reading", _build_value), ("reading slopes", _build_slopes))
+    value, jacobian = (
+        cached_function(pattern.robot, f"{name} {pattern.name}", partial(build, pattern))
+        for name, build in (("reading", _build_value), ("reading jacobian", _build_jacobian))
     )
-    rows = [name for name in slopes.name_out() if name not in ("h", "by_twists")]
+    rows = [name for name in jacobian.name_out() if name not in ("h", "by_twists")]
+
+    def key(name: str) -> str:
+        return function_key(pattern.robot, f"{name} {pattern.name}")
+
     return CompiledReading(
-        value=BatchFunction(value, shared=["placements"]),
-        slopes=BatchFunction(slopes, shared=["placements"], matrices=rows, sparse=["by_twists"]),
-        expression=slopes,
-        words=pattern.words,
-        probe=_probe(pattern) if _source(type(pattern.sensor)) else None,
+        value=BatchFunction(value, key=key("reading")),
+        jacobian=BatchFunction(
+            jacobian, matrices=rows, sparse=["by_twists"], key=key("reading jacobian")
+        ),
+        expression=jacobian,
+        name=pattern.name,
+        conditions=pattern.conditions,
+        probe=_probe(pattern) if source_digest(type(pattern.sensor)) else None,
     )
 
 
@@ -138,40 +139,38 @@ def _build_value(pattern: _Pattern) -> ca.Function:
     return ca.Function("h", inputs, [ca.densify(outputs[0])], INPUTS, ["h"])
 
 
-def _build_slopes(pattern: _Pattern) -> ca.Function:
+def _build_jacobian(pattern: _Pattern) -> ca.Function:
     inputs, outputs = pattern.expressions
     labels = ["h", *(f"by_{n}" for n in ("actuated", "passive", "twists", "zero", "unknowns"))]
-    return ca.Function("slopes", inputs, outputs, INPUTS, labels)
+    return ca.Function("jacobian", inputs, outputs, INPUTS, labels)
 
 
 def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
-    """Inputs and outputs: h; ∂h by actuated, passive, twists, zero drives and unknowns."""
-    robot, sensor = pattern.robot, pattern.sensor
-    here = compiled_robot(robot)
-    there = here.at_zero
+    """Inputs and outputs: h; ∂h by actuated, passive, twists, reference drives and nuisance."""
+    robot = pattern.robot
+    here: RobotFunctions = robot_functions(robot)
+    there = here.reference
     constants = ca.SX.sym("constants", pattern.n_constants)
-    unknowns = ca.SX.sym("unknowns", len(sensor.unknowns))
+    unknowns = ca.SX.sym("unknowns", len(pattern.unknowns))
     trees = [
         *((here, robot.frame_id(f)) for f in pattern.frames.in_posture),
         *((there, robot.frame_id(f)) for f in pattern.frames.at_zero),
     ]
-    poses, h = _own_expression(pattern, constants, unknowns)
-    pulls = [_pull(h, pose) for pose in poses]
+    poses, h = _sensor_expression(pattern, constants, unknowns)
+    wrenches = [_wrench(h, pose) for pose in poses]
     local = ca.Function(
         "sensor",
         [*(s for pose in poses for s in (pose.rotation, pose.position)), constants, unknowns],
-        [h, *(v for pull in pulls for v in pull), ca.jacobian(h, unknowns)],
+        [h, *(v for wrench in wrenches for v in wrench), ca.jacobian(h, unknowns)],
     )
-    seen = [machine.tree.frame_pose(frame) for machine, frame in trees]
-    found = local(
-        *(s for pose in seen for s in (pose.rotation, pose.position)), constants, unknowns
-    )
-    value, by_unknowns = found[0], found[-1]
+    at = [machine.tree.frame_pose(frame) for machine, frame in trees]
+    values = local(*(s for pose in at for s in (pose.rotation, pose.position)), constants, unknowns)
+    value, by_unknowns = values[0], values[-1]
     n_d, n_p = here.actuated.numel(), here.passive.numel()
     by_actuated, by_passive = ca.SX(1, n_d), ca.SX(1, n_p)
     by_zero, by_twists = ca.SX(1, n_d), ca.SX(1, here.n_twists)
     for i, (machine, frame) in enumerate(trees):
-        force, moment = found[1 + 2 * i], found[2 + 2 * i]
+        force, moment = values[1 + 2 * i], values[2 + 2 * i]
         joints, twists = machine.wrench_row(frame, force=force, moment=moment)
         actuated, passive = machine.split(joints)
         by_twists += twists
@@ -183,32 +182,73 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
     return inputs, [value, by_actuated, by_passive, by_twists, by_zero, by_unknowns]
 
 
-def _own_expression(
+def _sensor_expression(
     pattern: _Pattern, constants: ca.SX, unknowns: ca.SX
 ) -> tuple[list[Pose], ca.SX]:
-    """Symbols of the frames that a sensor looks at, and what it shows of them."""
+    """Symbols of a sensor's frames, and its reading as an expression of them."""
     count = len(pattern.frames.in_posture)
     poses = [
         Pose(ca.SX.sym("rotation", 3, 3), ca.SX.sym("position", 3))
         for _ in range(count + len(pattern.frames.at_zero))
     ]
-    view = View(poses[:count], poses[count:], constants, unknowns)
-    return poses, pattern.sensor.expression(view, pattern.robot)
+    frames = poses[:count], poses[count:]
+    return poses, express_reading(pattern.robot, pattern.sensor, *frames, constants, unknowns)
+
+
+def express_reading(
+    robot: Robot,
+    sensor: Sensor,
+    frames: Sequence[Pose],
+    at_zero: Sequence[Pose],
+    constants: ca.SX,
+    unknowns: ca.SX,
+) -> ca.SX:
+    """What a gauge shows, its zero at 0: the sensor's expression under the effects on readings.
+
+    Args:
+        robot: The robot.
+        sensor: The sensor.
+        frames: Poses of its frames in the posture.
+        at_zero: Poses of its frames in the zero posture.
+        constants: Constants of the sensor, then the conditions of the reading.
+        unknowns: Nuisance parameters of the sensor, then those of the effects.
+    """
+    names = reading_conditions(robot, sensor)
+    sizes = [condition_size(robot, c) for c in names]
+    n = constants.numel() - sum(sizes)
+    values = ca.vertsplit(constants, np.cumsum([0, n, *sizes]).tolist())
+    known = dict(zip(names, values[1:], strict=True))
+    first = len(sensor.unknowns)
+    seen: dict[str, ca.SX] = {c: known[c] for c in sensor_conditions(sensor)}
+    view = View(frames, at_zero, values[0], unknowns[:first], seen)
+    reading = sensor.expression(view, robot)
+    for effect in reading_effects(robot):
+        errors = {e.name: unknowns[first + i] for i, e in enumerate(effect.setup_errors)}
+        reading = effect.reading(reading, errors, {c: known[c] for c in effect.conditions})
+        first += len(errors)
+    return reading
+
+
+def reading_conditions(robot: Robot, sensor: Sensor) -> tuple[Condition, ...]:
+    """Conditions on which the reading of a sensor depends, by itself or by effects."""
+    needed = {c for effect in reading_effects(robot) for c in effect.conditions}
+    needed |= set(sensor_conditions(sensor))
+    return tuple(c for c in NEUTRAL if c in needed)
 
 
 def _probe(pattern: _Pattern) -> float:
-    """What a sensor shows for some values: two with one expression show the same."""
+    """Reading of a sensor at fixed arguments: equal for equal expressions."""
     constants = ca.SX.sym("constants", pattern.n_constants)
-    unknowns = ca.SX.sym("unknowns", len(pattern.sensor.unknowns))
-    poses, h = _own_expression(pattern, constants, unknowns)
+    unknowns = ca.SX.sym("unknowns", len(pattern.unknowns))
+    poses, h = _sensor_expression(pattern, constants, unknowns)
     symbols = [*(s for pose in poses for s in (pose.rotation, pose.position)), constants, unknowns]
     rng = np.random.default_rng(0)
     values = [ca.DM(rng.uniform(0.1, 1.0, s.shape)) for s in symbols]
     return float(ca.Function("probe", symbols, [h])(*values))
 
 
-def _pull(h: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
-    """Force and moment, in the world, by which a pose moves a reading."""
+def _wrench(h: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
+    """Derivatives of a reading by a pose as force and moment, in the world."""
     force = ca.jacobian(h, pose.position).T
     by_rotation = ca.reshape(ca.jacobian(h, ca.vec(pose.rotation)), 3, 3)
     moment = [ca.dot(by_rotation, ca.skew(ca.SX(np.eye(3)[i])) @ pose.rotation) for i in range(3)]

@@ -2,26 +2,32 @@
 
 A sensor looks at frames of the machine, in the posture and (where they move with drives alone) in
 the zero posture, and shows a number: an expression of their poses, of constants of its setup and of
-unknowns of its own, plus the zero of its setup, which is free and comes on top.
+unknowns of its own. The zero of its setup comes on top, unless it is known to be 0.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Protocol, Self
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from orthocal.effects.protocol import Condition
 from orthocal.io.documents import Name
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
 from orthocal.units import Unit
 
 Array = NDArray[np.float64]
+
+
+GaugeZero = Literal["free", "known"]
+"""Gauge zero of a setup: estimated from its readings, or known to be 0, so that its readings are
+absolute."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +58,8 @@ class View:
     """Of its setup, shape (n_constants,)."""
     unknowns: ca.SX
     """Its own, shape (n_unknowns,), [unit]."""
+    conditions: Mapping[str, ca.SX] = field(default_factory=dict)
+    """Conditions of the reading that it names under `conditions`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +114,8 @@ class SetupKeys(BaseModel):
     aligned_at: Name | None = None
     """Posture in which the operator aligned the gauge; by default the mechanical zero if the setup
     reads it, otherwise the posture nearest to it."""
+    zero: GaugeZero | None = None
+    """Whether the gauge zero is estimated or known to be 0; that of the sensor by default."""
 
 
 class Sensor(Protocol):
@@ -117,6 +127,12 @@ class Sensor(Protocol):
     """What a session.yaml says of a setup with it."""
     ideal: ClassVar[str]
     """What the place would be if there were no deviation, such as parallel."""
+
+    # conditions: ClassVar[tuple[Condition, ...]], optional: conditions of a reading on which its
+    # expression depends (`sensor_conditions`)
+
+    # zero: ClassVar[GaugeZero], optional: gauge zero of its setups unless they state another one;
+    # "free" by default (`default_zero`)
 
     @classmethod
     def from_keys(cls, keys: Any) -> Self:  # noqa: ANN401 - an instance of `keys`
@@ -167,3 +183,15 @@ class Sensor(Protocol):
             at_zero: Poses of its frames in the zero posture, shape (4, 4) each.
             robot: The robot.
         """
+
+
+def sensor_conditions(sensor: Sensor) -> tuple[Condition, ...]:
+    """Conditions of a reading on which a sensor's expression depends."""
+    conditions: tuple[Condition, ...] = getattr(sensor, "conditions", ())
+    return conditions
+
+
+def default_zero(sensor: Sensor) -> GaugeZero:
+    """Gauge zero of a sensor's setups that state none."""
+    zero: GaugeZero = getattr(sensor, "zero", "free")
+    return zero

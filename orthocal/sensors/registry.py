@@ -1,4 +1,11 @@
-"""The kinds of sensor that a session may name: each is known from here on by its protocol."""
+"""Kinds of sensor that a session may name: packaged, registered, or from installed packages.
+
+A package offers a kind by an entry point of the group `orthocal.sensors`. Its name is the kind, and
+its object is the class:
+
+    [project.entry-points."orthocal.sensors"]
+    tool = "my_package.tool:ToolIndicator"
+"""
 
 from __future__ import annotations
 
@@ -8,24 +15,42 @@ from typing import Any
 from orthocal.errors import OrthocalError
 from orthocal.io.documents import validate
 from orthocal.io.fields import As
+from orthocal.runtime.registry import Registry
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Sensor, SetupKeys
 from orthocal.sensors.rod_indicator import RodKeys, read_leg
 
 DEFAULT = LegIndicator.kind
 
-_KINDS: dict[str, tuple[type[SetupKeys], Callable[[Any], Sensor]]] = {DEFAULT: (RodKeys, read_leg)}
-"""What a document may say of each kind, and what makes a sensor of it."""
+GROUP = "orthocal.sensors"
+"""Group of the entry points by which installed packages offer kinds of sensor."""
+
+Kind = tuple[type[SetupKeys], Callable[[Any], Sensor]]
+"""Keys of a kind of sensor, and the function that builds a sensor from them."""
+
+
+def _read_kind(name: str, offered: type[Sensor]) -> Kind:
+    if offered.kind != name or not issubclass(offered.keys, SetupKeys):
+        raise TypeError(f"{offered.__qualname__} is not a sensor with kind = '{name}' and keys")
+    return offered.keys, offered.from_keys
+
+
+_KINDS = Registry[Kind](GROUP, "sensor", _read_kind, {DEFAULT: (RodKeys, read_leg)})
 
 
 def register_sensor(kind: type[Sensor]) -> None:
-    """Make a kind of sensor known by its name; one that is known already is replaced."""
-    _KINDS[kind.kind] = kind.keys, kind.from_keys
+    """Register a kind of sensor; it replaces one of the same name."""
+    _KINDS.register(kind.kind, (kind.keys, kind.from_keys))
+
+
+def unregister_sensor(kind: str) -> None:
+    """Forget a registered kind of sensor."""
+    _KINDS.unregister(kind)
 
 
 def sensor_kinds() -> tuple[str, ...]:
-    """Names of the kinds that are known."""
-    return tuple(_KINDS)
+    """Names of all kinds, with those of installed packages."""
+    return _KINDS.names
 
 
 def read_setup(
@@ -36,25 +61,20 @@ def read_setup(
     error: type[OrthocalError],
     gauge: Mapping[str, Any] | None = None,
 ) -> tuple[SetupKeys, Sensor]:
-    """What a document says of a setup, and the sensor that stands there.
+    """Keys of a setup and its sensor, from a document.
 
     Args:
         data: Keys and values of the setup.
         where: File, for messages.
         under: Key of the setup in it.
         error: Kind of error.
-        gauge: What its gauge says for all its setups, where a kind of sensor wants to know.
+        gauge: Keys that its gauge states for all its setups.
 
     Raises:
         OrthocalError: Of that kind, naming the key that does not fit.
     """
     name = data.get("sensor", DEFAULT)
-    if not isinstance(name, str) or name not in _KINDS:
-        raise error(
-            f"found {name!r}; expected one of {', '.join(_KINDS)}",
-            where=f"{where}: {under}.sensor",
-        )
-    schema, build = _KINDS[name]
+    schema, build = _KINDS.find(name, where=f"{where}: {under}.sensor", error=error)
     known = {k: v for k, v in (gauge or {}).items() if k in schema.model_fields}
     data = {**known, **data}
     keys = validate(schema, data, where=where, error=error, under=under)

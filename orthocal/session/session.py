@@ -8,17 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from orthocal.arguments import require_array
-from orthocal.io.fields import read_only
+from orthocal.io.documents import Number
+from orthocal.io.fields import CLOSED, read_only
 from orthocal.io.html import paragraph, table
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import Sensor
+from orthocal.sensors.protocol import GaugeZero, Sensor
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
@@ -29,7 +32,7 @@ ALIKE = 9
 
 @dataclass(frozen=True, slots=True)
 class Purpose:
-    """Which errors are free; `calibrate` takes them where nothing else is said."""
+    """Default model and free errors of `calibrate`."""
 
     model: str | None = None
     """A model of the robot's YAML."""
@@ -41,11 +44,11 @@ class Purpose:
 class Gauge:
     """The indicator."""
 
-    sigma: float | None
+    sigma: float | None = None
     """Standard deviation of one reading, [m]."""
-    resolution: float | None
+    resolution: float | None = None
     """[m]."""
-    range: tuple[float, float] | None
+    range: tuple[float, float] | None = None
     """Lowest and highest reading, [m]."""
 
 
@@ -71,55 +74,102 @@ class Setup:
     gauge: str = ""
     """Name of what shows its readings, among the session's gauges."""
     active: Array | None = None
-    """Offsets that were active in the controller while it stood, shape (n_drives,), [m, rad]; those
-    of the session where not given."""
+    """Offsets active in the controller during this setup, shape (n_drives,), [m, rad]; by default
+    those of the session."""
     aligned_at: str | None = None
     """Posture in which the operator aligned the gauge; None for the rule of
     `Session.alignment_postures`."""
+    zero: GaugeZero = "free"
+    """Gauge zero: estimated from the setup's readings, or known to be 0 (absolute readings)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """Conditions under which a reading was taken, as stated."""
+
+    __pydantic_config__ = CLOSED
+
+    approach: Annotated[str, Field(pattern="^[pnu]+$")] | None = None
+    """A letter for each drive in the robot's order: p if its coordinate grew in its last motion, n
+    if it fell, u if unknown."""
+    temperature: Annotated[Number | None, Field(alias="temperature_C")] = None
+    """[°C]."""
+    time: datetime | None = None
+    """With or without time zone."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """What the indicator showed in a posture, or in one less in another."""
+    """Reading of the indicator in a posture, or its difference between two."""
 
     setup: str
     posture: str
-    minus: str | None
+    minus: str | None = None
     """Posture whose reading was taken off; None for a reading as shown."""
-    cycle: int
-    value: float
+    cycle: int = 1
+    value: float = 0.0
     """[m]."""
-    line: int | None
+    line: int | None = None
     """Line in the CSV, for messages."""
     file: Path | None = None
     """The CSV; that of the session where not given."""
+    conditions: Conditions | None = None
+    """Of a reading as shown; None for a difference, or where nothing is stated."""
+
+    @property
+    def approach(self) -> str | None:
+        """Directions of the drives' last motions; None if all are unknown."""
+        return known_approach(self.conditions)
+
+    @property
+    def place(self) -> tuple[str, str, str | None, str | None]:
+        """Setup, postures and approach: readings with the same place repeat each other."""
+        return self.setup, self.posture, self.minus, self.approach
+
+    @property
+    def postures(self) -> str:
+        """Posture with its approach, or one less another, in words."""
+        return describe_postures(self.posture, self.minus, self.approach)
 
     @property
     def label(self) -> str:
         """Setup and postures in words."""
-        return f"{self.setup} {self.posture}" + (f" − {self.minus}" if self.minus else "")
+        return f"{self.setup} {self.postures}"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+def known_approach(conditions: Conditions | None) -> str | None:
+    """Directions of the drives' last motions; None if all are unknown."""
+    approach = None if conditions is None else conditions.approach
+    return approach if approach is not None and approach.strip("u") else None
+
+
+def describe_postures(posture: str, minus: str | None, approach: str | None) -> str:
+    """Postures of a reading in words, with the approach where one is known."""
+    if minus:
+        return f"{posture} − {minus}"
+    return posture if approach is None else f"{posture} (approach {approach})"
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Session:
     """A session of gauge readings on a robot."""
 
     robot: Robot
     robot_reference: str
     """As the file names it."""
-    title: str
-    source: str
+    title: str = ""
+    source: str = ""
     gauges: Mapping[str, Gauge]
     """Name to gauge; an only one may have the name ""."""
     postures: Mapping[str, Posture]
     setups: Mapping[str, Setup]
     readings: tuple[Reading, ...]
-    controller_offsets: Array | None
+    controller_offsets: Array | None = None
     """Offsets active in the controller, shape (n_drives,), [m, rad]; None where not stated."""
-    path: Path | None
+    path: Path | None = None
     """The session.yaml, or None for a session that is not from a file."""
-    readings_path: Path | None
-    sha256: str
+    readings_path: Path | None = None
+    sha256: str = ""
     parts: tuple[Session, ...] = ()
     """The sessions that were joined into this one, where they are at hand."""
     joined: bool = False
@@ -133,7 +183,7 @@ class Session:
         return next(iter(self.gauges.values()))
 
     def with_gauge(self, gauge: Gauge) -> Session:
-        """The same session with another gauge instead of all of its own."""
+        """Session with one gauge in place of all gauges."""
         setups = {name: replace(s, gauge="") for name, s in self.setups.items()}
         return replace(self, gauges={"": gauge}, setups=setups)
 
@@ -185,7 +235,7 @@ class Session:
 
     @property
     def only_differences(self) -> bool:
-        """Whether every reading is a difference of two postures."""
+        """True if every reading is a difference of two postures."""
         return all(r.minus is not None for r in self.readings)
 
     def where(self, reading: Reading) -> str:
@@ -213,7 +263,7 @@ class Session:
         )
 
     def select(self, readings: Sequence[Reading]) -> Session:
-        """The same session with some of its readings, and the setups and postures they need.
+        """Session with some of its readings, and the setups and postures they need.
 
         Gauges stay aligned where they were (`alignment_postures` of the whole session).
         """
@@ -229,7 +279,7 @@ class Session:
         )
 
     def with_controller(self, offsets: ArrayLike) -> Session:
-        """The same session with other offsets active in the controller than it states.
+        """Session with other offsets active in the controller than it states.
 
         Args:
             offsets: Shape (n_drives,), [m, rad].
@@ -243,7 +293,7 @@ class Session:
         return replace(self, postures=postures, controller_offsets=read_only(active), sha256="")
 
     def with_tolerances(self, given: Mapping[str, float]) -> Session:
-        """The same session of a robot whose errors have other tolerances.
+        """Session of the robot with other tolerances.
 
         Args:
             given: Name or glob with its unit to one standard deviation.
@@ -254,7 +304,7 @@ class Session:
         return replace(self, robot=self.robot.with_tolerances(given)) if given else self
 
     def with_values(self, values: Sequence[float] | Array) -> Session:
-        """The same session with other readings.
+        """Session with other readings.
 
         Args:
             values: Shape (n_readings,), [m].

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from orthocal.statistics.distributions import chi_square_tail, f_tail, normal_quantile, t_quantile
 
 BY_CHANCE = 0.01
 """Probability below which residuals that are larger than noise are not put down to chance."""
+
+COVERAGE = 2.0
+"""Coverage factor k of an expanded uncertainty."""
 
 
 def chance_of_excess(chi_square: float, dof: float, *, cycles_dof: float = 0.0) -> float:
@@ -33,3 +39,30 @@ def confidence_factor(dof: float, level: float = 0.95) -> float:
     if math.isinf(dof):
         return normal_quantile(tail)
     return t_quantile(dof, tail) if dof > 0 else float("inf")
+
+
+def coverage_factor(dof: float) -> float:
+    """Coverage factor of noise: k = 2, or Student's factor for 95 % if that is larger.
+
+    NaN where nothing determines the noise.
+    """
+    factor = confidence_factor(dof)
+    return max(COVERAGE, factor) if math.isfinite(factor) else math.nan
+
+
+def expanded_uncertainty(
+    std: ArrayLike, std_scatter: ArrayLike, *, dof: float
+) -> NDArray[np.float64]:
+    """Expanded uncertainty U of estimates, of any shape, in their unit.
+
+    U² = (k_ν s)² + k² (u² − s²), k = 2, with Student's factor k_ν for the part s that is due to
+    noise estimated with ν degrees of freedom.
+
+    Args:
+        std: Standard deviations u, everything that is not known included.
+        std_scatter: The parts s of them that are due to the noise of the readings.
+        dof: Degrees of freedom ν of the noise.
+    """
+    total, scatter = np.asarray(std, dtype=np.float64), np.asarray(std_scatter, dtype=np.float64)
+    rest = np.sqrt(np.maximum(total**2 - scatter**2, 0.0))
+    return np.asarray(np.hypot(coverage_factor(dof) * scatter, COVERAGE * rest))

@@ -111,6 +111,29 @@ class Information:
         result[np.ix_(free, free)] = 0.5 * (inverse + inverse.T)
         return result
 
+    def noise_covariance(
+        self,
+        *,
+        sigma: float,
+        precision: Array,
+        held: NDArray[np.bool_] | None = None,
+        loss: tuple[float, float] = (1.0, 1.0),
+    ) -> Array:
+        """Part of `covariance` that is due to noise, b A⁻¹ Jᵀ J A⁻¹/σ², shape (n_free, n_free).
+
+        Args:
+            sigma: Standard deviation of one reading, [m].
+            precision: Diagonal of P: 1 or 0, shape (n_free,).
+            held: Parameters that are held where they are, by a bound: no covariance.
+            loss: a, mean of ρ'', and b, mean square of ρ', of the residuals; 1 for squares.
+        """
+        gain, noise = loss
+        inverse = self.covariance(
+            sigma=sigma / np.sqrt(gain), precision=precision, held=held
+        )  # A⁻¹
+        spread = np.sqrt(noise) * inverse @ self.factor.T / sigma
+        return np.asarray(spread @ spread.T)
+
 
 def _inverse_square(matrix: Array) -> Array:
     """(MᵀM)⁻¹ without forming MᵀM; infinite where M has not full rank."""

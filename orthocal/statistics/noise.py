@@ -129,12 +129,12 @@ class KnownNoise:
 def estimate_repeatability(values: Array, observations: Observations) -> tuple[float, int]:
     """Standard deviation of repeated readings of the same setup in the same posture.
 
-    Within a setup the readings are fitted by one value a posture and one zero a group; what is
-    left is noise whatever the machine is like.
+    Within a setup the readings are fitted by one value for each posture and approach and one zero
+    for each group; their residuals are noise whatever the machine is like.
 
     Args:
         values: Readings as single ones, shape (n_entries,), [m].
-        observations: Which setup, posture and zero each belongs to.
+        observations: Setup, place and zero of each.
 
     Returns:
         Standard deviation [m] (NaN without repetition) and degrees of freedom.
@@ -142,7 +142,7 @@ def estimate_repeatability(values: Array, observations: Observations) -> tuple[f
     total, dof = 0.0, 0
     for setup in np.unique(observations.setup):
         entries = np.flatnonzero(observations.setup == setup)
-        postures, at_posture = np.unique(observations.posture[entries], return_inverse=True)
+        postures, at_posture = np.unique(observations.place[entries], return_inverse=True)
         if len(postures) == len(entries):
             continue
         zeros, at_zero = np.unique(observations.zero[entries], return_inverse=True)

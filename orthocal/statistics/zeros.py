@@ -17,7 +17,9 @@ Array = NDArray[np.float64]
 def project_out_zeros(
     values: Array, observations: Observations, *, weights: Array | None = None
 ) -> Array:
-    """Values less the mean of those that share their gauge zero, shape (n_entries, ...).
+    """Values minus the mean of those with the same free gauge zero, shape (n_entries, ...).
+
+    Values with a known zero stay as they are.
 
     Args:
         values: Shape (n_entries, ...).
@@ -29,4 +31,5 @@ def project_out_zeros(
     totals = observations.sum_by_zero(flat, own)
     counts = np.bincount(observations.zero, own, minlength=observations.n_zeros)
     means = totals / np.where(counts > 0.0, counts, 1.0)[:, None]
+    means[observations.zero_known] = 0.0
     return np.asarray((flat - means[observations.zero]).reshape(values.shape))

@@ -22,13 +22,18 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.kinematics.loop_closure import Assembly
-from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace, gauss_cube
+from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.workspace import (
+    FEWEST_ALIGNED,
+    Workspace,
+    cube_limits,
+    find_workspace,
+    gauss_box,
+)
 from orthocal.observation.simulate import limits_of, show_readings
 from orthocal.planning.expected_error import (
     Expected,
     ToolForecast,
-    default_workspace,
     noise_of,
     weigh_readings,
 )
@@ -38,7 +43,6 @@ from orthocal.session.session import Session
 from orthocal.study.batch import (
     columns_in_edge_units,
     estimate_batch,
-    predict_batch,
     tool_positions,
 )
 from orthocal.study.portable_session import PortableSession
@@ -81,8 +85,8 @@ class AccuracyStudy(Study):
     """Errors that all machines have, [SI]."""
     machines: int
     seed: int
-    half_side: float
-    """Half side of the cube in which the tool error is evaluated, [m]."""
+    box: tuple[tuple[float, float], ...]
+    """Box over which the tool's error is computed, relative to the mechanical zero, [m]."""
 
     @property
     def record(self) -> dict[str, Any]:
@@ -94,7 +98,7 @@ class AccuracyStudy(Study):
             "fixed": dict(self.fixed),
             "machines": self.machines,
             "seed": self.seed,
-            "half_side": self.half_side,
+            "box": self.box,
         }
 
     @property
@@ -164,7 +168,7 @@ class AccuracyStudy(Study):
         truth, n = prepared.truth, prepared.truth.n_machine
         drawn, _ = self.draw(prepared, number)
         scaled = drawn * truth.theta_scale
-        errors = truth.assembly.errors(scaled[:n])
+        errors = truth.closure.errors(scaled[:n])
         return np.append(prepared.identified_part(errors[None])[0], scaled[n:])
 
 
@@ -200,9 +204,9 @@ class _Prepared:
         session = study.session.unpack()
         robot = session.robot
         problem = weigh_readings(CalibrationProblem(session, study.choice.select(robot.parameters)))
-        workspace = gauss_cube(robot, half_side=study.half_side)
-        assembly = Assembly(robot)
-        nominal = assembly.inverse(workspace.points)
+        workspace = gauss_box(robot, study.box)
+        closure = LoopClosure(robot)
+        nominal = closure.inverse(workspace.points)
         drives = nominal - session.active_offsets
         limits = [limits_of(session, r) or (-np.inf, np.inf) for r in session.readings]
         prepared = cls(
@@ -212,27 +216,18 @@ class _Prepared:
             program=BatchProgram(problem),
             workspace=workspace,
             drives=drives,
-            passive=assembly.close(drives),
-            positions=assembly.tcp(nominal, assembly.close(nominal)),
+            passive=closure.close(drives),
+            positions=closure.tcp(nominal, closure.close(nominal)),
             limits=np.array(limits).T,
             sigma=noise_of(session),
         )
-        prepared = replace(prepared, sigma=_weighting_sigma(study, prepared))
-        sample = np.zeros((0, problem.observations.size))
-        if prepared.program.takes_values:
-            numbers = range(min(study.cases_per_task, study.machines))
-            measured = prepared.measure(study, numbers)
-            sample = measured.values[measured.status == CALIBRATED]
-            if not len(sample):
-                return prepared
-        program = prepared.program.fixed_by(sample, sigma=prepared.sigma, count=study.machines)
-        return replace(prepared, program=program)
+        return replace(prepared, sigma=_weighting_sigma(study, prepared))
 
     def measure(self, study: AccuracyStudy, numbers: Sequence[int]) -> _Measured:
         """Random machines and their readings."""
         draws, generators = zip(*(study.draw(self, n) for n in numbers), strict=True)
         theta, o, truth = np.array(draws), self.problem.observations, self.truth
-        predicted, closed = predict_batch(truth, theta)
+        predicted, _, closed = truth.simulate(theta * truth.theta_scale)
         status = np.where(closed, CALIBRATED, NOT_ASSEMBLED).astype(object)
         entries = predicted * self.problem.noise
         for i, rng in enumerate(generators):
@@ -241,7 +236,7 @@ class _Prepared:
         rows = np.array([o.rows(v) for v in entries])
         beyond = (rows < self.limits[0]) | (rows > self.limits[1])
         _set_reason(status, np.asarray(beyond.any(axis=1)), OUT_OF_RANGE)
-        errors = truth.assembly.errors() + theta[:, : truth.n_machine] @ truth.columns.T
+        errors = truth.closure.errors() + theta[:, : truth.n_machine] @ truth.columns.T
         return _Measured(errors, entries / self.problem.noise, rows, status)
 
     def tool_errors(
@@ -255,8 +250,8 @@ class _Prepared:
             status: Changed where the loops of a machine do not close.
         """
         names = self.problem.machine_selection.names
-        columns = self.problem.compiled.errors.columns(names)
-        estimated = self.problem.assembly.errors() + theta[:, : len(names)] @ columns.T
+        columns = self.problem.functions.errors.columns(names)
+        estimated = self.problem.closure.errors() + theta[:, : len(names)] @ columns.T
         good = np.flatnonzero(status == CALIBRATED)
         tools = np.full((2, *self.positions.shape, len(status)), np.nan)
         for tool, errors in zip(tools, (true, estimated), strict=True):
@@ -277,7 +272,7 @@ class _Prepared:
         Args:
             errors: All elementary errors, shape (n_sets, n_errors), [SI].
         """
-        columns = self.problem.compiled.errors.columns(self.problem.machine_selection.names)
+        columns = self.problem.functions.errors.columns(self.problem.machine_selection.names)
         return np.asarray(errors @ (columns / (columns**2).sum(axis=0)))
 
     def align(self, field: Array) -> Array:
@@ -322,8 +317,8 @@ def build_accuracy_study(
         fixed: Errors that all machines have, [SI].
         machines: Number of machines.
         seed: Seed of errors, gauges and noise.
-        half_side: Half side of the cube in which the tool error is evaluated, [m]; default: the
-            largest reachable cube of at most ±60 mm.
+        half_side: Half the side of a cube around the mechanical zero over which the tool error is
+            computed, [m]; by default the workspace of the robot.
 
     Raises:
         ParameterError: If a name or a number is invalid.
@@ -349,8 +344,7 @@ def build_accuracy_study(
                 "is missing: the study needs the noise of the gauge",
                 where=key if session.path is None else f"{session.path}: {key}",
             )
-    if half_side is None:
-        half_side = default_workspace(robot).half_side or 0.0
+    box = find_workspace(robot).limits if half_side is None else cube_limits(robot, half_side)
     return AccuracyStudy(
         session=PortableSession.of(session.with_values(np.zeros(len(session.readings)))),
         choice=chosen,
@@ -359,7 +353,7 @@ def build_accuracy_study(
         fixed=fixed,
         machines=machines,
         seed=seed,
-        half_side=half_side,
+        box=tuple((float(low), float(high)) for low, high in box),
     )
 
 
@@ -395,7 +389,7 @@ def _weighting_sigma(study: AccuracyStudy, p: _Prepared) -> float:
     It is the stated noise, unless machines have errors that are not identified. Then the residuals
     give it, as in a calibration: the median of a few pilot machines.
     """
-    columns = p.problem.compiled.errors.columns(p.problem.machine_selection.names)
+    columns = p.problem.functions.errors.columns(p.problem.machine_selection.names)
     projector = columns @ np.linalg.pinv(columns)
     if np.allclose(projector @ p.truth.columns, p.truth.columns, atol=1e-12):
         return p.sigma

@@ -1,12 +1,8 @@
-"""Many machines at once, as the studies use them: readings, Jacobians, tool positions.
-
-The only place where the studies call the batch interface of `estimation` and `kinematics`.
-"""
+"""Batches of machines, as the studies use them: tool positions and estimates."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,57 +10,11 @@ from numpy.typing import NDArray
 from orthocal.errors import ClosureError, SolverError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
-from orthocal.estimation.solvers.machine_readings import Fleet
-from orthocal.kinematics.machine_batch import Machines
+from orthocal.kinematics.loop_closure import Failures, LoopClosure
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-
-
-def predict_batch(
-    problem: CalibrationProblem, theta: Array, *, retry: bool = False
-) -> tuple[Array, Flags]:
-    """Readings of many machines, gauge zeros at 0.
-
-    Args:
-        problem: The problem.
-        theta: Scaled free parameters of each machine, shape (n_sets, n_free).
-        retry: Whether to close the loops of failed machines again, one by one.
-
-    Returns:
-        Readings, shape (n_sets, n_entries), [m of the first gauge], and whether the loops of each
-        machine close, shape (n_sets,).
-    """
-    machines = Fleet(problem, theta)
-    closed = machines.close()
-    for i in np.flatnonzero(~closed) if retry else ():
-        with suppress(ClosureError):
-            machines.passive[i] = problem.close(theta[i] * problem.theta_scale)
-            closed[i] = True
-    return machines.predict(), closed
-
-
-def linearise_batch(problem: CalibrationProblem, theta: Array) -> tuple[Array, Array, Flags]:
-    """Readings and Jacobians of many machines.
-
-    Args:
-        problem: The problem.
-        theta: Scaled free parameters of each machine, shape (n_sets, n_free).
-
-    Returns:
-        Of the machines whose loops close: readings, shape (n_closed, n_entries), and Jacobians by
-        scaled parameters, shape (n_closed, n_entries, n_free). Then whether the loops of each
-        machine close, shape (n_sets,).
-    """
-    machines = Fleet(problem, theta)
-    closed = machines.close()
-    if not closed.any():
-        shape = (0, problem.observations.size)
-        return np.zeros(shape), np.zeros((*shape, problem.n_free)), closed
-    slopes = FleetSlopes(problem, machines.theta[closed], machines.passive[closed])
-    return slopes.reading, slopes.jacobian(), closed
 
 
 def tool_positions(
@@ -81,9 +31,11 @@ def tool_positions(
     Returns:
         The positions, and whether the loops of each machine close, shape (n_sets,).
     """
-    machines = Machines(robot, errors, drives, passive)
-    closed = machines.close()
-    return np.moveaxis(machines.tool(), 0, -1), closed
+    closure, failures = LoopClosure(robot), Failures()
+    q = closure.close(drives, errors=errors, start=passive, failures=failures)
+    closed = np.ones(len(errors), dtype=np.bool_)
+    closed[[i // len(drives) for i in failures]] = False
+    return np.moveaxis(closure.tcp(drives, q, errors=errors), 0, -1), closed
 
 
 def estimate_batch(

@@ -8,7 +8,7 @@ not their total uncertainty.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -24,7 +24,6 @@ from orthocal.estimation.weighting import leverages
 from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
 from orthocal.session.session import Session
-from orthocal.statistics.zeros import project_out_zeros
 from orthocal.study.batch import columns_in_edge_units
 from orthocal.study.portable_session import PortableSession
 from orthocal.study.runner import StudyTable
@@ -100,7 +99,7 @@ class _Prepared:
         session = study.session.unpack()
         problem = CalibrationProblem(session, study.choice.select(session.robot.parameters))
         fit = fit_problem(problem, options=SolverOptions(solver="eliminated"))
-        prepared = cls(
+        return cls(
             fit=fit,
             values=problem.values,
             fitted=fit.prediction,
@@ -108,9 +107,6 @@ class _Prepared:
             cycles=find_cycles(session, problem.observations) if study.by == "cycles" else (),
             program=BatchProgram(problem, options=fit.program.options),
         )
-        sample = prepared.draw_each(study, study.case_numbers(0))
-        program = prepared.program.fixed_by(sample, sigma=fit.sigma, count=study.draws)
-        return replace(prepared, program=program)
 
     def draw_each(self, study: BootstrapStudy, numbers: Sequence[int]) -> Array:
         """Readings of these draws, shape (n_draws, n_entries), [m of the first gauge]."""
@@ -229,7 +225,7 @@ def summarise_bootstrap(study: BootstrapStudy, table: StudyTable) -> BootstrapSu
     if study.by == "cycles":
         cycles = min(len(c) for c in prepared.cycles)
         correction = float(np.sqrt(cycles / (cycles - 1)))
-    noise = np.sqrt(_noise_covariance(fit).diagonal())
+    noise = np.sqrt(fit.noise_covariance().diagonal())
     total = np.sqrt(np.diag(fit.covariance()))
     rows = []
     for i, p in enumerate(fit.problem.machine_selection.parameters):
@@ -278,11 +274,3 @@ def _posterior(fit: Fit) -> Array:
     return fit.information.covariance(
         sigma=fit.sigma, precision=fit.problem.prior_precision, held=fit.held
     )
-
-
-def _noise_covariance(fit: Fit) -> Array:
-    """Covariance of the machine's estimates by noise alone, [SI]: C Jᵀ J C/σ²."""
-    problem, n = fit.problem, fit.problem.n_machine
-    gain = _posterior(fit) @ project_out_zeros(fit.jacobian, problem.observations).T / fit.sigma
-    scale = problem.theta_scale[:n]
-    return np.asarray((gain @ gain.T)[:n, :n] * np.outer(scale, scale))

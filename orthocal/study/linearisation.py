@@ -27,13 +27,12 @@ from orthocal.estimation.linear import (
     twelve_row_covariance,
 )
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.robot.model import Robot
 from orthocal.sensors.mounting import EXACT
 from orthocal.session.session import Gauge, Session
 from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
-from orthocal.study.batch import linearise_batch, predict_batch
 from orthocal.study.paper_plan import PAPER_GAUGE, Displacements, build_paper_plan
 from orthocal.study.portable_session import PortableSession
 from orthocal.study.runner import StudyTable
@@ -136,7 +135,7 @@ class _Prepared:
 
     problem: CalibrationProblem
     linearisation: Linearisation
-    program: EliminatedProgram
+    program: VariableProjection
     matrices: Mapping[int, Array]
     """The paper's matrices by their number of rows; empty for other plans."""
     differences: Array
@@ -162,7 +161,7 @@ class _Prepared:
                     displacement_min=displacements.minimum,
                     rows=n,
                 )
-        return cls(problem, linearisation, EliminatedProgram(problem), matrices, differences)
+        return cls(problem, linearisation, VariableProjection(problem), matrices, differences)
 
     def paper_methods(self) -> Iterator[tuple[str, Array, Array | None]]:
         """Name, differences of readings (n_rows, n_entries) and covariance of each of them."""
@@ -181,7 +180,7 @@ class _Prepared:
             errors: True errors of the machines, shape (n_sets, n_free), [SI].
         """
         problem = self.problem
-        readings, assembled = predict_batch(problem, errors / problem.theta_scale, retry=True)
+        readings, _, assembled = problem.simulate(errors)
         good = assembled & np.isfinite(readings).all(axis=1)
         columns: dict[str, list[Any]] = {}
 
@@ -251,7 +250,10 @@ class _Prepared:
             theta: Shape (n_sets, n_free), [SI].
         """
         problem = self.problem
-        predicted, jacobian, closed = linearise_batch(problem, theta / problem.theta_scale)
+        _, passive, closed = problem.simulate(theta)
+        if not closed.any():
+            return np.full_like(theta, np.nan), closed
+        predicted, jacobian = problem.linearise(theta[closed], passive[closed])
         finite = np.isfinite(predicted).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
         predicted, jacobian = predicted[finite], jacobian[finite]
         alive = np.array(closed)

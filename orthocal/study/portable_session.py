@@ -9,10 +9,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from orthocal.effects.loading import load_robot
 from orthocal.errors import RobotError
 from orthocal.io.files import is_folder, read_file
 from orthocal.measurement.files.write_session import session_document
-from orthocal.robot.loading import load_robot, packaged_robots
+from orthocal.robot.loading import packaged_robots
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session
 
@@ -90,7 +91,9 @@ class PortableSession:
         document = session_document(session)
         document["robot"] = self.robot.name
         rows = "\n".join(
-            f"{r.setup},{r.posture},{r.minus or ''},{r.cycle},{r.value!r}" for r in session.readings
+            f"{r.setup},{r.posture},{r.minus or ''},{r.cycle},{r.value!r}"
+            + (f",{r.conditions}" if r.conditions else "")
+            for r in session.readings
         )
         return {
             "robot": {"name": self.robot.name, "sha256": self.robot.sha256},

@@ -17,6 +17,7 @@ from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.measurement.files.session_file import check_contacts
+from orthocal.observation.observations import drive_table
 from orthocal.robot.model import Robot
 from orthocal.session.session import Gauge, Posture, Reading, Session
 from orthocal.study.paper_plan import Displacements, build_paper_plan
@@ -65,7 +66,8 @@ class SensitivityStudy(Study):
         read = {postures[i] for i in o.posture}
         if session.robot.tcp is not None:
             tool = ToolSensitivity(session.robot, free=problem.machine_selection.names)
-            scaled = tool(problem.drives, names=postures) * problem.theta_scale[: len(parameters)]
+            by_tool = tool(drive_table(session), names=postures)
+            scaled = by_tool * problem.theta_scale[: len(parameters)]
             for posture, rows in zip(postures, scaled, strict=True):
                 if posture in read:
                     by_std.update({(posture, axis): r for axis, r in zip(TOOL, rows, strict=True)})

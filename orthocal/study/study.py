@@ -13,7 +13,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from orthocal import __version__
-from orthocal.kinematics.backend.lanes import expect_many
 
 Cell = float | int | str | bool | None
 Columns = Mapping[str, Sequence[Cell]]
@@ -88,7 +87,6 @@ def run_task(study: Study, task: int) -> dict[str, list[Cell]]:
 @lru_cache(maxsize=1)
 def prepare_once(study: Study) -> Any:  # noqa: ANN401 - as `prepare`
     """Data shared by all tasks of a study, prepared once in this process."""
-    expect_many()
     return study.prepare()
 
 

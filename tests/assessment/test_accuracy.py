@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import itertools
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -25,21 +27,27 @@ from orthocal import (
     summarize,
 )
 from orthocal.assessment.controller_entries import entered_offsets
-from orthocal.assessment.findings.comparison import decide_comparison
+from orthocal.assessment.judgement import find_tolerance_scale
 from orthocal.assessment.remaining_errors import find_remaining_errors
 from orthocal.assessment.tool_error import (
     assess_tool,
-    find_excess,
     measure_deviations,
     measure_uncertainty,
 )
+from orthocal.builder.build import make_robot
+from orthocal.builder.machine_file import Dimensions
 from orthocal.errors import RobotError
 from orthocal.estimation.problem import build_problem
+from orthocal.export.formats import export_corrections
+from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
 from orthocal.kinematics.orthoglide import inverse
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.kinematics.workspace import Workspace, cube, largest_cube, tool_at_zero
+from orthocal.kinematics.workspace import Workspace, cube, find_workspace, tool_at_zero
 from orthocal.observation.simulate import load_errors
+from orthocal.output.text.accuracy import accuracy_json
+from orthocal.planning.equipment import Equipment
+from orthocal.planning.first_plan import paper_plan
 from orthocal.statistics.information import decompose
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -195,15 +203,15 @@ def test_the_cube_is_around_the_mechanical_zero_and_within_reach(tmp_path):
     """A machine whose drives end 20 mm beyond their zero, and one whose zero is not the origin."""
     robot = load_robot(write_orthoglide(tmp_path / "short", 0.25, travel=(0.1, 0.27)))
     nominal = nominal_assembly(robot)
-    found = largest_cube(robot, nominal.inverse)
+    found = find_workspace(robot, nominal.inverse)
     assert found.half_side == pytest.approx(0.020)  # p + √(L² − …) ≤ 0.27 on the axis
-    assert found.words == "a cube of ±20 mm around the zero"
+    assert found.words == "the workspace ±20 mm"
     text = (tmp_path / "short/machine.yaml").read_text().replace("zero_mm: 250", "zero_mm: 240")
     (tmp_path / "short/machine.yaml").write_text(text)
     moved = load_robot(tmp_path / "short")
     middle = nominal_assembly(moved).forward(np.full(3, 0.24))
     assert tool_at_zero(moved) == pytest.approx(middle, abs=1e-12)
-    found = largest_cube(moved, nominal_assembly(moved).inverse)
+    found = find_workspace(moved, nominal_assembly(moved).inverse)
     assert found.weights @ found.points == pytest.approx(middle, abs=1e-12)
     assert 0.028 < found.half_side < 0.032
 
@@ -215,15 +223,16 @@ def test_a_machine_that_does_not_reach_60_mm_has_results_at_the_tool(tmp_path):
     session = simulate_session(
         load_plan(plans.write(tmp_path, plan)), {"x_slide.offset": 1e-3}, seed=1
     ).session
-    result = calibrate(session)
+    result = calibrate(session, "offsets")
     found = assess_tool(result)
     # drives end 30 mm beyond the zero, and some µm of offsets belong into the controller
     assert found.workspace.half_side == pytest.approx(0.029)
     text = " ".join(summarize(result, details=True).split())
-    assert "Over a cube of ±29 mm around the zero." in text
+    assert "Over the workspace ±29 mm." in text
     assert "missing" not in text
     compared = compare_models(session, models=["offsets", "lengths"])
-    assert "a cube of ±29 mm" in " ".join(f.text for f in decide_comparison(compared).findings)
+    assert result.assessment.tool.region == "±29 mm"
+    assert compared.assessment.tool.box == result.assessment.tool.box
     assert all(r.tool is not None for r in compared.results)
 
 
@@ -315,7 +324,8 @@ def test_what_is_entered_is_in_where_the_tool_is_then(calibrated):
 def test_offsets_alone_are_as_good_as_the_machines_are(root):
     """What is promised of them, whatever scatters; all errors but those of rods' ends and drives
     are in the independent model's 0.102 and 0.045 mm."""
-    found = assess_tool(calibrate(root / "examples/sweep", Choice(tolerances={"*.offset_m": 2e-3})))
+    choice = Choice("offsets", tolerances={"*.offset_m": 2e-3})
+    found = assess_tool(calibrate(root / "examples/sweep", choice))
     assert found.after.sizes.relative.rms * 1e3 == pytest.approx(0.102, rel=0.05)
     assert found.after.sizes.aligned.rms * 1e3 == pytest.approx(0.045, rel=0.06)
     full = calibrate(root / "examples/sweep", Choice(model="full", tolerances={"*.offset_m": 2e-3}))
@@ -362,7 +372,7 @@ def test_noise_does_not_make_a_machine_worse_than_its_tolerances(root, sigma):
     """One offset and nothing else: whatever the noise, no leg or axis is worse than expected."""
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     session = simulate_session(plan, {"x_slide.offset": 1e-3}, sigma=sigma).session
-    assert find_excess(calibrate(session)) == 1.0
+    assert find_tolerance_scale(session) == 1.0
 
 
 FULL = ["*", "!frame.*", "!*.scale", "!*_leg.length"]
@@ -379,7 +389,30 @@ def test_machines_that_are_worse_than_their_tolerances_are_found_to_be(root, tim
         drawn = draw_errors(plan.robot, FULL, seed=seed)
         errors = {n: v * (1.0 if n.endswith(".offset") else times) for n, v in drawn.items()}
         session = simulate_session(wide, errors, seed=seed).session
-        found.append(find_excess(calibrate(session, solver="eliminated")))
+        found.append(find_tolerance_scale(session))
     # of one machine the square scatters by 0.84 of its mean: a few combinations of errors decide
     three_sigma = 3.0 * 0.84 / 2.0 / np.sqrt(count)
     assert np.sqrt(np.mean(np.square(found))) == pytest.approx(times, rel=three_sigma)
+
+
+def test_every_figure_at_the_tool_is_for_the_stated_workspace(tmp_path):
+    """Tool error, correction table and LinuxCNC module of a machine with a box of its own."""
+    box = np.array([[-0.05, 0.06], [-0.06, 0.05], [-0.07, 0.04]])
+    robot = make_robot(Dimensions(workspace=tuple(map(tuple, box))), tmp_path / "mine")
+    session = simulate_session(paper_plan(robot, Equipment()), {"x_slide.offset": 1e-3}, seed=1)
+    result = calibrate(session.session, "offsets")
+    found = assess_tool(result)
+    assert found.workspace.limits == pytest.approx(box)
+    assert json.loads(accuracy_json(result, found))["box"] == pytest.approx(box)
+    text = " ".join(summarize(result, details=True).split())
+    assert "workspace x −50…60, y −60…50, z −70…40 mm" in text
+    table = np.loadtxt(
+        io.StringIO(export_corrections(result)["corrections.csv"]), delimiter=",", skiprows=1
+    )
+    assert table[:, :3].min(axis=0) == pytest.approx(box[:, 0] * 1e3)
+    assert table[:, :3].max(axis=0) == pytest.approx(box[:, 1] * 1e3)
+    module = approximate(result, within=1e-5)
+    assert (module.inverse.lower, module.inverse.upper) == (
+        pytest.approx(box[:, 0]),
+        pytest.approx(box[:, 1]),
+    )

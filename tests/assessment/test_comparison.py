@@ -1,4 +1,4 @@
-"""Which model the readings support: Table 1 says offsets only, displaced lines say all."""
+"""Models side by side: scores, predictions of setups left out, and one recommendation."""
 
 from __future__ import annotations
 
@@ -9,19 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthocal import load_session, summarize
+from orthocal import calibrate, load_session, summarize
 from orthocal.assessment.comparison import compare_models
-from orthocal.assessment.findings.comparison import decide_comparison
+from orthocal.assessment.recommendation import STRONG
 from orthocal.errors import ParameterError
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.statistics.zeros import project_out_zeros
-
-
-def reasons(comparison):
-    return [f.words for f in decide_comparison(comparison).findings]
-
 
 OFFSETS = {"*.offset_mm": 2.0}
 
@@ -43,33 +38,47 @@ def lines(root):
     return compare_models(session, models=["offsets", "full"], tolerances=OFFSETS)
 
 
-def test_six_readings_support_offsets_only(table1):
-    verdict = table1.verdict
-    assert verdict.supported == "offsets"
-    assert reasons(table1)[0] == "Six independent readings support offsets only."
+def test_the_complete_model_is_recommended_for_table_1(table1):
+    """Its residuals exceed the noise of the dial ten times, which no model of offsets explains."""
+    assert table1.recommendation.model == "full"
+    assert table1.best is table1["full"]
     assert (table1["offsets"].spare, table1["full"].spare) == (3, 0)
-    assert any(s.startswith("full: not supported. Its 129 parameters") for s in reasons(table1))
-    assert any(s.startswith("lengths: no") for s in reasons(table1))
+    found = table1.assessment
+    assert (found.decision.verdict, found.decision.exit_code) == ("enter", 0)
+    (recommended,) = found.of_kind("recommended")
+    assert recommended.numbers["log_evidence"] == 0.0
+    others = {f.text.split(":")[0]: f.numbers for f in found.of_kind("not recommended")}
+    assert others.keys() == {"offsets", "lengths"}
+    assert others["offsets"]["log_evidence"] == pytest.approx(-117.1, abs=0.5)
+    expected = table1["offsets"].exact.unseen_rms * 1e3
+    assert others["offsets"]["unseen_rms_mm"] == pytest.approx(expected, rel=1e-12)
+    (scale,) = found.of_kind("above tolerances")
+    assert scale.numbers["tolerance_scale"] == found.tolerance_scale > 1.0
+    assert found.of_kind("repetition unknown")  # no reading is left to check it
 
 
-def test_tolerances_that_shrink_offsets_do_not_make_lengths_supported(experiment_2):
-    """Beside a narrow prior lengths use up less than three parameters, which AICc rewards."""
-    found = compare_models(experiment_2, models=["offsets", "lengths"], tolerances=OFFSETS)
-    assert found["lengths"].exact.aicc < found["offsets"].exact.aicc - 2.0
-    assert found.verdict.supported == "offsets"
-    assert any(s.startswith("lengths: no more than offsets") for s in reasons(found))
+def test_residuals_of_offsets_repeat(root, experiment_2):
+    again = load_session(root / "examples/table1/experiment-3")
+    found = compare_models(experiment_2, models=["offsets"], repeat=again)
+    assert found.best is found["offsets"]  # the largest that is compared
+    assert found.repetition.repeats
+    assert found.repetition.correlation == pytest.approx(0.9937, abs=5e-5)
+    (repeat,) = found.assessment.of_kind("residuals repeat")
+    assert repeat.numbers["correlation"] == found.repetition.correlation
+    (excess,) = found.assessment.of_kind("model error")
+    assert excess.numbers["ratio"] == pytest.approx(9.8, abs=0.2)
 
 
-def test_what_remains_of_table_1_is_model_error_not_noise(table1):
-    text = " ".join(reasons(table1))
-    assert table1.verdict.model_error is True
-    assert decide_comparison(table1).exit_code == 3
-    assert "error of the model rather than noise: σ 0.276 mm of a difference against 0.028" in text
-    assert "10 times as much" in text
-    assert "worse than its tolerances, by about 2.1 times" in text
-    assert table1.repetition.repeats
-    assert table1.repetition.correlation == pytest.approx(0.9937, abs=5e-5)
-    assert "What remains repeats in 'Experiment 3" in text
+def test_the_tool_error_is_that_of_calibrate(raw_cycles):
+    compared = compare_models(raw_cycles, models=["offsets", "full"])
+    calibration = calibrate(raw_cycles, compared.best.model)
+    (first,) = compared.assessment.of_kind("tool error")
+    (second,) = calibration.assessment.of_kind("tool error")
+    assert first.text == second.text
+    assert compared.assessment.tool.box == calibration.assessment.tool.box
+    for name in ("now", "entered", "compensated"):
+        values = [getattr(a.tool, name) for a in (compared.assessment, calibration.assessment)]
+        assert values[0] == pytest.approx(values[1], rel=1e-6)
 
 
 def test_the_scores_of_table_1_solved_by_hand(table1):
@@ -99,8 +108,8 @@ def test_leaving_a_setup_out_is_really_leaving_it_out(experiment_2, table1):
         rest = replace(
             experiment_2, readings=tuple(r for r in experiment_2.readings if r.setup != row.setup)
         )
-        problem = build_problem(experiment_2)
-        fit = fit_problem(build_problem(rest))
+        problem = build_problem(experiment_2, model="offsets")
+        fit = fit_problem(build_problem(rest, model="offsets"))
         sigma = table1["offsets"].calibration.noise.sigma  # as gauges' tolerances weigh beside it
         solution = NonlinearProgram(fit.problem).solve(sigma=sigma)
         theta = with_gauges_of(problem, replace(fit, solution=solution))
@@ -137,40 +146,34 @@ def test_repeated_readings_are_not_counted_as_new_ones(cycles):
     assert cycles.independent == 12
     assert cycles["full"].spare == 0
     assert cycles.noise.source == "cycles"
-    assert cycles.verdict.supported == "offsets"
-    assert cycles.verdict.model_error is False
-    assert decide_comparison(cycles).exit_code == 0
+    assert cycles.recommendation.model == "offsets"
+    assert cycles.assessment.of_kind("fits")
+    assert cycles.assessment.decision.verdict == "enter"
 
 
 def test_displaced_lines_support_the_full_model(lines):
-    verdict = lines.verdict
-    assert verdict.supported == "full"
-    assert decide_comparison(lines).exit_code == 0
+    assert lines.recommendation.model == "full"
+    assert lines.assessment.decision.verdict == "enter"
     full, offsets = lines["full"], lines["offsets"]
     assert full.exact.unseen_rms < 0.8 * offsets.exact.unseen_rms
     # errors that no reading of a leg tells are in both, those of drives and rods' ends too
     assert full.tool.after.sizes.aligned.rms < 0.25 * offsets.tool.after.sizes.aligned.rms
-    assert "264 independent readings support full." in reasons(lines)
+    assert lines.independent == 264
 
 
-def test_readings_that_leave_an_offset_open_support_nothing(raw_cycles):
+def test_readings_that_leave_an_offset_open_are_held_by_the_tolerances(raw_cycles):
     rows = tuple(r for r in raw_cycles.readings if r.setup == "yx")
     found = compare_models(replace(raw_cycles, readings=rows), models=["offsets"])
-    assert found.verdict.supported is None
-    assert decide_comparison(found).exit_code == 4
-    (result,) = found.results  # held by the tolerances, as larger models are
+    (result,) = found.results  # held as larger models are
     assert (result.prior, result.by_choice, result.spare) == (True, False, 0)
-    assert "no reading is left to check it" in " ".join(reasons(found))
-    assert "support none of the models" in summarize(found)
     json.loads(found.to_json())
 
 
-def test_without_word_on_the_noise_it_says_so(experiment_2):
+def test_an_unstated_noise_is_unknown(experiment_2):
     session = experiment_2.with_gauge(replace(experiment_2.gauge, sigma=None))
     found = compare_models(session, models=["offsets"])
-    assert found.verdict.model_error is None
-    assert decide_comparison(found).exit_code == 0
-    assert "nothing says what the noise is" in " ".join(reasons(found))
+    assert found.assessment.of_kind("noise unknown")
+    assert found.assessment.decision.exit_code == 0
     assert json.loads(found.to_json())["noise"] is None
 
 
@@ -191,36 +194,33 @@ def test_a_small_model_is_not_worse_off_for_having_no_prior(raw_cycles):
     rows = tuple(r for r in raw_cycles.readings if r.setup in ("yx", "xy"))
     found = compare_models(replace(raw_cycles, readings=rows), models=["offsets", "lengths"])
     assert found.undetermined == ()
-    assert found.verdict.supported == "offsets"
-    assert "do not determine it: what they leave open is held by the tolerances" in " ".join(
-        reasons(found)
-    )
+    assert {r.model: r.by_choice for r in found.results} == {"offsets": False, "lengths": True}
 
 
-def test_the_reasons_stand_before_the_criteria_and_what_cannot_be_compared_is_left_out(table1):
+def test_the_recommendation_stands_first_and_unchecked_models_have_no_criteria(table1):
     text = summarize(table1)
-    assert text.index("Verdict") < text.index("Models side by side")
+    assert text.index("Recommendation") < text.index("Models side by side")
     rows = text[text.index("Models side by side") : text.index("Estimates")].splitlines()
     full = next(i for i, row in enumerate(rows) if row.strip().startswith("full"))
-    assert rows[full].split()[4:] == ["–"] * 6
-    assert rows[full + 1].split()[1:7] == ["–"] * 6
-    assert json.loads(table1.to_json())["verdict"]["models"]["full"]["standing"] == "no check"
+    assert rows[full].split()[4:9] == ["–"] * 5
+    assert rows[full + 1].split()[1:6] == ["–"] * 5
 
 
 def test_the_summary_shows_all_that_was_promised(table1):
     text = summarize(table1)
-    for words in ("linear", "exact", "χ²", "AICc", "BIC", "unseen", "tool", "Verdict"):
+    for words in ("linear", "exact", "χ²", "AICc", "BIC", "unseen", "tool", "ln evidence"):
         assert words in text
     row = next(line for line in text.splitlines() if line.strip().startswith("x_slide.offset"))
-    assert row.split() == ["x_slide.offset", "offsets", "-0.522", "-0.527", "0.511", "mm"]
+    assert row.split() == ["x_slide.offset", "offsets", "-0.522", "-0.527", "1.401", "mm"]
     assert max(len(line) for line in text.splitlines()) <= 100
     document = json.loads(table1.to_json())
-    assert document["verdict"]["supported"] == "offsets"
+    assert document["recommendation"]["model"] == "full"
     assert document["models"][0]["exact"]["rms"] == pytest.approx(0.195e-3, abs=5e-7)
 
 
-def test_readings_without_any_deviation_support_offsets_only(raw_cycles):
+def test_readings_without_any_deviation_speak_for_offsets_and_small_tolerances(raw_cycles):
     still = raw_cycles.with_values(np.zeros(len(raw_cycles.readings)))
     found = compare_models(still, models=["offsets", "lengths"])
-    assert found.verdict.supported == "offsets"
+    assert found.recommendation.of("offsets") > STRONG
+    assert found.recommendation.tolerance_scale < 0.2
     assert math.isfinite(found["lengths"].exact.aicc)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -12,12 +11,20 @@ import pytest
 from folders import session_folder
 from machines import write_orthoglide
 
-from orthocal import calibrate, load_plan, load_robot, load_session, simulate_session, summarize
-from orthocal.assessment.findings.calibration import decide
-from orthocal.assessment.plausibility import describe_machine, find_doubts
+from orthocal import (
+    calibrate,
+    join_sessions,
+    load_plan,
+    load_robot,
+    load_session,
+    simulate_session,
+    summarize,
+)
+from orthocal.assessment.judgement import judge_session
+from orthocal.assessment.plausibility import find_implausible
 from orthocal.calibration.file import calibration_json
 from orthocal.errors import RobotError
-from orthocal.output.text.explanation import advise
+from orthocal.output.text.heading import describe_machine
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
@@ -32,8 +39,8 @@ def session(plan):
     return simulate_session(plan, TRUTH, seed=4).session
 
 
-def kinds(calibration):
-    return [d.kind for d in find_doubts(calibration)]
+def kinds(session):
+    return [d.kind for d in find_implausible(session)]
 
 
 @pytest.mark.parametrize(
@@ -41,17 +48,15 @@ def kinds(calibration):
     ["raw-cycles", "sweep", "lines", *(f"table1/experiment-{n}" for n in ("1-printed", "2", "3"))],
 )
 def test_the_examples_are_sound(root, name):
-    assert kinds(calibrate(load_session(session_folder(root, name)))) == []
+    assert kinds(load_session(session_folder(root, name))) == []
 
 
 def test_readings_in_inches_are_noticed(session):
     inches = session.with_values(np.round(session.values / 25.4, 7))
-    result = calibrate(inches)
-    assert "finer than the dial" in kinds(result)
-    assert "too little left" in kinds(result)
-    assert [f.kind for f in decide(result).findings if f.severity != "informs"] == ["wrong unit"]
-    assert "in inches" in advise(result)
-    assert advise(result).startswith("Do not enter these.")
+    assert "finer than the gauge" in kinds(inches)
+    assert "residuals too small" in kinds(inches)
+    found = [f for f in judge_session(inches).findings if f.severity != "note"]
+    assert [f.kind for f in found] == ["wrong unit"]
 
 
 def test_readings_in_inches_of_a_dial_in_inches_leave_too_little(session):
@@ -59,16 +64,16 @@ def test_readings_in_inches_of_a_dial_in_inches_leave_too_little(session):
     rows = [r.value for r in session.readings]
     coarse = session.with_gauge(replace(session.gauge, resolution=1e-6))
     again = coarse.with_values(np.round(np.array(rows) / 25.4, 6))
-    assert kinds(calibrate(again)) == []  # finer steps stated: nothing contradicts
+    assert kinds(again) == []  # finer steps stated: nothing contradicts
     stated = session.with_gauge(replace(session.gauge, resolution=0.5e-3))
     smooth = stated.with_values(np.array(rows) / 25.4)
-    assert "too little left" in kinds(calibrate(smooth))
+    assert "residuals too small" in kinds(smooth)
 
 
 def test_means_of_cycles_may_be_finer_than_the_dial_here_and_there(session):
     values = session.values.copy()
     values[::4] += 3e-6
-    assert kinds(calibrate(session.with_values(values))) == []
+    assert kinds(session.with_values(values)) == []
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -77,8 +82,7 @@ def test_sound_sessions_raise_no_doubt(plan, seed):
     sigma = (2e-6, 5e-6, 10e-6, 30e-6)[seed % 4]
     errors = {n: 1.5e-3 * rng.normal() for n in TRUTH}
     found = simulate_session(plan, errors, seed=seed, sigma=sigma).session
-    for model in ("offsets", "lengths"):
-        assert kinds(calibrate(found, model)) == []
+    assert kinds(found) == []
 
 
 def test_the_machines_size_is_printed(session):
@@ -108,10 +112,9 @@ def test_postures_of_a_machine_of_another_size_are_noticed(tmp_path, root, plan,
     other = small_plan(tmp_path, postures=joints)
     own = {(r.setup[:2], r.posture): r.value for r in session.readings if r.cycle == 1}
     values = [own[r.setup[:2], r.posture] for r in other.readings]
-    result = calibrate(other.with_values(values))
-    assert kinds(result)[0] == "wrong size"
-    assert advise(result).startswith("Do not enter these.")
-    assert "another size" in advise(result)
+    found = judge_session(other.with_values(values))
+    assert found.findings[0].kind == "wrong dimensions"
+    assert found.verdict == "reject"
 
 
 def test_legs_of_different_lengths_are_noticed(tmp_path):
@@ -123,11 +126,9 @@ def test_legs_of_different_lengths_are_noticed(tmp_path):
     head, tail = text[: text.index("y_slide")], text[text.index("y_slide") :]
     urdf.write_text(head.replace('"0.31025', '"0.3083').replace('"0.155125', '"0.15415') + tail)
     plan = plans.paper() | {"robot": "machine", "gauge": {"sigma_mm": 0.01}}
-    result = calibrate(
-        simulate_session(load_plan(plans.write(tmp_path, plan)), TRUTH, seed=1).session
-    )
-    assert "legs differ" in kinds(result)
-    assert "legs of x 308.3, y 310.25, z 310.25 mm" in advise(result)
+    session = simulate_session(load_plan(plans.write(tmp_path, plan)), TRUTH, seed=1).session
+    (found,) = [f for f in find_implausible(session) if f.kind == "legs differ"]
+    assert found.numbers == pytest.approx({"x_mm": 308.3, "y_mm": 310.25, "z_mm": 310.25})
 
 
 def test_a_leg_of_250_metres_is_refused(tmp_path):
@@ -139,39 +140,35 @@ def test_a_leg_of_250_metres_is_refused(tmp_path):
 def test_a_sigma_in_micrometres_is_noticed_and_computed_readings_are_no_scatter(root):
     session = load_session(root / "examples/raw-cycles")
     coarse = session.with_gauge(replace(session.gauge, sigma=10e-3))
-    words = [d.words for d in find_doubts(calibrate(coarse)) if d.kind == "sigma too coarse"]
-    assert len(words) == 1
-    assert "The σ given for the gauge, 10 mm" in words[0]
-    assert not [d for d in find_doubts(calibrate(session)) if d.kind == "sigma too coarse"]
+    (found,) = [d for d in find_implausible(coarse) if d.kind == "sigma too large"]
+    assert found.numbers["given_mm"] == pytest.approx(10.0)
+    assert "sigma too large" not in kinds(session)
     same = session.with_values(np.zeros(len(session.readings)))
     same = same.with_gauge(replace(same.gauge, sigma=10e-6, resolution=None))
-    assert not [d for d in find_doubts(calibrate(same)) if d.kind == "sigma too coarse"]
+    assert "sigma too large" not in kinds(same)
+
+
+def near(session, name, other):
+    """The same session with a posture 0.05 mm a drive from another one."""
+    moved = replace(session.postures[name], drives=session.postures[other].drives + 0.05e-3)
+    return replace(session, postures={**session.postures, name: moved})
 
 
 def test_a_posture_in_metres_is_noticed(root):
-    calibration = calibrate(load_session(root / "examples/raw-cycles"))
-    assert not [d for d in find_doubts(calibration) if d.kind == "posture too near"]
-    first, *others = calibration.postures
-    near = tuple(v + 0.05e-3 for v in others[-1].drives)
-    moved = replace(calibration, postures=(replace(first, drives=near), *others))
-    words = [d.words for d in find_doubts(moved) if d.kind == "posture too near"]
-    assert len(words) == 1
-    assert "0.087 mm from another one" in words[0]
+    session = load_session(root / "examples/raw-cycles")
+    assert "postures too near" not in kinds(session)
+    first, *_, last = session.postures
+    (found,) = [f for f in find_implausible(near(session, first, last)) if "near" in f.kind]
+    assert found.numbers["gap_mm"] == pytest.approx(0.087, abs=0.001)
+    assert found.places[0].posture in (first, last)
 
 
-def test_postures_of_another_round_are_not_too_near(root, tmp_path):
+def test_postures_of_another_round_are_not_too_near(root):
     """Their drives differ by the offsets that were entered in between, by fractions of a mm."""
     session = load_session(root / "examples/raw-cycles")
-    copy = tmp_path / "later"
-    shutil.copytree(root / "examples/raw-cycles", copy)
-    text = (copy / "session.yaml").read_text()
-    assert "offsets_mm: [0.0, 0.0, 0.0]" in text
-    (copy / "session.yaml").write_text(text.replace("[0.0, 0.0, 0.0]", "[0.1, -0.1, 0.05]"))
-    rows = (copy / "readings.csv").read_text()
-    (copy / "readings.csv").write_text(rows.replace(",0.19", ",0.18"))
-    both = calibrate([session, load_session(copy)])
-    assert "posture too near" not in {d.kind for d in find_doubts(both)}
-    first, *others = both.postures
-    near = tuple(v + 0.05e-3 for v in others[0].drives)
-    moved = replace(both, postures=(replace(first, drives=near), *others))
-    assert "posture too near" in {d.kind for d in find_doubts(moved)}
+    later = session.with_controller([0.1e-3, -0.1e-3, 0.05e-3])
+    both = join_sessions([session, later])
+    assert "postures too near" not in kinds(both)
+    first, second, *_ = session.postures
+    both = join_sessions([session, near(later, first, second)])
+    assert "postures too near" in kinds(both)

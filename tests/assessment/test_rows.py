@@ -149,4 +149,4 @@ def test_json_of_too_many_points_says_so(monkeypatch, capsys, tmp_path, calibrat
     with pytest.raises(SystemExit) as stopped:
         cli.main()
     assert stopped.value.code == 2
-    assert "holds 5001 points; expected at most 5000 with --json" in capsys.readouterr().err
+    assert "contains 5001 points; expected at most 5000 with --json" in capsys.readouterr().err

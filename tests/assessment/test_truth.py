@@ -15,7 +15,6 @@ from orthocal.calibration.build_record import assemble_calibration
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.estimation.solvers.machine_readings import Fleet
 from orthocal.kinematics.loop_closure import Assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import cube
@@ -58,9 +57,8 @@ class Machines:
 
     def solve(self, truths, rng):
         """What is identified of machines from their readings, of the same shape, [SI]."""
-        fleet = Fleet(self.problem, truths / self.problem.theta_scale)
-        assert fleet.close().all()
-        values = fleet.predict()
+        values, _, reached = self.problem.simulate(truths)
+        assert reached.all()
         return self.batch.solve(values + SIGMA * rng.normal(size=values.shape), sigma=SIGMA).theta
 
     def tool(self, theta):

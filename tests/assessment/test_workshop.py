@@ -15,7 +15,7 @@ from workshop import Workshop, draw_crooked
 from orthocal import draw_errors, load_plan
 from orthocal.assessment.tool_error import measure_uncertainty
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.kinematics.loop_closure import Assembly
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import cube
@@ -77,7 +77,7 @@ def test_the_error_at_the_tool_is_what_is_predicted(root, name, offsets_mm, most
     assembly = Assembly(robot, free=names)
     drives = Assembly(robot).inverse(space.points)
     tool = ToolSensitivity(robot, free=names)(drives)
-    program = EliminatedProgram(problem)
+    program = VariableProjection(problem)
     drawn = {"*.offset_mm": offsets_mm}
     squares, promised, hits = [], [], []
     for seed in range(MACHINES):

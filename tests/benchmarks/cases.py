@@ -20,7 +20,7 @@ from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.choice import build_program
 from orthocal.estimation.solvers.program import Program, Solution
-from orthocal.kinematics.backend.lanes import expect_many
+from orthocal.kinematics.backend import llvm
 from orthocal.measurement.joining import join_sessions
 from orthocal.observation.simulate import draw_errors
 from orthocal.session.session import Gauge, Session
@@ -176,7 +176,7 @@ def identify(session: Session, other: Session, *, solver: SolverKind = "ipopt") 
     again = program.solve(sigma=SIGMA, values=values)
     ended = time.perf_counter()
     timing = Timing(
-        postures=problem.n_postures,
+        postures=problem.n_states,
         readings=len(session.readings),
         seconds_build=built - began,
         seconds_solve=solved - built,
@@ -193,7 +193,8 @@ def load_libraries() -> None:
     """Load what is loaded when first needed: SciPy, as for the peer, and LLVM where it is."""
     for name in ("scipy.linalg", "scipy.sparse"):
         import_module(name)
-    expect_many()
+    if llvm.is_installed():
+        llvm.compile_interpreter()
 
 
 def measure(n_postures: int, solver: SolverKind = "ipopt") -> Timing:

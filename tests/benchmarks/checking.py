@@ -2,6 +2,7 @@
 
 python tests/benchmarks/checking.py                     a few sessions of every example
 python tests/benchmarks/checking.py --sessions 10 --sound 334
+python tests/benchmarks/checking.py --pairs 40          two reversed signs in different setups
 """
 
 from __future__ import annotations
@@ -9,19 +10,25 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import tempfile
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import numpy as np
 from made_mistakes import SIZES, is_named, make_mistakes, sound_session
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from typer.testing import CliRunner
 
 from orthocal import load_plan
-from orthocal.hypotheses.search import find_mistakes
+from orthocal.cli import make_program
+from orthocal.hypotheses import search
+from orthocal.hypotheses.linear_model import LinearModel
 
 EXAMPLES = ("raw-cycles", "sweep", "workshop")
 ROOT = Path(__file__).parents[2]
@@ -43,10 +50,12 @@ def count_mistakes(example: str, sessions: int, sizes: tuple[float, ...]) -> dic
     for seed in range(sessions):
         session = sound_session(plan, seed, entered=seed % 2 == 1)
         for name, size, made in make_mistakes(session, seed, sizes=sizes):
-            told = find_mistakes(session.with_values(made.values))
-            named = [is_named(m, made) for t in told[:1] for m in (t, *t.others)]
-            placed = [frozenset(t.rows) == made.rows for t in told[:1]]
-            alone = bool(told) and not told[0].others
+            found = search.find_anomalies(session.with_values(made.values)).found
+            told = [a.explanation for a in found[:1]]
+            every = [e for a in found[:1] for e in (a.explanation, *a.alternatives)]
+            named = [is_named(e, made) for e in every]
+            placed = [frozenset(e.rows) == made.rows for e in told]
+            alone = bool(found) and not found[0].ambiguous
             row = counts[name, size]
             row[0] += 1
             row[1] += bool(told)
@@ -60,9 +69,94 @@ def count_accused(example: str, sessions: int) -> int:
     """Sound sessions of which a mistake is told."""
     plan = load_plan(ROOT / "examples" / example / "plan.yaml")
     return sum(
-        bool(find_mistakes(sound_session(plan, seed, entered=seed % 2 == 1)))
+        bool(search.find_anomalies(sound_session(plan, seed, entered=seed % 2 == 1)).found)
         for seed in range(sessions)
     )
+
+
+def plan_with(readings: int):
+    """The plan that `orthocal new` makes for a machine of the packaged dimensions."""
+    machine = "--leg-mm 310.25 --travel-mm=190:390 --attachment-mm 40 --rods-apart-mm 80"
+    more = "--rod-radius-mm 5 --counts up --at-zero-mm 310.25"
+    with tempfile.TemporaryDirectory() as folder:
+        done = CliRunner().invoke(
+            make_program(), ["new", f"{folder}/m", *machine.split(), *more.split()]
+        )
+        assert done.exit_code == 0, done.output
+        plan = load_plan(f"{folder}/m/first/session.yaml")
+    assert len(plan.readings) == readings
+    return plan
+
+
+def reverse_two_signs(plan, pairs: int) -> Iterator[tuple[object, frozenset[int]]]:
+    """Sessions in which the signs of two readings of different setups are reversed."""
+    for seed in range(pairs):
+        session = sound_session(plan, seed, entered=seed % 2 == 1)
+        rng = np.random.default_rng((seed, 11))
+        while True:
+            one, other = rng.choice(len(session.readings), 2, replace=False)
+            values = session.values
+            apart = session.readings[one].setup != session.readings[other].setup
+            if apart and values[one] and values[other]:
+                break
+        values[[one, other]] *= -1.0
+        yield session.with_values(values), frozenset((int(one), int(other)))
+
+
+class _Exhaustive(search._Search):
+    """A search that linearises far more sets of at most two hypotheses anew."""
+
+    def sets(self, rows: frozenset[int]) -> tuple[float, float]:
+        """Log evidence of the true pair, and of the best other set of one or two hypotheses."""
+        state, table = self.sound, search.Rows(self.session, self.values)
+        scored = list(self._score(state, search._families(self.model, table)))
+        scored += list(self._score(state, search.inconsistent_groups(table)))
+        sets = [(t,) for t in self._shortlist(scored, table)]
+        sets += self._pairs(state, scored)[0]
+        family = next(
+            f for f, _ in scored
+            if (e := f.explain(0)).kind == "reversed sign" and e.scope == "reading"
+        )  # fmt: skip
+        truth = tuple(self._term(family, i, table) for i in sorted(rows))
+        own = self.evaluate(truth, state.about).log_posterior
+        keys = frozenset(t.explanation for t in truth)
+        others = [
+            self.evaluate(s, state.about).log_posterior
+            for s in sets
+            if frozenset(t.explanation for t in s) != keys
+        ]
+        return own - state.log_posterior, max(others, default=-np.inf) - state.log_posterior
+
+
+def count_pairs(plan, pairs: int) -> dict[str, int]:
+    """Pairs of reversed signs that can be named, that are, and what is reported of the others."""
+    counts = dict.fromkeys(("made", "can be named", "named", "others beyond 7", "reported"), 0)
+    for session, rows in reverse_two_signs(plan, pairs):
+        found = search.find_anomalies(session)
+        refitted = search.MOST_REFITTED, search.MOST_PAIRS_REFITTED
+        search.MOST_REFITTED, search.MOST_PAIRS_REFITTED = 40, 100
+        own, other = _Exhaustive(session, LinearModel(session)).sets(rows)
+        search.MOST_REFITTED, search.MOST_PAIRS_REFITTED = refitted
+        can = own >= search.CLEARLY and own - other >= search.NEARLY
+        kinds = {a.explanation.kind for a in found.found}
+        told = frozenset(i for a in found.found for i in a.explanation.rows)
+        named = kinds == {"reversed sign"} and told == rows and not found.ambiguous
+        counts["made"] += 1
+        counts["can be named"] += can
+        counts["named"] += can and named
+        beyond = not can and max(own, other) >= search.CLEARLY
+        counts["others beyond 7"] += beyond
+        counts["reported"] += beyond and bool(found.found)
+    return counts
+
+
+def print_pairs(console: Console, pairs: int) -> None:
+    """Print how often two reversed signs in different setups are named."""
+    plans = {name: load_plan(ROOT / "examples" / name / "plan.yaml") for name in EXAMPLES[::2]}
+    table = Table("plan", "made", "can be named", "named", "others beyond 7", "reported")
+    for name, plan in {"new": plan_with(24), **plans}.items():
+        table.add_row(name, *map(str, count_pairs(plan, pairs).values()))
+    console.print(table)
 
 
 def main() -> None:
@@ -71,8 +165,12 @@ def main() -> None:
     parser.add_argument("--sound", type=int, default=20, help="without, of every example")
     parser.add_argument("--example", action="append", choices=EXAMPLES)
     parser.add_argument("--size", action="append", type=float)
+    parser.add_argument("--pairs", type=int, help="pairs of reversed signs on each plan")
     given = parser.parse_args()
     console = Console(width=100)
+    if given.pairs:
+        print_pairs(console, given.pairs)
+        return
     for example in given.example or EXAMPLES:
         counts = count_mistakes(example, given.sessions, tuple(given.size or SIZES))
         table = Table(
@@ -82,7 +180,8 @@ def main() -> None:
             shares = [f"{n / made:.2f}" for n in others]
             table.add_row(name, f"{size:g}" if size else "", str(made), *shares)
         every = [sum(row[k] for row in counts.values()) for k in range(5)]
-        table.add_row("all", "", str(every[0]), *(f"{n / every[0]:.2f}" for n in every[1:]))
+        shares = [f"{n / max(every[0], 1):.2f}" for n in every[1:]]
+        table.add_row("all", "", str(every[0]), *shares)
         console.print(f"\n{example}")
         console.print(table)
         accused = count_accused(example, given.sound)

@@ -10,7 +10,7 @@ import numpy as np
 from orthocal.export.correction_field import CorrectionField
 from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.program import ProgramCorrector
-from orthocal.kinematics.backend.lanes import Way, running
+from orthocal.kinematics.backend import llvm
 
 CORRECTED = 9.0
 """Points that are read, corrected and written a second over those that the machine itself corrects
@@ -20,7 +20,9 @@ asks for four or five points a piece."""
 LINES = 8000
 
 
-def test_programs_are_corrected_faster_than_the_machine_is_asked(orthoglide, record_property):
+def test_programs_are_corrected_faster_than_the_machine_is_asked(
+    orthoglide, record_property, monkeypatch
+):
     errors = {"x_slide.offset": 1e-3, "y_slide.offset": -1e-3, "z_slide.offset": 2e-3}
     machine = SimpleNamespace(robot=orthoglide, errors=errors)
     field = CorrectionField(machine, np.zeros(3), within=1e-6)
@@ -35,7 +37,8 @@ def test_programs_are_corrected_faster_than_the_machine_is_asked(orthoglide, rec
         return sum(1 for _ in corrector.run(text))
 
     def ask():
-        with running(Way.CASADI):
+        with monkeypatch.context() as patch:
+            patch.setattr(llvm, "is_installed", lambda: False)
             field.exactly(points[:1000] * 1e-3)
 
     rates = []

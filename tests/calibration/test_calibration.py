@@ -16,6 +16,7 @@ from orthocal import (
     load_calibration,
     load_plan,
     load_session,
+    parameter_table,
     simulate_session,
     summarize,
 )
@@ -23,7 +24,7 @@ from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.file import calibration_document, calibration_json, write_calibration
 from orthocal.errors import CalibrationFileError, ClosureError
 from orthocal.kinematics import orthoglide as closed_form
-from orthocal.output.text.explanation import explain_fit
+from orthocal.statistics.chance import COVERAGE, confidence_factor
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
@@ -41,7 +42,7 @@ def test_the_file_gives_the_same_object_back(root, tmp_path, example, model):
     assert calibration_document(again) == calibration_document(calibration)
     assert calibration_json(again) == calibration_json(calibration)
     assert [p.name for p in again.free] == [p.name for p in calibration.free]
-    assert np.array_equal(again.covariance, calibration.covariance)
+    assert np.array_equal(again.total_covariance, calibration.total_covariance)
     joints = np.full(3, 0.31)
     assert (
         np.abs(again.machine.forward(joints) - calibration.machine.forward(joints)).max()
@@ -58,7 +59,8 @@ def test_the_file_has_what_was_promised(result):
         "model",
         "solver",
         "parameters",
-        "covariance",
+        "model_covariance",
+        "noise_covariance",
         "sigma",
         "dof",
         "rms_before",
@@ -66,9 +68,16 @@ def test_the_file_has_what_was_promised(result):
         "residuals",
         "orthocal",
     } <= set(document)
-    assert {"name", "unit", "value", "std", "tolerance", "free", "identifiable"} <= set(
-        document["parameters"][0]
-    )
+    assert {
+        "name",
+        "unit",
+        "value",
+        "std",
+        "std_scatter",
+        "tolerance",
+        "free",
+        "identifiable",
+    } <= set(document["parameters"][0])
     assert {
         "setup",
         "posture",
@@ -85,7 +94,7 @@ def test_the_file_has_what_was_promised(result):
 
 def test_the_truth_is_within_its_interval(result):
     for p in result.free:
-        assert abs(p.value - TRUTH[p.name]) < result.confidence_factor * p.std
+        assert abs(p.value - TRUTH[p.name]) < confidence_factor(result.dof) * p.std
 
 
 def test_measured_is_prediction_and_residual(result, raw_cycles):
@@ -166,7 +175,7 @@ def test_a_robot_that_changed_is_noticed(root, tmp_path, result):
     file = tmp_path / "calibration.json"
     file.write_text(json.dumps(document))
     with pytest.raises(CalibrationFileError, match="another version of robot 'orthoglide'"):
-        load_calibration(file).machine.forward([0.31, 0.31, 0.31])
+        load_calibration(file)
 
 
 def test_an_unknown_parameter_is_a_key_error(result):
@@ -175,13 +184,37 @@ def test_an_unknown_parameter_is_a_key_error(result):
 
 
 def test_every_doubt_of_an_offset_is_in_what_is_entered(root):
-    """Scatter and errors that were left out, at their tolerances."""
-    result = calibrate(load_session(root / "examples/sweep"))
-    bias = np.sqrt(np.diag(result.unmodelled.bias_covariance))
-    for entry, own in zip(find_entries(result), bias, strict=True):
-        assert entry.std == pytest.approx(np.hypot(entry.scatter, own))
-        assert entry.std > 10.0 * entry.scatter
+    """Scatter, mounting of the gauges, and errors that were left out, at their tolerances."""
+    result = calibrate(load_session(root / "examples/sweep"), "offsets")
+    bias = np.diag(result.unmodelled.bias_covariance)
+    variance = np.diag(result.model_covariance)
+    for entry, known, own in zip(find_entries(result), variance, bias, strict=True):
+        assert entry.std == pytest.approx(np.sqrt(known + own))
+        assert entry.std_scatter**2 < known
+        assert entry.std > 10.0 * entry.std_scatter
         assert entry.held is None
+
+
+def test_an_offset_has_one_standard_deviation_everywhere(experiment_2):
+    """Table, file, value to enter and the printed ± agree for the paper's Experiment 2."""
+    result = calibrate(experiment_2)
+    document = json.loads(calibration_json(result))
+    table = {p["name"]: p for p in parameter_table(result)}
+    in_file = {p["name"]: p for p in document["parameters"]}
+    entries = {e["drive"]: e for e in document["assessment"]["entries"]}
+    printed = {cells[0]: cells for cells in map(str.split, summarize(result).splitlines()) if cells}
+    factor = confidence_factor(result.dof)
+    for i, drive in enumerate(("x_slide", "y_slide", "z_slide")):
+        found = table[f"{drive}.offset"]
+        std, scatter = found["std"], found["std_scatter"]
+        assert 0.0 < scatter < std
+        assert std == pytest.approx(result.standard_deviations[i], rel=1e-12)
+        for other in (in_file[f"{drive}.offset"], entries[drive]):
+            assert other["std"] == pytest.approx(std, rel=1e-12)
+            assert other["std_scatter"] == pytest.approx(scatter, rel=1e-12)
+        half = math.hypot(factor * scatter, COVERAGE * math.sqrt(std**2 - scatter**2))
+        assert float(printed[drive][-2]) == pytest.approx(half * 1e3, abs=0.5e-3)
+        assert (found["high"] - found["low"]) / 2 == pytest.approx(half, rel=1e-9)
 
 
 def test_what_a_bound_or_a_known_value_holds_is_not_proved(experiment_2):
@@ -195,22 +228,20 @@ def test_what_a_bound_or_a_known_value_holds_is_not_proved(experiment_2):
     entered = text[text.index("What to enter into the controller") :]
     assert "lower bound" in entered
     assert "known" in entered
-    sentence = next(s for s in explain_fit(bounded) if s.startswith("Offsets that must change"))
-    assert "x_slide" not in sentence
-    assert "y_slide" not in sentence
+    judged = bounded.assessment.of_kind("must change", "not significant", "no change needed")
+    assert {p.parameter for f in judged for p in f.places} == {"z_slide"}
 
 
 def test_students_factor_counts_for_what_the_readings_told(experiment_2):
     """Three degrees of freedom say nothing of a length that only its prior tells."""
     result = calibrate(experiment_2, "lengths")
-    names = [p.name for p in result.free]
-    bias = np.sqrt(np.diag(result.unmodelled.bias_covariance))
-    for name, factor in (("x_leg.length", 1.96), ("x_slide.offset", result.confidence_factor)):
-        low, high = result.intervals[names.index(name)]
-        rest = 1.96 * bias[names.index(name)]
-        assert (high - low) / 2 == pytest.approx(
-            math.hypot(factor * result[name].std, rest), rel=0.02
-        )
+    half = dict(zip([p.name for p in result.free], result.expanded_uncertainties, strict=True))
+    assert half["x_leg.length"] == pytest.approx(2.0 * result["x_leg.length"].std, rel=0.02)
+    offset = result["x_slide.offset"]
+    rest = math.sqrt(offset.std**2 - offset.std_scatter**2)
+    assert offset.std_scatter > 0.0
+    expected = math.hypot(confidence_factor(result.dof) * offset.std_scatter, 2.0 * rest)
+    assert half["x_slide.offset"] == pytest.approx(expected, rel=1e-12)
 
 
 def test_cycles_that_are_all_equal_scatter_by_the_resolution(raw_cycles):
@@ -219,7 +250,7 @@ def test_cycles_that_are_all_equal_scatter_by_the_resolution(raw_cycles):
     for model in ("offsets", "full"):
         result = calibrate(raw_cycles.with_values(values), model)
         assert result.noise.cycles_sigma == pytest.approx(0.01e-3 / np.sqrt(12.0))
-        assert np.isfinite(result.covariance).all()
+        assert np.isfinite(result.total_covariance).all()
         assert "unknown" not in summarize(result, details=True)
     zero = calibrate(raw_cycles.with_values(np.zeros(len(values))), "full")
     assert zero["x_slide.offset"].std > 0.1e-3  # one with other errors, as its tolerance says
@@ -229,7 +260,7 @@ def test_one_free_parameter_alone(experiment_2):
     rows = experiment_2.readings[:1]
     result = calibrate(replace(experiment_2, readings=rows), Choice(base=True))
     assert len(result.free) == 1
-    assert np.isfinite(result.covariance).all()
+    assert np.isfinite(result.total_covariance).all()
 
 
 def test_the_machine_goes_no_further_than_its_drives(experiment_2):

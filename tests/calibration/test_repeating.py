@@ -72,7 +72,10 @@ EDITED = [
     ("residuals", 4, "residual"),
     ("residuals", 4, "predicted"),
     ("parameters", 1, "std"),
-    ("covariance", 1, 1),
+    ("parameters", 1, "std_scatter"),
+    ("model_covariance", 1, 1),
+    ("noise_covariance", 1, 1),
+    ("unmodelled", "leakage", 1, 1),
 ]
 
 

@@ -92,7 +92,7 @@ def test_rows_of_one_leg_do_not_determine_three_offsets():
 
 def test_the_closed_loop_model_agrees_to_first_order_with_equation_8(experiment_2):
     """Six differences of the URDF's model against the reduced system, rows and solution."""
-    problem = build_problem(exact(experiment_2))
+    problem = build_problem(exact(experiment_2), model="offsets")
     _, jacobian = problem.linearise(problem.reference)
     slopes = problem.observations.rows(jacobian) / problem.theta_scale
     matrix = leg_parallelism_matrix(**GEOMETRY, rows=6)
@@ -109,7 +109,7 @@ def test_twelve_generalised_rows_are_raw_readings_with_their_zeros(root):
     plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
     rng = np.random.default_rng(0)
     session = plan.with_values(1e-3 * rng.normal(size=len(plan.readings)))
-    problem = build_problem(session)
+    problem = build_problem(session, model="offsets")
     theta = solve_linearised(problem, sigma=1e-5)
     means = {}
     for r in session.readings:

@@ -11,8 +11,8 @@ from tolerances import KINEMATICS
 from orthocal import load_plan
 from orthocal.errors import ParameterError, RobotError
 from orthocal.estimation.problem import build_problem
-from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_frames import predict_entries
+from orthocal.estimation.solvers.symbolic_problem import SymbolicProblem
+from orthocal.observation.model import predict_readings
 
 
 @pytest.fixture(scope="module")
@@ -52,11 +52,8 @@ def test_frames_and_scales_can_be_freed_too(plan):
 def test_predictions_are_those_of_the_observation_model(plan):
     problem = build_problem(plan, model="full")
     theta = 2.0 * np.random.default_rng(3).normal(size=problem.n_free) * problem.theta_scale
-    entries = predict_entries(
-        plan,
-        build_observations(plan),
-        problem.split_errors(theta),
-        unknowns=theta[problem.n_machine :],
+    entries = predict_readings(
+        plan, problem.split_errors(theta), nuisance=theta[problem.n_machine :]
     )
     assert np.abs(problem.predict(theta) - entries).max() < KINEMATICS * 10
 
@@ -65,7 +62,7 @@ def test_known_values_are_held(plan):
     fixed = {"x_leg.length": 0.3e-3, "x_slide.offset": 1e-3}
     problem = build_problem(plan, model="lengths", known=fixed)
     assert "x_slide.offset" not in problem.free
-    entries = predict_entries(plan, build_observations(plan), fixed)
+    entries = predict_readings(plan, fixed)
     assert np.abs(problem.predict(np.zeros(problem.n_free)) - entries).max() < KINEMATICS * 10
 
 
@@ -74,14 +71,14 @@ def test_what_the_controller_corrects_is_the_reference(root):
 
     plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
     active = replace(plan, controller_offsets=np.array([1e-3, 2e-3, 3e-3]))
-    assert np.array_equal(build_problem(active).reference, [1e-3, 2e-3, 3e-3])
+    assert np.array_equal(build_problem(active, model="offsets").reference, [1e-3, 2e-3, 3e-3])
 
 
 def test_readings_depend_on_few_variables(plan):
     """A reading knows its own leg only: this is what makes large problems fast."""
     problem = build_problem(plan, model="full")
     setups = list(plan.setups.values())
-    for piece in problem.reading_pieces:
+    for piece in SymbolicProblem(problem).readings:
         (leg,) = {setups[i].sensor.leg for i in problem.observations.setup[piece.entries]}
         assert piece.passive_index.size == 3
         assert piece.theta_index.size == 21
@@ -110,4 +107,4 @@ def test_closure_rows_that_depend_on_others_are_named(root, tmp_path):
         "setups:\n  yx: {leg: x, direction: y, section: {fraction: 0.5}}\n"
     )
     with pytest.raises(RobotError, match=r"closure rows depend on others: z of apex; leave them"):
-        build_problem(load_plan(tmp_path / "plan.yaml"))
+        build_problem(load_plan(tmp_path / "plan.yaml"), model="offsets")

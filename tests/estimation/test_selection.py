@@ -20,8 +20,13 @@ def parameters(orthoglide):
     return orthoglide.parameters
 
 
-def test_offsets_are_free_by_default_and_have_no_prior(parameters):
-    chosen = select_parameters(parameters)
+def test_the_complete_model_is_the_default(parameters):
+    chosen, full = select_parameters(parameters), select_parameters(parameters, model="full")
+    assert (chosen.names, chosen.label) == (full.names, "full")
+
+
+def test_offsets_have_no_prior(parameters):
+    chosen = select_parameters(parameters, model="offsets")
     assert chosen.names == ("x_slide.offset", "y_slide.offset", "z_slide.offset")
     assert not chosen.prior.any()
     assert chosen.label == "offsets"
@@ -54,7 +59,7 @@ def test_a_tolerance_holds_for_what_its_glob_matches(parameters):
 
 def test_known_values_are_held_or_become_a_prior(parameters):
     known = {"x_leg.length": (0.12e-3, 0.02e-3), "y_leg.length": 0.05e-3}
-    chosen = select_parameters(parameters, known=known)
+    chosen = select_parameters(parameters, model="offsets", known=known)
     assert chosen.names[-1] == "x_leg.length"
     assert list(chosen.prior) == [False, False, False, True]
     assert chosen.mean[-1] == 0.12e-3
@@ -63,7 +68,7 @@ def test_known_values_are_held_or_become_a_prior(parameters):
 
 
 def test_bounds_are_open_where_none_is_given(parameters):
-    chosen = select_parameters(parameters, bounds={"x_*.offset": (-1e-3, np.inf)})
+    chosen = select_parameters(parameters, model="offsets", bounds={"x_*.offset": (-1e-3, np.inf)})
     assert chosen.lower[0] == -1e-3
     assert np.isinf(chosen.upper).all()
     assert np.isinf(chosen.lower[1:]).all()

@@ -210,7 +210,7 @@ def test_command_line(command, tmp_path):
     assert code == 0
     assert out.splitlines()[0] == "G21 G0 X1.0000 Y2.0000 Z3.0000"
     assert "For a controller with the offsets to enter: x_slide -0.5" in err
-    assert "The program's coordinates are taken as machine coordinates." in err
+    assert "The program's coordinates are read as machine coordinates." in err
     code, out, err = command(PROGRAM, "--offsets", "active", "--work-offset-mm", "10,0,-5")
     assert code == 0
     assert "active during the measurement: x_slide +0.0000 mm" in err

@@ -14,6 +14,7 @@ from commands import run_orthocal
 
 from orthocal import (
     ExportError,
+    ExportOptions,
     ParameterError,
     calibrate,
     export_calibration,
@@ -39,8 +40,8 @@ def full(root):
 
 
 @pytest.fixture(scope="module")
-def reversed_sign(root):
-    """A calibration with a reversed sign in setup zy, which is not to be entered."""
+def turned(root):
+    """A machine whose setup zy was read with the wrong sign: to be reviewed."""
     from dataclasses import replace
 
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
@@ -81,18 +82,44 @@ def test_parameters_round_trip(full, tmp_path):
     assert "#   x_slide_mm: " in path.read_text()
 
 
-def test_export_needs_anyway_if_the_decision_is_not_to_enter(reversed_sign, tmp_path):
-    with pytest.raises(ExportError, match="Do not enter these"):
-        export_calibration(reversed_sign, "yaml")
-    assert "errors.yaml" in export_calibration(reversed_sign, "yaml", anyway=True)
-    file = write_calibration(reversed_sign, tmp_path / "calibration.json")
-    words = ["export", file, "--to", "yaml", "--out", "out"]
-    refused = run_orthocal(tmp_path, *words)
-    assert refused.returncode == 3
-    assert "Do not enter these" in refused.stderr
-    assert not (tmp_path / "out").exists()
-    assert run_orthocal(tmp_path, *words, "--anyway").returncode == 0
-    assert (tmp_path / "out/errors.yaml").exists()
+STATED = {"yaml": "errors.yaml", "table": "README.md", "urdf": "README.md", "linuxcnc": "README.md"}
+"""File of each format that states that it was written against the verdict."""
+
+
+@pytest.mark.parametrize("to", STATED)
+def test_against_the_verdict_nothing_is_exported_unless_asked_for_and_stated(turned, full, to):
+    with pytest.raises(ExportError) as refused:
+        export_calibration(turned, to)
+    assert refused.value.exit_code == 3
+    assert turned.assessment.decision.headline in str(refused.value)
+    files = export_calibration(turned, to, anyway=True)
+    assert "against the verdict 'review'" in files[STATED[to]].splitlines()[0]
+    options = ExportOptions(module=False) if to == "linuxcnc" else None
+    sound = export_calibration(full, to, anyway=True, options=options)
+    assert "against the verdict" not in sound.get(STATED[to], "")
+
+
+PROGRAM = "%\nG21 G90\nG0 X0 Y0 Z0\nG1 X10 F600\nM2\n%\n"
+
+
+def test_against_the_verdict_nothing_is_written_by_command(turned, tmp_path):
+    file = write_calibration(turned, tmp_path / "calibration.json")
+    (tmp_path / "part.ngc").write_text(PROGRAM)
+    out = tmp_path / "out"
+    for words in (
+        ["export", str(file), "--to", "yaml", "--out", str(out)],
+        ["correct", str(file), str(tmp_path / "part.ngc"), "--out", str(out / "part.ngc")],
+    ):
+        refused = run_orthocal(tmp_path, *words)
+        assert refused.returncode == 3
+        assert turned.assessment.decision.headline in refused.stderr
+        assert not out.exists()
+        assert run_orthocal(tmp_path, *words, "--anyway").returncode == 0
+        if words[0] == "correct":
+            first, second, *_ = (out / "part.ngc").read_text().splitlines()
+            assert first == "%"
+            assert second.startswith("; Written against the verdict 'review'")
+        shutil.rmtree(out)
 
 
 def test_unknown_format_is_refused(experiment_2):
@@ -205,7 +232,9 @@ def test_offset_displaces_the_origin_of_its_drive(root, tmp_path):
 
 
 def test_error_of_a_frame_on_a_moving_link_is_refused(orthoglide):
-    error = ElementaryError("frame.x_crossbar.x", "translation", "x_crossbar", True, 0, "m")
+    error = ElementaryError(
+        "frame.x_crossbar.x", "translation", "x_crossbar", "m", 1e-4, of_frame=True, axis=0
+    )
     parameters = SimpleNamespace(elementary={error.name: error})
     robot = SimpleNamespace(parameters=parameters, urdf=orthoglide.urdf, model=orthoglide.model)
     with pytest.raises(ExportError, match="is an error of a frame on a moving link"):

@@ -167,13 +167,13 @@ def change(document, keys, value):
         (["identifiability", "singular_values", 2], -1.0, "expected positive numbers"),
         (["identifiability", "singular_values", 0], 0.0, "the largest first"),
         (["identifiability", "rank"], 4, "identifiability.rank: found 4"),
-        (["covariance"], [], "covariance: expected 3 × 3 numbers"),
+        (["model_covariance"], [], "covariance: expected 3 × 3 numbers"),
         (["parameters", 0, "tolerance"], 0, "expected greater than 0"),
         (["robot", "folder"], "a\x00b", "a text contains a control character"),
         (["robot", "folder"], "x" * 300, "is neither a robot of orthocal"),
         (["session", "title"], "\ud800", "half of a surrogate pair"),
         (["residuals"], [0] * 300_000, "residuals[0]: found '0'; expected keys and values"),
-        (["covariance"], [["a"] * 3] * 100_000, "covariance[0][0]: found 'a'"),
+        (["model_covariance"], [["a"] * 3] * 100_000, "covariance[0][0]: found 'a'"),
     ],
     ids=lambda v: None if isinstance(v, list | str) and len(v) > 40 else str(v)[:40],
 )
@@ -188,8 +188,9 @@ def test_numbers_of_a_calibration_that_cannot_be(keys, value, message, document,
 
 
 def test_a_calibration_of_nothing(document, tmp_path):
-    empty = change(document, ["covariance"], [])
+    empty = change(document, ["model_covariance"], [])
     empty["parameters"] = [{**p, "free": False} for p in empty["parameters"]]
+    empty["noise_covariance"] = []
     empty["unmodelled"]["leakage"] = []
     (tmp_path / "calibration.json").write_text(json.dumps(empty))
     with pytest.raises(OrthocalError, match="parameters: holds none that is free"):

@@ -10,15 +10,12 @@ from derivatives import assert_derivative, central_differences
 from tolerances import DERIVATIVE, KINEMATICS
 
 from orthocal import load_robot
+from orthocal.effects.protocol import Placement
 from orthocal.errors import RobotError
 from orthocal.kinematics.symbolic import (
-    ErrorExpressions,
-    Pose,
     SymbolicRobot,
     SymbolicTree,
     erroneous_placements,
-    exp6,
-    log6,
 )
 from orthocal.robot.frames import find_frame, place_frames
 from orthocal.robot.urdf import load_urdf
@@ -61,13 +58,10 @@ def build(model, joints, frames):
     q = ca.SX.sym("q", model.nv)
     dj = ca.SX.sym("dj", 6, len(joints))
     df = ca.SX.sym("df", 6, len(frames))
-    errors = ErrorExpressions(
-        {model.getJointId(name): dj[:, i] for i, name in enumerate(joints)},
-        {find_frame(model, name, where=""): df[:, i] for i, name in enumerate(frames)},
-        ca.SX(0, 1),
-        ca.SX(0, 1),
-    )
-    at_joints, at_frames = erroneous_placements(model, errors)
+    at = [Placement(model.getJointId(name), False) for name in joints]
+    at += [Placement(find_frame(model, name, where=""), True) for name in frames]
+    twists = dict(zip(at, ca.horzsplit(ca.horzcat(dj, df)), strict=True))
+    at_joints, at_frames = erroneous_placements(model, twists)
     tree = SymbolicTree(model, q, joint_placements=at_joints, frame_placements=at_frames)
     poses = [tree.frame_pose(i) for i in moving_frames(model)]
     stacked = ca.vertcat(*(ca.vertcat(ca.vec(p.rotation), p.position) for p in poses))
@@ -132,10 +126,8 @@ def test_error_derivatives_equal_pinocchios_kinematic_regressor(orthoglide):
     joints = list(model.names)[1:]
     frame = orthoglide.frame_id("tcp")
     q, dj = ca.SX.sym("q", model.nv), ca.SX.sym("dj", 6, len(joints))
-    errors = ErrorExpressions(
-        {model.getJointId(n): dj[:, i] for i, n in enumerate(joints)}, {}, ca.SX(0, 1), ca.SX(0, 1)
-    )
-    tree = SymbolicTree(model, q, joint_placements=erroneous_placements(model, errors)[0])
+    twists = {Placement(model.getJointId(n), False): dj[:, i] for i, n in enumerate(joints)}
+    tree = SymbolicTree(model, q, joint_placements=erroneous_placements(model, twists)[0])
     pose = tree.frame_pose(frame)
     stacked = ca.vertcat(ca.vec(pose.rotation), pose.position)
     slope = ca.Function("slope", [q, dj], [ca.jacobian(stacked, ca.vec(dj))])
@@ -155,45 +147,6 @@ def test_error_derivatives_equal_pinocchios_kinematic_regressor(orthoglide):
         axis=1,
     )
     assert np.abs(np.vstack([linear, angular]) - theirs).max() < KINEMATICS
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-4, 0.03, 0.0447, 0.045, 0.19, 0.21, 1.0, 3.0])
-def test_exp6_and_log6_equal_pinocchios_and_undo_each_other(angle):
-    rng = np.random.default_rng(2)
-    twist = ca.SX.sym("twist", 6)
-    pose = exp6(twist)
-    forward = ca.Function("f", [twist], [pose.rotation, pose.position])
-    back = ca.Function("g", [twist], [log6(pose)])
-    axis = rng.normal(size=3)
-    xi = np.r_[rng.normal(size=3), angle * axis / np.linalg.norm(axis)]
-    rotation, position = (np.asarray(v) for v in forward(xi))
-    theirs = pin.exp6(xi)
-    assert np.abs(rotation - theirs.rotation).max() < KINEMATICS
-    assert np.abs(position.ravel() - theirs.translation).max() < KINEMATICS
-    # near half a turn the logarithm itself is ill-conditioned
-    slack = KINEMATICS * (1.0 if angle < 2.0 else 100.0)
-    assert np.abs(np.asarray(back(xi)).ravel() - xi).max() < slack
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-8, 0.0447, 0.045, 0.2, 1.0])
-def test_exp6_and_log6_have_exact_first_and_second_derivatives(angle):
-    twist = ca.SX.sym("twist", 6)
-    pose = exp6(twist)
-    weights = np.random.default_rng(4).normal(size=18)
-    relative = Pose(pose.rotation, pose.position) * Pose(
-        ca.SX(pin.exp3(np.full(3, 0.01))), ca.SX(3, 1)
-    )
-    outputs = ca.vertcat(ca.vec(pose.rotation), pose.position, log6(relative))
-    scalar = ca.dot(weights, outputs)
-    hessian, gradient = ca.hessian(scalar, twist)
-    value, first, second = (
-        ca.Function(n, [twist], [e]) for n, e in (("v", scalar), ("g", gradient), ("h", hessian))
-    )
-    xi = np.r_[0.3, -0.2, 0.5, angle * np.array([0.36, 0.48, 0.8])]
-    assert_derivative(
-        np.asarray(first(xi)).reshape(1, 6), lambda u: np.asarray(value(u)).ravel(), xi
-    )
-    assert_derivative(np.asarray(second(xi)), lambda u: np.asarray(first(u)).ravel(), xi)
 
 
 @pytest.mark.parametrize("robot", ["orthoglide", "fivebar", "biglide"])

@@ -14,7 +14,7 @@ from orthocal.errors import SessionError
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
-from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
@@ -62,7 +62,7 @@ def test_two_halves_are_the_whole(sweep, model, solver):
 def test_a_session_counted_twice_halves_the_variance(raw_cycles):
     stated = exact(raw_cycles).with_gauge(replace(raw_cycles.gauge, sigma=50e-6, resolution=None))
     once, twice = calibrate(stated), calibrate([stated, stated])
-    assert twice.covariance == pytest.approx(0.5 * once.covariance, rel=1e-7)
+    assert twice.model_covariance == pytest.approx(0.5 * once.model_covariance, rel=1e-7)
     for p, q in zip(once.free, twice.free, strict=True):
         assert q.value == pytest.approx(p.value, abs=1e-12)
     assert len(twice.setups) == 2 * len(once.setups)
@@ -97,13 +97,13 @@ def test_noise_is_told_for_each_session(root):
     assert found.gauges[1].noise == pytest.approx(5e-6, rel=0.4)
     alone = calibrate(fine)
     for p, q in zip(alone.free, found.free, strict=True):
-        assert q.std < p.std
-        assert q.std > 0.9 * p.std
-        assert abs(q.value - p.value) < 0.5 * p.std
+        assert q.std_scatter < p.std_scatter
+        assert q.std_scatter > 0.9 * p.std_scatter
+        assert abs(q.value - p.value) < 0.5 * p.std_scatter
     # were both to count alike, the coarse one would decide
-    same = build_problem(join_sessions([coarse, fine]))
-    alike = EliminatedProgram(same).solve(sigma=1e-5).theta
-    assert np.abs(alike - [p.value for p in found.free]).max() > found.free[0].std
+    same = build_problem(join_sessions([coarse, fine]), model="offsets")
+    alike = VariableProjection(same).solve(sigma=1e-5).theta
+    assert np.abs(alike - [p.value for p in found.free]).max() > found.free[0].std_scatter
 
 
 def test_deviations_of_mixed_sessions_are_those_of_many(root):
@@ -116,7 +116,7 @@ def test_deviations_of_mixed_sessions_are_those_of_many(root):
             simulate_session(plan, TRUTH, seed=2 * seed + i, sigma=s).session
             for i, s in enumerate((40e-6, 5e-6))
         ]
-        fit = fit_problem(build_problem(join_sessions(pair)), options=options)
+        fit = fit_problem(build_problem(join_sessions(pair), model="offsets"), options=options)
         n = fit.problem.n_machine
         names, values = fit.problem.free[:n], fit.solution.theta[:n]
         std = np.sqrt(np.diag(fit.covariance())[:n])
@@ -125,7 +125,8 @@ def test_deviations_of_mixed_sessions_are_those_of_many(root):
     found = calibrate(pair, solver=options)
     assert [p.name for p in found.free] == list(names)
     assert [p.value for p in found.free] == values.tolist()
-    assert [p.std for p in found.free] == pytest.approx(std, rel=1e-12)
+    known = np.sqrt(np.diag(found.model_covariance))
+    assert known == pytest.approx(std, rel=1e-12)
 
 
 def test_both_solvers_weigh_gauges_alike(root):
@@ -139,7 +140,7 @@ def test_both_solvers_weigh_gauges_alike(root):
         from orthocal.estimation.loss import Loss
 
         options = SolverOptions(loss=Loss(loss))
-        ours = EliminatedProgram(problem, options=options).solve(sigma=2e-5)
+        ours = VariableProjection(problem, options=options).solve(sigma=2e-5)
         for hessian in ("gauss-newton", "exact"):
             given = replace(options, hessian=hessian)
             ipopts = NonlinearProgram(problem, options=given).solve(sigma=2e-5)

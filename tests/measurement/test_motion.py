@@ -18,20 +18,22 @@ from linuxcnc import Joint, run_programs
 from machines import place
 
 from orthocal import calibrate, export_calibration, load_plan, simulate_session
+from orthocal.builder.build import make_robot
+from orthocal.builder.machine_file import Counting, Dimensions
 from orthocal.errors import ParameterError, SessionError
 from orthocal.export.linuxcnc.export import ExportOptions
 from orthocal.kinematics.loop_closure import nominal_assembly
 from orthocal.measurement.motion.motion import APPROACH, plan_motion, shown_joints
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
-from orthocal.robot.builder.build import make_robot
-from orthocal.robot.builder.dimensions import Counting, Sizes
 from orthocal.units import MM
 
 ROUNDED = 1e-4
 """Rounding of coordinates and joints in a program, [mm]. Half a unit in each of three
 joints moves the tool by less."""
 
-SMALL = Sizes(leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004)
+SMALL = Dimensions(
+    leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004
+)
 COUNTING = (Counting(True, 0.0), Counting(False, 0.005), Counting(False, None))
 
 PLAN = """robot: mine
@@ -42,7 +44,8 @@ postures:
   in: {joints_mm: [200, 245, 240]}
 setups:
   "y(x)#ä": {leg: x, touches: a, direction: y, section: {fraction: 0.5}}
-  xy: {leg: y, touches: b, direction: -x, section: {fraction: 0.4}, postures: [in, out]}
+  xy: {leg: y, touches: b, direction: -x, section: {fraction: 0.4}, postures: [in, out],
+       aligned_at: zero}
 """
 
 
@@ -77,12 +80,14 @@ def read_program(text, robot):
     return np.array(points), pauses
 
 
-def test_program_pauses_in_every_posture_in_order(small, motions):
+def test_program_pauses_in_the_alignment_posture_and_at_each_reading(small, motions):
     for motion in motions:
         text = write_program(small, motion)
         _, pauses = read_program(text, small.robot)
         rows = [r.posture for r in small.readings if r.setup == motion.setup]
         assert [s.posture for s in motion.stops if s.role == "reading"] == rows
+        if motion.setup == "xy":  # aligned in a posture that it does not read
+            rows = ["zero", *rows]
         assert len(pauses) == text.splitlines().count("M0") == len(rows)
         expected = nominal_assembly(small.robot).forward(
             np.array([small.postures[p].drives for p in rows])
@@ -92,6 +97,29 @@ def test_program_pauses_in_every_posture_in_order(small, motions):
         assert text.splitlines()[-1] == "M2"
         assert max(len(line) for line in text.splitlines()) < 255
         assert text.isascii()
+
+
+@pytest.mark.parametrize(
+    ("aligned_at", "separate"), [(None, False), ("zero", False), ("in", True), ("out", True)]
+)
+def test_gauge_is_aligned_at_the_first_pause(small, aligned_at, separate):
+    """The first setup reads zero first, the other postures later."""
+    name = next(iter(small.setups))
+    setups = {**small.setups, name: replace(small.setups[name], aligned_at=aligned_at)}
+    session = replace(small, setups=setups)
+    motion = plan_motion(session)[0]
+    assert (motion.alignment is not None) == separate
+    before_first_pause, between, *_ = write_program(session, motion).split("\nM0\n")
+    assert "mount the gauge, centre its ball on the rod" in before_first_pause
+    assert ("set the gauge zero, then read" in before_first_pause) == (not separate)
+    assert ("set the gauge zero, then read" in between) == separate
+    if motion.alignment is not None:
+        assert (motion.alignment.posture, motion.alignment.line) == (aligned_at, None)
+        assert motion.alignment.lift == ""
+        # the gauge is on the rod on the way to the first reading: its plunger is checked there
+        shallow = replace(small.gauge, range=(-2e-3, 2e-3))
+        first = plan_motion(replace(session, gauges={"": shallow}))[0].stops[0]
+        assert bool(first.lift) == (np.abs(motion.alignment.expected) > 2e-3)
 
 
 def test_commented_joints_reach_the_coordinates_by_pinocchio(small, motions):
@@ -214,17 +242,17 @@ def test_shift_moves_all_coordinates(small, motions):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("option", "value", "where"),
     [
-        (ProgramOptions(feed=0.0), "--feed: found 0; expected 1 to 20000 mm/min"),
-        (ProgramOptions(approach_feed=float("nan")), "--approach-feed: found nan"),
-        (ProgramOptions(shift_mm=(0.0, 1e9, 0.0)), "--shift-mm: expected numbers within"),
+        ("feed", 0.0, "--feed"),
+        ("approach_feed", float("nan"), "--approach-feed"),
+        ("shift_mm", (0.0, 1e9, 0.0), "--shift-mm"),
     ],
 )
-def test_feeds_and_shifts_out_of_range_are_refused(small, motions, options, message):
-    with pytest.raises(ParameterError) as e:
-        write_program(small, motions[0], options)
-    assert message in str(e.value)
+def test_feeds_and_shifts_out_of_range_are_refused(option, value, where):
+    with pytest.raises(ParameterError) as refused:
+        ProgramOptions(**{option: value})
+    assert refused.value.where == where
 
 
 def test_too_many_readings_are_refused(small):

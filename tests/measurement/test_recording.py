@@ -15,14 +15,13 @@ import numpy as np
 import pytest
 
 from orthocal import load_session
-from orthocal.cli.record import record
+from orthocal.cli import record as command
 from orthocal.errors import OrthocalError, OutputError, SessionError
-from orthocal.hypotheses import prediction as foresight
 from orthocal.io.tables.numerals import parse_typed_reading
+from orthocal.measurement import recording as module
 from orthocal.measurement.files import session_file
 from orthocal.measurement.files.session_file import load_plan, load_rows
-from orthocal.measurement.recording import recording as module
-from orthocal.measurement.recording.recording import SUFFIX, open_recording
+from orthocal.measurement.recording import SUFFIX, open_recording
 from orthocal.runtime.interrupts import ending_at_interrupt
 from orthocal.units import MM
 
@@ -108,6 +107,27 @@ def test_what_is_read_is_on_disk_at_once_and_all_of_it_makes_a_session(plan):
     assert [v / MM for v in session.values] == pytest.approx(0.01 * np.arange(12) - 0.05)
 
 
+def test_what_was_measured_is_a_session_of_the_rows_that_were_read(plan):
+    with open_recording(plan) as r:
+        for i in (1, 3, 4):
+            r.read(i, 0.1 * i * MM)
+        read = r.measured()
+        assert [x.line for x in read.readings] == [3, 5, 6]
+        assert [x.line for x in r.measured(without=[3]).readings] == [3, 6]
+        assert read.values == pytest.approx(np.array([0.1, 0.3, 0.4]) * MM)
+        aligned_at = r.session.alignment_postures["yx"]
+        assert read.alignment_postures == {"yx": aligned_at}
+        r.drop(0)
+        assert [x.line for x in r.measured().readings] == [2, 4, 5]
+        for i in r.missing:
+            r.read(i, 0.0)
+        complete = r.measured()
+    loaded = load_session(plan)
+    assert [x.line for x in complete.readings] == [x.line for x in loaded.readings]
+    assert complete.values == pytest.approx(loaded.values, abs=1e-15)
+    assert complete.alignment_postures == loaded.alignment_postures
+
+
 def test_what_nobody_touched_stays_byte_by_byte(root, tmp_path):
     folder = shutil.copytree(root / "examples/table1/experiment-2", tmp_path / "s")
     before = (folder / "readings.csv").read_bytes()
@@ -176,7 +196,9 @@ def test_the_only_row_stays(plan):
 def test_two_people_do_not_record_one_session(plan):
     with (
         open_recording(plan),
-        pytest.raises(OrthocalError, match=r"journal: .* recorded by somebody else; one at a time"),
+        pytest.raises(
+            OrthocalError, match=r"journal: .* recorded by another process; one at a time"
+        ),
         open_recording(plan),
     ):
         pass
@@ -196,7 +218,7 @@ def test_cut_off_between_journal_and_table_a_reading_is_there_all_the_same(plan,
     monkeypatch.undo()
     assert list(values(plan).values())[:2] == [0.1, None]
     with open_recording(plan) as r:
-        assert (r.redone, r.edited) == (1, False)
+        assert (r.restored, r.edited) == (1, False)
         assert r.missing[0] == 2
     assert list(values(plan).values())[:3] == [0.1, 0.2, None]
 
@@ -213,7 +235,7 @@ def test_after_a_power_cut_several_changes_are_done_again(plan, monkeypatch):
         new = (plan / "readings.csv").read_bytes()
     (plan / "readings.csv").write_bytes(old)
     with open_recording(plan) as r:
-        assert r.redone == 4
+        assert r.restored == 4
     assert (plan / "readings.csv").read_bytes() == new
 
 
@@ -221,15 +243,15 @@ def test_a_table_edited_by_hand_counts(plan, monkeypatch):
     with open_recording(plan) as r:
         blank = (plan / "readings.csv").read_bytes()
         r.read(0, 0.1 * MM)
-    (plan / "readings.csv").write_bytes(blank)  # as it was once: left in order, nothing is redone
+    (plan / "readings.csv").write_bytes(blank)  # as it was once: left in order, nothing is restored
     with open_recording(plan) as r:
-        assert (r.redone, r.missing[0]) == (0, 0)
+        assert (r.restored, r.missing[0]) == (0, 0)
         monkeypatch.setattr(module.Recording, "close", lambda self: None)
         r.read(0, 0.3 * MM)
     edited = (plan / "readings.csv").read_text().replace("0.30", "0.35")
     (plan / "readings.csv").write_text(edited)
     with open_recording(plan) as r:
-        assert (r.redone, r.edited) == (0, True)
+        assert (r.restored, r.edited) == (0, True)
     assert values(plan)["yx", "zero", 1] == 0.35
 
 
@@ -253,14 +275,17 @@ DIGESTS = '"before": "BEFORE", "after": ""}'
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("nonsense\n", "is no recording's journal; move it away"),
-        ('{"format": "orthocal/study/1"}\n', "is no recording's journal"),
-        ("HEAD" + "[1]\n", r"journal:2: is no line of a recording: it is damaged"),
-        ("HEAD" + READ.replace("0.1", "NaN") + DIGESTS + "\n", ":2: is no line of a recording"),
-        ("HEAD" + READ.replace("0.1", "1e9") + DIGESTS + "\n", ":2: is no line of a recording"),
-        ("HEAD" + READ.replace("read", "burnt", 1) + DIGESTS + "\n", "is no line of a recording"),
-        ("HEAD" + "[" * 70_000 + "\n", "is no line of a recording"),
-        ("HEAD" + "x" * 70_000, "is no line of a recording"),
+        ("nonsense\n", "is not the journal of a recording; move it away"),
+        ('{"format": "orthocal/study/1"}\n', "is not the journal of a recording"),
+        ("HEAD" + "[1]\n", r"journal:2: is not a line of a recording: the journal is damaged"),
+        ("HEAD" + READ.replace("0.1", "NaN") + DIGESTS + "\n", ":2: is not a line of a recording"),
+        ("HEAD" + READ.replace("0.1", "1e9") + DIGESTS + "\n", ":2: is not a line of a recording"),
+        (
+            "HEAD" + READ.replace("read", "burnt", 1) + DIGESTS + "\n",
+            "is not a line of a recording",
+        ),
+        ("HEAD" + "[" * 70_000 + "\n", "is not a line of a recording"),
+        ("HEAD" + "x" * 70_000, "is not a line of a recording"),
         ("HEAD" + READ.replace("yx", "no") + DIGESTS + "\n", r":2: does not fit readings\.csv"),
     ],
 )
@@ -285,21 +310,22 @@ def talk(folder, lines, said):
     sys.stdin = os.fdopen(0, "r", encoding="utf-8", closefd=False)
     sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
     with ending_at_interrupt():
-        record(folder)
+        command.record(folder)
 
 
-KEPT = re.compile(r"Kept: row \d+, (\S+) (\S+?)(?:, cycle (\d+))?: (-?[0-9.]+) mm\n")
+KEPT = re.compile(r"Recorded: row \d+, (\S+) (\S+?)(?:, cycle (\d+))?: (-?[0-9.]+) mm\n")
 
 
 def test_killed_a_hundred_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
     """Killed while lines come in as fast as they are taken, among them corrections and repeats."""
     monkeypatch.setenv("COLUMNS", "100")
     folder = make_plan(tmp_path / "session", cycles=150)  # more than are read before all ends
-    monkeypatch.setattr(foresight, "build_foresight", lambda session: None)
+    monkeypatch.setattr(command._Dialogue, "_is_doubtful", lambda *_: False)
+    monkeypatch.setattr(command._Dialogue, "_judge", lambda *_: None)
     robot = load_plan(folder).robot
     monkeypatch.setattr(session_file, "load_robot", lambda *_, **__: robot)
     rng = np.random.default_rng(0)
-    accepted, redone, busy = {}, 0, 0
+    accepted, restored, busy = {}, 0, 0
     for _ in range(KILLS):
         lines_out, lines_in = os.pipe()
         said_out, said_in = os.pipe()
@@ -316,7 +342,7 @@ def test_killed_a_hundred_times_no_accepted_reading_is_lost(tmp_path, monkeypatc
                 text += ["back", f"{value / 100 - 0.01:.2f}"]
         os.write(lines_in, ("\n".join(text) + "\n").encode()[:60_000])
         answer = b""
-        while b"Kept" not in answer:  # what comes before is the same every time
+        while b"Recorded: row" not in answer:  # what comes before is the same every time
             answer += os.read(said_out, 65536)
         time.sleep(float(rng.uniform(0.0, 0.05)))
         os.kill(child.pid, signal.SIGKILL)
@@ -331,8 +357,8 @@ def test_killed_a_hundred_times_no_accepted_reading_is_lost(tmp_path, monkeypatc
         assert [float(value) for *_, value in found] == numbers[: len(found)]
         accepted |= {(s, p, int(c or 1)): float(v) for s, p, c, v in found}
         with open_recording(folder) as r:  # it loads as it lies there, whenever it was
-            assert r.redone <= 1
-            redone += r.redone
+            assert r.restored <= 1
+            restored += r.restored
             there = {
                 row.key[:2] + row.key[3:]: round(row.value / MM, 9)
                 for row in r.rows
@@ -345,7 +371,7 @@ def test_killed_a_hundred_times_no_accepted_reading_is_lost(tmp_path, monkeypatc
         accepted = there
     assert busy == KILLS
     assert len(accepted) > KILLS // 2
-    assert redone > 0
+    assert restored > 0
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,9 @@ from machines import reading_by_pinocchio
 from tolerances import KINEMATICS, PRINTED, THREE_DECIMALS_MM
 
 from orthocal import load_plan, load_session
+from orthocal.observation.contacts import locate_contacts
+from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_frames import locate_contacts, predict_entries
 from orthocal.sensors.leg_indicator import Section
 
 OFFSETS = ("x_slide.offset", "y_slide.offset", "z_slide.offset")
@@ -20,7 +21,9 @@ OFFSETS = ("x_slide.offset", "y_slide.offset", "z_slide.offset")
 
 def differences(session, offsets):
     o = build_observations(session)
-    return o.rows(predict_entries(session, o, dict(zip(OFFSETS, offsets, strict=True))))
+    return o.rows(
+        predict_readings(session, dict(zip(OFFSETS, offsets, strict=True)), observations=o)
+    )
 
 
 def test_readings_equal_those_of_a_pinocchio_machine_with_all_errors(root):
@@ -48,7 +51,7 @@ def test_readings_equal_those_of_a_pinocchio_machine_with_all_errors(root):
     names = plan.robot.parameters.select(["*", "!frame.*_leg_root.*"])
     rng = np.random.default_rng(3)
     errors = {n: 5.0 * plan.robot.parameters[n].tolerance * rng.normal() for n in names}
-    ours = predict_entries(plan, o, errors)
+    ours = predict_readings(plan, errors, observations=o)
     machine = plan.robot.with_errors(errors)
     seen = set()
     for i in range(o.size):
@@ -84,13 +87,13 @@ def test_a_negative_direction_turns_the_sign(raw_cycles):
         n: replace(s, sensor=replace(s.sensor, direction=f"-{s.sensor.direction}"))
         for n, s in raw_cycles.setups.items()
     }
-    there = predict_entries(replace(raw_cycles, setups=turned), o, errors)
-    assert np.abs(there + predict_entries(raw_cycles, o, errors)).max() < KINEMATICS
+    there = predict_readings(replace(raw_cycles, setups=turned), errors, observations=o)
+    assert np.abs(there + predict_readings(raw_cycles, errors, observations=o)).max() < KINEMATICS
 
 
 def test_a_perfect_machine_shows_no_deviation(raw_cycles):
     o = build_observations(raw_cycles)
-    assert np.abs(predict_entries(raw_cycles, o)).max() < KINEMATICS * 10
+    assert np.abs(predict_readings(raw_cycles, observations=o)).max() < KINEMATICS * 10
 
 
 def test_offsets_that_the_controller_corrects_do_not_show(raw_cycles):
@@ -98,7 +101,7 @@ def test_offsets_that_the_controller_corrects_do_not_show(raw_cycles):
     postures = {n: replace(p, drives=p.drives - offsets) for n, p in raw_cycles.postures.items()}
     corrected = replace(raw_cycles, postures=postures, controller_offsets=offsets)
     o = build_observations(corrected)
-    shown = predict_entries(corrected, o, dict(zip(OFFSETS, offsets, strict=True)))
+    shown = predict_readings(corrected, dict(zip(OFFSETS, offsets, strict=True)), observations=o)
     assert np.abs(shown).max() < KINEMATICS * 10
 
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from linkages import joint, write_robot, write_wide_linkage
-from scipy.stats import binom
+from scipy.stats import binom, norm
 from tolerances import KINEMATICS, TRUTH_BACK
 
 from orthocal import calibrate, load_plan, load_session, write_session
 from orthocal.assessment.controller_entries import find_entries
-from orthocal.assessment.validation import CHANGE_CHANCE, validate_calibration
+from orthocal.assessment.predictive import chance_of_deviations, expect_rms
+from orthocal.assessment.validation import validate_calibration
+from orthocal.calibration.refit import repeat_calibration, repeat_fit
 from orthocal.errors import SessionError
 from orthocal.measurement.motion.motion import guide
-from orthocal.measurement.recording.recording import open_recording
+from orthocal.measurement.recording import open_recording
 from orthocal.observation.simulate import simulate_session
 from orthocal.output.text.recording import describe_row
 from orthocal.statistics.chance import BY_CHANCE
@@ -89,7 +91,7 @@ def test_offsets_in_the_controller_lead_to_the_same_truth(tmp_path, robot, unit)
     results = []
     for plan in (plain, active):
         session = simulate_session(plan, OFFSETS, exact=True).session
-        results.append((session, calibrate(session)))
+        results.append((session, calibrate(session, "offsets")))
     (first, one), (second, other) = results
     assert np.abs(first.values - second.values).max() > 1e-5
     for name, value in OFFSETS.items():
@@ -114,22 +116,35 @@ def test_offsets_survive_a_round_trip(tmp_path, robot):
 
 def test_what_was_identified_is_validated(tmp_path, robot):
     """Entered as found, it is confirmed; entered otherwise, the key that states it is named."""
-    before, confirmed, sizes = load_plan(write_plan(tmp_path / "a", robot)), [], []
+    before = load_plan(write_plan(tmp_path / "a", robot))
+    chances, confirmed, sizes = [], [], []
     for seed in range(40):  # legs that turn by 6 degrees: how a gauge stands matters most
-        found = calibrate(simulate_session(before, OFFSETS, seed=seed).session)
+        first = simulate_session(before, OFFSETS, seed=seed)
+        found = calibrate(first.session)
         entered = [round(e.enter * 1e3, 4) for e in find_entries(found)]
         folder = tmp_path / f"b{seed}"
         plan = load_plan(write_plan(folder, robot, f"{{offsets_mrad: {entered}}}"))
-        new = simulate_session(plan, OFFSETS, seed=seed + 1000).session
+        second = simulate_session(plan, OFFSETS, seed=seed + 1000)
+        # the same dial in both sessions: at 10 mm its scale matters more than its noise
+        scales = [1.0 + s.unknowns["gauge.scale"] for s in (first, second)]
+        new = second.session.with_values(second.session.values * scales[0] / scales[1])
         result = validate_calibration(found, new)
+        assert result.mistake is None
         confirmed.append(result.confirmed)
-        sizes.append((result.expected_rms, result.achieved_rms))
-    # one in a hundred is refused for its noise, one in twenty for a change
-    assert binom.cdf(sum(confirmed), 40, (1 - BY_CHANCE) * (1 - CHANGE_CHANCE)) > 0.01
-    # how gauges stood is what is expected to differ most
-    expected, achieved = np.sqrt(np.mean(np.square(sizes), axis=0))
-    assert expected > 2.0 * found.rms_after
-    assert achieved == pytest.approx(expected, rel=0.2)
+        # another dial, as it is predicted
+        fit = repeat_fit(found, second.session)
+        chances.append(chance_of_deviations(found, fit))
+        achieved = repeat_calibration(found, second.session).rms_before
+        sizes.append((expect_rms(found, fit), achieved))
+    # one in a hundred is refused for its deviations
+    assert binom.cdf(np.sum(np.array(chances) >= BY_CHANCE), 40, 1 - BY_CHANCE) > 0.01
+    # an offset is compared with the one entered, which is as uncertain: 2 / √2 standard deviations
+    kept = 2.0 * norm.cdf(2.0 / np.sqrt(2.0)) - 1.0
+    assert binom.cdf(sum(confirmed), 40, (1 - BY_CHANCE) * kept**2) > 0.01
+    # mountings are what differs most
+    predicted, achieved = np.sqrt(np.mean(np.square(sizes), axis=0))
+    assert predicted > 2.0 * found.rms_after
+    assert achieved == pytest.approx(predicted, rel=0.2)
     wrong = load_plan(write_plan(tmp_path / "c", robot, "{offsets_deg: [0, 0]}"))
     with pytest.raises(
         SessionError, match=r"controller.*: motor_a has 0 mrad where the calibration"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -22,11 +21,13 @@ from orthocal import (
     simulate_session,
     summarize,
 )
-from orthocal.assessment.findings.calibration import decide
+from orthocal.assessment.assess import expanded_uncertainty
+from orthocal.assessment.words.entries import describe_tool_error
 from orthocal.output.report.page import build_report
-from orthocal.output.text.answer import _suspicion, render_answer
+from orthocal.output.text.answer import LISTED, MORE, MOST_LISTED, render_answer
 from orthocal.output.text.layout import to_text
 from orthocal.output.text.summary import render_calibration
+from orthocal.statistics.chance import coverage_factor
 
 MOST_LINES = 40
 
@@ -35,10 +36,14 @@ NOT_SAID = (
 )
 """Words of the field that a short answer does without."""
 
-EXAMPLES = [
-    *("raw-cycles", "sweep", "lines"),
-    *(f"table1/experiment-{n}" for n in ("1-printed", "1-corrected", "2", "3")),
-]
+EXAMPLES = {
+    "raw-cycles": "offsets",
+    "sweep": "offsets",
+    "lines": "offsets",
+    "workshop": "full",
+    **{f"table1/experiment-{n}": "offsets" for n in ("1-printed", "1-corrected", "2", "3")},
+}
+"""Examples and their models."""
 
 
 def machine_of_250_mm(folder):
@@ -52,13 +57,15 @@ def machine_of_250_mm(folder):
 @pytest.fixture(scope="module")
 def answers(root, tmp_path_factory):
     """Calibrations of all examples, and of what may be the matter with them."""
-    found = {n: calibrate(load_session(session_folder(root, n))) for n in EXAMPLES}
+    found = {
+        n: calibrate(load_session(session_folder(root, n)), model) for n, model in EXAMPLES.items()
+    }
     cycles = load_session(root / "examples/raw-cycles")
     sign = np.where([r.setup == "zx" for r in cycles.readings], -1.0, 1.0)
     found["turned"] = calibrate(cycles.with_values(sign * cycles.values))
     lines = load_session(root / "tests/sessions/lines")
     sign = np.where([r.setup == "yx" for r in lines.readings], -1.0, 1.0)
-    found["turned lines"] = calibrate(lines.with_values(sign * lines.values))
+    found["turned lines"] = calibrate(lines.with_values(sign * lines.values), "offsets")
     slips = cycles.values.copy()
     slips[[4, 11, 20, 31, 40, 47, 52]] += 0.3e-3
     found["slips"] = calibrate(cycles.with_values(slips))
@@ -67,7 +74,8 @@ def answers(root, tmp_path_factory):
     found["inches"] = calibrate(cycles.with_values(np.round(cycles.values / 25.4, 7)))
     found["full"] = calibrate(load_session(root / "examples/sweep"), "full")
     found["lengths"] = calibrate(cycles, "lengths")
-    found["250 mm"] = calibrate(machine_of_250_mm(tmp_path_factory.mktemp("short")))
+    short = machine_of_250_mm(tmp_path_factory.mktemp("short"))
+    found["250 mm"] = calibrate(short, "offsets")
     bare = replace(cycles, robot=replace(cycles.robot, tcp=None))
     found["no tool"] = calibrate(bare)
     found["no offset"] = calibrate(cycles, Choice(free=["x_leg.length"]))
@@ -76,18 +84,8 @@ def answers(root, tmp_path_factory):
 
 CASES = [
     *EXAMPLES,
-    *(
-        "turned",
-        "turned lines",
-        "slips",
-        "huber",
-        "inches",
-        "full",
-        "lengths",
-        "250 mm",
-        "no tool",
-        "no offset",
-    ),
+    *("turned", "turned lines", "slips", "huber", "inches", "full", "lengths", "250 mm"),
+    *("no tool", "no offset"),
 ]
 
 
@@ -104,99 +102,110 @@ def test_an_answer_is_short_and_in_plain_words(answers, name):
         assert "\n\n\n" not in text
 
 
+def words_of(calibration, **options):
+    return " ".join(summarize(calibration, **options).split())
+
+
 @pytest.mark.parametrize("name", CASES)
-def test_what_was_measured_comes_first_then_the_decision_and_then_the_rest(answers, name):
+def test_the_subject_comes_first_then_the_decision_and_then_the_rest(answers, name):
     calibration = answers[name]
-    decision = decide(calibration)
-    text = " ".join(summarize(calibration).split())
+    found = calibration.assessment
+    text = words_of(calibration)
     parts = [
-        "Calibration of orthoglide" if name != "250 mm" else "Calibration of machine",
+        f"Calibration of {calibration.robot_record.name}, model '{calibration.model}'",
         f"Machine: legs of {'250' if name == '250 mm' else '310.25'} mm, travel",
         "Measured: ",
-        f"{decision.headline} {decision.reason}",
-        *([f"Next: {decision.action}"] if decision.action else []),
-        "--details shows",
+        f"{found.decision.headline} {found.decision.reason}",
+        *(f.text for f in found.of_kind("tool error")),
+        "Next: ",
+        MORE,
     ]
-    places = [text.index(" ".join(part.split())) for part in parts if "machine" not in part]
+    places = [text.index(" ".join(part.split())) for part in parts]
     assert places == sorted(places), places
-    assert text.count(decision.headline) == 1
+    assert text.count(found.decision.headline) == 1
+    if found.decision.verdict != "enter":
+        assert f"Next: {found.decision.action}".strip() in text
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_nothing_grave_is_kept_back(answers, name):
-    """Whatever stops or warns is said; readings that stand out are named or counted."""
+    """Whatever decides is shown, up to the most that are listed, the gravest first."""
+    found = answers[name].assessment
+    text = words_of(answers[name])
+    grave = [f for f in found.findings if f.severity != "note"]
+    for finding in grave[: MOST_LISTED + 1]:
+        assert " ".join(finding.text.split()) in text
+    order = {"reject": 0, "review": 1, "note": 2}
+    ranks = [order[f.severity] for f in found.findings]
+    assert ranks == sorted(ranks)
+    # all of them are in the details
+    details = words_of(answers[name], details=True)
+    assert all(" ".join(f.text.split()) in details for f in found.findings)
+
+
+@pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles", "250 mm", "workshop"])
+def test_values_to_enter_have_their_expanded_uncertainty(answers, name):
     calibration = answers[name]
-    decision = decide(calibration)
-    text = " ".join(summarize(calibration).split())
-    for finding in decision.findings:
-        if finding.severity != "informs" and finding.kind != "suspicious reading":
-            assert " ".join(finding.text.split()) in text
-    found = decision.of_kind("suspicious reading")
-    if decision.of_kind("turned setup"):
+    lines = [line.split() for line in summarize(calibration).splitlines()]
+    for e in calibration.assessment.entries:
+        half = expanded_uncertainty(calibration, e)
+        assert half >= (2.0 - 1e-12) * e.std
+        (row,) = [cells for cells in lines if cells[:1] == [e.drive]]
+        assert row[-3:] == [f"{e.enter * 1e3:+.3f}", f"{half * 1e3:.3f}", "mm"]
+
+
+def test_few_degrees_of_freedom_widen_the_noise_alone(answers):
+    """Six differences and three offsets: Student's factor 3.18, of the scatter only."""
+    calibration = answers["table1/experiment-2"]
+    factor = coverage_factor(calibration.dof)
+    assert factor == pytest.approx(3.18, abs=0.01)
+    for e in calibration.assessment.entries:
+        rest = e.std**2 - e.std_scatter**2
+        expected = np.sqrt((factor * e.std_scatter) ** 2 + 4.0 * rest)
+        assert expanded_uncertainty(calibration, e) == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_rejected_session_offers_nothing_to_type(answers):
+    calibration = answers["table1/experiment-1-printed"]
+    assert calibration.assessment.decision.verdict == "reject"
+    assert "x_slide" not in summarize(calibration).split()
+    assert "x_slide" in summarize(calibration, details=True).split()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_one_tool_error_in_one_sentence_everywhere(answers, name):
+    calibration = answers[name]
+    found = calibration.assessment
+    if found.tool is None:
+        assert found.of_kind("out of reach")[0].text in words_of(calibration)
         return
-    for finding in found[:5]:
-        place = finding.places[0]
-        assert f"line {place.line}: {place.setup} {place.posture}" in text
-    assert (f"and {len(found) - 5} more" in text) == (len(found) > 5)
+    sentence = describe_tool_error(found.tool, keep=found.keeps_offsets)
+    (stated,) = found.of_kind("tool error")
+    assert stated.text == sentence
+    assert stated.numbers["entered_um"] == pytest.approx(found.tool.entered * 1e6)
+    assert words_of(calibration).count(sentence) == 1
+    # the answer, the section of the tool, the findings, and what to enter if anything is
+    assert words_of(calibration, details=True).count(sentence) == 3 + bool(found.entries)
+    assert ("corrects all errors: " in words_of(calibration)) == (not calibration.only_offsets)
 
 
-def test_suspicious_readings_are_named_by_file_and_line(answers, root):
-    text = summarize(answers["huber"])
-    rows = load_session(root / "examples/raw-cycles").readings
-    lines = {int(n) for n in re.findall(r"line (\d+): ", text)}
-    assert len(lines) == 5
-    assert lines <= {rows[i].line for i in (4, 11, 20, 31, 40, 47, 52)}
-    assert "readings.csv:" in text
-    assert "Check before you enter these. 7 readings contradict all others." in text
+def test_offsets_that_need_no_change_are_left_as_they_are(answers):
+    found = answers["table1/experiment-3"].assessment
+    assert found.keeps_offsets
+    assert found.decision.verdict == "enter"
+    assert found.tool.now == pytest.approx(156.6e-6, rel=0.02)
+    assert not found.of_kind("must change")
+    entered = answers["table1/experiment-2"].assessment
+    assert not entered.keeps_offsets
+    assert entered.tool.entered < entered.tool.now
 
 
-def test_a_reading_that_the_fit_gives_way_to_does_not_contradict_itself(answers):
-    first = decide(answers["huber"]).of_kind("suspicious reading")[0]
-    assert "mm, expected" in _suspicion(first)
-    followed = replace(
-        first, numbers=first.numbers | {"expected_mm": first.numbers["measured_mm"] + 1e-5}
-    )
-    assert _suspicion(followed).endswith("mm; the fit gives way, all others say otherwise")
-
-
-def test_a_turned_setup_accuses_no_single_reading_and_offers_nothing_to_type(answers):
-    text = summarize(answers["turned lines"])
-    assert answers["turned lines"].suspicious
-    assert "Suspicious" not in text
-    assert "x_slide" not in text
-    assert "At the tool" not in text
-    # all of that stands in the details
-    assert "Suspicious readings" in summarize(answers["turned lines"], details=True)
-
-
-@pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles", "250 mm"])
-def test_what_to_enter_has_one_spread_of_all_that_is_not_known(answers, name):
-    calibration = answers[name]
-    text = summarize(calibration)
-    for p, std in zip(calibration.free, calibration.total_std, strict=True):
-        row = next(
-            t for t in text.splitlines() if t.split()[:1] == [p.name.removesuffix(".offset")]
-        )
-        assert row.split()[-3:] == [f"{p.value * 1e3:+.3f}", f"{std * 1e3:.3f}", "mm"]
-    assert text.count("±:") == 1
-    assert "one standard deviation of all that is not known" in " ".join(text.split())
-
-
-def test_the_tool_is_promised_in_micrometres(answers):
-    for name in ("table1/experiment-2", "full", "250 mm"):
-        calibration = answers[name]
-        n = decide(calibration).of_kind("at the tool")[0].numbers
-        text = " ".join(summarize(calibration).split())
-        assert f"At the tool expect {n['expected_um']:.0f} µm with these entered" in text or (
-            f"At the tool expect {n['expected_um']:.1f} µm with these entered" in text
-        )
-    assert "In a controller that knows all errors: " in " ".join(summarize(answers["full"]).split())
-    text = " ".join(summarize(answers["table1/experiment-2"]).split())
-    assert "at 2.1 times their tolerances" in text
-    text = " ".join(summarize(answers["table1/experiment-3"]).split())
-    assert "At the tool expect 126 µm as it is" in text
-    assert "Leave the offsets as they are" in text
-    assert "no tool centre point" in " ".join(summarize(answers["no tool"]).split())
+def test_the_scale_of_the_tolerances_is_listed(answers):
+    calibration = answers["table1/experiment-2"]
+    (found,) = calibration.assessment.of_kind("above tolerances")
+    assert found.numbers["tolerance_scale"] == calibration.tolerance_scale > 1.0
+    assert found.kind in LISTED
+    assert " ".join(found.text.split()) in words_of(calibration)
 
 
 def test_long_names_and_paths_leave_it_short(answers):
@@ -220,8 +229,8 @@ def test_details_and_all_hold_the_answer_and_the_rest(answers):
         details = summarize(calibration, details=True)
         assert details.startswith(answer)
         for title in (
-            *("How it was done", "What was identified", "What the readings tell"),
-            *("Readings before and after", "How well it fits", "At the tool", "What it means"),
+            *("How it was done", "What was identified", "Identifiability"),
+            *("Readings before and after", "How well it fits", "At the tool", "Findings"),
             "What to enter into the controller",
         ):
             assert f"\n{title}\n" in details
@@ -235,17 +244,16 @@ def test_notebook_and_report_show_the_same_answer(answers):
     reports = {}
     for name in ("table1/experiment-2", "turned", "slips"):
         calibration = answers[name]
-        decision = decide(calibration)
+        decision = calibration.assessment.decision
         notebook, reports[name] = calibration._repr_html_(), build_report(calibration)
         for page in (notebook, reports[name]):
             assert decision.headline in page
-            for finding in decision.findings:
-                if finding.severity == "stops":
+            for finding in calibration.assessment.findings:
+                if finding.severity != "note" or finding.kind == "tool error":
                     assert finding.text.replace("'", "&#x27;") in page
         assert "studentised" not in notebook
-    report = reports["turned"]
-    # what was found stands in the long form, though it is not to be entered
-    assert report.index("Do not enter these.") < report.index("<td>x_slide</td>")
+    headline = answers["turned"].assessment.decision.headline
+    assert reports["turned"].index(headline) < reports["turned"].index("<td>x_slide</td>")
 
 
 def test_an_answer_without_heading_is_the_rest_of_it(answers):

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
 
-from orthocal import Choice, calibrate, load_session, summarize
-from orthocal.output.text.explanation import advise, explain_fit
+from orthocal import calibrate, load_session, summarize
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +20,7 @@ def line(text, beginning):
 
 def test_linear_and_exact_stand_side_by_side(table1):
     row = line(summarize(table1, details=True), "y_slide.offset").split()
-    assert row[1:4] == ["+0.599", "+0.592", "0.517"]
+    assert row[1:4] == ["+0.599", "+0.592", "1.409"]
     assert row[-3:] == ["-0.0068", "-0.013", "mm"]
 
 
@@ -48,22 +46,26 @@ def test_sigma_is_held_against_the_gauges_own(table1):
     text = " ".join(summarize(table1, details=True).split())
     assert "σ of a difference: 0.276 mm, from the residuals, 3 degrees of freedom" in text
     assert "σ given for the gauge: 0.020 mm a reading, 0.028 mm a difference" in text
-    assert (
-        "is 10 times what the gauge itself would leave (0.028 mm): it is error of the model" in text
-    )
+    (found,) = table1.assessment.of_kind("model error")
+    assert found.numbers["ratio"] == pytest.approx(10.0, abs=0.3)
+    assert found.text in text
 
 
 def test_it_says_what_to_type_and_what_to_believe(table1):
     text = summarize(table1, details=True)
     entered = text[text.index("What to enter into the controller") :]
-    assert line(entered, "z_slide").split() == [*("z_slide", "+0.000", "-1.761", "0.519", "mm")]
-    assert "Offsets that must change (95 %, with all that is not known): z_slide." in text
+    assert line(entered, "z_slide").split() == [*("z_slide", "+0.000", "-1.761", "1.414", "mm")]
+    (found,) = table1.assessment.of_kind("must change")
+    assert [p.parameter for p in found.places] == ["z_slide"]
+    assert found.text in text
 
 
 def test_an_unstated_controller_is_said_to_be_so(root):
-    text = summarize(calibrate(load_session(root / "examples/table1/experiment-3")), details=True)
-    assert "add to the present offset" in text
-    assert "does not state the offsets that were active" in text
+    result = calibrate(load_session(root / "examples/table1/experiment-3"))
+    (found,) = result.assessment.of_kind("controller not stated")
+    text = " ".join(summarize(result, details=True).split())
+    assert found.text in text
+    assert result.assessment.entries[0].active is None
 
 
 def _silent(session):
@@ -71,36 +73,50 @@ def _silent(session):
     return session.with_gauge(replace(session.gauge, sigma=None))
 
 
-def test_readings_that_fit_are_said_to_fit(raw_cycles):
-    sentences = explain_fit(calibrate(_silent(raw_cycles)))
-    assert "What remains is what repeated cycles scatter by: the model fits." in sentences
+def spoil(session, rows, by):
+    values = session.values.copy()
+    values[rows] += by
+    return session.with_values(values)
 
 
-def test_cycles_that_cannot_explain_the_residuals_are_said_to_be_model_error(raw_cycles):
-    values = raw_cycles.values.copy()
-    for i, r in enumerate(raw_cycles.readings):
-        if (r.setup, r.posture) == ("yx", "x_max"):
-            values[i] += 0.3e-3  # every time again
-    result = calibrate(raw_cycles.with_values(values))
-    assert result.noise.source == "residuals"
-    assert "times what repeated cycles scatter by" in " ".join(explain_fit(result))
+def every_time(session):
+    """One posture of one setup off by as much in every cycle."""
+    rows = [(r.setup, r.posture) == ("yx", "x_max") for r in session.readings]
+    return calibrate(spoil(session, rows, 0.3e-3))
 
 
-def test_one_wrong_sign_among_cycles_is_pointed_at(raw_cycles):
-    """Every single reading of 0.1 mm or more, its sign turned in one cycle of three."""
-    turned = 0
-    for i, r in enumerate(raw_cycles.readings):
-        if abs(r.value) >= 0.1e-3 and i % 4 == 0:
-            values = raw_cycles.values.copy()
-            values[i] = -values[i]
-            text = " ".join(explain_fit(calibrate(raw_cycles.with_values(values))))
-            assert f"readings.csv:{r.line}: " in text
-            if f"the sign of {r.label}" in text:
-                turned += 1
-                continue
-            assert f"They differ most at {r.label}" in text
-            assert "Check these for a wrong sign or row" in text
-    assert turned >= 6
+def once(session):
+    rows = tuple(r for r in session.readings if r.cycle == 1)
+    return calibrate(_silent(replace(session, readings=rows)))
+
+
+def three_rows(session):
+    return calibrate(_silent(replace(session, readings=session.readings[1:4])))
+
+
+def three_stated_rows(session):
+    return calibrate(replace(session, readings=session.readings[1:4]))
+
+
+EXPLAINED = {
+    "fits": (lambda c, e: calibrate(_silent(c)), {"scatter_mm": 0.0102}),
+    "model error": (lambda c, e: calibrate(e), {"ratio": 9.8, "sigma_mm": 0.195}),
+    "model error beside cycles": (lambda c, e: every_time(c), {}),
+    "noise from residuals": (lambda c, e: once(c), {}),
+    "noise unknown": (lambda c, e: three_rows(e), {}),
+    "no redundancy": (lambda c, e: three_stated_rows(e), {"parameters": 3.0}),
+}
+"""Kinds of findings that explain a fit, the calibration, and numbers."""
+
+
+@pytest.mark.parametrize("case", EXPLAINED)
+def test_a_fit_is_explained(raw_cycles, experiment_2, case):
+    make, numbers = EXPLAINED[case]
+    result = make(raw_cycles, experiment_2)
+    (found,) = result.assessment.of_kind(case.removesuffix(" beside cycles"))
+    for name, value in numbers.items():
+        assert found.numbers[name] == pytest.approx(value, rel=0.02)
+    assert " ".join(found.text.split()) in " ".join(summarize(result, details=True).split())
 
 
 def test_a_prior_marks_what_the_readings_leave_open(root):
@@ -108,7 +124,7 @@ def test_a_prior_marks_what_the_readings_leave_open(root):
     text = summarize(result, details=True)
     assert line(text, "x_leg.length").split()[4] == "0%"
     assert line(text, "x_slide.offset").split()[4] == "99%"
-    assert "told: how much of what the tolerance left open" in text
+    assert "resolved: part of the prior variance that the readings removed" in text
     assert "tolerances as prior" in text
 
 
@@ -127,99 +143,3 @@ def test_names_from_files_are_not_markup(table1):
     text = summarize(replace(table1, residuals=rows, setups=setups, session=titled), details=True)
     assert "[red]y " in text
     assert "[bold]x[/nonsense]" in text
-
-
-# ---- whether to enter what was identified
-
-
-def turn(session, setup):
-    values = [-r.value if r.setup == setup else r.value for r in session.readings]
-    return session.with_values(values)
-
-
-def test_sound_readings_are_to_be_entered(raw_cycles):
-    assert advise(calibrate(_silent(raw_cycles))) == (
-        "Enter these, and measure again. What remains is what repeated cycles scatter by: the "
-        "model fits. Measure again with these in the controller (`orthocal again` makes that "
-        "session), and hold it against this calibration: `orthocal validate`."
-    )
-
-
-def test_error_of_the_model_is_to_be_measured_again(experiment_2):
-    text = advise(calibrate(experiment_2))
-    assert text.startswith("Enter these, and measure again. What remains, σ = 0.276 mm ")
-    assert "it is error of the model" in text
-
-
-def test_a_setup_of_the_wrong_sign_is_named_before_anything_is_entered(raw_cycles):
-    text = advise(calibrate(turn(raw_cycles, "zx")))
-    assert text.startswith(
-        "Do not enter these. The readings of setup zx seem to have the wrong sign."
-    )
-    assert "by 0.402 mm (r.m.s.); with the sign turned by 0.007 mm" in text
-    for shown in (False, True):
-        summary = summarize(calibrate(turn(raw_cycles, "zx")), details=shown)
-        assert "Do not enter these. The readings of setup zx seem" in " ".join(summary.split())
-
-
-def test_readings_far_beyond_all_tolerances_are_not_to_be_entered(raw_cycles):
-    """One leg's readings off by millimetres: the setup that differs most from others is named."""
-    wrong = {"x_max": 2e-3, "x_min": -1e-3}
-    values = [
-        r.value + (wrong.get(r.posture, 0.0) if r.setup == "zx" else 0.0)
-        for r in raw_cycles.readings
-    ]
-    text = advise(calibrate(raw_cycles.with_values(values)))
-    assert text.startswith("Do not enter these. ")
-    assert "it looks as if setup zx was another one than is said" in text
-
-
-def test_one_wrong_reading_is_to_be_read_again(raw_cycles):
-    values = raw_cycles.values.copy()
-    values[4] += 0.2e-3
-    text = advise(calibrate(raw_cycles.with_values(values)))
-    setup = raw_cycles.readings[4].setup
-    assert text.startswith(
-        f"Check before you enter these. 1 reading contradicts all others (setup {setup})."
-    )
-    assert "read it again if it is wrong" in text
-
-
-def test_readings_that_do_not_repeat_are_to_be_read_again(raw_cycles):
-    """One sign of eighteen readings of each cycle: no single reading stands out of so few."""
-    two = replace(raw_cycles, readings=tuple(r for r in raw_cycles.readings if r.cycle < 3))
-    values = two.values.copy()
-    wrong = next(i for i, r in enumerate(two.readings) if (r.setup, r.posture) == ("xz", "z_min"))
-    values[wrong] *= -1.0
-    spoilt = calibrate(two.with_values(values))
-    text = " ".join(explain_fit(spoilt))
-    assert "They differ most at xz z_min: " in text
-    where = f"readings.csv:{two.readings[wrong].line}."
-    assert f"the one that stands apart is in {two.readings_path.parent}/{where}" in text
-    text = advise(replace(spoilt, critical=math.inf))
-    assert text.startswith("Check before you enter these. Repeated readings scatter by ")
-    assert "They differ most at xz z_min: " in text
-    assert "Check these for a wrong sign or row before anything is entered" in text
-
-
-def test_noise_that_only_the_residuals_tell_does_not_confirm_the_model(raw_cycles):
-    once = tuple(r for r in raw_cycles.readings if r.cycle == 1)
-    silent = replace(raw_cycles, readings=once).with_gauge(replace(raw_cycles.gauge, sigma=None))
-    text = advise(calibrate(silent))
-    assert text.startswith(
-        "Enter these, and measure again. Only what remains says how large the noise is"
-    )
-
-
-def test_without_word_or_check_it_is_said(experiment_2):
-    silent = experiment_2.with_gauge(replace(experiment_2.gauge, sigma=None))
-    three = replace(silent, readings=silent.readings[1:4])
-    assert "nothing tells how far they can be trusted" in advise(calibrate(three))
-    given = replace(experiment_2, readings=experiment_2.readings[1:4])
-    text = advise(calibrate(given))
-    assert text.startswith("Check before you enter these. ")
-    assert "none is left to check the model: nothing says whether these are right" in text
-
-
-def test_nothing_is_advised_where_no_offset_was_identified(raw_cycles):
-    assert advise(calibrate(raw_cycles, Choice(free=["x_leg.length"]))) == ""

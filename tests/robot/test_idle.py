@@ -7,8 +7,8 @@ import pytest
 from models import JOINTS
 
 from orthocal import load_robot
-from orthocal.kinematics.compiled import compiled_robot
 from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.robot_functions import robot_functions
 
 STEP = 1e-6
 """[m, rad]"""
@@ -17,14 +17,14 @@ STEP = 1e-6
 def seen_by(robot, errors, drives):
     """Tool and ends of all rods of a machine, loops closed anew, shape (K, n), [m]."""
     assembly = Assembly(robot, fixed=errors)
-    passive, machine = assembly.close(drives), assembly.machine()
+    passive, machine = assembly.close(drives), assembly.geometry()
     frames = [robot.tcp.frame] + [
         frame
         for leg in robot.legs.values()
         for rod in (leg.rods.values() or (leg,))
         for frame in (rod.root, rod.tip)
     ]
-    compiled = compiled_robot(robot)
+    compiled = robot_functions(robot)
     at = machine.drives(drives), passive, machine.placements
     return np.hstack([compiled.position(f)(*at)[0] for f in dict.fromkeys(frames)])
 

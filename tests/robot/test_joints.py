@@ -7,8 +7,9 @@ import shutil
 import numpy as np
 import pytest
 
+from orthocal.effects.loading import load_robot
 from orthocal.errors import RobotError
-from orthocal.robot.loading import load_robot, packaged_robots
+from orthocal.robot.loading import packaged_robots
 
 
 def with_joint(folder, text):

@@ -9,15 +9,16 @@ import pytest
 from lxml import etree
 from tolerances import CLOSED_FORM
 
+from orthocal.builder.build import describe_machine, make_robot, remake_robot
+from orthocal.builder.machine_file import MACHINE, Counting, Dimensions, read_machine
 from orthocal.errors import RobotError
 from orthocal.kinematics import orthoglide as closed_forms
 from orthocal.kinematics.loop_closure import Assembly
-from orthocal.robot.builder.build import describe_machine, make_robot, remake_robot
-from orthocal.robot.builder.dimensions import Counting, Sizes
-from orthocal.robot.builder.machine_file import MACHINE, read_machine
 from orthocal.robot.loading import packaged_robots
 
-SMALL = Sizes(leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004)
+SMALL = Dimensions(
+    leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004
+)
 
 
 def elements(text):
@@ -27,14 +28,14 @@ def elements(text):
 
 def test_the_packaged_machine_comes_out_of_its_own_sizes():
     folder = packaged_robots()["orthoglide"]
-    made = describe_machine(Sizes(), name="orthoglide")
+    made = describe_machine(Dimensions(), name="orthoglide")
     assert elements(made["orthoglide.urdf"].partition("\n")[2]) == elements(
         (folder / "orthoglide.urdf").read_text().partition("\n")[2]
     )
     assert made["orthoglide.yaml"].endswith((folder / "orthoglide.yaml").read_text())
 
 
-@pytest.mark.parametrize("sizes", [SMALL, Sizes(leg=0.5, lower=0.3, upper=0.7)])
+@pytest.mark.parametrize("sizes", [SMALL, Dimensions(leg=0.5, lower=0.3, upper=0.7)])
 def test_a_machine_of_other_sizes_moves_as_the_papers_equations_say(tmp_path, sizes):
     robot = make_robot(sizes, tmp_path / "mine")
     points = np.random.default_rng(0).uniform(-0.06, 0.06, (20, 3))
@@ -61,8 +62,8 @@ def test_a_machine_of_other_sizes_moves_as_the_papers_equations_say(tmp_path, si
     ],
 )
 def test_sizes_that_make_no_machine_are_refused(tmp_path, change, message):
-    with pytest.raises(RobotError, match="sizes") as e:
-        make_robot(Sizes(**change), tmp_path / "mine")
+    with pytest.raises(RobotError, match="dimensions") as e:
+        make_robot(Dimensions(**change), tmp_path / "mine")
     assert message in str(e.value)
     assert not (tmp_path / "mine").exists()
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import load_afresh
 
-from orthocal.kinematics.compiled import CompiledRobot
+from orthocal.kinematics.robot_functions import RobotFunctions
 from orthocal.robot import urdf
 from orthocal.runtime import disk_cache as cache
 
@@ -159,24 +159,24 @@ def test_a_folder_that_cannot_be_made_stops_nothing(tmp_path, monkeypatch):
 
 
 def test_functions_that_were_kept_are_those_that_are_built(folder):
-    built = CompiledRobot(load_afresh("orthoglide"))
+    built = RobotFunctions(load_afresh("orthoglide"))
     where = built.robot.drive_zero[None], built.robot.zero[built.robot.passive_index][None]
     where = (*where, built.errors.placements(np.full(len(built.errors.names), 1e-3)))
-    expected = built.slopes(*where)
+    expected = built.closure_jacobian(*where)
     assert list(folder.glob("*.kept"))
     for path in folder.glob("*.kept"):
         path.touch()
-    kept = CompiledRobot(load_afresh("orthoglide"))
+    kept = RobotFunctions(load_afresh("orthoglide"))
     kept.tree.frame_pose = None  # nothing is built: no expression is made
-    for ours, theirs in zip(kept.slopes(*where), expected, strict=True):
+    for ours, theirs in zip(kept.closure_jacobian(*where), expected, strict=True):
         assert np.array_equal(ours, theirs)
 
 
 def test_functions_of_another_machine_are_others(folder, orthoglide):
-    _ = CompiledRobot(orthoglide).closing
+    _ = RobotFunctions(orthoglide).closure_by_passive
     count = len(list(folder.glob("*.kept")))
     machine = orthoglide.with_errors({"x_coupler.x": 1e-3})
-    _ = CompiledRobot(machine).closing
+    _ = RobotFunctions(machine).closure_by_passive
     assert len(list(folder.glob("*.kept"))) == count + 1
 
 

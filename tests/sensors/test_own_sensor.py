@@ -17,25 +17,27 @@ from tool_coordinate import ToolCoordinate
 
 from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
 from orthocal.calibration.file import calibration_json, write_calibration
-from orthocal.cli import app
+from orthocal.cli import make_program
 from orthocal.errors import OrthocalError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
-from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
+from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_frames import predict_entries
 from orthocal.observation.simulate import draw_errors
 from orthocal.output.report.page import build_report
 from orthocal.sensors import registry
 from orthocal.sensors.compiled import compile_reading
+from orthocal.session.session import Conditions
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
 PLAN = """robot: orthoglide
+calibration: {model: offsets}
 title: tool and legs
 gauges:
   fine: {sigma_mm: 0.002, resolution_mm: 0.001, range_mm: [-200, 200]}
@@ -64,7 +66,7 @@ cycles: 2
 def known():
     registry.register_sensor(ToolCoordinate)
     yield
-    registry._KINDS.pop(ToolCoordinate.kind)
+    registry.unregister_sensor(ToolCoordinate.kind)
 
 
 @pytest.fixture
@@ -75,7 +77,7 @@ def plan(tmp_path):
 
 def test_its_readings_are_those_of_the_tool(plan):
     o = build_observations(plan)
-    found = predict_entries(plan, o, TRUTH, unknowns=np.array([1e-3, -2e-3]))
+    found = predict_readings(plan, TRUTH, observations=o, nuisance=np.array([1e-3, -2e-3]))
     from orthocal.kinematics.loop_closure import Assembly
 
     drives = np.array([p.drives for p in plan.postures.values()])
@@ -92,7 +94,7 @@ def test_what_is_not_known_of_it_is_identified_beside_the_machine(plan):
     assert set(simulated.unknowns) == {"dial.d.slope", "setup.tz.slope"}
     result = calibrate(simulated.session)
     for p in result.sensors:
-        assert 0.0 < p.std < 0.2 * p.tolerance
+        assert 0.0 < p.std_scatter < 0.2 * p.tolerance
         assert abs(p.value - simulated.unknowns[p.name]) < 4.0 * p.std
     for name, value in TRUTH.items():
         assert abs(result[name].value - value) < 4.0 * result[name].std
@@ -104,7 +106,7 @@ def test_its_deviations_are_those_of_many_simulated_calibrations(plan):
     options, scores = SolverOptions(solver="eliminated"), []
     for seed in range(60):
         simulated = simulate_session(plan, TRUTH, seed=seed)
-        fit = fit_problem(build_problem(simulated.session), options=options)
+        fit = fit_problem(build_problem(simulated.session, model="offsets"), options=options)
         truth = {**TRUTH, **simulated.unknowns}
         names, std = fit.problem.free, np.sqrt(np.diag(fit.covariance()))
         scores.append((fit.solution.theta - [truth[name] for name in names]) / std)
@@ -114,7 +116,8 @@ def test_its_deviations_are_those_of_many_simulated_calibrations(plan):
     estimates = (*result.free, *result.sensors)
     assert [p.name for p in estimates] == list(names)
     assert [p.value for p in estimates] == fit.solution.theta.tolist()
-    assert [p.std for p in estimates] == pytest.approx(std, rel=1e-12)
+    known = np.sqrt(np.diag(result.model_covariance))
+    assert known == pytest.approx(std[: len(known)], rel=1e-12)
 
 
 def test_all_that_is_not_known_of_it_holds_on_machines_with_all_errors(plan):
@@ -125,9 +128,8 @@ def test_all_that_is_not_known_of_it_holds_on_machines_with_all_errors(plan):
         simulated = simulate_session(plan, errors, seed=seed)
         result = calibrate(simulated.session, solver=SolverOptions(solver="eliminated"))
         truth = {**TRUTH, **simulated.unknowns}
-        stds = [*result.total_std, *result.sensor_total_std]
         estimates = (*result.free, *result.sensors)
-        scores.append([(p.value - truth[p.name]) / s for p, s in zip(estimates, stds, strict=True)])
+        scores.append([(p.value - truth[p.name]) / p.std for p in estimates])
     spread = np.sqrt(np.mean(np.square(scores), axis=0))
     n = len(TRUTH)
     assert spread[:n] == pytest.approx(1.0, abs=0.3)  # 3 standard deviations of a spread of 60
@@ -142,7 +144,7 @@ def test_both_solvers_find_one_optimum(plan, model, hessian):
     session = simulate_session(plan, TRUTH, seed=1).session
     problem = build_problem(session, model=model)
     given = {"sigma": 2e-6}
-    ours = EliminatedProgram(problem).solve(**given)
+    ours = VariableProjection(problem).solve(**given)
     ipopts = NonlinearProgram(problem, options=SolverOptions(hessian=hessian)).solve(**given)
     assert ours.theta.size == problem.n_machine + 2
     assert np.abs(ours.theta - ipopts.theta).max() < SAME_OPTIMUM
@@ -176,12 +178,14 @@ def test_it_is_written_and_read(plan, tmp_path):
 
 def test_it_is_told_reported_and_drawn(plan, tmp_path, capsys):
     path = write_session(simulate_session(plan, TRUTH, seed=1).session, tmp_path / "s")
-    app(["calibrate", str(path), "--out", str(tmp_path / "out")], standalone_mode=False)
+    make_program()(["calibrate", str(path), "--out", str(tmp_path / "out")], standalone_mode=False)
     told = capsys.readouterr().out
     assert "legs x, y and tool" in told
     report = build_report(load_calibration(tmp_path / "out"))
     assert "dial.d.slope" in report
-    app(["view", str(tmp_path / "out"), "--html", str(tmp_path / "v.html")], standalone_mode=False)
+    make_program()(
+        ["view", str(tmp_path / "out"), "--html", str(tmp_path / "v.html")], standalone_mode=False
+    )
     assert "tool" in (tmp_path / "v.html").read_text()
 
 
@@ -214,6 +218,31 @@ def test_what_differs_between_setups_belongs_into_constants(plan):
         compile_reading(plan.robot, Selfish("y", 1e-3, None))
 
 
+def test_a_sensor_may_depend_on_the_conditions_of_a_reading(plan):
+    """One that shows 1 µm more for each degree, and 2 µm in the direction of the first drive."""
+
+    class Warm(ToolCoordinate):
+        conditions = ("approach", "temperature")
+
+        def expression(self, view, robot):
+            warmer = 1e-6 * (view.conditions["temperature"] - 20.0)
+            return super().expression(view, robot) + warmer + 2e-6 * view.conditions["approach"][0]
+
+    setups = {
+        n: replace(s, sensor=Warm(n[1], 1e-3, None)) for n, s in plan.setups.items() if n[0] == "t"
+    }
+    rows = [r for r in plan.readings if r.setup in setups]
+    stated = [Conditions("npp", 20.0 + i) if i % 3 else None for i in range(len(rows))]
+    readings = tuple(replace(r, conditions=c) for r, c in zip(rows, stated, strict=True))
+    warm = replace(plan, setups=setups, readings=readings)
+    shown = predict_readings(warm, TRUTH)
+    cold = predict_readings(replace(warm, readings=tuple(rows)), TRUTH)
+    expected = [1e-6 * i - 2e-6 if i % 3 else 0.0 for i in range(len(rows))]
+    assert np.abs(shown - cold - expected).max() < 1e-15
+    o = build_observations(warm)  # it depends on conditions, the loop closures do not
+    assert np.array_equal(o.state, o.posture)
+
+
 OWN = """
 import sys
 sys.path.insert(0, {folder!r})
@@ -221,8 +250,8 @@ import numpy as np, orthocal, own
 from orthocal.sensors.compiled import compile_reading
 robot = orthocal.load_robot("orthoglide")
 value = compile_reading(robot, own.Own("x", 1e-3, None)).value
-from orthocal.kinematics.compiled import compiled_robot
-errors = compiled_robot(robot).errors
+from orthocal.kinematics.robot_functions import robot_functions
+errors = robot_functions(robot).errors
 zero = errors.placements(np.zeros(len(errors.names)))
 h, = value(robot.drive_zero[None] + 0.01, robot.zero[robot.passive_index][None], zero,
            robot.drive_zero[None], np.array([[1.0, 0.0, 0.0]]), np.zeros((1, 1)))

@@ -19,10 +19,10 @@ from orthocal import (
 )
 from orthocal.errors import SessionError
 from orthocal.kinematics.error_map import error_map
-from orthocal.observation.manual_alignment import find_setting
+from orthocal.observation.contacts import locate_contacts
+from orthocal.observation.model import ObservationModel, predict_readings
 from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_frames import locate_contacts, predict_entries
-from orthocal.observation.sensor_groups import sensor_unknowns
+from orthocal.observation.sensor_groups import nuisance_parameters
 
 PLAN = """robot: orthoglide
 gauge: {{sigma_mm: 0.005, resolution_mm: 0.001, range_mm: [-20, 20]}}
@@ -60,11 +60,11 @@ def plan(folder, tip, rod="a"):
 
 def set_beside(session, o, errors):
     """How far each entry's ball is beside the drawing, over the rod that is there, [m]."""
-    known = sensor_unknowns(session)
+    known = nuisance_parameters(session)
     found = dict(
         zip(
             [p.name for p in known.parameters],
-            find_setting(session)(error_map(session.robot).expand(errors)),
+            ObservationModel(session).alignment(error_map(session.robot).expand(errors)),
             strict=True,
         )
     )
@@ -78,7 +78,7 @@ def test_readings_are_those_of_solids_that_touch(tmp_path, tip, rod):
     """The rod's axis by Pinocchio, the tip by the distance from it: exactly the radii."""
     session = plan(tmp_path, tip, rod)
     o = build_observations(session)
-    found = predict_entries(session, o, TRUTH)
+    found = predict_readings(session, TRUTH, observations=o)
     robot = session.robot
     beside = set_beside(session, o, TRUTH)
     real = robot.with_errors(TRUTH)

@@ -20,10 +20,9 @@ from orthocal import (
 from orthocal.errors import SessionError
 from orthocal.kinematics.error_map import error_map
 from orthocal.measurement.joining import join_sessions
-from orthocal.observation.manual_alignment import find_setting
+from orthocal.observation.model import ObservationModel, predict_readings
 from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_frames import predict_entries
-from orthocal.observation.sensor_groups import sensor_unknowns
+from orthocal.observation.sensor_groups import nuisance_parameters
 
 TIPS = {
     "ball": "{ball: {radius_mm: 1.5}}",
@@ -56,7 +55,7 @@ def plan(folder, tip="ball", *, yx="", zx="", yz=""):
 
 
 def names(session):
-    return [p.name for p in sensor_unknowns(session).parameters]
+    return [p.name for p in nuisance_parameters(session).parameters]
 
 
 @pytest.mark.parametrize("tip", TIPS)
@@ -78,13 +77,13 @@ def test_crooked_readings_are_those_of_solids_that_touch(tmp_path, tip, oblique)
             )
         session = load_plan(path)
     o, workshop = build_observations(session), Workshop(session, ERRORS)
-    beside = find_setting(session)(error_map(session.robot).expand(ERRORS))
-    rng, known = np.random.default_rng(0), sensor_unknowns(session)
+    beside = ObservationModel(session).alignment(error_map(session.robot).expand(ERRORS))
+    rng, known = np.random.default_rng(0), nuisance_parameters(session)
     setups, missed = list(session.setups), 0
     for _ in range(40):
         values = 3.0 * rng.normal(size=len(known.parameters))
         values *= [p.tolerance for p in known.parameters]
-        found = predict_entries(session, o, ERRORS, unknowns=values)
+        found = predict_readings(session, ERRORS, observations=o, nuisance=values)
         said = dict(zip(names(session), (values + beside).tolist(), strict=True))
         for i, r in enumerate(session.readings):
             own = {f.name: said.get(f"setup.{r.setup}.{f.name}", 0.0) for f in fields(Crooked)}
@@ -100,10 +99,10 @@ def test_a_line_is_read_as_by_an_edge_without_a_radius(tmp_path, root):
     """Turned and moved, an edge in the plane of plunger and edge; square, the paper's section."""
     session = load_plan(root / "tests/sessions/lines/plan.yaml")
     o, rng = build_observations(session), np.random.default_rng(1)
-    known = sensor_unknowns(session)
+    known = nuisance_parameters(session)
     values = rng.normal(size=len(known.parameters)) * [p.tolerance for p in known.parameters]
     said = dict(zip(names(session), values.tolist(), strict=True))
-    found = predict_entries(session, o, ERRORS, unknowns=values)
+    found = predict_readings(session, ERRORS, observations=o, nuisance=values)
     workshop = Workshop(session, ERRORS)
     postures, setups = list(session.postures), session.setups
     for i in range(0, o.size, 7):

@@ -46,7 +46,9 @@ def test_the_order_of_rows_changes_no_estimate(how, workshop, calibration):
     expected, found = (np.array([p.value for p in c.free]) for c in (calibration, other))
     np.testing.assert_allclose(found / scale, expected / scale, atol=1e-9)
     unit = np.outer(scale, scale)
-    np.testing.assert_allclose(other.covariance / unit, calibration.covariance / unit, atol=1e-9)
+    np.testing.assert_allclose(
+        other.total_covariance / unit, calibration.total_covariance / unit, atol=1e-9
+    )
     tools = [assess_tool(c) for c in (calibration, other)]
     np.testing.assert_allclose(
         tools[1].error_after_offsets, tools[0].error_after_offsets, atol=1e-12

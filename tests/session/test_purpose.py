@@ -75,8 +75,10 @@ def test_options_come_before_what_a_session_says(stated):
 
 
 def test_where_nothing_is_said(raw_cycles, stated):
-    assert choose(None, raw_cycles).model == "offsets"
-    assert choose(None, raw_cycles, usual="full").model == "full"
+    silent = replace(raw_cycles, purpose=None)
+    assert choose(None, raw_cycles).model == "offsets"  # as it states
+    assert choose(None, silent).model == "full"
+    assert choose(None, silent, usual="lengths").model == "lengths"
     assert choose(None, None, usual="full").model == "full"
     assert choose(None, stated, usual="lengths").model == "full"
 
@@ -103,7 +105,8 @@ def test_sessions_agree_or_are_asked(raw_cycles, stated, tmp_path):
         f"{offsets.path}; say which"
     )
     assert choose("full", joined).model == "full"
-    assert choose(None, join_sessions([stated, raw_cycles])).model == "full"
+    silent = replace(raw_cycles, purpose=None)
+    assert choose(None, join_sessions([stated, silent])).model == "full"
 
 
 def test_one_machine_has_one_tolerance(raw_cycles, stated, tmp_path):

@@ -14,10 +14,14 @@ from orthocal import calibrate, load_plan
 from orthocal.errors import NotIdentifiableError
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.estimation.solvers.machine_readings import Fleet
+from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import Observations, build_observations
-from orthocal.observation.sensor_frames import predict_entries
-from orthocal.statistics.chance import chance_of_excess, confidence_factor
+from orthocal.statistics.chance import (
+    chance_of_excess,
+    confidence_factor,
+    coverage_factor,
+    expanded_uncertainty,
+)
 from orthocal.statistics.information import Information, decompose, marginalise
 from orthocal.statistics.noise import KnownNoise, Noise, estimate_noise, estimate_repeatability
 
@@ -27,8 +31,22 @@ TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 
 def observations(setup, posture, zero):
     s, p, z = (np.array(v, dtype=np.int64) for v in (setup, posture, zero))
     n = int(z.max()) + 1
-    rows = np.arange(len(s))
-    return Observations(s, p, z, n, ("s",) * n, (True,) * n, rows, np.full(len(s), -1))
+    place = np.unique(np.column_stack([s, p]), axis=0, return_inverse=True)[1].reshape(-1)
+    return Observations(
+        setup=s,
+        posture=p,
+        zero=z,
+        n_zeros=n,
+        zero_setup=("s",) * n,
+        zero_real=(True,) * n,
+        zero_known=np.zeros(n, dtype=np.bool_),
+        plus=np.arange(len(s)),
+        minus=np.full(len(s), -1),
+        state=p,
+        place=place,
+        conditions={},
+        states=None,
+    )
 
 
 def test_covariance_of_a_line_solved_by_hand():
@@ -68,7 +86,7 @@ def test_repeatability_of_differences_is_that_of_one_reading(root):
     rows = [replace(r, minus="zero") for r in plan.readings if r.posture != "zero"]
     plan = replace(plan, readings=tuple(rows))
     o = build_observations(plan)
-    entries = predict_entries(plan, o, TRUTH)
+    entries = predict_readings(plan, TRUTH, observations=o)
     rng = np.random.default_rng(0)
     found = []
     for _ in range(60):
@@ -128,6 +146,16 @@ def test_confidence_factors_are_students():
     assert confidence_factor(0.0) == np.inf
 
 
+def test_expanded_uncertainty_is_twice_the_deviation_or_students_factor_of_the_noise():
+    assert coverage_factor(np.inf) == 2.0
+    assert coverage_factor(3.0) == confidence_factor(3.0)
+    assert np.isnan(coverage_factor(0.0))
+    assert expanded_uncertainty(3.0, 3.0, dof=np.inf) == 6.0
+    assert expanded_uncertainty([5.0], [0.0], dof=2.0) == [10.0]
+    both = expanded_uncertainty(5.0, 3.0, dof=3.0)
+    assert both == pytest.approx(np.hypot(3.0 * confidence_factor(3.0), 8.0))
+
+
 def test_readings_of_one_leg_leave_an_offset_open(raw_cycles):
     rows = tuple(r for r in raw_cycles.readings if r.setup == "yx")
     with pytest.raises(NotIdentifiableError, match=r"do not determine z_slide\.offset") as caught:
@@ -136,7 +164,7 @@ def test_readings_of_one_leg_leave_an_offset_open(raw_cycles):
 
 
 def test_six_equations_have_the_closed_form_covariance(experiment_2):
-    problem = build_problem(exact(experiment_2))
+    problem = build_problem(exact(experiment_2), model="offsets")
     _, jacobian = problem.linearise(problem.reference)
     information = decompose(jacobian, problem.observations)
     scale = np.outer(problem.theta_scale, problem.theta_scale)
@@ -155,15 +183,14 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations(root, model
     rng = np.random.default_rng(0)
     # as the prior says, where there is one
     truths = rng.normal(size=(300, problem.n_free))
-    machines = Fleet(problem, truths)
-    assert machines.close().all()
-    entries = machines.predict()
+    entries, _, reached = problem.simulate(truths * problem.theta_scale)
+    assert reached.all()
     measured = entries + sigma * rng.normal(size=entries.shape)
     solved = BatchProgram(problem).solve(measured, sigma=sigma)
-    found = Fleet(problem, solved.theta / problem.theta_scale)
-    assert found.close().all()
+    _, found, reached = problem.simulate(solved.theta)
+    assert reached.all()
     whitened = []
-    for truth, theta, passive in zip(truths, solved.theta, found.passive, strict=True):
+    for truth, theta, passive in zip(truths, solved.theta, found, strict=True):
         _, jacobian = problem.linearise(theta, passive)
         covariance = decompose(jacobian, problem.observations).covariance(
             sigma=sigma, precision=problem.prior_precision

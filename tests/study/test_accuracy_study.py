@@ -11,7 +11,7 @@ from tolerances import TRUTH_BACK
 from orthocal import Choice, load_plan, load_robot
 from orthocal.errors import ParameterError, SessionError
 from orthocal.kinematics.loop_closure import Assembly
-from orthocal.kinematics.workspace import cube, gauss_cube
+from orthocal.kinematics.workspace import cube, gauss_box
 from orthocal.session.session import Gauge
 from orthocal.study.accuracy import (
     CALIBRATED,
@@ -78,7 +78,7 @@ def test_tool_error_of_one_machine_agrees_with_pinocchio(workshop):
     study = build_accuracy_study(workshop, choice, machines=4, half_side=0.05)
     rows = run_task(study, 0)
     robot, prepared = workshop.robot, study.prepare()
-    space = gauss_cube(robot, half_side=0.05)
+    space = gauss_box(robot, [[-0.05, 0.05]] * 3)
     drives = Assembly(robot).inverse(space.points)
     drawn, _ = study.draw(prepared, 2)
     truth = dict(zip(study.drawn, drawn * prepared.truth.theta_scale, strict=False))
@@ -98,7 +98,7 @@ def test_tool_error_of_one_machine_agrees_with_pinocchio(workshop):
 
 
 def test_gauss_points_agree_with_a_fine_grid(orthoglide):
-    few, many = gauss_cube(orthoglide, half_side=0.06), cube(orthoglide, points_a_side=21)
+    few, many = gauss_box(orthoglide, [[-0.06, 0.06]] * 3), cube(orthoglide, points_a_side=21)
 
     def square(space):
         x, y, z = space.points.T

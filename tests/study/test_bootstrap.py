@@ -67,7 +67,7 @@ def test_session_without_residuals_or_cycles(root):
     with pytest.raises(SessionError, match="has no residuals to resample"):
         build_bootstrap_study(load_session(root / "examples/workshop"), "full")
     with pytest.raises(SessionError, match=r"setups\.\w+: has one cycle of readings"):
-        build_bootstrap_study(load_session(root / "examples/workshop"), by="cycles")
+        build_bootstrap_study(load_session(root / "examples/workshop"), "offsets", by="cycles")
 
 
 def test_cycles_with_different_postures(raw_cycles):

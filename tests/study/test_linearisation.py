@@ -7,15 +7,12 @@ import pytest
 from gauges import exact
 from tolerances import THREE_DECIMALS_MM
 
-from orthocal import Choice, load_plan
+from orthocal import load_plan
+from orthocal.builder.build import Dimensions, make_robot
 from orthocal.errors import NotIdentifiableError, ParameterError
-from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.batch_adjoint import FleetSlopes
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.kinematics import orthoglide as closed_forms
-from orthocal.robot.builder.build import Sizes, make_robot
 from orthocal.session.session import Gauge
-from orthocal.study.batch import predict_batch
 from orthocal.study.linearisation import (
     IDENTIFIED,
     METHODS,
@@ -119,7 +116,7 @@ def test_batch_step_equals_single_gauss_newton_steps(study):
     prepared = study.prepare()
     problem = prepared.problem
     errors = np.array(study.directions[:4]) * 20e-3
-    read, _ = predict_batch(problem, errors / problem.theta_scale)
+    read, _, _ = problem.simulate(errors)
     theta = 0.8 * errors
     found, alive = prepared.step(read, theta)
     assert alive.all()
@@ -131,19 +128,6 @@ def test_batch_step_equals_single_gauss_newton_steps(study):
         left = project_out_zeros(y - reading, problem.observations)
         expected = at + np.linalg.lstsq(slopes, left)[0] * problem.theta_scale
         assert np.abs(step - expected).max() < 1e-12
-
-
-def test_batch_jacobians_equal_single_jacobians(root):
-    """All errors, what is not known of gauges among them."""
-    plan = load_plan(root / "examples/workshop/plan.yaml")
-    choice = Choice("full")
-    problem = CalibrationProblem(plan, choice.select(plan.robot.parameters))
-    theta = 0.5 * np.random.default_rng(0).normal(size=(2, problem.n_free))
-    passive = np.array([problem.close(t * problem.theta_scale) for t in theta])
-    found = FleetSlopes(problem, theta, passive).jacobian()
-    for own, t in zip(found, theta, strict=True):
-        _, expected = problem.linearise(t * problem.theta_scale)
-        assert np.abs(own - expected).max() < 1e-12
 
 
 def test_order_of_convergence(summary):
@@ -161,7 +145,9 @@ def test_order_of_convergence(summary):
 
 def test_gauss_newton_diverges_on_short_legs(tmp_path):
     """A machine of short legs, 60 mm off."""
-    robot = make_robot(Sizes(leg=0.15, lower=0.06, upper=0.24, attachment=0.02), tmp_path / "m")
+    robot = make_robot(
+        Dimensions(leg=0.15, lower=0.06, upper=0.24, attachment=0.02), tmp_path / "m"
+    )
     from orthocal.study.paper_plan import Displacements
 
     study = build_linearisation_study(
@@ -173,7 +159,7 @@ def test_gauss_newton_diverges_on_short_legs(tmp_path):
 
 
 def test_longer_legs_are_less_nonlinear(tmp_path, orthoglide):
-    longer = make_robot(Sizes(leg=0.6205, lower=0.43, upper=0.7), tmp_path / "long")
+    longer = make_robot(Dimensions(leg=0.6205, lower=0.43, upper=0.7), tmp_path / "long")
     errors = [
         run_task(build_linearisation_study(r, sizes=[2.0], along=ALONG), 0)["first_order"][0]
         for r in (orthoglide, longer)

@@ -324,9 +324,9 @@ def test_workers_end_with_their_parent(root, tmp_path):
 
 def test_a_robot_whose_directory_is_gone(orthoglide, tmp_path):
     """As on another machine, or where its files were changed meanwhile."""
-    from orthocal.robot.builder.build import Sizes, make_robot
+    from orthocal.builder.build import Dimensions, make_robot
 
-    sizes = Sizes(leg=0.25, lower=0.1, upper=0.32)
+    sizes = Dimensions(leg=0.25, lower=0.1, upper=0.32)
     robot = make_robot(sizes, tmp_path / "mine")
     study = build_linearisation_study(robot, sizes=[1.0], along=[1, -0.6, 0.3])
     expected = run_study(study).columns

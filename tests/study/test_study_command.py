@@ -113,7 +113,7 @@ def test_interrupt_ends_workers_and_names_the_way_to_resume(tmp_path, root, out)
         (["accuracy", "examples/workshop", "--model", "all"], "'all' is not a model"),
         (["accuracy", "examples/workshop", "--draw", "nothing"], "nothing"),
         (["accuracy", "examples/workshop", "--error", "x_slide.offset"], "expected NAME=VALUE"),
-        (["accuracy", "examples/workshop", "--half-side-mm", "0"], "--half-side-mm: found 0;"),
+        (["accuracy", "examples/workshop", "--half-side-mm", "0"], "--half-side-mm: found '0'"),
         (["accuracy", "examples/workshop", "--tolerance", "*.offset=2"], "--tolerance"),
         (
             ["accuracy", "examples/workshop", "--dask", "tcp://127.0.0.1:1", "--workers", "2"],
@@ -140,7 +140,7 @@ def test_interrupt_ends_workers_and_names_the_way_to_resume(tmp_path, root, out)
         (["sensitivity", "--free", "nothing"], "nothing"),
         (["bootstrap", "examples/raw-cycles", "--by", "chance"], "--by: found 'chance'; expected"),
         (
-            ["bootstrap", "examples/workshop", "--by", "cycles"],
+            ["bootstrap", "examples/workshop", "--model", "offsets", "--by", "cycles"],
             "has one cycle of readings; expected",
         ),
     ],

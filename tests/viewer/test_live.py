@@ -27,7 +27,7 @@ from orthocal.errors import OrthocalError
 PATIENCE = 60.0
 """Longest wait for an expected event, [s]."""
 
-VIEW = [sys.executable, "-m", "orthocal.cli", "view", "orthoglide"]
+VIEW = [sys.executable, "-m", "orthocal", "view", "orthoglide"]
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from tolerances import KINEMATICS
 from orthocal import calibrate, draw_scene, load_robot, load_session
 from orthocal.assessment.calibrated_tool import error_covariance
 from orthocal.assessment.controller_entries import find_entries
-from orthocal.assessment.tool_error import assess_tool, find_excess, measure_uncertainty
+from orthocal.assessment.tool_error import assess_tool, measure_uncertainty
 from orthocal.calibration.file import load_calibration, write_calibration
 from orthocal.errors import ParameterError
 from orthocal.measurement.files.session_file import load_plan
@@ -502,13 +502,13 @@ def test_headline_of_the_tool_states_error_and_uncertainty(calibration):
     largest = np.linalg.norm(found.align(found.deviation), axis=1).max() * 1e6
     assert scene.headline.startswith(f"Tool error now: up to {largest:.0f} µm over ±60 mm")
     # with errors enlarged by the tolerance scale
-    covariance = error_covariance(calibration, excess=find_excess(calibration))
+    covariance = error_covariance(calibration, excess=calibration.tolerance_scale)
     known = measure_uncertainty(found.jacobian, covariance, found.workspace, found.targets)
     known = known.sizes.aligned.largest
     assert known > 1.2 * found.after.sizes.aligned.largest
     assert f"With all corrected: {known * 1e6:.0f} µm or less" in scene.headline
     (told,) = (e.text for e in scene.legend if e.nodes == (tool_errors.TOOL_UNCERTAINTY,))
-    assert "errors at 2.1 × tolerances" in told
+    assert f"errors at {calibration.tolerance_scale:.1f} × tolerances" in told
 
 
 def test_only_machines_sessions_and_calibrations_are_drawn():

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from orthocal.io.documents import Count, Number
 from orthocal.io.fields import CLOSED, NumberOrNaN
+from orthocal.session.session import Conditions, describe_postures, known_approach
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +44,8 @@ class ResidualRow:
     """Which parameter that is."""
     unseen: NumberOrNaN
     """Error of predicting it from all other setups, [m]; NaN if they do not determine the model."""
+    conditions: Conditions | None = None
+    """Conditions of the reading, where stated."""
 
     @property
     def deviation(self) -> float:
@@ -56,8 +59,8 @@ class ResidualRow:
 
     @property
     def postures(self) -> str:
-        """Posture, or one less another, in words."""
-        return f"{self.posture} − {self.minus}" if self.minus else self.posture
+        """Posture with its approach, or one less another, in words."""
+        return describe_postures(self.posture, self.minus, known_approach(self.conditions))
 
     @property
     def label(self) -> str:

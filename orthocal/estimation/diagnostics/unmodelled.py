@@ -23,7 +23,7 @@ from orthocal.estimation.selection import Selection
 from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.io.documents import Number
 from orthocal.io.fields import CLOSED, Many, Matrix, Sizes, read_only
-from orthocal.kinematics.function_cache import once_a_robot
+from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.robot.model import Robot
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -67,7 +67,7 @@ class OtherErrors:
     """∂h of one tolerance of each, gauge zeros eliminated, shape (n_entries, n_others), [m]."""
 
 
-@once_a_robot(maxsize=8)
+@cached_per_robot(maxsize=8)
 def machine_errors(robot: Robot) -> tuple[str, ...]:
     """Names of all errors that a machine is taken to have, in the robot's order.
 

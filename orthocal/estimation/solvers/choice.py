@@ -1,4 +1,4 @@
-"""The solver that is asked for."""
+"""Choice of the solver."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from orthocal.estimation.solvers.program import Program
 
 
 def build_program(problem: CalibrationProblem, options: SolverOptions | None = None) -> Program:
-    """A problem made ready for the solver that is chosen; Ipopt by default."""
+    """A problem prepared for the chosen solver; Ipopt by default."""
     chosen = options or SolverOptions()
     if chosen.solver == "eliminated":
-        from orthocal.estimation.solvers.variable_projection import EliminatedProgram
+        from orthocal.estimation.solvers.variable_projection import VariableProjection
 
-        return EliminatedProgram(problem, options=chosen)
+        return VariableProjection(problem, options=chosen)
     if chosen.solver == "linearised":
         from orthocal.estimation.solvers.linearised import LinearisedProgram
 

@@ -1,7 +1,7 @@
-"""The exact identification as one nonlinear program, solved with Ipopt.
+"""The exact identification as one nonlinear program, solved by Ipopt.
 
-Variables are θ̂, the gauge zeros ẑ and every posture's passive coordinates q̂_k; the closures of
-every posture are constraints (`nlp.py` has the functions).
+Its variables are θ̂, the gauge zeros ẑ and the passive coordinates q̂_k of every posture; the
+closures of every posture are constraints (see `nlp.py`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.errors import SolverError
-from orthocal.estimation.options import SolverOptions
+from orthocal.errors import OrthocalError, SolverError
+from orthocal.estimation.options import OptionValue, SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.solvers.nlp import ProgramFunctions
 from orthocal.estimation.solvers.program import LEFT_OUT, Solution, no_convergence
@@ -28,50 +28,66 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 FINEST_WEIGHT = 5e-6
-"""Readings are weighted as if they had at least this standard deviation, [m], and the prior is
-scaled down with them: the same optimum, with rounding errors that stay below the tolerance."""
+"""Least standard deviation by which readings are weighted, [m]. The prior is scaled down with them:
+the optimum is the same, and rounding errors stay below the tolerance."""
 
 EXACT_READINGS = 20_000
-"""Readings up to which the tolerance is kept; with more it grows as their sum's rounding errors."""
+"""Readings from which the tolerance grows, like the rounding errors of their sum."""
 
 MOST_EXACT = 2_000
-"""Readings up to which the exact Hessian is tried where the other does not converge."""
+"""Readings up to which the exact Hessian is tried if the other one does not converge."""
 
 WIDENINGS = (256.0, 64.0, 16.0, 4.0, 2.0, 1.0)
-"""Widths of a robust loss, as multiples of the one wanted, each solution the next one's start: for
-readings so far out that a loss as narrow as wanted does not converge at once."""
+"""Widths of a robust loss as multiples of the requested one; each solution starts the next. Used
+when outliers are so large that the requested width does not converge at once."""
 
 CONVERGED = frozenset({"Solve_Succeeded"})
-"""Ipopt's words for a solution; anything else is an error."""
-
+"""Status of Ipopt for a solution; any other is an error."""
 
 COMPLEMENTARITY = 1e-11
-"""Multiplier of a bound times the distance to it, both scaled, at most. A parameter within the root
-of that of its bound is said to be held by it, whether it is or not: 16 nm of an offset of 5 mm."""
+"""Largest product of a bound's multiplier and the distance to it, both scaled. A parameter closer
+to its bound than the square root of this counts as held: 16 nm for a tolerance of 5 mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expressions:
-    """A nonlinear program as expressions."""
+    """A nonlinear program as CasADi expressions of its variables and parameters."""
 
     variables: ca.MX
-    """x: θ̂, gauge zeros, the passive coordinates of every posture and where gauges stand that were
-    set by the machine, scaled."""
+    """x: θ̂, gauge zeros, the passive coordinates of every posture and the values of manually
+    aligned nuisance parameters, scaled."""
     parameters: ca.MX
     """p: readings, their weights and noise."""
     objective: ca.MX
+    """Σ ρ(r/σ) plus the prior's share."""
     constraints: ca.MX
-    """0 where all loops are closed, and gauges stand as they were set."""
+    """0 where all loops are closed and aligned nuisance parameters have their values."""
     errors: dict[str, ca.MX]
-    """Free parameter to its value, [SI]."""
+    """Free parameter to its value, [SI]: errors of the machine, then nuisance parameters."""
+    nuisance: dict[str, ca.MX]
+    """Nuisance parameter to its deviation from the manual alignment, [SI]."""
+    zeros: ca.MX
+    """Gauge zeros, shape (n_zeros,), [m of the first gauge]."""
+    readings: ca.MX
+    """Predicted readings with their gauge zeros, shape (n_entries,), [m of the first gauge], in the
+    order of `problem.observations`."""
+    residuals: ca.MX
+    """Readings minus predicted ones, shape (n_entries,), [m of the first gauge]."""
+    passive: dict[str, ca.MX]
+    """Posture to its passive coordinates q, shape (n_passive,), [m, rad]."""
+    closures: dict[str, ca.MX]
+    """Posture to the residuals g of its loop closures, shape (closure_rows,), [m]."""
 
 
 class NonlinearProgram:
-    """A calibration problem as a nonlinear program; solved again and again without rebuilding.
+    """A calibration problem as a nonlinear program, built once for any number of solutions.
 
     Args:
         problem: The problem.
-        options: How Ipopt is run.
+        options: Options of the solver.
+
+    Raises:
+        OrthocalError: If Ipopt does not accept one of `options.ipopt`.
     """
 
     def __init__(
@@ -83,13 +99,15 @@ class NonlinearProgram:
         self._n_theta = problem.n_free
         self._n_zeros = problem.observations.n_zeros
         self._n_passive = problem.robot.passive_index.size
-        functions = ProgramFunctions(problem, hessian=self.options.hessian, loss=self.options.loss)
-        self._functions = functions.build()
+        self._builder = ProgramFunctions(
+            problem, hessian=self.options.hessian, loss=self.options.loss
+        )
+        self._functions = self._builder.build()
         self._solver = self._start_ipopt()
         self.seconds_build = time.perf_counter() - began
 
     def with_problem(self, problem: CalibrationProblem) -> NonlinearProgram:
-        """The same program for another `with_values` of its problem; nothing is built again."""
+        """The same program for a `with_values` of its problem; nothing is built again."""
         other = copy.copy(self)
         other.problem = problem
         other.__dict__.pop("_exact", None)
@@ -157,7 +175,7 @@ class NonlinearProgram:
         held: Mapping[int, float],
         widening: float,
     ) -> Solution:
-        """One run of Ipopt, the width of a robust loss a multiple of the one wanted."""
+        """One run of Ipopt, with a multiple of the width of a robust loss."""
         problem = self.problem
         lower, upper = (self._bounds(side, held) for side in ("lower", "upper"))
         theta = np.array(problem.reference if start is None else start, dtype=np.float64)
@@ -183,9 +201,9 @@ class NonlinearProgram:
             )
         x = np.asarray(answer["x"].full()).reshape(-1)
         closures = np.abs(np.asarray(answer["g"].full())).max(initial=0.0)
-        pull = np.asarray(answer["lam_x"].full()).reshape(-1)[: self._n_theta]
+        multipliers = np.asarray(answer["lam_x"].full()).reshape(-1)[: self._n_theta]
         first = self._n_theta + self._n_zeros
-        passive = slice(first, first + problem.n_postures * self._n_passive)
+        passive = slice(first, first + problem.n_states * self._n_passive)
         return Solution(
             theta=x[: self._n_theta] * problem.theta_scale,
             zeros=x[self._n_theta : self._n_theta + self._n_zeros] * LENGTH_SCALE,
@@ -197,7 +215,7 @@ class NonlinearProgram:
             seconds_build=self.seconds_build,
             seconds_solve=seconds,
             closure=float(closures) * LENGTH_SCALE,
-            at_bound=_at_bound(x[: self._n_theta], pull, lower, upper, held),
+            at_bound=_at_bound(x[: self._n_theta], multipliers, lower, upper, held),
         )
 
     def begin(
@@ -209,15 +227,14 @@ class NonlinearProgram:
         passive: Array | None = None,
         widening: float = 1.0,
     ) -> Array:
-        """The program's variables x with closed loops and the best zeros for some parameters.
+        """The program's variables x with closed loops and optimal zeros, for free parameters.
 
         Args:
-            theta: Free parameters, shape (n_free,), [SI]; what the controller already corrects by
-                default.
+            theta: Free parameters, shape (n_free,), [SI]; the reference by default.
             sigma: Standard deviation of one reading, [m].
             values: Readings as single ones, shape (n_entries,), [m]; the session's by default.
             passive: Passive coordinates to start closing the loops from.
-            widening: What the width of a robust loss is multiplied by.
+            widening: Factor on the width of a robust loss.
 
         Raises:
             ClosureError: If the machine cannot reach a posture.
@@ -228,28 +245,50 @@ class NonlinearProgram:
         y = problem.values if values is None else values
         residual = (y - problem.predict(at, closed)) / sigma
         wide = replace(loss, width=loss.width * widening)
-        follows = problem.setting.follows
+        aligned = problem.model.alignment.aligned
         zeros = sigma * wide.centres(residual, o.zero, o.n_zeros, weights=np.ones(o.size))
+        zeros[o.zero_known] = 0.0
         return np.concatenate(
             [
                 at / problem.theta_scale,
                 zeros / LENGTH_SCALE,
                 (closed / problem.passive_scale).reshape(-1),
-                problem.standing(at)[follows] / problem.theta_scale[problem.n_machine :][follows],
+                problem.nuisance_values(at)[aligned]
+                / problem.theta_scale[problem.n_machine :][aligned],
             ]
         )
 
     def expressions(self) -> Expressions:
-        """The program as expressions of CasADi, for terms and constraints of one's own.
+        """The program as CasADi expressions, for additional terms and constraints.
 
         `begin` and `pack` give values of its variables and parameters.
         """
-        nlp = self._functions["nlp"]
+        problem, o, nlp = self.problem, self.problem.observations, self._functions["nlp"]
         x, p = ca.MX.sym("x", nlp.size1_in(0)), ca.MX.sym("p", nlp.size1_in(1))
         objective, constraints = nlp(x, p)
-        scale = self.problem.theta_scale
-        errors = {name: x[i] * float(scale[i]) for i, name in enumerate(self.problem.free)}
-        return Expressions(x, p, objective, constraints, errors)
+        errors = {n: x[i] * float(problem.theta_scale[i]) for i, n in enumerate(problem.free)}
+        first, n, rows = self._n_theta + self._n_zeros, self._n_passive, problem.robot.closure_rows
+        zeros = x[self._n_theta : first] * LENGTH_SCALE
+        readings = self._builder.predict(x, p) + zeros[o.zero.tolist()]
+        states = list(enumerate(problem.states.names))
+        return Expressions(
+            variables=x,
+            parameters=p,
+            objective=objective,
+            constraints=constraints,
+            errors=errors,
+            nuisance={name: errors[name] for name in problem.free[problem.n_machine :]},
+            zeros=zeros,
+            readings=readings,
+            residuals=p[: o.size] - readings,
+            passive={
+                name: x[first + k * n : first + (k + 1) * n] * ca.DM(problem.passive_scale)
+                for k, name in states
+            },
+            closures={
+                name: constraints[k * rows : (k + 1) * rows] * LENGTH_SCALE for k, name in states
+            },
+        )
 
     def pack(
         self,
@@ -265,7 +304,7 @@ class NonlinearProgram:
             sigma: Standard deviation of one reading, [m].
             values: Readings as single ones, shape (n_entries,), [m]; the session's by default.
             left_out: Entries not to be used, as indices.
-            widening: What the width of a robust loss is multiplied by.
+            widening: Factor on the width of a robust loss.
         """
         y = self.problem.values if values is None else values
         weights = np.ones(y.size)
@@ -281,11 +320,15 @@ class NonlinearProgram:
 
     @cached_property
     def _exact(self) -> NonlinearProgram:
-        """The same with the exact Hessian: slower, and it converges where the other does not."""
+        """The same with the exact Hessian: slower, but it converges in more cases."""
         return NonlinearProgram(self.problem, options=replace(self.options, hessian="exact"))
 
     def _start_ipopt(self) -> ca.Function:
-        """Ipopt, ready to solve."""
+        """Ipopt with its functions and options.
+
+        Raises:
+            OrthocalError: If Ipopt does not accept an option.
+        """
         entries = self.problem.observations.size
         ipopt: dict[str, Any] = {
             "tol": self.options.tolerance * max(1.0, entries / EXACT_READINGS),
@@ -298,7 +341,9 @@ class NonlinearProgram:
             "nlp_scaling_method": "none",  # everything is of order one already
             "linear_solver": "mumps",
             "mumps_pivot_order": 6,  # QAMD, made for a few dense rows: the parameters
+            **_plain(self.options.ipopt),
         }
+        _require_accepted(self.options.ipopt)
         return ca.nlpsol(
             "calibration",
             "ipopt",
@@ -315,28 +360,56 @@ class NonlinearProgram:
         )
 
     def _bounds(self, side: Literal["lower", "upper"], held: Mapping[int, float]) -> Array:
-        """Bounds of all variables, scaled: only parameters have any."""
+        """Bounds of all variables, scaled; a known zero is fixed at 0."""
         problem = self.problem
-        k = problem.n_postures * self._n_passive + self._n_zeros
-        k += int(problem.setting.follows.sum())
-        own = getattr(problem.selection, side) / problem.theta_scale
+        k = problem.n_states * self._n_passive + self._n_zeros
+        k += int(problem.model.alignment.aligned.sum())
+        bounds = getattr(problem.selection, side) / problem.theta_scale
         for i, value in held.items():
-            own[i] = value / problem.theta_scale[i]
-        return np.concatenate([own, np.full(k, -np.inf if side == "lower" else np.inf)])
+            bounds[i] = value / problem.theta_scale[i]
+        others = np.full(k, -np.inf if side == "lower" else np.inf)
+        others[: self._n_zeros][problem.observations.zero_known] = 0.0
+        return np.concatenate([bounds, others])
+
+
+def _plain(options: Mapping[str, OptionValue]) -> dict[str, float | int | str]:
+    """Options as Ipopt takes them: yes and no for truth values."""
+    words = {True: "yes", False: "no"}
+    return {k: words[v] if isinstance(v, bool) else v for k, v in options.items()}
+
+
+def _require_accepted(options: Mapping[str, OptionValue]) -> None:
+    """Refuse options that Ipopt does not accept.
+
+    Raises:
+        OrthocalError: Naming the option.
+    """
+    x = ca.MX.sym("x")
+    for name, value in options.items():
+        try:
+            ipopt = {"print_level": 0, "sb": "yes", **_plain({name: value})}
+            ca.nlpsol("probe", "ipopt", {"x": x, "f": x**2}, {"ipopt": ipopt, "print_time": False})
+        except RuntimeError as e:
+            unknown = "No such IPOPT option" in str(e)
+            raise OrthocalError(
+                f"SolverOptions(ipopt=...): Ipopt has no option '{name}'"
+                if unknown
+                else f"SolverOptions(ipopt=...): {value!r} is not a value of Ipopt's '{name}'"
+            ) from None
 
 
 def _weighting(sigma: float) -> tuple[float, float]:
-    """Standard deviation that readings are weighted by, and the scale of the whole objective."""
+    """Standard deviation by which readings are weighted, and the scale of the objective."""
     weighted = max(sigma, FINEST_WEIGHT)
     return weighted, (sigma / weighted) ** 2
 
 
 def _at_bound(
-    theta: Array, pull: Array, lower: Array, upper: Array, held: Mapping[int, float]
+    theta: Array, multipliers: Array, lower: Array, upper: Array, held: Mapping[int, float]
 ) -> NDArray[np.int8]:
-    """Which parameters their bounds hold: the multiplier outweighs what is left of the way."""
+    """Parameters held by a bound: its multiplier exceeds the distance to it."""
     result = np.zeros(theta.size, dtype=np.int8)
-    result[-pull > np.abs(theta - lower[: theta.size])] = -1
-    result[pull > np.abs(theta - upper[: theta.size])] = 1
+    result[-multipliers > np.abs(theta - lower[: theta.size])] = -1
+    result[multipliers > np.abs(theta - upper[: theta.size])] = 1
     result[list(held)] = 0
     return result

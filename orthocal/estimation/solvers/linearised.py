@@ -1,4 +1,4 @@
-"""The identification to first order, as the paper's: one step from what the controller corrects."""
+"""The identification to first order, as in the paper: one step from the active offsets."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ Array = NDArray[np.float64]
 
 
 class LinearisedProgram:
-    """A calibration problem with its readings taken to first order.
+    """A calibration problem with readings to first order.
 
     Args:
         problem: The problem.
-        options: The loss; the rest is that of other solvers.
+        options: The loss; other options do not apply.
     """
 
     def __init__(
@@ -31,7 +31,7 @@ class LinearisedProgram:
         self.options = options or SolverOptions(solver="linearised")
 
     def with_problem(self, problem: CalibrationProblem) -> LinearisedProgram:
-        """The same for another problem: nothing is built."""
+        """The same solver for another problem; nothing is built."""
         return LinearisedProgram(problem, options=self.options)
 
     def solve(
@@ -46,11 +46,10 @@ class LinearisedProgram:
     ) -> Solution:
         """Solve for given readings; arguments as for `Program.solve`.
 
-        The readings are taken to first order about what the controller already corrects, wherever
-        the start is.
+        The point of linearisation is the reference, whatever the start.
 
         Raises:
-            ClosureError: If the machine found cannot reach a posture.
+            ClosureError: If the solution cannot reach a posture.
         """
         del start
         began = time.perf_counter()
@@ -66,19 +65,19 @@ class LinearisedProgram:
         about = task.at(problem.reference / problem.theta_scale, start_passive)
         _, jacobian = problem.linearise(problem.reference, about.passive)
         jacobian /= sigma
-        within = task.moved(about, jacobian, task.start(None) - about.theta)
-        found = task.moved(within, jacobian, task.step(within, jacobian))
-        theta = np.clip(found.theta, task.low, task.high) * problem.theta_scale
+        begin = task.moved(about, jacobian, task.start(None) - about.theta)
+        final = task.moved(begin, jacobian, task.step(begin, jacobian))
+        theta = np.clip(final.theta, task.low, task.high) * problem.theta_scale
         return Solution(
             theta=theta,
-            zeros=found.zeros * sigma,
+            zeros=final.zeros * sigma,
             passive=problem.close(theta, start=about.passive),
-            objective=found.objective,
+            objective=final.objective,
             status="Solve_Succeeded",
             iterations=1,
             hessian="gauss-newton",
             seconds_build=0.0,
             seconds_solve=time.perf_counter() - began,
             closure=0.0,
-            at_bound=task.held_by_bounds(found, jacobian, held),
+            at_bound=task.held_by_bounds(final, jacobian, held),
         )

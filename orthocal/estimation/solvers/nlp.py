@@ -1,14 +1,14 @@
-"""The whole nonlinear program as functions, with exact and sparse derivatives.
+"""Functions of the complete nonlinear program, with exact and sparse derivatives.
 
-One posture and one reading are written as CasADi functions, mapped over postures and readings, and
-their results gathered into the gradient, Jacobian and Hessian of the whole by index: building does
-not grow with the session. Functions of a posture and of a reading are kept, in memory and on disk.
+One posture and one reading are CasADi functions, mapped over postures and readings. Their results
+are gathered into the gradient, Jacobian and Hessian of the program by index, so that the time to
+build it does not grow with the session. The functions are cached in memory and on disk.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import casadi as ca
@@ -17,61 +17,105 @@ from numpy.typing import NDArray
 
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import Hessian
-from orthocal.estimation.pieces import ReadingPiece
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
-from orthocal.estimation.sparse import SparseSum
-from orthocal.kinematics.function_cache import kept_function
+from orthocal.estimation.solvers.symbolic_problem import ReadingExpressions, SymbolicProblem
+from orthocal.kinematics.function_cache import cached_function
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-class ProgramFunctions:
-    """Builds the functions of a problem's program.
+class SparseSum:
+    """Sums of contributions into the nonzeros of one sparse matrix or vector."""
 
-    Variables x are θ̂, gauge zeros, the passive coordinates of every posture and where gauges stand
-    that were set by the machine, scaled; parameters p are readings, weights and noise of each
-    entry, then σ, the prior's scale and the loss's width.
+    def __init__(self, n_rows: int, n_columns: int) -> None:
+        self._shape = (n_rows, n_columns)
+        self._rows: list[Indices] = []
+        self._columns: list[Indices] = []
+        self._values: list[ca.MX] = []
+
+    def add(self, rows: Indices, columns: Indices, values: ca.MX) -> None:
+        """Add values (a column vector) at positions."""
+        self._rows.append(np.asarray(rows, dtype=np.int64).reshape(-1))
+        self._columns.append(np.asarray(columns, dtype=np.int64).reshape(-1))
+        self._values.append(values)
+
+    def build(self) -> ca.MX:
+        """The sparse matrix."""
+        rows, columns = np.concatenate(self._rows), np.concatenate(self._columns)
+        values = ca.vertcat(*self._values)
+        keys = columns * self._shape[0] + rows  # order of compressed columns
+        unique, position = np.unique(keys, return_inverse=True)
+        sparsity = ca.Sparsity(
+            *self._shape,
+            _column_starts(unique // self._shape[0], self._shape[1]),
+            (unique % self._shape[0]).tolist(),
+        )
+        if unique.size == keys.size:
+            order = np.empty(keys.size, dtype=np.int64)
+            order[position] = np.arange(keys.size)
+            nonzeros = values[order.tolist()]
+        else:
+            summing = ca.Sparsity(
+                unique.size, keys.size, list(range(keys.size + 1)), position.tolist()
+            )
+            nonzeros = ca.mtimes(ca.MX(ca.DM.ones(summing)), values)
+        return ca.MX(sparsity, ca.densify(nonzeros))
+
+
+def _column_starts(columns: Indices, count: int) -> list[int]:
+    starts = np.zeros(count + 1, dtype=np.int64)
+    np.cumsum(np.bincount(columns, minlength=count), out=starts[1:])
+    return [int(v) for v in starts]
+
+
+class ProgramFunctions:
+    """Builder of the functions of a problem's program.
+
+    Variables x are θ̂, gauge zeros, the passive coordinates of every posture and the manually
+    aligned nuisance parameters, scaled. Parameters p are readings, weights and noise of each entry,
+    then σ, the scale of the prior and the width of the loss.
 
     Args:
         problem: The problem.
-        hessian: Of the Lagrangian: exact, or without the curvature of readings and closures.
-        loss: What a residual costs.
+        hessian: Hessian of the Lagrangian: exact, or without curvature of readings and closures.
+        loss: Cost of a residual.
     """
 
     def __init__(self, problem: CalibrationProblem, *, hessian: Hessian, loss: Loss) -> None:
         self.problem, self.hessian, self.loss = problem, hessian, loss
+        self._symbolic = SymbolicProblem(problem)
         self._n_theta = problem.n_free
         self._n_zeros = problem.observations.n_zeros
         self._n_passive = problem.robot.passive_index.size
-        first = self._n_theta + self._n_zeros + problem.n_postures * self._n_passive
-        # free parameters that a hand sets by the machine; where they stand is a variable of its own
-        self._set = problem.n_machine + np.flatnonzero(problem.setting.follows)
-        self._standing = np.arange(self._n_theta)
-        self._standing[self._set] = first + np.arange(self._set.size)
+        first = self._n_theta + self._n_zeros + problem.n_states * self._n_passive
+        # the value of an aligned nuisance parameter is a variable beside its deviation in θ̂
+        self._aligned = problem.n_machine + np.flatnonzero(problem.model.alignment.aligned)
+        self._value_of = np.arange(self._n_theta)
+        self._value_of[self._aligned] = first + np.arange(self._aligned.size)
 
     def build(self) -> dict[str, ca.Function]:
         """Objective and constraints, gradient, Jacobian and Hessian, of (x, p[, lam_f, lam_g])."""
         problem = self.problem
-        k = problem.n_postures
-        n = self._n_theta + self._n_zeros + k * self._n_passive + self._set.size
+        k = problem.n_states
+        n = self._n_theta + self._n_zeros + k * self._n_passive + self._aligned.size
         x = ca.MX.sym("x", n)
         entries = problem.observations.size
         p = ca.MX.sym("p", 3 * entries + 3)
         lam_f = ca.MX.sym("lam_f")
-        lam_g = ca.MX.sym("lam_g", k * problem.robot.closure_rows + self._set.size)
+        lam_g = ca.MX.sym("lam_g", k * problem.robot.closure_rows + self._aligned.size)
         theta = x[: self._n_theta]
         prior = p[3 * entries + 1] * ca.DM(problem.prior_precision)
         from_mean = theta - ca.DM(problem.prior_mean / problem.theta_scale)
 
-        shared = list(self._shared_call(theta[: problem.n_machine]))
+        shared = self._shared_calls(theta[: problem.n_machine])
         objective = 0.5 * ca.dot(prior * from_mean, from_mean)
         gradient, hessian = SparseSum(n, 1), SparseSum(n, n)
         diagonal = np.arange(self._n_theta)
         gradient.add(diagonal, np.zeros_like(diagonal), prior * from_mean)
         hessian.add(diagonal, diagonal, lam_f * prior)
-        for piece in problem.reading_pieces:
-            objective += self._add_readings(piece, x, p, shared, lam_f, gradient, hessian)
+        for one in self._symbolic.readings:
+            objective += self._add_readings(one, x, p, shared, lam_f, gradient, hessian)
         constraints, jacobian = self._add_closures(x, lam_g, shared, hessian)
 
         f, g = ca.densify(objective), ca.densify(constraints)
@@ -90,241 +134,301 @@ class ProgramFunctions:
         }
         return functions
 
-    def _passive_variables(self, postures: Indices, index: Indices) -> Indices:
-        """Positions in x of passive coordinates, shape (n_postures, n_index)."""
+    def _passive_variables(self, states: Indices, index: Indices) -> Indices:
+        """Positions in x of passive coordinates, shape (n_states, n_index)."""
         first = self._n_theta + self._n_zeros
-        return np.asarray(first + postures[:, None] * self._n_passive + index[None, :])
+        return np.asarray(first + states[:, None] * self._n_passive + index[None, :])
 
-    def _shared_call(self, theta: ca.MX) -> tuple[ca.MX, ...]:
-        """What depends on θ̂ alone, once for all postures and readings."""
-        return tuple(self.problem.machine_map.function(theta))
+    def _shared_calls(self, theta: ca.MX) -> list[tuple[ca.MX, ...]]:
+        """Functions of θ̂ alone, evaluated once for all states and readings of each variant."""
+        commands = self.problem.states.variant_commands
+        conditions = commands[:, len(self.problem.robot.drives) :]
+        function = self._symbolic.error_map.function
+        return [tuple(function(theta, ca.DM(values))) for values in conditions]
+
+    def _variant(self, one: ReadingExpressions) -> int:
+        """Conditions of the placements of a sensor group."""
+        return self.problem.model.groups[one.group].variant
 
     def _add_readings(
         self,
-        piece: ReadingPiece,
+        one: ReadingExpressions,
         x: ca.MX,
         p: ca.MX,
-        shared: list[ca.MX],
+        shared: list[tuple[ca.MX, ...]],
         lam_f: ca.MX,
         gradient: SparseSum,
         hessian: SparseSum,
     ) -> ca.MX:
-        """Add the readings of one kind to gradient and Hessian; returns their objective.
+        """Add the readings of one sensor group to gradient and Hessian; return their objective.
 
-        Local variables are (θ̂, û, ẑ, q̂) in the order that they have in x, û what is not known of
-        the sensor.
+        Local variables are (θ̂, ν̂, ẑ, q̂) in the order of x.
         """
-        problem, o = self.problem, self.problem.observations
-        count, n_t = piece.entries.size, piece.theta_index.size
-        postures = o.posture[piece.entries]
-        variables = np.hstack(
-            [
-                np.tile(piece.theta_index, (count, 1)),
-                self._standing[piece.unknown_index],
-                (self._n_theta + o.zero[piece.entries])[:, None],
-                self._passive_variables(postures, piece.passive_index),
-            ]
-        )
-        local, n_u = variables[:, n_t:], piece.unknown_index.shape[1]
-        tolerances = ca.DM(problem.theta_scale[piece.unknown_index].T)
-        own = [
-            ca.reshape(x[local[:, :n_u].reshape(-1).tolist()], n_u, count),
-            ca.MX(tolerances),
-            x[local[:, n_u].tolist()].T,
-            ca.reshape(x[local[:, n_u + 1 :].reshape(-1).tolist()], -1, count),
-            p[piece.entries.tolist()].T,
-            p[(o.size + piece.entries).tolist()].T,
-            p[(2 * o.size + piece.entries).tolist()].T,
-            ca.MX(ca.DM(problem.drives[postures].T)),
-            ca.MX(ca.DM(problem.session.zero_drives[piece.setups].T)),
-            ca.MX(ca.DM(piece.table.T)),
-        ]
-        common = [p[3 * o.size], p[3 * o.size + 2], *shared]
-        arguments = [*own, *common]
-        masks = [*(False for _ in own), *(True for _ in common)]
-        functions = self._reading_functions(piece)
+        count, n_t = one.entries.size, one.theta_index.size
+        theta = np.tile(one.theta_index, (count, 1))
+        variables = np.hstack([theta, self._local_variables(one)])
+        local = variables[:, n_t:]
+        arguments, masks = self._reading_arguments(one, local, x, p, shared)
+        functions = self._reading_functions(one)
 
         total = functions["objective"].map(count, masks, [True])(*arguments)
         # the part of the gradient by θ̂ is a sum over readings, and so is that of the Hessian
         by_theta, by_local = functions["gradient"].map(count, masks, [True, False])(*arguments)
-        gradient.add(piece.theta_index, np.zeros_like(piece.theta_index), by_theta)
+        gradient.add(one.theta_index, np.zeros_like(one.theta_index), by_theta)
         gradient.add(local, np.zeros_like(local), ca.vec(by_local))
 
         summed, rest = functions["hessian"].map(count, masks, [True, False])(*arguments)
         rows, columns = _triangle(n_t)
-        hessian.add(piece.theta_index[rows], piece.theta_index[columns], lam_f * summed)
+        hessian.add(one.theta_index[rows], one.theta_index[columns], lam_f * summed)
         rows, columns = _rest_of_triangle(variables.shape[1], n_t)
         rows, columns = variables[:, rows], variables[:, columns]
-        # unknowns that setups share may come in any order
+        # nuisance parameters that setups share may have any order
         upper = np.minimum(rows, columns), np.maximum(rows, columns)
         hessian.add(*upper, lam_f * ca.vec(rest))
         return total
 
-    def _kept(self, name: str, build: Callable[[], ca.Function]) -> ca.Function:
-        """A function of one posture or one reading, kept by all that is a constant in it."""
+    def _local_variables(self, one: ReadingExpressions) -> Indices:
+        """Positions in x of the (ν̂, ẑ, q̂) of a sensor group's entries, shape (n, n_local)."""
+        o = self.problem.observations
+        return np.hstack(
+            [
+                self._value_of[one.nuisance_index],
+                (self._n_theta + o.zero[one.entries])[:, None],
+                self._passive_variables(o.state[one.entries], one.passive_index),
+            ]
+        )
+
+    def predict(self, x: ca.MX, p: ca.MX) -> ca.MX:
+        """Predicted readings of all entries, gauge zeros at 0, shape (n_entries,).
+
+        Args:
+            x: Variables of the program.
+            p: Parameters of the program.
+
+        Returns:
+            In metres of the first gauge.
+        """
+        shared = self._shared_calls(x[: self.problem.n_machine])
+        values, entries = [], []
+        for one in self._symbolic.readings:
+            local = self._local_variables(one)
+            arguments, masks = self._reading_arguments(one, local, x, p, shared)
+            function = self._reading_functions(one)["reading"]
+            values.append(ca.vec(function.map(one.entries.size, masks, [False])(*arguments)))
+            entries.append(one.entries)
+        order = np.argsort(np.concatenate(entries)) if entries else np.empty(0, dtype=np.int64)
+        return ca.vertcat(ca.MX(0, 1), *values)[order.tolist()]
+
+    def _reading_arguments(
+        self,
+        one: ReadingExpressions,
+        local: Indices,
+        x: ca.MX,
+        p: ca.MX,
+        shared: Sequence[tuple[ca.MX, ...]],
+    ) -> tuple[list[ca.MX], list[bool]]:
+        """Arguments of the mapped functions of a sensor group, and a mask of the common ones.
+
+        Args:
+            one: The reading.
+            local: Positions in x of its (ν̂, ẑ, q̂), shape (n, n_local).
+            x: Variables of the program.
+            p: Parameters of the program.
+            shared: Functions of θ̂ alone, by variant.
+        """
+        problem, o = self.problem, self.problem.observations
+        count, n_u = one.nuisance_index.shape
+        variant = self._variant(one)
+        references = problem.model.reference_commands[variant]
+        tolerances = ca.DM(problem.theta_scale[one.nuisance_index].T)
+        separate = [
+            ca.reshape(x[local[:, :n_u].reshape(-1).tolist()], n_u, count),
+            ca.MX(tolerances),
+            x[local[:, n_u].tolist()].T,
+            ca.reshape(x[local[:, n_u + 1 :].reshape(-1).tolist()], -1, count),
+            p[one.entries.tolist()].T,
+            p[(o.size + one.entries).tolist()].T,
+            p[(2 * o.size + one.entries).tolist()].T,
+            ca.MX(ca.DM(problem.states.commands[o.state[one.entries]].T)),
+            ca.MX(ca.DM(references[one.setups].T)),
+            ca.MX(ca.DM(one.table.T)),
+        ]
+        common = [p[3 * o.size], p[3 * o.size + 2], *shared[variant]]
+        arguments = [*separate, *common]
+        masks = [*(False for _ in separate), *(True for _ in common)]
+        return arguments, masks
+
+    def _cached(self, name: str, build: Callable[[], ca.Function]) -> ca.Function:
+        """A cached function of one posture or one reading; its constants are part of the key."""
         problem = self.problem
-        parts = [name, self.hessian, self.loss.kind, problem.machine_map.digest]
+        parts = [name, self.hessian, self.loss.kind, self._symbolic.error_map.digest]
         parts += [problem.passive_scale.tobytes().hex(), str(problem.n_free - problem.n_machine)]
         digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()
-        return kept_function(problem.robot, f"program {digest}", build)
+        return cached_function(problem.robot, f"program {digest}", build)
 
-    def _reading_functions(self, piece: ReadingPiece) -> dict[str, ca.Function]:
-        """Objective, gradient (by θ̂; by ẑ and q̂) and Hessian (θ̂ with θ̂; the rest) of one."""
-        words = self.problem.sensor_groups[piece.group].reading.words
+    def _reading_functions(self, one: ReadingExpressions) -> dict[str, ca.Function]:
+        """Value, objective, gradient (θ̂; others) and Hessian (θ̂ with θ̂; others) of a reading."""
+        sensor = self.problem.model.groups[one.group].reading.name
         built: dict[str, ca.Function] = {}
 
         def build(name: str) -> ca.Function:
-            if not built:  # all from the same expressions
-                built.update(self._build_reading(piece))
+            if not built:  # all of them from the same expressions
+                built.update(self._build_reading(one))
             return built[name]
 
         return {
-            name: self._kept(f"{name} of {words}", partial(build, name))
-            for name in ("objective", "gradient", "hessian")
+            name: self._cached(f"{name} of {sensor}", partial(build, name))
+            for name in ("reading", "objective", "gradient", "hessian")
         }
 
-    def _build_reading(self, piece: ReadingPiece) -> dict[str, ca.Function]:
+    def _build_reading(self, one: ReadingExpressions) -> dict[str, ca.Function]:
         zero, y, weight = ca.SX.sym("zero"), ca.SX.sym("y"), ca.SX.sym("weight")
         sigma, width, loss = ca.SX.sym("sigma"), ca.SX.sym("width"), self.loss
-        n_t, n_u = piece.theta_index.size, piece.unknowns.numel()
+        n_t, n_u = one.theta_index.size, one.nuisance.numel()
         noise, scaled = ca.SX.sym("noise"), ca.SX.sym("scaled", n_u)
         tolerances = ca.SX.sym("tolerances", n_u)
-        residual = (y - piece.reading / noise - zero * LENGTH_SCALE) / sigma
-        slope = -ca.horzcat(
-            piece.by_theta / noise,
-            piece.by_unknowns @ ca.diag(tolerances) / noise,
+        residual = (y - one.reading / noise - zero * LENGTH_SCALE) / sigma
+        row = -ca.horzcat(
+            one.by_theta / noise,
+            one.by_nuisance @ ca.diag(tolerances) / noise,
             LENGTH_SCALE,
-            piece.by_passive / noise,
+            one.by_passive / noise,
         )
-        slope = ca.densify(slope / sigma)
-        pull = weight * loss.slope(residual, width)
-        gradient = (pull * slope).T
+        row = ca.densify(row / sigma)
+        influence = weight * loss.slope(residual, width)
+        gradient = (influence * row).T
         exact = self.hessian == "exact"
-        # Gauss-Newton takes the secant ρ'/r, which is never below ρ'': far out, where ρ is nearly
-        # straight, a step by ρ'' goes much too far
+        # Gauss-Newton uses the secant ρ'/r, which is never below ρ'': at large residuals, where ρ
+        # is nearly straight, a step with ρ'' is much too long
         bend = loss.curvature(residual, width) if exact else loss.secant(residual, width)
-        second = weight * bend * (slope.T @ slope)
+        second = weight * bend * (row.T @ row)
         if exact:
-            second += pull * self._reading_curvature(piece, tolerances) / (-sigma * noise)
-        inputs = [scaled, tolerances, zero, piece.passive, y, weight, noise]
-        inputs += [piece.drives, piece.zero, piece.constants, sigma, width]
-        inputs += self.problem.machine_map.symbols
+            second += influence * self._reading_curvature(one, tolerances) / (-sigma * noise)
+        inputs = [scaled, tolerances, zero, one.passive, y, weight, noise]
+        inputs += [one.command, one.reference, one.constants, sigma, width]
+        inputs += self._symbolic.error_map.symbols
 
         def pick(rows: Indices, columns: Indices) -> ca.SX:
             return ca.vertcat(*(second[int(i), int(j)] for i, j in zip(rows, columns, strict=True)))
 
-        triangle = _triangle(n_t), _rest_of_triangle(slope.numel(), n_t)
+        triangle = _triangle(n_t), _rest_of_triangle(row.numel(), n_t)
         outputs = {
+            "reading": [one.reading / noise],
             "objective": [weight * loss.cost(residual, width)],
             "gradient": [gradient[:n_t], gradient[n_t:]],
             "hessian": [pick(*triangle[0]), pick(*triangle[1])],
         }
-        own = scaled * tolerances
+        nuisance = scaled * tolerances
         return {
             name: ca.Function(
                 name,
                 inputs,
-                [ca.densify(ca.substitute(v, piece.unknowns, own) if n_u else v) for v in values],
+                [
+                    ca.densify(ca.substitute(v, one.nuisance, nuisance) if n_u else v)
+                    for v in values
+                ],
             )
             for name, values in outputs.items()
         }
 
-    def _reading_curvature(self, piece: ReadingPiece, tolerances: ca.SX) -> ca.SX:
-        """Second derivatives of h by (θ̂, û, ẑ, q̂), in the variables of the piece."""
-        direct = self.problem.direct
-        theta = direct.theta[piece.theta_index.tolist()]
-        passive = direct.passive[piece.passive_index.tolist()]
-        unknowns, constants = direct.unknowns[piece.group], direct.constants[piece.group]
-        u = ca.vertcat(theta, unknowns, ca.SX.sym("zero"), passive)
-        second, _ = ca.hessian(direct.readings[piece.group], u)
+    def _reading_curvature(self, one: ReadingExpressions, tolerances: ca.SX) -> ca.SX:
+        """Second derivatives of h by (θ̂, ν̂, ẑ, q̂)."""
+        direct = self._symbolic.direct
+        theta = direct.theta[one.theta_index.tolist()]
+        passive = direct.passive[one.passive_index.tolist()]
+        nuisance, constants = direct.nuisance[one.group], direct.constants[one.group]
+        u = ca.vertcat(theta, nuisance, ca.SX.sym("zero"), passive)
+        second, _ = ca.hessian(direct.readings[one.group], u)
         n_t, n = theta.numel(), u.numel()
         scale = ca.diag(
-            ca.vertcat(ca.SX.ones(n_t), tolerances, ca.SX.ones(n - n_t - unknowns.numel()))
+            ca.vertcat(ca.SX.ones(n_t), tolerances, ca.SX.ones(n - n_t - nuisance.numel()))
         )
         function = ca.Function(
             "curvature",
-            [direct.theta, unknowns, passive, direct.drives, direct.zero, constants],
+            [direct.theta, nuisance, passive, direct.command, direct.reference, constants],
             [ca.densify(second)],
         )
-        theta = self.problem.machine_map.symbols[0]
-        found = function(
-            theta, piece.unknowns, piece.passive, piece.drives, piece.zero, piece.constants
+        theta = self._symbolic.error_map.symbols[0]
+        values = function(
+            theta, one.nuisance, one.passive, one.command, one.reference, one.constants
         )
-        return scale @ found @ scale
+        return scale @ values @ scale
 
     def _add_closures(
-        self, x: ca.MX, lam_g: ca.MX, shared: list[ca.MX], hessian: SparseSum
+        self, x: ca.MX, lam_g: ca.MX, shared: list[tuple[ca.MX, ...]], hessian: SparseSum
     ) -> tuple[ca.MX, ca.MX]:
-        """Closures of all postures and their Jacobian; their curvature goes into the Hessian."""
+        """Closures of all states and their Jacobian; their curvature goes into the Hessian."""
         problem = self.problem
-        k, n_p = problem.n_postures, self._n_passive
+        k, n_p = problem.n_states, self._n_passive
         n_g, first = problem.robot.closure_rows, self._n_theta + self._n_zeros
-        closure_f, slope_f = (self._closure_function(name) for name in ("closure", "closure_slope"))
-        pattern_rows, pattern_columns = (np.array(v) for v in slope_f.sparsity_out(0).get_triplet())
-        arguments = [
-            ca.reshape(x[first : first + k * n_p], n_p, k),
-            ca.MX(ca.DM(problem.drives.T)),
-            *shared,
-        ]
-        masks = [False, False, *(True for _ in shared)]
-        constraints = ca.vec(closure_f.map(k, masks, [False])(*arguments))
-        nonzeros = slope_f.map(k, masks, [False])(*arguments).nz[:]
-
-        postures = np.arange(k)
-        variables = np.hstack(
-            [
-                np.tile(np.arange(problem.n_machine), (k, 1)),
-                self._passive_variables(postures, np.arange(n_p)),
-            ]
+        names = ("closure", "closure_jacobian")
+        closure_f, jacobian_f = (self._closure_function(name) for name in names)
+        pattern_rows, pattern_columns = (
+            np.array(v) for v in jacobian_f.sparsity_out(0).get_triplet()
         )
-        rows = postures[:, None] * n_g + pattern_rows[None, :]
-        jacobian = SparseSum(k * n_g + self._set.size, x.numel())
-        jacobian.add(rows, variables[:, pattern_columns], nonzeros)
+        passive = ca.reshape(x[first : first + k * n_p], n_p, k)
+        commands = ca.MX(ca.DM(problem.states.commands.T))
+        machine = np.tile(np.arange(problem.n_machine), (k, 1))
+        variables = np.hstack([machine, self._passive_variables(np.arange(k), np.arange(n_p))])
+        jacobian = SparseSum(k * n_g + self._aligned.size, x.numel())
+        parts, order = [], []
+        for variant, common in enumerate(shared):
+            states = np.flatnonzero(problem.states.variant == variant)
+            chosen = states.tolist()
+            arguments = [passive[:, chosen], commands[:, chosen], *common]
+            masks = [False, False, *(True for _ in common)]
+            parts.append(ca.vec(closure_f.map(states.size, masks, [False])(*arguments)))
+            order.append((states[:, None] * n_g + np.arange(n_g)).reshape(-1))
+            nonzeros = jacobian_f.map(states.size, masks, [False])(*arguments).nz[:]
+            rows = states[:, None] * n_g + pattern_rows[None, :]
+            jacobian.add(rows, variables[states][:, pattern_columns], nonzeros)
+        constraints = ca.vertcat(*parts)[np.argsort(np.concatenate(order)).tolist()]
         if self.hessian == "exact":
-            self._add_closure_curvature(arguments[:3], lam_g[: k * n_g], variables, hessian)
-        if self._set.size:
-            slopes, start = self._set_by_machine()
-            constraints = ca.vertcat(constraints, slopes @ x + start)
-            of_rows, columns = (np.array(v) for v in slopes.sparsity().get_triplet())
-            jacobian.add(k * n_g + of_rows, columns, ca.MX(ca.DM(slopes.nonzeros())))
+            arguments = [passive, commands, shared[0][0]]
+            self._add_closure_curvature(arguments, lam_g[: k * n_g], variables, hessian)
+        if self._aligned.size:
+            matrix, start = self._alignment_constraints()
+            constraints = ca.vertcat(constraints, matrix @ x + start)
+            of_rows, columns = (np.array(v) for v in matrix.sparsity().get_triplet())
+            jacobian.add(k * n_g + of_rows, columns, ca.MX(ca.DM(matrix.nonzeros())))
         return constraints, jacobian.build()
 
     def _closure_function(self, name: str) -> ca.Function:
-        """The closures of a posture, or their slope by (θ̂, q̂), sparse."""
+        """The closures of a posture, or their sparse Jacobian by (θ̂, q̂)."""
 
         def build() -> ca.Function:
-            piece = self.problem.posture_piece
-            inputs = [piece.passive, piece.drives, *self.problem.machine_map.symbols]
+            posture = self._symbolic.posture
+            inputs = [posture.passive, posture.command, *self._symbolic.error_map.symbols]
             values = {
-                "closure": ca.densify(piece.closure),
-                "closure_slope": ca.sparsify(ca.horzcat(piece.by_theta, piece.by_passive)),
+                "closure": ca.densify(posture.closure),
+                "closure_jacobian": ca.sparsify(ca.horzcat(posture.by_theta, posture.by_passive)),
             }
             return ca.Function(name, inputs, [values[name]])
 
-        return self._kept(name, build)
+        return self._cached(name, build)
 
-    def _set_by_machine(self) -> tuple[ca.DM, ca.DM]:
-        """Slopes by x, and constants, of what is 0 where gauges stand as they were set.
+    def _alignment_constraints(self) -> tuple[ca.DM, ca.DM]:
+        """Matrix and constants of A x + b = 0 for the manually aligned nuisance parameters.
 
-        That is how much the tolerance of a parameter has of: set by the machine, and beside that,
-        less where it stands.
+        In units of its tolerance: alignment (a function of the errors) plus deviation minus value.
         """
         problem, n = self.problem, self.problem.n_machine
-        own, scale = self._set - n, problem.theta_scale[self._set]
-        rows = np.arange(self._set.size)
-        slopes = np.zeros((rows.size, int(self._standing.max()) + 1))
-        slopes[:, :n] = problem.set_by[own] / scale[:, None]
-        slopes[rows, self._set] = 1.0
-        slopes[rows, self._standing[self._set]] = -1.0
-        start = problem.setting(problem.assembly.errors())[own] / scale
-        return ca.sparsify(ca.DM(slopes)), ca.DM(start)
+        index, scale = self._aligned - n, problem.theta_scale[self._aligned]
+        rows = np.arange(self._aligned.size)
+        matrix = np.zeros((rows.size, int(self._value_of.max()) + 1))
+        alignment = problem.model.alignment
+        matrix[:, :n] = (alignment.slopes @ problem.columns)[index] / scale[:, None]
+        matrix[rows, self._aligned] = 1.0
+        matrix[rows, self._value_of[self._aligned]] = -1.0
+        start = alignment(problem.closure.errors())[index] / scale
+        return ca.sparsify(ca.DM(matrix)), ca.DM(start)
 
     def _add_closure_curvature(
         self, arguments: list[ca.MX], lam_g: ca.MX, variables: Indices, hessian: SparseSum
     ) -> None:
-        """Σ λᵀ ∇²ĝ of every posture; arguments are q̂, drives and θ̂."""
-        direct = self.problem.direct
-        k, n_g = self.problem.n_postures, self.problem.robot.closure_rows
+        """Σ λᵀ ∇²ĝ of every state; arguments are q̂, commands and θ̂."""
+        direct = self._symbolic.direct
+        k, n_g = self.problem.n_states, self.problem.robot.closure_rows
         multiplier = ca.SX.sym("multiplier", n_g)
         u = ca.vertcat(direct.theta, direct.passive)
         second = ca.triu(ca.hessian(ca.dot(multiplier, direct.closure), u)[0])
@@ -332,7 +436,7 @@ class ProgramFunctions:
         summed_part = columns < self.problem.n_machine
         function = ca.Function(
             "closure_hessian",
-            [direct.passive, direct.drives, direct.theta, multiplier],
+            [direct.passive, direct.command, direct.theta, multiplier],
             [
                 ca.densify(second.nz[np.flatnonzero(part).tolist()])
                 for part in (summed_part, ~summed_part)

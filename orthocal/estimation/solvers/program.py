@@ -1,4 +1,4 @@
-"""What every solver is: a function of a problem. Same problem in, same solution out."""
+"""Interface of the solvers. The same problem gives the same solution."""
 
 from __future__ import annotations
 
@@ -15,42 +15,42 @@ from orthocal.estimation.problem import CalibrationProblem
 Array = NDArray[np.float64]
 
 LEFT_OUT = 1e-9
-"""Weight of readings that are left out: next to nothing, and their gauge zeros stay determined."""
+"""Weight of excluded readings: negligible, but their gauge zeros stay determined."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """What a solver found."""
+    """Solution of a calibration problem."""
 
     theta: Array
     """Free parameters, shape (n_free,), [SI]."""
     zeros: Array
     """Gauge zeros, shape (n_zeros,), [m]."""
     passive: Array
-    """Passive coordinates, shape (n_postures, n_passive), [m, rad]."""
+    """Passive coordinates, shape (n_states, n_passive), [m, rad]."""
     objective: float
-    """Σ ρ((y − h − z)/σ), and the prior's share."""
+    """Σ ρ((y − h − z)/σ) plus the contribution of the prior."""
     status: str
-    """Ipopt's word, or the same of another solver."""
+    """Status as Ipopt names it."""
     iterations: int
     hessian: Hessian
-    """With which it was found; that of the others is Gauss-Newton's."""
+    """Hessian of the solver; always Gauss-Newton for solvers other than Ipopt."""
     seconds_build: float
     seconds_solve: float
     closure: float
-    """Largest closure residual that is left, rotations times characteristic length, [m]."""
+    """Largest remaining closure residual, rotations times characteristic length, [m]."""
     at_bound: NDArray[np.int8]
-    """-1 where a parameter is held by its lower bound, 1 by its upper one, else 0, (n_free,)."""
+    """-1 for a parameter at its lower bound, 1 at its upper bound, else 0, shape (n_free,)."""
 
 
 class Program(Protocol):
-    """A problem made ready for a solver; solved again and again without rebuilding."""
+    """A problem prepared for a solver, for any number of solutions."""
 
     problem: CalibrationProblem
     options: SolverOptions
 
     def with_problem(self, problem: CalibrationProblem) -> Program:
-        """The same for another `with_values` of its problem; nothing is built again."""
+        """The same program for a `with_values` of its problem; nothing is built again."""
 
     def solve(
         self,
@@ -68,10 +68,10 @@ class Program(Protocol):
             sigma: Standard deviation of one reading, [m].
             values: Readings as single ones, shape (n_entries,), [m of the first gauge]; the
                 session's by default.
-            start: Free parameters to start from, shape (n_free,), [SI]; by default what the
-                controller already corrects.
+            start: Free parameters to start from, shape (n_free,), [SI]; by default the
+                reference.
             start_passive: Passive coordinates to start closing the loops from.
-            left_out: Entries not to be used, as indices.
+            left_out: Indices of the entries to exclude.
             held: Index of a free parameter to the value it is held at, [SI].
 
         Raises:
@@ -81,7 +81,7 @@ class Program(Protocol):
 
 
 def no_convergence(options: SolverOptions) -> str:
-    """What to look for where a solver does not converge."""
+    """Advice after a solver did not converge."""
     return "there is no result. Look for a reading with a wrong sign or in a wrong row first" + (
         "" if options.loss.robust else "; with the loss 'huber' it may be named"
     )

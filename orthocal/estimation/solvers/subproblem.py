@@ -1,7 +1,7 @@
-"""A calibration problem in its free parameters alone: where it is, and its step to first order.
+"""The problem in its free parameters alone, for one set of readings, and its Gauss-Newton step.
 
-The passive coordinates follow the parameters by the implicit function theorem, ∂q/∂θ = −g_q⁻¹ g_θ;
-a gauge's zero is where it leaves least. What remains is small and dense.
+The passive coordinates follow the parameters by the implicit function theorem, ∂q/∂θ = −g_q⁻¹ g_θ.
+Free gauge zeros have their optimal values. The remaining problem is small and dense.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ from orthocal.errors import SolverError
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.program import LEFT_OUT
-from orthocal.observation.expansion import Expansion
+from orthocal.observation.model import Linearisation
 
 Array = NDArray[np.float64]
 
 SETTLED_WITHIN = 1e-11
-"""Last step towards the optimum of a subproblem with a robust loss, in tolerances."""
+"""Last step of a subproblem with a robust loss, [tolerances]."""
 
 MOST_STEPS_WITHIN = 100
 
 ROWS_AT_ONCE = 2048
-"""Of the Jacobian, while they are squared: what stays near the processor."""
+"""Rows of the Jacobian that are multiplied at once: they stay in the processor's cache."""
 
 FEW = 50
-"""Unknowns up to which an elimination takes less than SciPy's triangular one takes to import."""
+"""Size of systems that NumPy solves faster than SciPy's triangular solver is imported."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """The problem at some θ, or to first order near one."""
+    """The problem at some θ̂, or to first order near it."""
 
     theta: Array
     """θ̂, shape (n_free,)."""
     passive: Array
-    """Passive coordinates of every posture where it is no approximation, [m, rad]."""
+    """Passive coordinates of every posture, not updated by first-order changes, [m, rad]."""
     deviation: Array
-    """Readings less predictions, zeros still in them, shape (n_entries,), [σ]."""
+    """Readings minus predictions, with gauge zeros, shape (n_entries,), [σ]."""
     zeros: Array
     """Shape (n_zeros,), [σ]."""
     objective: float
@@ -70,7 +70,7 @@ class Task:
         left_out: ArrayLike | None,
         held: Mapping[int, float] | None,
     ) -> Task:
-        """What a solver is asked for; arguments as for `Program.solve`."""
+        """Task of a solver; arguments as for `Program.solve`."""
         lower, upper = problem.selection.lower.copy(), problem.selection.upper.copy()
         for i, value in (held or {}).items():
             lower[i] = upper[i] = value
@@ -84,17 +84,17 @@ class Task:
     def start(self, theta: ArrayLike | None) -> Array:
         """θ̂ to start from, within the bounds, shape (n_free,)."""
         problem = self.problem
-        given = np.array(problem.reference if theta is None else theta, dtype=np.float64)
-        return np.clip(given / problem.theta_scale, self.low, self.high)
+        start = np.array(problem.reference if theta is None else theta, dtype=np.float64)
+        return np.clip(start / problem.theta_scale, self.low, self.high)
 
     def held_by_bounds(
         self, state: State, jacobian: Array, held: Mapping[int, float] | None
     ) -> NDArray[np.int8]:
-        """-1 where a lower bound holds a parameter, 1 where an upper one does, shape (n_free,)."""
-        pull = self.slope(state, jacobian)
+        """-1 for a parameter held by its lower bound, 1 by its upper bound, shape (n_free,)."""
+        gradient = self.slope(state, jacobian)
         result = np.zeros(state.theta.size, dtype=np.int8)
-        result[(state.theta <= self.low) & (pull > 0.0)] = -1
-        result[(state.theta >= self.high) & (pull < 0.0)] = 1
+        result[(state.theta <= self.low) & (gradient > 0.0)] = -1
+        result[(state.theta >= self.high) & (gradient < 0.0)] = 1
         result[list(held or {})] = 0
         return result
 
@@ -109,12 +109,12 @@ class Task:
         closed = problem.close(si, start=passive)
         return self._state(theta, closed, (self.values - problem.predict(si, closed)) / self.sigma)
 
-    def begin(self, theta: ArrayLike | None, passive: Array | None) -> tuple[State, Expansion]:
-        """The problem where a solver begins; arguments as for `Program.solve`.
+    def begin(self, theta: ArrayLike | None, passive: Array | None) -> tuple[State, Linearisation]:
+        """The problem at the start of a solver; arguments as for `Program.solve`.
 
         Raises:
             ClosureError: If the machine cannot reach a posture there.
-            SolverError: If a sensor shows nothing there.
+            SolverError: If a sensor has no reading there.
         """
         problem, at = self.problem, self.start(theta)
         if passive is None:
@@ -123,23 +123,23 @@ class Task:
                 passive = problem.close(at * problem.theta_scale, start=passive)
         else:
             passive = problem.close(at * problem.theta_scale, start=passive)
-        expansion = self.expand(at, passive)
-        if not np.isfinite(expansion.jacobian).all():
+        linear = self.linearise(at, passive)
+        if not np.isfinite(linear.jacobian).all():
             raise SolverError(
                 "cannot begin: on the machine that the readings lead to a tip passes what it "
                 "touched, or a sensor shows nothing; look for a wrong sign, row or setup",
                 status="Invalid_Number_Detected",
                 iterations=0,
             )
-        return self.near(at, passive, expansion), expansion
+        return self.near(at, passive, linear), linear
 
-    def expand(self, theta: Array, passive: Array) -> Expansion:
+    def linearise(self, theta: Array, passive: Array) -> Linearisation:
         """Readings to first order about some θ̂ and passive coordinates near closed loops."""
-        return self.problem.expand(theta * self.problem.theta_scale, passive)
+        return self.problem.linearisation(theta * self.problem.theta_scale, passive)
 
-    def near(self, theta: Array, passive: Array, expansion: Expansion) -> State:
-        """The problem at some θ̂, its loops closed to first order."""
-        predicted = expansion.reading + expansion.opening
+    def near(self, theta: Array, passive: Array, linear: Linearisation) -> State:
+        """The problem at some θ̂, with loops closed to first order."""
+        predicted = linear.reading + linear.opening
         return self._state(theta, passive, (self.values - predicted) / self.sigma)
 
     def moved(self, state: State, jacobian: Array, change: Array) -> State:
@@ -147,13 +147,13 @@ class Task:
         return self._state(state.theta + change, state.passive, state.deviation - jacobian @ change)
 
     def step(self, state: State, jacobian: Array) -> Array:
-        """Change of θ̂ that solves the problem, its readings taken to first order, (n_free,).
+        """Change of θ̂ that solves the problem with readings to first order, shape (n_free,).
 
-        Squares: one solve. A robust loss: Newton's method, whose weights are ρ''; where that does
-        not make it better, by the secant ρ'/r, which always does.
+        Least squares take one solve. A robust loss takes Newton's method with weights ρ''; where
+        that does not decrease the objective, with the secant ρ'/r, which always does.
 
         Args:
-            state: Where.
+            state: The point of linearisation.
             jacobian: dh/dθ̂ there, shape (n_entries, n_free), [σ per tolerance].
         """
         at = state
@@ -163,17 +163,17 @@ class Task:
             residual = at.deviation - at.zeros[self.problem.observations.zero]
             for weights in (self.loss.bend(residual), self.loss.weight(residual)):
                 change = self._change(at, jacobian, self.weights * weights)
-                found = self.moved(at, jacobian, change)
-                if found.objective <= at.objective:
+                trial = self.moved(at, jacobian, change)
+                if trial.objective <= at.objective:
                     break
             settled = float(np.abs(change).max(initial=0.0)) < SETTLED_WITHIN
-            if settled or found.objective > at.objective:
+            if settled or trial.objective > at.objective:
                 break
-            at = found
+            at = trial
         return np.asarray(at.theta - state.theta)
 
     def _change(self, at: State, jacobian: Array, weights: Array) -> Array:
-        """Newton's step with given weights, within the bounds, shape (n_free,)."""
+        """Newton step with weights of the entries, within the bounds, shape (n_free,)."""
         square = self._square(jacobian, weights)
         square[np.diag_indices_from(square)] += self.problem.prior_precision
         return self._solve(square, -self.slope(at, jacobian), at.theta)
@@ -181,17 +181,18 @@ class Task:
     def slope(self, state: State, jacobian: Array) -> Array:
         """Derivative of the objective by θ̂, shape (n_free,)."""
         residual = state.deviation - state.zeros[self.problem.observations.zero]
-        own = self.problem.prior_precision * self._off(state.theta)
-        return np.asarray(own - jacobian.T @ (self.weights * self.loss.influence(residual)))
+        prior = self.problem.prior_precision * self._off(state.theta)
+        return np.asarray(prior - jacobian.T @ (self.weights * self.loss.influence(residual)))
 
     def _state(self, theta: Array, passive: Array, deviation: Array) -> State:
         o, off = self.problem.observations, self._off(theta)
         zeros = self.loss.centres(deviation, o.zero, o.n_zeros, weights=self.weights)
+        zeros[o.zero_known] = 0.0
         own = 0.5 * float(off @ (self.problem.prior_precision * off))
         cost = float(self.weights @ self.loss.value(deviation - zeros[o.zero]))
         return State(theta, passive, deviation, zeros, cost + own)
 
-    def _solve(self, square: Array, pull: Array, theta: Array) -> Array:
+    def _solve(self, square: Array, gradient: Array, theta: Array) -> Array:
         """The s that minimises ½ sᵀ A s − bᵀ s within the bounds, shape (n_free,).
 
         Parameters with a bound come last in the triangular factor, so that its last rows are a
@@ -203,36 +204,37 @@ class Task:
         n_open = int((~bounded).sum())
         scale = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
         scaled = (square * np.outer(scale, scale))[np.ix_(order, order)]
-        target = (pull * scale)[order]
+        target = (gradient * scale)[order]
         step = np.empty_like(theta)
         try:
             factor: Array = np.asarray(np.linalg.cholesky(scaled).T, dtype=np.float64)
-        except np.linalg.LinAlgError:  # not told by anything: the least change
+        except np.linalg.LinAlgError:  # undetermined parameters: the smallest change
             values, vectors = np.linalg.eigh(scaled)
-            kept = values > 1e-13 * values.max(initial=0.0)
-            step[order] = vectors[:, kept] @ ((vectors[:, kept].T @ target) / values[kept])
+            large = values > 1e-13 * values.max(initial=0.0)
+            step[order] = vectors[:, large] @ ((vectors[:, large].T @ target) / values[large])
             return np.asarray(np.clip(step * scale, low, high))
         target = _solve_triangular(factor, target, transposed=True)
         last = slice(n_open, None)
         limits = ((side / scale)[order][last] for side in (low, high))
-        found = np.empty_like(target)
-        found[last] = _bounded(factor[last, last], target[last], *limits)
-        found[:n_open] = _solve_triangular(
-            factor[:n_open, :n_open], target[:n_open] - factor[:n_open, last] @ found[last]
+        solution = np.empty_like(target)
+        solution[last] = _bounded(factor[last, last], target[last], *limits)
+        solution[:n_open] = _solve_triangular(
+            factor[:n_open, :n_open], target[:n_open] - factor[:n_open, last] @ solution[last]
         )
-        step[order] = found
+        step[order] = solution
         return np.asarray(np.clip(step * scale, low, high))
 
     def _off(self, theta: Array) -> Array:
-        """How far θ̂ is from its prior's mean, shape (n_free,)."""
+        """Deviation of θ̂ from the mean of its prior, shape (n_free,)."""
         return np.asarray(theta - self.problem.prior_mean / self.problem.theta_scale)
 
     def _square(self, jacobian: Array, weights: Array) -> Array:
-        """Jᵀ W J, rows less the weighted mean of those that share their zero, some zeros at a time.
+        """Jᵀ W J of rows minus the weighted mean of those with the same free zero.
 
-        A large Jacobian is read once, and never copied as a whole.
+        Works on some zeros at a time: a large Jacobian is read once and never copied completely.
         """
-        zero = self.problem.observations.zero
+        o = self.problem.observations
+        zero = o.zero
         order = np.argsort(zero, kind="stable")
         starts = np.flatnonzero(np.diff(zero[order], prepend=-1))
         ends = np.append(starts[1:], zero.size)
@@ -240,16 +242,19 @@ class Task:
         first = 0
         while first < starts.size:
             last = max(first + 1, int(np.searchsorted(ends, starts[first] + ROWS_AT_ONCE, "right")))
-            rows, own = order[starts[first] : ends[last - 1]], starts[first:last] - starts[first]
+            rows, groups = order[starts[first] : ends[last - 1]], starts[first:last] - starts[first]
             counts = ends[first:last] - starts[first:last]
             part, weight = jacobian[rows], weights[rows]
+            known = o.zero_known[zero[order[starts[first:last]]]]
             if (weight != 1.0).any():
-                means = np.add.reduceat(part * weight[:, None], own, axis=0)
-                means /= np.add.reduceat(weight, own)[:, None]
+                means = np.add.reduceat(part * weight[:, None], groups, axis=0)
+                means /= np.add.reduceat(weight, groups)[:, None]
+                means[known] = 0.0
                 part -= np.repeat(means, counts, axis=0)
                 part *= np.sqrt(weight)[:, None]
             else:
-                means = np.add.reduceat(part, own, axis=0) / counts[:, None]
+                means = np.add.reduceat(part, groups, axis=0) / counts[:, None]
+                means[known] = 0.0
                 part -= np.repeat(means, counts, axis=0)
             result += part.T @ part
             first = last
@@ -274,8 +279,8 @@ def _bounded(factor: Array, target: Array, low: Array, high: Array) -> Array:
 
     movable = high > low
     result = np.where(movable, 0.0, low)
-    left = target - factor @ result
+    remainder = target - factor @ result
     limits = low[movable], high[movable]
-    found = lsq_linear(factor[:, movable], left, bounds=limits, method="bvls", tol=1e-15)
-    result[movable] = found.x
+    solution = lsq_linear(factor[:, movable], remainder, bounds=limits, method="bvls", tol=1e-15)
+    result[movable] = solution.x
     return np.asarray(result)

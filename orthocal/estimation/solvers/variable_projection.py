@@ -1,10 +1,10 @@
-"""The exact identification with passive joints and gauge zeros eliminated: Gauss-Newton on θ alone.
+"""Variable projection: the exact identification by Gauss-Newton on θ alone.
 
-About the present θ the problem is linear but for a robust loss: that subproblem is solved to its
-end, within the bounds. The passive joints follow the step to first order, and where that leaves the
-loops nearly closed and the whole better, what is left open is a correction to the next step.
-Elsewhere the loops are closed, and the step is taken as far as it makes the whole better. The
-optimum is that of the whole program which Ipopt solves.
+Passive joints and gauge zeros are eliminated. About the present θ the problem is linear except for
+a robust loss; this subproblem is solved completely, within the bounds. The passive joints follow
+the step to first order. If the loops stay nearly closed and the objective decreases, their opening
+is corrected in the next step. Otherwise the loops are closed and the step is halved until the
+objective decreases. The optimum is that of the complete program, which Ipopt solves.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.solvers.program import Solution, no_convergence
 from orthocal.estimation.solvers.subproblem import State, Task
-from orthocal.observation.expansion import Expansion
+from orthocal.observation.model import Linearisation
 
 Array = NDArray[np.float64]
 
 SETTLED = 1e-8
-"""Largest change of θ̂ that the next step would make, in tolerances, by how the last ones shrank:
-each is smaller than the one before by what errors change of the derivatives."""
+"""Estimated next step at which the solver has converged, extrapolated from the ratio of the last
+steps, [tolerances]."""
 
 NEARLY_CLOSED = 1e-3
 """Largest correction of a passive coordinate that readings are taken to follow to first order,
@@ -36,15 +36,15 @@ NEARLY_CLOSED = 1e-3
 MOST_HALVINGS = 12
 
 ROUNDING = 1e-12
-"""Relative growth of the objective that is none."""
+"""Relative growth of the objective that counts as rounding."""
 
 
-class EliminatedProgram:
-    """A calibration problem with nothing left but its free parameters.
+class VariableProjection:
+    """A calibration problem reduced to its free parameters.
 
     Args:
         problem: The problem.
-        options: Iterations and loss; the rest is Ipopt's.
+        options: Iterations and loss; other options do not apply.
     """
 
     def __init__(
@@ -53,9 +53,9 @@ class EliminatedProgram:
         self.problem = problem
         self.options = options or SolverOptions(solver="eliminated")
 
-    def with_problem(self, problem: CalibrationProblem) -> EliminatedProgram:
-        """The same for another problem: nothing is built."""
-        return EliminatedProgram(problem, options=self.options)
+    def with_problem(self, problem: CalibrationProblem) -> VariableProjection:
+        """The same solver for another problem; nothing is built."""
+        return VariableProjection(problem, options=self.options)
 
     def solve(
         self,
@@ -84,10 +84,10 @@ class EliminatedProgram:
         )
         begin = task.begin(start, start_passive)
         try:
-            found = self._descend(task, begin, follow=True)
-        except (ClosureError, SolverError):  # on the way the loops were not looked at
-            found = self._descend(task, task.begin(start, start_passive), follow=False)
-        state, jacobian, iterations = found
+            optimum = self._descend(task, begin, follow=True)
+        except (ClosureError, SolverError):  # with open loops; now close them in every step
+            optimum = self._descend(task, task.begin(start, start_passive), follow=False)
+        state, jacobian, iterations = optimum
         return Solution(
             theta=state.theta * self.problem.theta_scale,
             zeros=state.zeros * sigma,
@@ -103,40 +103,40 @@ class EliminatedProgram:
         )
 
     def _descend(
-        self, task: Task, begin: tuple[State, Expansion], *, follow: bool
+        self, task: Task, begin: tuple[State, Linearisation], *, follow: bool
     ) -> tuple[State, Array, int]:
-        """The optimum, the Jacobian by which it was found, and iterations.
+        """Gauss-Newton iterations: the optimum, the last Jacobian and the number of iterations.
 
         Args:
-            task: What is asked for.
-            begin: Where to begin, loops closed.
-            follow: Whether passive joints may follow a step to first order.
+            task: The task.
+            begin: The start, with closed loops.
+            follow: Let passive joints follow a step to first order.
 
         Raises:
             SolverError: If it does not converge.
-            ClosureError: If the machine found cannot reach a posture.
+            ClosureError: If the solution cannot reach a posture.
         """
         most = self.options.max_iterations
         sizes: list[float] = []
-        state, expansion = begin
+        state, linear = begin
         for iterations in range(1, most + 1):
-            jacobian = expansion.jacobian
-            jacobian /= task.sigma  # in its place: it may be large, and is of no more use as it was
+            jacobian = linear.jacobian
+            jacobian /= task.sigma  # in place: it may be large, and is not used again
             step = task.step(state, jacobian)
             sizes.append(float(np.abs(step).max(initial=0.0)))
             if follow and _settled(sizes):
                 theta = np.clip(state.theta + step, task.low, task.high)
-                passive = state.passive + expansion.follow(theta - state.theta)
+                passive = state.passive + linear.follow(theta - state.theta)
                 return task.at(theta, passive), jacobian, iterations
-            followed = self._follow(task, state, expansion, step) if follow else None
+            followed = self._follow(task, state, linear, step) if follow else None
             if followed is not None:
-                state, expansion = followed
+                state, linear = followed
                 continue
-            state, taken = self._move(task, state, step)
-            sizes[-1] = float(np.abs(taken).max(initial=0.0))
+            state, step = self._move(task, state, step)
+            sizes[-1] = float(np.abs(step).max(initial=0.0))
             if _settled(sizes):
                 return state, jacobian, iterations
-            expansion = task.expand(state.theta, state.passive)
+            linear = task.linearise(state.theta, state.passive)
         raise SolverError(
             f"did not converge: the step is still {sizes[-1]:.2g} tolerances after {most} "
             f"iterations; {no_convergence(self.options)}",
@@ -145,35 +145,35 @@ class EliminatedProgram:
         )
 
     def _follow(
-        self, task: Task, state: State, expansion: Expansion, step: Array
-    ) -> tuple[State, Expansion] | None:
-        """A whole step with passive joints that follow it; None where that is not good enough."""
+        self, task: Task, state: State, linear: Linearisation, step: Array
+    ) -> tuple[State, Linearisation] | None:
+        """A full step with passive joints that follow it; None if the loops open too far."""
         theta = np.clip(state.theta + step, task.low, task.high)
-        passive = state.passive + expansion.follow(theta - state.theta)
+        passive = state.passive + linear.follow(theta - state.theta)
         try:
-            found = task.expand(theta, passive)
+            following = task.linearise(theta, passive)
         except np.linalg.LinAlgError:
             return None
-        turned = np.abs(found.correction / task.problem.passive_scale).max(initial=0.0)
-        if not turned * LENGTH_SCALE < NEARLY_CLOSED * task.problem.robot.characteristic_length:
+        motion = np.abs(following.correction / task.problem.passive_scale).max(initial=0.0)
+        if not motion * LENGTH_SCALE < NEARLY_CLOSED * task.problem.robot.characteristic_length:
             return None
-        after = task.near(theta, passive, found)
-        return (after, found) if after.objective <= _no_more_than(state) else None
+        after = task.near(theta, passive, following)
+        return (after, following) if after.objective <= _no_more_than(state) else None
 
     def _move(self, task: Task, state: State, step: Array) -> tuple[State, Array]:
-        """Take a step as far as it makes the objective smaller, loops closed.
+        """Halve a step until the objective decreases, with closed loops.
 
         Raises:
-            SolverError: If no part of it does.
+            SolverError: If it never does.
         """
         for halving in range(MOST_HALVINGS):
             part = step * 0.5**halving
             try:
-                found = task.at(np.clip(state.theta + part, task.low, task.high), state.passive)
-            except ClosureError:  # there the machine cannot be assembled
+                trial = task.at(np.clip(state.theta + part, task.low, task.high), state.passive)
+            except ClosureError:  # the machine cannot reach a posture there
                 continue
-            if found.objective <= _no_more_than(state):
-                return found, part
+            if trial.objective <= _no_more_than(state):
+                return trial, part
             if np.abs(part).max(initial=0.0) < SETTLED:
                 return state, np.zeros_like(step)
         raise SolverError(
@@ -184,7 +184,7 @@ class EliminatedProgram:
 
 
 def _settled(sizes: list[float]) -> bool:
-    """Whether the next step would change nothing, shrinking as the last two did, or slower."""
+    """True if the next step is negligible, extrapolated from the last three."""
     last = sizes[-3:]
     if last[-1] <= SETTLED:
         return True

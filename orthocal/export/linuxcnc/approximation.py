@@ -24,7 +24,7 @@ from orthocal.export.linuxcnc.nominal_form import NominalForm, Tangent, find_nom
 from orthocal.export.polynomial import Polynomial, PolynomialFit, chebyshev_line, total_degree
 from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.loop_closure import find_beyond_travel
-from orthocal.kinematics.workspace import grid_points, tool_at_zero
+from orthocal.kinematics.workspace import cube_limits, describe_box, grid_points, tool_at_zero
 from orthocal.units import MM, UM
 
 Array = NDArray[np.float64]
@@ -134,19 +134,20 @@ def approximate(
 
     Args:
         calibration: The calibration.
-        within: Largest distance of the tip from its target, [m].
-        tool: Tip in the frame of the robot's tool centre point, shape (3,), [m].
-        half_side: Half the side of the region around the mechanical zero, [m]; by default the
-            largest that the machine reaches, at most 60 mm.
+        within: Largest distance of the tip from where it belongs, [m].
+        tool: The tip in the frame of the robot's tool centre point, shape (3,), [m].
+        half_side: Half the side of a cube around the mechanical zero, [m]; by default the region
+            is the workspace.
 
     Raises:
         ExportError: If no degree meets the tolerance, with the best error; if the machine has no
             tool or does not reach the region.
     """
-    tip, robot = ToolTip(calibration, tool), calibration.robot
-    middle = tool_at_zero(robot)
+    tip = ToolTip(calibration, tool)
+    robot = calibration.robot
+    box = _find_box(calibration, half_side)
+    middle, half = tool_at_zero(robot) + 0.5 * box.sum(axis=1), 0.5 * (box[:, 1] - box[:, 0])
     n = middle.size
-    half = np.full(n, _find_half_side(calibration) if half_side is None else half_side)
     most = MOST_DEGREE[n]
     nodes = grid_points(chebyshev_line(most + EXTRA_NODES), n)
     checks = middle + half * check_points(n)
@@ -158,8 +159,8 @@ def approximate(
         expected, passive = tip.reach(checks)
     except ClosureError as e:
         raise ExportError(
-            f"the machine does not reach ±{half[0] / MM:g} mm ({e.reason}); "
-            "use a smaller --half-side-mm"
+            f"the machine does not reach {describe_box(box)} ({e.reason}); "
+            "give a smaller --half-side-mm"
         ) from None
     form = find_nominal_form(robot, middle, half)
     corrections = drives - form(middle + half * nodes)[0]
@@ -185,8 +186,8 @@ def approximate(
                 longer=_error_of_longer_tool(tip, expected, passive),
             )
     raise ExportError(
-        f"no polynomial up to degree {most} keeps the tool within {within / UM:g} µm "
-        f"over ±{half[0] / MM:g} mm; the best one reaches {rounded_up(best / UM)} µm"
+        f"no polynomial of a degree up to {most} keeps the tool within {within / UM:g} µm "
+        f"over {describe_box(box)}; the best of them reaches {rounded_up(best / UM)} µm"
     )
 
 
@@ -209,11 +210,14 @@ def corners(n: int) -> Array:
     return grid_points(np.array([-1.0, 1.0]), n)
 
 
-def _find_half_side(calibration: Calibration) -> float:
+def _find_box(calibration: Calibration, half_side: float | None) -> Array:
+    """Region relative to the mechanical zero, shape (n_coordinates, 2), [m]."""
+    if half_side is not None:
+        return cube_limits(calibration.robot, half_side)
     tool = find_tool(calibration)
-    if tool is None or tool.workspace.half_side is None:
+    if tool is None:
         raise ExportError("the machine has no tool that its drives command over a region")
-    return tool.workspace.half_side
+    return tool.workspace.limits
 
 
 def _estimate(inverse: CorrectedInverse, points: Array, drives: Array) -> float:

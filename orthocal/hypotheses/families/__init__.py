@@ -1,1 +1,1 @@
-"""Kinds of mistake, one family a file: which edits of the readings would mend it."""
+"""Families of hypotheses, one topic per module: what may have gone wrong with a session."""

@@ -1,152 +1,123 @@
-"""What moved while readings were taken: a bumped stand, a drift, a dial that stuck."""
+"""Displaced gauge, drift and stuck dial: what changes while a setup is read.
+
+Differences of postures show neither a displaced gauge nor a drift.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.hypotheses.edits import Edit, Family, Table
+from orthocal.hypotheses.anomaly import Explanation, Scope
+from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, Tails, marks, sparse_rows
 
 Indices = NDArray[np.int64]
 
 FEWEST = 4
-"""Readings of a setup below which a tail or a drift is not told from a single reading."""
+"""Readings of a setup below which a tail or a drift is not distinguished from an outlier."""
 
 FEWEST_STUCK = 3
-"""Readings alike in a row below which a dial is not said to have stuck."""
+"""Equal readings in a row from which on a dial may have stuck."""
 
 MOST_STUCK = 16
 """Readings of a run that are used."""
 
 
-def find_moved(table: Table) -> Iterator[Family]:
-    """Stands that were bumped, and drifts; differences of postures show neither."""
-    for family in (_bumped(table), _cycles_apart(table), _drift(table), _stuck(table)):
-        if family.edits:
+def displaced_gauges(rows: Rows) -> Iterator[Family]:
+    """Gauges displaced within a setup or for one cycle, drifts, stuck dials."""
+    for family in (_displaced(rows), _cycle_apart(rows), _drift(rows), _stuck(rows)):
+        if family is not None:
             yield family
 
 
-def _bumped(table: Table) -> Family:
-    edits: list[Callable[[], Edit]] = []
-    tails = []
-    for name, rows in table.setups.items():
-        if not table.raw[rows].all():
+def _displaced(rows: Rows) -> Family | None:
+    segments = [
+        (own, np.ones(own.size))
+        for own in rows.setups.values()
+        if rows.single[own].all() and own.size >= FEWEST
+    ]
+    if not segments:
+        return None
+    starts = [np.arange(2, own.size - 1) for own, _ in segments]
+    segment = np.repeat(np.arange(len(segments)), [s.size for s in starts])
+    start = np.concatenate(starts)
+
+    def explain(h: int) -> Explanation:
+        own = segments[segment[h]][0]
+        setup = rows.session.readings[own[0]].setup
+        later = tuple(own[start[h] :].tolist())
+        return Explanation("displaced gauge", "setup", later, names=(setup,))
+
+    none = sparse_rows([np.empty(0, dtype=np.int64)] * start.size, [], rows.count)
+    effects = Patterns(none, Tails(segments, segment, start))
+    return Family(explain, start.size, start.size, effects=effects)
+
+
+def _cycle_apart(rows: Rows) -> Family | None:
+    """An inner cycle; before the second and the last one the gauge was displaced for good."""
+    groups: list[Indices] = []
+    keys: list[tuple[str, int]] = []
+    for (name, cycle), own in rows.cycles.items():
+        setup = rows.setups[name]
+        inner = own[0] != setup[0] and own[-1] != setup[-1]
+        if inner and own.size > 1 and rows.single[own].all():
+            groups.append(own)
+            keys.append((name, cycle))
+    if not groups:
+        return None
+
+    def explain(h: int) -> Explanation:
+        name, cycle = keys[h]
+        own = tuple(groups[h].tolist())
+        return Explanation("displaced gauge", "cycle", own, names=(name,), cycle=cycle)
+
+    return Family(explain, len(groups), len(groups), effects=marks(groups, rows.count))
+
+
+def _drift(rows: Rows) -> Family | None:
+    drifting = {
+        name: own
+        for name, own in rows.setups.items()
+        if own.size >= FEWEST and rows.single[own].all()
+    }
+    groups: list[tuple[tuple[str, ...], Indices]] = [
+        ((name,), own) for name, own in drifting.items()
+    ]
+    ramps = [np.linspace(0.0, 1.0, own.size) for own in drifting.values()]
+    if not groups:
+        return None
+    if len(groups) > 1:
+        groups.append((tuple(drifting), np.concatenate(list(drifting.values()))))
+        ramps.append(np.concatenate(ramps))
+
+    def explain(h: int) -> Explanation:
+        setups, own = groups[h]
+        scope: Scope = "setup" if len(setups) == 1 else "session"
+        return Explanation("drift", scope, tuple(own.tolist()), setups)
+
+    effects = Patterns(sparse_rows([own for _, own in groups], ramps, rows.count))
+    return Family(explain, len(groups), len(groups), effects=effects)
+
+
+def _stuck(rows: Rows) -> Family | None:
+    runs: list[Indices] = []
+    for own in rows.setups.values():
+        if not rows.single[own].all():
             continue
-        for k in range(2, rows.size - 1):
-            tails.append(rows[k:])
-            edits.append(
-                partial(
-                    Edit,
-                    "bumped stand",
-                    f"the stand of setup {name} was bumped before {table.label(int(rows[k]))}: all "
-                    "its later readings are shifted",
-                    "If so, read setup "
-                    f"{name} again, or make a setup of its own of what was read after that.",
-                    tuple(rows[k:].tolist()),
-                )
-            )
-    return _additive(table, edits, tails)
+        ends = np.flatnonzero(np.append(np.diff(rows.values[own]) != 0.0, True))
+        begins = np.append(0, ends[:-1] + 1)
+        for k in np.flatnonzero(ends - begins >= FEWEST_STUCK - 1):
+            run = own[begins[k] : ends[k] + 1]
+            if len({rows.session.readings[i].posture for i in run}) > 1:
+                runs.append(run)
+    if not runs:
+        return None
 
+    def explain(h: int) -> Explanation:
+        setup = rows.session.readings[runs[h][0]].setup
+        return Explanation("stuck dial", "setup", tuple(runs[h].tolist()), names=(setup,))
 
-def _cycles_apart(table: Table) -> Family:
-    edits: list[Callable[[], Edit]] = []
-    groups = []
-    for (name, cycle), rows in table.cycles.items():
-        own = table.setups[name]
-        # of the first and the last cycle the stand was bumped between
-        inner = rows[0] != own[0] and rows[-1] != own[-1]
-        if inner and rows.size > 1 and table.raw[rows].all():
-            groups.append(rows)
-            edits.append(
-                partial(
-                    Edit,
-                    "bumped stand",
-                    f"the gauge of setup {name} was set anew for cycle {cycle}, or touched",
-                    f"If so, read cycle {cycle} again, or leave it out.",
-                    tuple(rows.tolist()),
-                )
-            )
-    return _additive(table, edits, groups)
-
-
-def _additive(table: Table, edits: list[Callable[[], Edit]], groups: list[Indices]) -> Family:
-    wrong = np.zeros((len(groups), table.count))
-    for h, rows in enumerate(groups):
-        wrong[h, rows] = 1.0
-    return Family(edits, np.zeros_like(wrong), max(len(edits), 1), wrong=wrong)
-
-
-def _drift(table: Table) -> Family:
-    edits: list[Callable[[], Edit]] = []
-    ramps = []
-    every, drifting = np.zeros(table.count), []
-    for name, rows in table.setups.items():
-        if rows.size < FEWEST or not table.raw[rows].all():
-            continue
-        ramp = np.zeros(table.count)
-        ramp[rows] = np.linspace(0.0, 1.0, rows.size)
-        every += ramp
-        drifting.append(rows)
-        ramps.append(ramp)
-        edits.append(
-            partial(
-                Edit,
-                "drift",
-                f"the readings of setup {name} drifted from the first to the last",
-                "Let the machine and the stand come to one temperature, return to the first "
-                "posture at the end, and read it again.",
-                tuple(rows.tolist()),
-                (name,),
-            )
-        )
-    if len(ramps) > 1:
-        ramps.append(every)
-        edits.append(
-            partial(
-                Edit,
-                "drift",
-                "the readings of every setup drifted alike from its first to its last",
-                "Let the machine and the stand come to one temperature, and read it again.",
-                tuple(np.concatenate(drifting).tolist()),
-                tuple(table.setups),
-            )
-        )
-    wrong = np.array(ramps).reshape(-1, table.count)
-    return Family(edits, np.zeros_like(wrong), max(len(edits), 1), wrong=wrong)
-
-
-def _stuck(table: Table) -> Family:
-    edits: list[Callable[[], Edit]] = []
-    unknown: list[tuple[int, ...]] = []
-    for name, rows in table.setups.items():
-        if not table.raw[rows].all():
-            continue
-        values = table.values[rows]
-        ends = np.flatnonzero(np.append(np.diff(values) != 0.0, True))
-        begin = 0
-        for end in ends:
-            run = rows[begin : end + 1]
-            begin = int(end) + 1
-            postures = {table.session.readings[i].posture for i in run}
-            if run.size < FEWEST_STUCK or len(postures) < 2:
-                continue
-            unknown.append(tuple(run[1 : MOST_STUCK + 1].tolist()))
-            edits.append(
-                partial(
-                    Edit,
-                    "stuck dial",
-                    f"the dial stuck in setup {name}: from {table.label(int(run[0]))} on it shows "
-                    f"the same {run.size} times",
-                    "See whether the plunger moves freely and touches, and read these again.",
-                    tuple(run.tolist()),
-                )
-            )
-    return Family(
-        edits,
-        np.zeros((len(edits), table.count)),
-        table.count * MOST_STUCK,
-        unknown=unknown,
-    )
+    silent = [run[1 : MOST_STUCK + 1] for run in runs]
+    return Family(explain, len(runs), rows.count * MOST_STUCK, silent=silent)

@@ -1,59 +1,86 @@
-"""A step that was missed or doubled: all later readings stand a row too high or too low."""
+"""Row offset: a step was missed or written twice, so that later readings are one row off."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from orthocal.hypotheses.edits import Edit, Family, Table
+from orthocal.hypotheses.anomaly import Explanation
+from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, Tails, sparse_rows
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 FEWEST = 3
-"""Rows of a setup below which a shift is an exchange."""
+"""Rows of a setup below which a row offset is a swap."""
 
 
-def find_shifted(table: Table) -> Iterator[Family]:
-    """A step missed or doubled in a setup, or in one cycle of it; and rows gone round by one."""
-    segments = [(name, rows) for name, rows in table.setups.items() if rows.size >= FEWEST]
+class _Offsets(NamedTuple):
+    """Row offsets of one kind in a setup or cycle."""
+
+    rows: Indices
+    """Rows in the order of measuring, shape (m,)."""
+    base: Array
+    """Correction of each row from the start on, shape (m,), [m]."""
+    position: Indices
+    """Place of the first row that is wrong, shape (h,)."""
+    start: Indices
+    """Place from which on `base` applies, shape (h,)."""
+    at: Indices
+    """Row with a correction of its own, shape (h,)."""
+    value: Array
+    """That correction, shape (h,), [m]."""
+    lost: Indices
+    """Row whose reading is lost, shape (h,)."""
+
+
+def row_offsets(rows: Rows) -> Iterator[Family]:
+    """A step missed or written twice in a setup or in one cycle of it.
+
+    If a step is missed, the last row is empty or holds what belongs into the first of the rows;
+    if one is written twice, the last reading is lost. The lost reading is of unknown size.
+    """
+    segments = [own for own in rows.setups.values() if own.size >= FEWEST]
     segments += [
-        (name, rows)
-        for (name, _), rows in table.cycles.items()
-        if FEWEST <= rows.size < table.setups[name].size
+        own for (name, _), own in rows.cycles.items() if FEWEST <= own.size < rows.setups[name].size
     ]
-    moves: list[tuple[Callable[[], Edit], list[int], list[int], int]] = []
-    for name, rows in segments:
-        for k in range(rows.size - 1):
-            to, last = rows[k:].tolist(), int(rows[-1])
-            # what was read next stands in the row of the step that was missed
-            moves.append((partial(_missed, table, name, to), to[1:] + to[:1], to, to[0]))
-            if k > 0:
-                moves.append((partial(_doubled, table, name, to), to, [*to[1:], last], last))
-    if not moves:
+    if not segments:
         return
-    change = np.zeros((len(moves), table.count))
-    wrong = np.zeros_like(change)
-    for h, (_, to, source, lost) in enumerate(moves):
-        change[h, to] = table.values[source] - table.values[to]
-        wrong[h, lost] = 1.0
-    yield Family([m[0] for m in moves], change, len(moves), wrong=wrong)
-
-
-def _missed(table: Table, setup: str, rows: list[int]) -> Edit:
-    return Edit(
-        "shifted rows",
-        f"{table.label(rows[0])} was not read, and all later readings of setup {setup} stand in "
-        "the row before their own",
-        "If so, move them down by a row and read what is missing.",
-        tuple(rows),
+    offsets = [_offsets(own, rows.values[own], m) for own in segments for m in (True, False)]
+    sizes = [o.position.size for o in offsets]
+    which = np.repeat(np.arange(len(offsets)), sizes)
+    position, start, at, value, lost = (
+        np.concatenate([getattr(o, name) for o in offsets]) for name in _Offsets._fields[2:]
     )
 
+    def explain(h: int) -> Explanation:
+        own = offsets[which[h]].rows[position[h] :]
+        cycles = {rows.session.readings[i].cycle for i in own}
+        return Explanation(
+            "row offset",
+            "setup",
+            tuple(own.tolist()),
+            names=(rows.session.readings[own[0]].setup,),
+            cycle=cycles.pop() if len(cycles) == 1 else None,
+            missing=int(which[h]) % 2 == 0,
+        )
 
-def _doubled(table: Table, setup: str, rows: list[int]) -> Edit:
-    return Edit(
-        "shifted rows",
-        f"the reading before {table.label(rows[0])} was written twice, and all later readings of "
-        f"setup {setup} stand in the row after their own",
-        "If so, move them up by a row and read the last one again.",
-        tuple(rows),
-    )
+    count, ones = which.size, np.ones((which.size, 1))
+    tails = Tails([(o.rows, o.base) for o in offsets], which, start)
+    edits = Patterns(sparse_rows(list(at[:, None]), list(value[:, None]), rows.count), tails)
+    effects = Patterns(sparse_rows(list(lost[:, None]), list(ones), rows.count))
+    yield Family(explain, count, count, edits, effects)
+
+
+def _offsets(own: Indices, values: Array, missing: bool) -> _Offsets:
+    """Row offsets of one kind in some rows, one per row from which on it may begin."""
+    k = np.arange(0 if missing else 1, own.size - 1)
+    if missing:  # rows after k get the reading before, row k gets the last one
+        base = np.append(0.0, values[:-1] - values[1:])
+        return _Offsets(own, base, k, k + 1, own[k], values[-1] - values[k], own[k])
+    # rows from k on get the reading after, the last one is lost
+    base = np.append(values[1:] - values[:-1], 0.0)
+    return _Offsets(own, base, k, k, own[k], np.zeros(k.size), np.full(k.size, own[-1]))

@@ -1,119 +1,95 @@
-"""Single readings: a slip, a forgotten minus, a point in the wrong place, the dial misread.
-
-Each also in all cycles of a posture, where only other postures can tell.
-"""
+"""Single readings: outlier, reversed sign, decimal point, misread dial; also in all cycles."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.hypotheses.edits import Edit, Family, Table
-from orthocal.hypotheses.mistake import MistakeKind
-from orthocal.units import MM
+from orthocal.hypotheses.anomaly import AnomalyKind, Explanation, Scope
+from orthocal.hypotheses.families.unit_and_sign import DECIMAL_POINTS
+from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, marks, sparse_rows
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-PLACES = (10.0, 0.1, 100.0, 0.01)
-"""What a reading is multiplied by where its decimal point is put right."""
-
 MISREAD = (1e-3, 0.5e-3, 0.2e-3, 0.1e-3)
-"""What a dial is misread by: a turn, half a turn, a turn of a fine dial, a numbered mark, [m]."""
+"""Amounts by which a dial is misread: a turn, half a turn, a turn of a fine dial, a numbered mark,
+[m]."""
 
 FEWEST_POSTURES = 3
-"""Postures of a setup of which one may be wrong in all cycles."""
+"""Postures of a setup from which on one may be wrong in all cycles."""
 
 
-def find_single(table: Table) -> Iterator[Family]:
-    """All that may be wrong with one reading, or with one posture in all cycles."""
-    single = [np.array([i]) for i in range(table.count)]
-    yield _slips(table, single, "suspicious reading")
-    yield _multiplied(table, single, (-1.0,), "turned reading")
-    yield _multiplied(table, single, PLACES, "decimal place")
-    yield _misread(table, single)
+def wrong_readings(rows: Rows) -> Iterator[Family]:
+    """Errors of one reading, or of one posture of a setup in all cycles."""
+    single = [np.array([i]) for i in range(rows.count)]
+    yield _outliers(rows, single)
+    yield _multiplied(rows, single, (-1.0,), "reversed sign")
+    yield _multiplied(rows, single, DECIMAL_POINTS, "decimal point")
+    yield _misread(rows, single)
     several = [
-        rows
-        for (setup, _), rows in table.repeated.items()
-        if len(rows) > 1 and len(table.setups[setup]) >= FEWEST_POSTURES * len(rows)
+        own
+        for (setup, *_), own in rows.repeated.items()
+        if len(own) > 1 and len(rows.setups[setup]) >= FEWEST_POSTURES * len(own)
     ]
     if several:
-        yield _slips(table, several, "suspicious posture")
-        yield _multiplied(table, several, (-1.0,), "turned reading")
-        yield _multiplied(table, several, PLACES, "decimal place")
+        yield _outliers(rows, several)
+        yield _multiplied(rows, several, (-1.0,), "reversed sign")
+        yield _multiplied(rows, several, DECIMAL_POINTS, "decimal point")
 
 
-def _words(table: Table, rows: Indices) -> str:
-    if len(rows) == 1:
-        return table.label(int(rows[0]))
-    return f"{table.session.readings[int(rows[0])].label} in all cycles"
+def explain_rows(
+    rows: Rows, own: Indices, kind: AnomalyKind, *, factor: float | None = None
+) -> Explanation:
+    """Explanation that concerns one reading, or one posture in all cycles."""
+    scope: Scope = "reading" if len(own) == 1 else "posture"
+    names = (rows.posture(int(own[0])),)
+    return Explanation(kind, scope, tuple(own.tolist()), names=names, factor=factor)
 
 
-def _marks(table: Table, groups: Sequence[Indices]) -> Array:
-    result = np.zeros((len(groups), table.count))
-    for h, rows in enumerate(groups):
-        result[h, rows] = 1.0
-    return result
-
-
-def _slips(table: Table, groups: Sequence[Indices], kind: MistakeKind) -> Family:
-    edits = [partial(_slip, table, rows, kind) for rows in groups]
-    marks = _marks(table, groups)
-    return Family(edits, np.zeros_like(marks), len(groups), wrong=marks)
-
-
-def _slip(table: Table, rows: Indices, kind: MistakeKind) -> Edit:
-    what = f"{_words(table, rows)} was misread or mistyped"
-    return Edit(kind, what, "Read it again, or leave it out.", tuple(rows.tolist()))
+def _outliers(rows: Rows, groups: Sequence[Indices]) -> Family:
+    kind: AnomalyKind = "outlier" if len(groups[0]) == 1 else "inconsistent posture"
+    return Family(
+        lambda h: explain_rows(rows, groups[h], kind),
+        len(groups),
+        len(groups),
+        effects=marks(groups, rows.count),
+    )
 
 
 def _multiplied(
-    table: Table, groups: Sequence[Indices], factors: Sequence[float], kind: MistakeKind
+    rows: Rows, groups: Sequence[Indices], factors: Sequence[float], kind: AnomalyKind
 ) -> Family:
-    marks = _marks(table, groups)
-    edits: list[Callable[[], Edit]] = []
-    change, volume = [], []
-    for factor in factors:
-        change.append(marks * table.values * (factor - 1.0))
-        volume.append(marks.sum(axis=1) * np.log(abs(factor)))
-        edits += [partial(_multiplied_edit, table, rows, factor, kind) for rows in groups]
+    tried = [(factor, own) for factor in factors for own in groups]
+    change = [(factor - 1.0) * rows.values[own] for factor, own in tried]
     return Family(
-        edits,
-        np.concatenate(change),
-        len(edits),
-        log_volume=np.concatenate(volume),
+        lambda h: explain_rows(rows, tried[h][1], kind, factor=tried[h][0]),
+        len(tried),
+        len(tried),
+        Patterns(sparse_rows([own for _, own in tried], change, rows.count)),
+        log_volume=np.array([len(own) * np.log(abs(factor)) for factor, own in tried]),
     )
 
 
-def _multiplied_edit(table: Table, rows: Indices, factor: float, kind: MistakeKind) -> Edit:
-    words = _words(table, rows)
-    found = table.values[int(rows[0])] / MM
-    put = f"If so, write {found * factor:+.6g} instead of {found:+.6g}."
-    if len(rows) > 1:
-        put = f"If so, multiply these by {factor:g}."
-    what = (
-        f"the sign of {words} was turned"
-        if factor == -1.0
-        else f"the decimal point of {words} is in the wrong place"
-    )
-    return Edit(kind, what, put, tuple(rows.tolist()), factor=factor)
-
-
-def _misread(table: Table, groups: Sequence[Indices]) -> Family:
+def _misread(rows: Rows, groups: Sequence[Indices]) -> Family:
     steps = [sign * size for size in MISREAD for sign in (1.0, -1.0)]
-    marks = _marks(table, groups)
-    edits = [partial(_misread_edit, table, rows, step) for step in steps for rows in groups]
-    return Family(edits, np.concatenate([marks * step for step in steps]), len(edits))
+    tried = [(step, own) for step in steps for own in groups]
+    change = [np.full(len(own), step) for step, own in tried]
 
+    def explain(h: int) -> Explanation:
+        step, own = tried[h]
+        return Explanation(
+            "misread dial",
+            "reading",
+            tuple(own.tolist()),
+            names=(rows.posture(int(own[0])),),
+            amount=-step,
+        )
 
-def _misread_edit(table: Table, rows: Indices, step: float) -> Edit:
-    found = table.values[int(rows[0])]
-    what = (
-        f"{_words(table, rows)} was read {abs(step) / MM:g} mm too "
-        f"{'low' if step > 0 else 'high'}, by a turn or a mark of the dial"
+    return Family(
+        explain,
+        len(tried),
+        len(tried),
+        Patterns(sparse_rows([own for _, own in tried], change, rows.count)),
     )
-    put = f"If so, write {(found + step) / MM:+.6g} instead of {found / MM:+.6g}."
-    return Edit("misread dial", what, put, tuple(rows.tolist()))

@@ -1,170 +1,164 @@
-"""Readings in each other's place: two rows, two postures, two setups, two legs."""
+"""Swapped rows: two readings, postures, setups or legs in each other's place.
+
+In sessions of more than `FAR_APART` rows two rows of a setup are considered only if they are
+neighbours, and a family of more than `MOST` pairs is not considered at all.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.hypotheses.edits import Edit, Family, Table
+from orthocal.hypotheses.anomaly import Explanation, Scope
+from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, sparse_rows
 
 Indices = NDArray[np.int64]
 
 FAR_APART = 400
-"""Rows above which only neighbours in a setup are tried."""
+"""Rows of a session above which only neighbours in a setup are considered."""
 
-MOST = 4000
-"""Pairs of a kind above which none is tried."""
-
-Pair = tuple[Callable[[], str], Indices, Indices, tuple[str, ...]]
+MOST = 60_000
+"""Pairs of a family above which none is considered."""
 
 
-def find_exchanged(table: Table) -> Iterator[Family]:
-    """All pairs of a kind."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """Rows that may stand in each other's place."""
+
+    scope: Scope
+    one: Indices
+    other: Indices
+    setups: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+
+
+def swapped_rows(rows: Rows) -> Iterator[Family]:
+    """Swapped rows of every scope, one family each."""
     for pairs in (
-        _rows(table),
-        _across(table),
-        _postures(table),
-        _postures_everywhere(table),
-        _setups(table),
-        _legs(table),
-        _reversed(table),
+        _of_setup(rows),
+        _across_setups(rows),
+        _postures_of_setup(rows),
+        _postures(rows),
+        _setups(rows),
+        _legs(rows),
+        _backwards(rows),
     ):
         if 0 < len(pairs) <= MOST:
-            yield _exchanged(table, pairs)
+            yield _swapped(rows, pairs)
 
 
-def _exchanged(table: Table, pairs: Sequence[Pair]) -> Family:
-    change = np.zeros((len(pairs), table.count))
-    edits = []
-    for h, (words, one, other, setups) in enumerate(pairs):
-        change[h, one] = table.values[other] - table.values[one]
-        change[h, other] = table.values[one] - table.values[other]
-        edits.append(partial(_edit, words, one, other, setups))
-    return Family(edits, change, len(pairs))
+def _swapped(rows: Rows, pairs: Sequence[_Pair]) -> Family:
+    both = [np.concatenate([p.one, p.other]) for p in pairs]
+    change = [
+        np.concatenate([rows.values[p.other] - rows.values[p.one]] * 2)
+        * np.repeat([1.0, -1.0], p.one.size)
+        for p in pairs
+    ]
+
+    def explain(h: int) -> Explanation:
+        p = pairs[h]
+        return Explanation("swapped rows", p.scope, tuple(both[h].tolist()), p.setups, p.names)
+
+    edits = Patterns(sparse_rows(both, change, rows.count))
+    return Family(explain, len(pairs), len(pairs), edits)
 
 
-def _edit(words: Callable[[], str], one: Indices, other: Indices, setups: tuple[str, ...]) -> Edit:
-    return Edit(
-        "exchanged readings",
-        f"{words()} were exchanged",
-        "If so, exchange them again.",
-        (*one.tolist(), *other.tolist()),
-        setups,
-    )
+def _rows(one: int, other: int) -> _Pair:
+    return _Pair("reading", np.array([one]), np.array([other]))
 
 
-def _two_rows(table: Table, one: int, other: int) -> str:
-    return f"the readings {table.label(one)} and {table.label(other)}"
-
-
-def _rows(table: Table) -> list[Pair]:
-    found: list[Pair] = []
-    for rows in table.cycles.values():
-        near = table.count > FAR_APART
-        pairs = pairwise(rows) if near else combinations(rows, 2)
-        found += [
-            (
-                partial(_two_rows, table, int(i), int(j)),
-                np.array([i]),
-                np.array([j]),
-                (),
-            )
-            for i, j in pairs
-        ]
-    return found
-
-
-def _across(table: Table) -> list[Pair]:
-    """The same posture in two setups: a column slipped in one line of the sheet."""
-    found: dict[tuple[str, int], list[int]] = {}
-    for i, r in enumerate(table.session.readings):
-        found.setdefault((f"{r.posture}/{r.minus}", r.cycle), []).append(i)
+def _of_setup(rows: Rows) -> list[_Pair]:
+    near = rows.count > FAR_APART
     return [
-        (partial(_two_rows, table, int(i), int(j)), np.array([i]), np.array([j]), ())
-        for rows in found.values()
-        for i, j in combinations(rows, 2)
+        _rows(i, j)
+        for own in rows.cycles.values()
+        for i, j in (pairwise(own) if near else combinations(own, 2))
     ]
 
 
-def _postures(table: Table) -> list[Pair]:
+def _across_setups(rows: Rows) -> list[_Pair]:
+    """Pairs of the same posture in two setups, as in a line of the sheet with slipped columns."""
+    found: dict[tuple[str, int], list[int]] = {}
+    for i, r in enumerate(rows.session.readings):
+        found.setdefault((r.postures, r.cycle), []).append(i)
+    if sum(len(own) ** 2 for own in found.values()) > 2 * MOST:
+        return []
+    return [
+        _rows(i, j)
+        for own in found.values()
+        for i, j in combinations(own, 2)
+        if rows.session.readings[i].setup != rows.session.readings[j].setup
+    ]
+
+
+def _postures_of_setup(rows: Rows) -> list[_Pair]:
     """Two postures of a setup, in all cycles."""
     by_setup: dict[str, list[Indices]] = {}
-    for (setup, _), rows in table.repeated.items():
-        by_setup.setdefault(setup, []).append(rows)
+    for (setup, *_), own in rows.repeated.items():
+        if len(own) > 1:
+            by_setup.setdefault(setup, []).append(own)
+    if sum(len(groups) ** 2 for groups in by_setup.values()) > 2 * MOST:
+        return []
     return [
-        (
-            partial(_two_postures, table, a, b, setup),
-            a,
-            b,
-            (),
-        )
+        _Pair("posture", a, b, names=(setup, rows.posture(int(a[0])), rows.posture(int(b[0]))))
         for setup, groups in by_setup.items()
         for a, b in combinations(groups, 2)
-        if len(a) == len(b) > 1
+        if len(a) == len(b)
     ]
 
 
-def _two_postures(table: Table, one: Indices, other: Indices, setup: str) -> str:
-    return f"{_label(table, one)} and {_label(table, other)} in all cycles of setup {setup}"
-
-
-def _label(table: Table, rows: Indices) -> str:
-    r = table.session.readings[int(rows[0])]
-    return r.posture + (f" − {r.minus}" if r.minus else "")
-
-
-def _postures_everywhere(table: Table) -> list[Pair]:
-    """Two postures in all setups that were read in both."""
+def _postures(rows: Rows) -> list[_Pair]:
+    """Two postures in all setups that read both."""
     by_label: dict[str, dict[tuple[str, int], int]] = {}
-    for i, r in enumerate(table.session.readings):
-        label = r.posture + (f" − {r.minus}" if r.minus else "")
-        by_label.setdefault(label, {})[r.setup, r.cycle] = i
-    found: list[Pair] = []
+    for i, r in enumerate(rows.session.readings):
+        by_label.setdefault(rows.posture(i), {})[r.setup, r.cycle] = i
+    if len(by_label) ** 2 > 2 * MOST or len(by_label) * rows.count > 100 * MOST:
+        return []
+    found: list[_Pair] = []
     for a, b in combinations(by_label, 2):
         both = [k for k in by_label[a] if k in by_label[b]]
         if len({setup for setup, _ in both}) > 1:
             one, other = (np.array([by_label[x][k] for k in both]) for x in (a, b))
-            words = f"the readings of postures {a} and {b} in all setups"
-            found.append((partial(str, words), one, other, ()))
+            found.append(_Pair("postures", one, other, names=(a, b)))
     return found
 
 
-def _setups(table: Table) -> list[Pair]:
+def _setups(rows: Rows) -> list[_Pair]:
+    """Two setups of one session."""
+    if len(rows.setups) ** 2 > 2 * MOST:
+        return []
+
+    def session(setup: str) -> str:
+        return setup.partition("/")[0] if rows.session.joined else ""
+
     return [
-        (
-            partial(str, f"the readings of setups {a} and {b}"),
-            table.setups[a],
-            table.setups[b],
-            (a, b),
-        )
-        for a, b in combinations(table.setups, 2)
-        if table.setups[a].size == table.setups[b].size
+        _Pair("setups", rows.setups[a], rows.setups[b], (a, b))
+        for a, b in combinations(rows.setups, 2)
+        if rows.setups[a].size == rows.setups[b].size and session(a) == session(b)
     ]
 
 
-def _legs(table: Table) -> list[Pair]:
+def _legs(rows: Rows) -> list[_Pair]:
     """All setups of two legs, in their order."""
-    legs = {w: g for w, g in table.groups.items() if w.startswith("leg ")}
-    found: list[Pair] = []
+    legs = {name: setups for (scope, name), setups in rows.groups.items() if scope == "leg"}
+    found: list[_Pair] = []
     for a, b in combinations(legs, 2):
-        sizes = [[table.setups[s].size for s in legs[x]] for x in (a, b)]
+        sizes = [[rows.setups[s].size for s in legs[x]] for x in (a, b)]
         if sizes[0] == sizes[1]:
-            one, other = table.rows_of(legs[a]), table.rows_of(legs[b])
-            words = f"the readings of {a.replace('leg', 'legs')} and {b.removeprefix('leg ')}"
-            found.append((partial(str, words), one, other, (*legs[a], *legs[b])))
+            one, other = rows.of_setups(legs[a]), rows.of_setups(legs[b])
+            found.append(_Pair("legs", one, other, (*legs[a], *legs[b]), (a, b)))
     return found
 
 
-def _reversed(table: Table) -> list[Pair]:
+def _backwards(rows: Rows) -> list[_Pair]:
     """The rows of a setup written from the last to the first."""
-    found: list[Pair] = []
-    for name, rows in table.setups.items():
-        half = rows.size // 2
+    found: list[_Pair] = []
+    for name, own in rows.setups.items():
+        half = own.size // 2
         if half > 1:
-            words = f"the first and the last rows of setup {name}, which was written backwards,"
-            found.append((partial(str, words), rows[:half], rows[::-1][:half], (name,)))
+            found.append(_Pair("setup", own[:half], own[::-1][:half], (name,)))
     return found

@@ -1,147 +1,141 @@
-"""Whole setups, cycles, legs, gauges or sessions in another unit, or with the wrong sign."""
+"""Wrong units, decimal points and signs of setups, cycles, legs, gauges or all readings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.hypotheses.edits import Edit, Family, Table
-from orthocal.hypotheses.mistake import MistakeKind
+from orthocal.hypotheses.anomaly import AnomalyKind, Explanation, Scope
+from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, sparse_rows
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-UNITS = {25.4: "in inches", 1.0 / 25.4: "in mm but taken for inches", 1e3: "in m", 1e-3: "in µm"}
-"""Factors that make mm of other units."""
+UNITS = (25.4, 1.0 / 25.4, 1e3, 1e-3)
+"""Factors that correct inches, mm taken for inches, m, and µm."""
 
-WRONG_PLACES = dict.fromkeys((10.0, 0.1, 100.0, 0.01), "with the decimal point in the wrong place")
-"""Factors that put a decimal point right."""
+DECIMAL_POINTS = (10.0, 0.1, 100.0, 0.01)
+"""Factors that correct a misplaced decimal point."""
 
 COARSEST = 10.0
-"""Standard deviations of a reading that nobody's last figure is worth."""
+"""Step of the corrected numbers, over the noise, beyond which a unit is not considered."""
 
 FINEST = 1e-3
-"""Standard deviations of a reading that nobody writes down more finely than: numbers with more
-digits are no dial's, and that little is left of them is no mistake."""
+"""Step of the corrected numbers, over the noise, below which a unit is not considered: computed
+numbers have more digits than any dial."""
 
 MOST_DECIMALS = 9
-"""Of numbers in mm that are looked at."""
+"""Decimals of numbers in mm that are considered."""
 
 FINER = 1e-3
 """Part of a step by which numbers may miss it."""
 
 MOST_PAIRED = 24
-"""Setups above which pairs of them are not tried."""
+"""Setups above which pairs of them are not considered."""
 
 
-def find_scaled(table: Table, sigma: float) -> Iterator[Family]:
-    """Signs and units of groups of readings.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Group:
+    """Rows that may share a factor."""
+
+    scope: Scope
+    rows: Indices
+    setups: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    cycle: int | None = None
+
+    def explain(self, kind: AnomalyKind, factor: float) -> Explanation:
+        return Explanation(
+            kind,
+            self.scope,
+            tuple(self.rows.tolist()),
+            self.setups,
+            self.names,
+            cycle=self.cycle,
+            factor=factor,
+        )
+
+
+def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
+    """Factors that groups of readings share.
 
     Args:
-        table: The readings.
+        rows: The rows.
         sigma: Standard deviation of a reading, [m].
     """
-    groups = _groups(table)
-    yield _turned(table, groups)
-    names = list(table.setups)
+    groups = _groups(rows)
+    yield _reversed(rows, groups)
+    names = list(rows.setups)
     if 3 < len(names) <= MOST_PAIRED:
-        yield _turned(
-            table,
-            [
-                (f"setups {a} and {b}", (a, b), table.rows_of((a, b)))
-                for a, b in combinations(names, 2)
-            ],
-        )
+        pairs = combinations(names, 2)
+        yield _reversed(rows, [_Group("setups", rows.of_setups(p), p) for p in pairs])
     groups += [
-        (f"setup {name}, cycle {cycle}", (), rows)
-        for (name, cycle), rows in table.cycles.items()
-        if len(rows) < len(table.setups[name])
+        _Group("cycle", own, names=(name,), cycle=cycle)
+        for (name, cycle), own in rows.cycles.items()
+        if len(own) < len(rows.setups[name])
     ]
-    yield _scaled(table, groups, "wrong unit", UNITS, sigma)
-    yield _scaled(table, groups, "decimal place", WRONG_PLACES, sigma)
+    yield _scaled(rows, groups, "wrong unit", UNITS, sigma)
+    yield _scaled(rows, groups, "decimal point", DECIMAL_POINTS, sigma)
 
 
-def _groups(table: Table) -> list[tuple[str, tuple[str, ...], Indices]]:
-    every = tuple(table.setups)
-    found = [("all readings", every, np.arange(table.count))]
-    found += [(f"the readings of {w}", g, table.rows_of(g)) for w, g in table.groups.items()]
+def _groups(rows: Rows) -> list[_Group]:
+    every = tuple(rows.setups)
+    found = [_Group("session", np.arange(rows.count), every)]
+    for (scope, name), setups in rows.groups.items():
+        kind: Scope = "leg" if scope == "leg" else "gauge"
+        found.append(_Group(kind, rows.of_setups(setups), setups, (name,)))
     if len(every) > 1:
-        found += [(f"setup {name}", (name,), rows) for name, rows in table.setups.items()]
+        found += [_Group("setup", own, (name,)) for name, own in rows.setups.items()]
     return found
 
 
-def _dimensions(table: Table, rows: Indices, whole: bool) -> int:
-    """Numbers that are free in some rows: of whole setups less the gauge's zeros."""
-    if not whole:
-        return rows.size
-    raw = {table.session.readings[i].setup for i in rows if table.raw[i]}
-    return rows.size - len(raw)
-
-
-def _turned(table: Table, groups: list[tuple[str, tuple[str, ...], Indices]]) -> Family:
-    edits = []
-    change = np.zeros((len(groups), table.count))
-    for h, (words, setups, rows) in enumerate(groups):
-        change[h, rows] = -2.0 * table.values[rows]
-        edits.append(
-            partial(
-                Edit,
-                "turned setup",
-                f"the sign of {words} was turned",
-                "See which way the gauge stood and whether a minus was forgotten; then turn the "
-                "signs, or `direction`.",
-                tuple(rows.tolist()),
-                setups,
-                -1.0,
-            )
-        )
-    return Family(edits, change, len(groups))
+def _reversed(rows: Rows, groups: list[_Group]) -> Family:
+    change = [-2.0 * rows.values[g.rows] for g in groups]
+    edits = Patterns(sparse_rows([g.rows for g in groups], change, rows.count))
+    return Family(
+        lambda h: groups[h].explain("reversed sign", -1.0), len(groups), len(groups), edits
+    )
 
 
 def _scaled(
-    table: Table,
-    groups: list[tuple[str, tuple[str, ...], Indices]],
-    kind: MistakeKind,
-    factors: dict[float, str],
+    rows: Rows,
+    groups: list[_Group],
+    kind: AnomalyKind,
+    factors: tuple[float, ...],
     sigma: float,
 ) -> Family:
-    edits: list[Callable[[], Edit]] = []
-    written = [_written(table.values[group[2]]) for group in groups]
-    pairs = [
-        (factor, group)
+    steps = [_step(rows.values[g.rows]) for g in groups]
+    tried = [
+        (factor, g)
         for factor in factors
-        for group, step in zip(groups, written, strict=True)
+        for g, step in zip(groups, steps, strict=True)
         if factor < 1.0 or FINEST * sigma <= factor * step <= COARSEST * sigma
     ]
-    change = np.zeros((len(pairs), table.count))
-    volume = np.zeros(len(pairs))
-    for factor, (words, setups, rows) in pairs:
-        how = factors[factor]
-        h = len(edits)
-        change[h, rows] = (factor - 1.0) * table.values[rows]
-        volume[h] = _dimensions(table, rows, bool(setups)) * np.log(factor)
-        be = "were" if words.startswith(("all", "the")) else "was"
-        edits.append(
-            partial(
-                Edit,
-                kind,
-                f"{words} {be} written {how}",
-                f"If so, multiply these by {factor:.6g}.",
-                tuple(rows.tolist()),
-                setups,
-                factor,
-            )
-        )
-    return Family(edits, change, len(groups) * len(factors), log_volume=volume)
+    change = [(factor - 1.0) * rows.values[g.rows] for factor, g in tried]
+    return Family(
+        lambda h: tried[h][1].explain(kind, tried[h][0]),
+        len(tried),
+        len(groups) * len(factors),
+        Patterns(sparse_rows([g.rows for _, g in tried], change, rows.count)),
+        log_volume=np.array([_dimensions(rows, g) * np.log(factor) for factor, g in tried]),
+    )
 
 
-def _written(values: Array) -> float:
-    """The step that numbers were written in, [m]: a power of ten of mm."""
+def _dimensions(rows: Rows, group: _Group) -> int:
+    """Independent numbers in a group of rows: those of whole setups less their gauge zeros."""
+    if not group.setups:
+        return group.rows.size
+    readings = rows.session.readings
+    return group.rows.size - len({readings[i].setup for i in group.rows if rows.single[i]})
+
+
+def _step(values: Array) -> float:
+    """Step in which numbers are written, a power of ten of 1 mm, [m]."""
     for decimals in range(MOST_DECIMALS):
         step = 10.0**-decimals * MM
         if np.abs(values / step - np.round(values / step)).max() < FINER:

@@ -1,189 +1,226 @@
-"""Evaluation of one CasADi function at many points, straight from and into NumPy arrays."""
+"""Evaluation of one CasADi function at many points, on NumPy arrays."""
 
 from __future__ import annotations
 
+import itertools
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.kinematics.backend.lanes import (
-    Listing,
-    find_listing,
-    pays,
-    recall_listing,
-    run_in_lanes,
-)
+from orthocal.kinematics.backend import llvm
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Backend = Literal["casadi", "llvm", "numpy"]
 
-SIZES = (32, 8, 1)
-"""Points evaluated in one call, the largest first: few maps are built, and what they read and write
-stays near."""
+BLOCK_SIZES = (32, 8, 1)
+"""Points of one call of a mapped CasADi function, largest first."""
+
+MIN_POINTS, MIN_OPERATIONS = 16, 2e4
+"""Points of a call, and instructions times points, from which the LLVM backend is used. It takes a
+tenth of CasADi's time, but 0.1 s once to start: sessions of a few postures do not start it."""
+
+MAX_SHORT = 100
+"""Instructions of a function that NumPy executes, one after another for all points at once: calls
+of CasADi would take longer than its 20 instructions."""
+
+_UFUNCS: dict[str, Callable[..., Any]] = {
+    "ASSIGN": np.positive,
+    "ADD": np.add,
+    "SUB": np.subtract,
+    "MUL": np.multiply,
+    "DIV": np.divide,
+    "NEG": np.negative,
+    "SQ": np.square,
+    "TWICE": lambda a: a + a,
+    "INV": np.reciprocal,
+    "SQRT": np.sqrt,
+    "FABS": np.abs,
+}
+"""Operations that NumPy rounds as CasADi does, with their functions."""
 
 
 class BatchFunction:
-    """A CasADi function of column vectors, mapped over points.
+    """A CasADi function of column vectors, evaluated at many points.
 
-    CasADi's own conversion of results goes through Python lists; its buffers do not.
+    All backends execute the same instructions in the same order and give the same numbers, bit by
+    bit. The choice among them depends only on the function, the number of points and whether
+    llvmlite is installed.
 
     Args:
-        function: Inputs are column vectors; outputs are taken dense.
-        shared: Names of the inputs that are the same at every point.
+        function: Its inputs are column vectors.
         matrices: Names of the outputs that are matrices, though they may have one column.
-        sparse: Names of the outputs of which the nonzeros are taken, in the order of `pattern`.
+        sparse: Names of the outputs of which the nonzeros are returned, in the order of `pattern`;
+            other outputs are dense.
+        key: Key by which the function's instructions are cached on disk; not cached by default.
     """
 
     def __init__(
         self,
         function: ca.Function,
         *,
-        shared: Sequence[str] = (),
         matrices: Sequence[str] = (),
         sparse: Sequence[str] = (),
+        key: str | None = None,
     ) -> None:
-        self._function = dense(function, sparse=sparse)
-        self._shared = [function.index_in(name) for name in shared]
-        self._sparse = frozenset(sparse)
+        self.function = _densified(function, sparse=sparse)
         self._shapes = [
-            (function.nnz_out(i), 1) if name in self._sparse else function.size_out(i)
+            (function.nnz_out(i), 1) if name in sparse else function.size_out(i)
             for i, name in enumerate(function.name_out())
         ]
-        self._sizes = [rows * columns for rows, columns in self._shapes]
-        self._matrices = [function.index_out(name) for name in matrices]
+        self._matrices = frozenset(function.index_out(name) for name in matrices)
+        self._key = key
+        self._patterns: dict[str, tuple[Indices, Indices]] = {}
         self._local = threading.local()
-        self._points = 0
-        self._same: BatchFunction | None = None
-
-    @cached_property
-    def unshared(self) -> BatchFunction:
-        """The same with inputs of their own at every point.
-
-        Their shape is (K, n), or (K / m, n) for a row that stands for m points in turn.
-        """
-        names = [self._function.name_out(i) for i in self._matrices]
-        found = BatchFunction(self._function, matrices=names, sparse=tuple(self._sparse))
-        found._same = self
-        return found
-
-    @cached_property
-    def _instructions(self) -> int:
-        return int(self._function.n_instructions())
 
     def pattern(self, name: str) -> tuple[Indices, Indices]:
         """Rows and columns of the nonzeros of a sparse output, shape (nnz,) each."""
-        sparsity = self._function.sparsity_out(self._function.index_out(name))
-        rows, columns = (np.array(v, dtype=np.int64) for v in sparsity.get_triplet())
-        return rows, columns
+        if name not in self._patterns:
+            sparsity = self.function.sparsity_out(self.function.index_out(name))
+            rows, columns = (np.array(v, dtype=np.int64) for v in sparsity.get_triplet())
+            self._patterns[name] = rows, columns
+        return self._patterns[name]
 
     def __call__(self, *inputs: ArrayLike) -> tuple[Array, ...]:
-        """Evaluate at K points.
+        """Evaluate the function at K points.
 
         Args:
-            inputs: Shape (K, n) each, or (n,) for the shared ones.
+            inputs: Shape (K, n) each; (K/m, n) where each row holds for m successive points, such
+                as the postures of one machine; (n,) where one row holds for all.
 
         Returns:
             Each output with shape (K, rows, columns), or (K, rows) for a column vector; `matrices`
-            keep their one column; sparse ones have shape (K, nnz).
+            keep their one column; sparse outputs have shape (K, nnz).
         """
-        arrays = [np.asarray(a, dtype=np.float64) for a in inputs]
-        count = max(len(a) for i, a in enumerate(arrays) if i not in self._shared)
-        flat = None
-        if pays(self._instructions, count, self._points, lambda: self._kept is not None):
-            listing = self._listing
-            flat = None if listing is None else run_in_lanes(listing, arrays, self._shared, count)
-        self._points += count
-        if flat is None:
-            flat = self._by_casadi(arrays, count)
-        results = [y.reshape(count, c, r) for y, (r, c) in zip(flat, self._shapes, strict=True)]
-        return tuple(
-            np.asarray(
-                y[:, 0, :] if shape[1] == 1 and i not in self._matrices else y.transpose(0, 2, 1)
-            )
-            for i, (y, shape) in enumerate(zip(results, self._shapes, strict=True))
-        )
+        if self._short:
+            return self.evaluate(*inputs, backend="numpy")
+        count = self._count(inputs)
+        large = count >= MIN_POINTS and self._n_instructions * count >= MIN_OPERATIONS
+        fast = large and llvm.is_installed()
+        return self.evaluate(*inputs, backend="llvm" if fast else "casadi")
+
+    def evaluate(self, *inputs: ArrayLike, backend: Backend) -> tuple[Array, ...]:
+        """Evaluate with one backend; arguments and result as for a call.
+
+        CasADi evaluates a function with an instruction that another backend lacks.
+        """
+        arrays = [np.atleast_2d(np.asarray(a, dtype=np.float64)) for a in inputs]
+        count = self._count(inputs)
+        nonzeros = None
+        if backend == "llvm" and self._program is not None:
+            nonzeros = llvm.run(self._program, arrays, count)
+        elif backend == "numpy" and self._short and self._program is not None:
+            nonzeros = _run_numpy(self._program, arrays, count)
+        if nonzeros is None:
+            nonzeros = self._run_casadi(arrays, count)
+        results = []
+        for i, (values, (rows, columns)) in enumerate(zip(nonzeros, self._shapes, strict=True)):
+            matrix = values.reshape(count, columns, rows)
+            column = columns == 1 and i not in self._matrices
+            results.append(np.asarray(matrix[:, 0] if column else matrix.transpose(0, 2, 1)))
+        return tuple(results)
+
+    @staticmethod
+    def _count(inputs: Sequence[ArrayLike]) -> int:
+        """Number of points."""
+        counts = [len(a) for a in map(np.asarray, inputs) if a.ndim > 1]
+        return 0 if 0 in counts else max(counts, default=1)
 
     @cached_property
-    def _kept(self) -> Listing | None:
-        """Its instructions, where they are kept on disk."""
-        return recall_listing(self._function) if self._same is None else self._same._kept
+    def _n_instructions(self) -> int:
+        return int(self.function.n_instructions())
 
     @cached_property
-    def _listing(self) -> Listing | None:
-        """Its instructions; None where one of them is not known."""
-        if self._same is not None:
-            return self._same._listing
-        return self._kept or find_listing(self._function)
+    def _short(self) -> bool:
+        """True for a short function whose operations NumPy has."""
+        if self._n_instructions > MAX_SHORT or self._program is None:
+            return False
+        names = {llvm.OPERATIONS[code] for code in self._program.table[:, 0].tolist()}
+        return names <= {"CONST", "INPUT", "OUTPUT", *_UFUNCS}
 
-    def _by_casadi(self, arrays: list[Array], count: int) -> list[Array]:
+    @cached_property
+    def _program(self) -> llvm.Program | None:
+        """The function's instructions; None where one of them is unknown."""
+        return llvm.load_program(self.function, key=self._key)
+
+    def _run_casadi(self, arrays: Sequence[Array], count: int) -> list[Array]:
         """Nonzeros of each output, shape (count, nnz)."""
-        flat = [np.empty((count, size)) for size in self._sizes]
+        results = [np.empty((count, rows * columns)) for rows, columns in self._shapes]
+        repeats = [count // len(a) if count else 1 for a in arrays]
         first = 0
-        for size in SIZES:
-            if count - first < size:
-                continue
-            lanes = self._lanes(size)
-            lanes.share({i: arrays[i] for i in self._shared})
-            own = [
-                (i, a if len(a) == count else np.repeat(a, count // len(a), axis=0))
-                for i, a in enumerate(arrays)
-                if i not in self._shared
-            ]
+        for size in BLOCK_SIZES:
             while count - first >= size:
-                part = slice(first, first + size)
-                for i, a in own:
-                    lanes.inputs[i][...] = a[part]
-                lanes.trigger()
-                for found, y in zip(lanes.outputs, flat, strict=True):
-                    y[part] = found
+                block = self._block(size)
+                for buffer, a, repeat in zip(block.inputs, arrays, repeats, strict=True):
+                    buffer[...] = a[np.arange(first, first + size) // repeat]
+                block.evaluate()
+                for values, result in zip(block.outputs, results, strict=True):
+                    result[first : first + size] = values
                 first += size
-        return flat
+        return results
 
-    def _lanes(self, size: int) -> _Lanes:
-        """So many points at once; memory of their own for each thread."""
-        if not hasattr(self._local, "lanes"):
-            self._local.lanes = {}
-        lanes: dict[int, _Lanes] = self._local.lanes
-        if size not in lanes:
-            lanes[size] = _Lanes(self._function, size, self._shared)
-        return lanes[size]
+    def _block(self, size: int) -> _MappedBlock:
+        """The mapped function of a number of points, with memory of this thread."""
+        if not hasattr(self._local, "blocks"):
+            self._local.blocks = {}
+        blocks: dict[int, _MappedBlock] = self._local.blocks
+        if size not in blocks:
+            blocks[size] = _MappedBlock(self.function, size)
+        return blocks[size]
 
 
-class _Lanes:
-    """A function mapped over a number of points, with memory that it reads from and writes to."""
+def _run_numpy(program: llvm.Program, arrays: Sequence[Array], count: int) -> list[Array]:
+    """Nonzeros of each output, shape (count, nnz)."""
+    inputs = [a if len(a) in (1, count) else np.repeat(a, count // len(a), axis=0) for a in arrays]
+    work: dict[int, Any] = {}
+    result = np.empty((count, int(program.output_starts[-1])))
+    for (code, to, a, b), constant in zip(
+        program.table.tolist(), program.constants.tolist(), strict=True
+    ):
+        name = llvm.OPERATIONS[code]
+        if name == "CONST":
+            work[to] = constant
+        elif name == "INPUT":
+            work[to] = inputs[a][:, b]
+        elif name == "OUTPUT":
+            result[:, to] = work[a]
+        else:
+            ufunc = _UFUNCS[name]
+            binary = name in ("ADD", "SUB", "MUL", "DIV")
+            work[to] = ufunc(work[a], work[b]) if binary else ufunc(work[a])
+    starts = program.output_starts.tolist()
+    return [result[:, first:end] for first, end in itertools.pairwise(starts)]
 
-    def __init__(self, function: ca.Function, size: int, shared: list[int]) -> None:
-        name = f"{function.name()}_{size}"
-        mapped = function if size == 1 else function.map(name, "serial", size, shared, [])
-        self._shared = shared
-        self._buffer, self.trigger = mapped.buffer()
-        self.inputs = [
-            np.zeros((1 if i in shared else size, function.nnz_in(i)))
-            for i in range(function.n_in())
-        ]
+
+class _MappedBlock:
+    """A function mapped over a number of points, with the memory that it reads and writes.
+
+    CasADi converts results through Python lists; its buffers avoid that.
+    """
+
+    def __init__(self, function: ca.Function, size: int) -> None:
+        mapped = function if size == 1 else function.map(size)
+        self._buffer, self.evaluate = mapped.buffer()
+        self.inputs = [np.zeros((size, function.nnz_in(i))) for i in range(function.n_in())]
         self.outputs = [np.zeros((size, function.nnz_out(i))) for i in range(function.n_out())]
-        # casadi's type information describes the C++ call, with a pointer and a size
+        # CasADi's type information describes the C++ call, with a pointer and a size
         for i, a in enumerate(self.inputs):
             self._buffer.set_arg(i, memoryview(a.reshape(-1)))  # type: ignore[call-arg,arg-type]
         for i, a in enumerate(self.outputs):
             self._buffer.set_res(i, memoryview(a.reshape(-1)))  # type: ignore[call-arg,arg-type]
 
-    def share(self, values: dict[int, Array]) -> None:
-        """Set the inputs that are the same at every point."""
-        for i, value in values.items():
-            self.inputs[i][0] = value
 
-
-def dense(function: ca.Function, *, sparse: Sequence[str] = ()) -> ca.Function:
-    """The same function with dense outputs, but for some."""
+def _densified(function: ca.Function, *, sparse: Sequence[str]) -> ca.Function:
+    """The function with dense outputs, except for some."""
     names = function.name_out()
     if all(n in sparse or function.sparsity_out(i).is_dense() for i, n in enumerate(names)):
         return function
     symbols = [function.sx_in(i) for i in range(function.n_in())]
-    found = function.call(symbols)
-    outputs = [y if name in sparse else ca.densify(y) for name, y in zip(names, found, strict=True)]
+    values = function.call(symbols)
+    outputs = [y if n in sparse else ca.densify(y) for n, y in zip(names, values, strict=True)]
     return ca.Function(function.name(), symbols, outputs, function.name_in(), names)

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from orthocal.errors import SessionError
 from orthocal.io.documents import parse_number
 from orthocal.measurement.files.schema import LARGEST_READING_MM, MOST_READINGS
-from orthocal.session.session import Gauge, Reading, Session
+from orthocal.robot.model import Robot
+from orthocal.session.session import Conditions, Gauge, Reading, Session
 from orthocal.text import shorten
 from orthocal.units import MM
+
+LOWEST_C, HIGHEST_C = -50.0, 100.0
+"""No machine is measured outside: it is another unit, [°C]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +33,15 @@ class RawReading:
     cycle: str
     reading: str
     """In mm, with a decimal point."""
+    approach: str = ""
+    temperature: str = ""
+    """In °C, with a decimal point."""
+    time: str = ""
+
+    @property
+    def has_conditions(self) -> bool:
+        """Whether a condition is stated."""
+        return bool(self.approach or self.temperature or self.time)
 
 
 def check_readings(
@@ -51,23 +65,12 @@ def check_readings(
     rows = iter(rows)
     readings: list[Reading] = []
     seen: dict[tuple[Any, ...], int] = {}
+    zones: dict[bool, int] = {}
     raw: dict[tuple[str, int], int] = {}
     joined: dict[tuple[str, int], dict[str, str]] = {}
     for row in rows:
         where = row.where
-        setup, posture, minus = row.setup, row.posture, row.minus
-        if setup not in plan.setups:
-            raise SessionError(
-                f"'{setup}' is not a setup; setups: {', '.join(plan.setups)}", where=where
-            )
-        for name in (posture, minus):
-            if name not in plan.postures and (name or name is posture):
-                raise SessionError(
-                    f"'{name}' is not a posture; postures: {', '.join(plan.postures)}",
-                    where=where,
-                )
-        if minus == posture:
-            raise SessionError(f"takes posture '{posture}' off itself", where=where)
+        _check_names(row, plan)
         cycle = parse_cycle(row.cycle, where)
         if not row.reading:
             if unread is None:
@@ -84,8 +87,17 @@ def check_readings(
             unread.add(len(readings))
         text = row.reading or "0"
         value = parse_number(text, where=where, name="reading_mm", error=SessionError)
-        reading = Reading(setup, posture, minus or None, cycle, value * MM, row.line)
-        key = (setup, posture, minus, cycle)
+        conditions = read_conditions(row, plan.robot)
+        reading = Reading(
+            row.setup,
+            row.posture,
+            row.minus or None,
+            cycle,
+            value * MM,
+            row.line,
+            conditions=conditions,
+        )
+        key = (*reading.place, cycle)
         if key in seen:
             raise SessionError(
                 f"repeats {reading.label} of cycle {cycle}, first in line {seen[key]}; "
@@ -93,14 +105,140 @@ def check_readings(
                 where=where,
             )
         seen[key] = row.line
+        _check_zone(row, conditions, zones)
         if len(readings) >= MOST_READINGS:
             raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(file))
-        check_range(value, plan.gauges[plan.setups[setup].gauge], bool(minus), where)
+        check_range(value, plan.gauges[plan.setups[row.setup].gauge], bool(row.minus), where)
         _check_form(reading, raw, joined, where)
         readings.append(reading)
     if not readings:
         raise SessionError("holds no readings", where=str(file))
     return tuple(readings)
+
+
+def _check_names(row: RawReading, plan: Session) -> None:
+    """Refuse a setup or postures that the session does not have."""
+    if row.setup not in plan.setups:
+        raise SessionError(
+            f"'{row.setup}' is not a setup; setups: {', '.join(plan.setups)}", where=row.where
+        )
+    for name in (row.posture, row.minus) if row.minus else (row.posture,):
+        if name not in plan.postures:
+            raise SessionError(
+                f"'{name}' is not a posture; postures: {', '.join(plan.postures)}",
+                where=row.where,
+            )
+    if row.minus == row.posture:
+        raise SessionError(f"takes posture '{row.posture}' off itself", where=row.where)
+
+
+def _check_zone(row: RawReading, conditions: Conditions | None, zones: dict[bool, int]) -> None:
+    """Refuse times with and without time zone in one session.
+
+    Args:
+        row: The row.
+        conditions: Its conditions.
+        zones: Line of the first time with and without zone; filled here.
+    """
+    if conditions is None or conditions.time is None:
+        return
+    zoned = conditions.time.tzinfo is not None
+    zones.setdefault(zoned, row.line)
+    if len(zones) > 1:
+        raise SessionError(
+            f"time is '{row.time}'; expected all times of a session with a time zone, or all "
+            f"without one, as in line {zones[not zoned]}",
+            where=row.where,
+        )
+
+
+def read_conditions(row: RawReading, robot: Robot) -> Conditions | None:
+    """Conditions of a row; None if it states none.
+
+    Raises:
+        SessionError: Naming file, line and column.
+    """
+    if not row.has_conditions:
+        return None
+    if row.minus:
+        column = "approach" if row.approach else "temperature_C" if row.temperature else "time"
+        raise SessionError(
+            f"{column} is '{shorten(getattr(row, column.removesuffix('_C')))}'; expected an empty "
+            "cell: the row is a difference, and conditions belong to single readings",
+            where=row.where,
+        )
+    return Conditions(
+        parse_approach(row.approach, robot, row.where) if row.approach else None,
+        parse_temperature(row.temperature, row.where) if row.temperature else None,
+        parse_time(row.time, row.where) if row.time else None,
+    )
+
+
+def check_conditions(conditions: Conditions, robot: Robot, difference: bool, where: str) -> None:
+    """Refuse conditions that a reading cannot have.
+
+    Raises:
+        SessionError: At `where`.
+    """
+    if difference:
+        raise SessionError(
+            "is a difference of two postures; conditions belong to single readings", where=where
+        )
+    if conditions.approach is not None:
+        parse_approach(conditions.approach, robot, where)
+    if conditions.temperature is not None:
+        parse_temperature(str(conditions.temperature), where)
+
+
+def parse_approach(text: str, robot: Robot, where: str) -> str:
+    """Directions of the drives' last motions.
+
+    Raises:
+        SessionError: If it is not a letter for each drive.
+    """
+    if len(text) != len(robot.drives) or text.strip("pnu"):
+        drives = ", ".join(d.name for d in robot.drives)
+        raise SessionError(
+            f"approach is '{shorten(text)}'; expected {len(robot.drives)} letters, one for each "
+            f"drive ({drives}): p if its coordinate grew in its last motion, n if it fell, u if "
+            "unknown",
+            where=where,
+        )
+    return text
+
+
+def parse_temperature(text: str, where: str) -> float:
+    """A temperature, [°C].
+
+    Raises:
+        SessionError: If it is not one of a workshop.
+    """
+    value = parse_number(text, where=where, name="temperature_C", error=SessionError)
+    if not LOWEST_C <= value <= HIGHEST_C:
+        raise SessionError(
+            f"temperature_C is {value:g}; expected degrees Celsius from {LOWEST_C:g} to "
+            f"{HIGHEST_C:g}",
+            where=where,
+        )
+    return value
+
+
+def parse_time(text: str, where: str) -> datetime:
+    """Date and time of day.
+
+    Raises:
+        SessionError: If it is not in the form of ISO 8601.
+    """
+    try:
+        if len(text) <= len("2025-03-14"):
+            raise ValueError
+        return datetime.fromisoformat(text)
+    except ValueError:
+        raise SessionError(
+            f"time is '{shorten(text)}'; expected date and time of ISO 8601, such as "
+            "2025-03-14T09:26:53 or 2025-03-14T09:26:53+01:00",
+            where=where,
+        ) from None
 
 
 def parse_cycle(text: str, where: str) -> int:

@@ -34,7 +34,7 @@ from orthocal.measurement.importing.headings import EXPECTED, Columns, choose_co
 from orthocal.text import composed, shorten
 
 REQUIRED = ("setup", "posture", "reading_mm")
-OPTIONAL = ("minus", "cycle")
+OPTIONAL = ("minus", "cycle", "approach", "temperature_C", "time")
 
 
 def mm_text(value: Decimal) -> str:
@@ -146,6 +146,9 @@ def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
             minus=row.get("minus", ""),
             cycle=row.get("cycle", ""),
             reading=_house_number(row["reading_mm"], sign),
+            approach=row.get("approach", ""),
+            temperature=_house_number(row.get("temperature_C", ""), sign),
+            time=row.get("time", ""),
         )
 
 
@@ -215,11 +218,15 @@ def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
                 ("minus", columns.minus),
                 ("cycle", columns.cycle),
                 ("reading", reading.index),
+                ("approach", columns.approach),
+                ("temperature", columns.temperature),
+                ("time", columns.time),
             )
         }
-        value = None if sign is None else parse_numeral(text["reading"], sign)
-        if value is not None:
-            text["reading"] = mm_text(value)
+        for name in ("reading", "temperature"):
+            value = None if sign is None else parse_numeral(text[name], sign)
+            if value is not None:
+                text[name] = mm_text(value)
         yield RawReading(where, row.line, **text)
 
 

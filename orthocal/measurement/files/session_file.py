@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.effects.loading import load_robot
 from orthocal.errors import ClosureError, ParameterError, RobotError, SessionError
 from orthocal.io.documents import read_yaml, validate
 from orthocal.io.fields import read_only
@@ -30,10 +31,9 @@ from orthocal.measurement.files.readings_checks import check_readings
 from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
 from orthocal.measurement.files.session_robot import build_offsets, require_given_zero
-from orthocal.observation.sensor_frames import locate_contacts
-from orthocal.robot.loading import load_robot
+from orthocal.observation.contacts import locate_contacts
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import Sensor, SetupKeys, Unknown
+from orthocal.sensors.protocol import Sensor, SetupKeys, Unknown, default_zero
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge, Posture, Purpose, Reading, Session, Setup
 from orthocal.units import DRIVE_UNITS, MM
@@ -275,8 +275,8 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
                 f"'{setup.aligned_at}' is not a posture; postures: {', '.join(keys.postures)}",
                 where=f"{where}.aligned_at",
             )
-        gauge = _gauge_of(setup, gauges, where)
-        setups[name] = Setup(name, sensor, gauge, aligned_at=setup.aligned_at)
+        gauge, zero = _gauge_of(setup, gauges, where), setup.zero or default_zero(sensor)
+        setups[name] = Setup(name, sensor, gauge, zero=zero, aligned_at=setup.aligned_at)
     _check_shared(setups, str(file))
     _check_planned_postures(file, keys, read)
     return Session(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,12 +12,22 @@ import yaml
 
 from orthocal.io.files import write_files
 from orthocal.robot.loading import packaged_robots
+from orthocal.sensors.protocol import default_zero
 from orthocal.sensors.registry import write_sensor
-from orthocal.session.session import Gauge, Purpose, Reading, Session
+from orthocal.session.session import Conditions, Gauge, Purpose, Reading, Session
 from orthocal.units import MM, tidy, to_mm
 
-COLUMNS = ("setup", "posture", "minus", "cycle", "reading_mm")
-"""Columns of a readings.csv; `minus` and `cycle` may be absent."""
+COLUMNS = (
+    *("setup", "posture", "minus", "cycle", "reading_mm"),
+    *("approach", "temperature_C", "time"),
+)
+"""Columns of a readings.csv; all but `setup`, `posture` and `reading_mm` may be absent."""
+
+UNSTATED = {"cycle": "1"}
+"""Values of optional columns that need not be stated."""
+
+MEASURED = ("temperature_C", "time")
+"""Conditions that are measured with a reading, not planned."""
 
 
 def session_document(session: Session, *, readings: str = "readings.csv") -> dict[str, Any]:
@@ -49,6 +58,7 @@ def session_document(session: Session, *, readings: str = "readings.csv") -> dic
             **write_sensor(s.sensor),
             **({"gauge": s.gauge} if s.gauge else {}),
             "aligned_at": aligned_at[s.name],
+            **({"zero": s.zero} if s.zero != default_zero(s.sensor) else {}),
         }
         for s in session.setups.values()
     }
@@ -118,39 +128,61 @@ def write_session(
     text = head + yaml.safe_dump(
         document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
     )
-    table = readings_table(
-        session.readings, [None if blank else r.value for r in session.readings], decimals=decimals
-    )
+    values = [None if blank else r.value for r in session.readings]
+    table = readings_table(session.readings, values, decimals=decimals, blank=blank)
     files = {"session.yaml": text, "readings.csv": table, **(extra or {})}
     write_files(folder, files)
     return folder / "session.yaml"
 
 
 def readings_table(
-    rows: Sequence[Reading], values: Sequence[float | None], *, decimals: int = 6
+    rows: Sequence[Reading],
+    values: Sequence[float | None],
+    *,
+    decimals: int = 6,
+    blank: bool = False,
 ) -> str:
     """Text of a readings.csv.
 
     Args:
-        rows: What is read where.
+        rows: What is read where, under which conditions.
         values: Their readings, [m]; None for a cell that stays empty.
         decimals: Decimals of a reading in mm.
+        blank: Leave the cells of measured conditions empty.
     """
-    table = io.StringIO()
-    with_minus = any(r.minus for r in rows)
-    with_cycle = any(r.cycle != 1 for r in rows)
-    columns = [c for c in COLUMNS if (c != "minus" or with_minus) and (c != "cycle" or with_cycle)]
-    table.write(",".join(columns) + "\n")
-    for r, value in zip(rows, values, strict=True):
-        fields = {
+    cells = [
+        {
             "setup": r.setup,
             "posture": r.posture,
             "minus": r.minus or "",
             "cycle": str(r.cycle),
             "reading_mm": "" if value is None else _trim(f"{value / MM:.{decimals}f}"),
+            **condition_cells(r.conditions),
         }
-        table.write(",".join(fields[c] for c in columns) + "\n")
-    return table.getvalue()
+        for r, value in zip(rows, values, strict=True)
+    ]
+    columns = used_columns(cells)
+    if blank:
+        cells = [{**row, **dict.fromkeys(MEASURED, "")} for row in cells]
+    lines = [",".join(columns), *(",".join(row[c] for c in columns) for row in cells)]
+    return "\n".join(lines) + "\n"
+
+
+def condition_cells(conditions: Conditions | None) -> dict[str, str]:
+    """Cells of the conditions of a row; empty for those that are not stated."""
+    c = conditions or Conditions()
+    return {
+        "approach": c.approach or "",
+        "temperature_C": "" if c.temperature is None else f"{c.temperature:.12g}",
+        "time": "" if c.time is None else c.time.isoformat(),
+    }
+
+
+def used_columns(rows: Sequence[Mapping[str, str]]) -> list[str]:
+    """Columns of a readings.csv without the optional ones that no row needs."""
+    needed = {"setup", "posture", "reading_mm"}
+    needed |= {c for c in COLUMNS if any(row[c] not in ("", UNSTATED.get(c)) for row in rows)}
+    return [c for c in COLUMNS if c in needed]
 
 
 def _trim(number: str) -> str:

@@ -17,8 +17,14 @@ from orthocal.io.tables.cell import Row
 from orthocal.io.tables.numerals import tidy_text
 from orthocal.text import composed, shorten
 
-Role = Literal["setup", "posture", "minus", "cycle", "reading"]
+Role = Literal["setup", "posture", "minus", "cycle", "approach", "temperature", "time", "reading"]
 """Role of a column."""
+
+SINGLE: tuple[Role, ...] = (
+    *("setup", "posture", "minus", "cycle"),
+    *("approach", "temperature", "time"),
+)
+"""Roles of one column at most."""
 
 EXPECTED = "the headings setup, posture and reading"
 
@@ -44,6 +50,9 @@ WORDS: dict[Role, tuple[str, ...]] = {
         *("indicator", "dial", "dial reading", "indicator reading", "gauge reading"),
         *("messwert", "messwerte", "ablesung", "anzeige", "wert", "messuhr", "gemessen"),
     ),
+    "approach": ("approach",),
+    "temperature": ("temperature c",),
+    "time": ("time",),
 }
 """Headings of every role, in lower case, with single blanks."""
 
@@ -110,6 +119,9 @@ class Columns:
     readings: tuple[ReadingColumn, ...]
     extra: tuple[int, ...]
     """Columns with a heading that has no role."""
+    approach: int | None = None
+    temperature: int | None = None
+    time: int | None = None
 
     @property
     def keys(self) -> tuple[int, ...]:
@@ -265,7 +277,7 @@ def choose_columns(texts: Sequence[str], assigned: Mapping[str, str], *, where: 
             raise SessionError(f"column '{shorten(name)}' {problem}", where=f"{where}: {key}")
     headings = _read_headings(texts, assigned)
     single: dict[str, int] = {}
-    for role in ("setup", "posture", "minus", "cycle"):
+    for role in SINGLE:
         places = [i for i, h in enumerate(headings) if h is not None and h.role == role]
         if len(places) > 1:
             raise _several_columns(texts, places, role, where)
@@ -290,6 +302,9 @@ def choose_columns(texts: Sequence[str], assigned: Mapping[str, str], *, where: 
         cycle=single.get("cycle"),
         readings=tuple(readings),
         extra=tuple(i for i, text in enumerate(texts) if i not in used and text.strip()),
+        approach=single.get("approach"),
+        temperature=single.get("temperature"),
+        time=single.get("time"),
     )
 
 

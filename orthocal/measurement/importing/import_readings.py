@@ -14,10 +14,15 @@ from orthocal.errors import SessionError
 from orthocal.io.files import content_withheld_outside, exists, read_file, write_file
 from orthocal.io.tables.numerals import Sign
 from orthocal.io.tables.table import Table, read_table
-from orthocal.measurement.files.readings_checks import RawReading, check_readings, parse_cycle
+from orthocal.measurement.files.readings_checks import (
+    RawReading,
+    check_readings,
+    parse_cycle,
+    parse_time,
+)
 from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.session_file import check_contacts, load_unread
-from orthocal.measurement.files.write_session import COLUMNS
+from orthocal.measurement.files.write_session import used_columns
 from orthocal.measurement.importing.headings import (
     EXPECTED,
     UNITS,
@@ -32,6 +37,9 @@ from orthocal.text import shorten
 
 Key = tuple[str, str, str, int]
 """Setup, posture, minus and cycle of a reading."""
+
+CONDITIONS = ("approach", "temperature", "time")
+"""Fields of a row that state conditions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +76,7 @@ class TableImport:
     text: str
     """New content of the readings.csv."""
     filled: int
-    """Number of empty cells that get a reading."""
+    """Number of rows that get a reading, or conditions beside it."""
     replaced: int
     """Number of readings that get another value."""
     unchanged: int
@@ -93,7 +101,7 @@ def import_readings(
 ) -> TableImport:
     """Read a table and merge its readings into those of a session; writes nothing.
 
-    Rows match by setup, posture, minus and cycle.
+    Rows match by setup, posture, minus and cycle, and by approach where both state one.
 
     Args:
         table: A CSV file of any spreadsheet program, or an .xlsx workbook.
@@ -122,6 +130,8 @@ def import_readings(
     columns = choose_columns(
         content.header, options.columns, where=content.place(content.header_line)
     )
+    if "time" not in options.columns:
+        columns = _without_clock_times(content, columns)
     long_table = make_long_table(
         content,
         columns,
@@ -179,6 +189,20 @@ def _check_options(options: TableOptions) -> None:
         parse_role(key)
 
 
+def _without_clock_times(table: Table, columns: Columns) -> Columns:
+    """Columns without one of times that are not those of a session, such as a clock's."""
+    if columns.time is None:
+        return columns
+    texts = (row.cell(columns.time).text.strip() for row in table.rows)
+    try:
+        for text in texts:
+            if text:
+                parse_time(text, "")
+    except SessionError:
+        return replace(columns, time=None, extra=tuple(sorted((*columns.extra, columns.time))))
+    return columns
+
+
 def _read_existing(
     readings_path: Path, table: Path, long_table: LongTable, overwrite: bool
 ) -> list[RawReading]:
@@ -214,53 +238,92 @@ def _merge(
         Rows, and numbers of rows that are filled, replaced, unchanged and added.
 
     Raises:
-        SessionError: If a reading differs, unless it may be overwritten.
+        SessionError: If a reading or a condition differs, unless it may be overwritten.
     """
-    pending = {_key(row): row for row in new}
+    pending: dict[Key, list[RawReading]] = {}
+    for row in new:
+        pending.setdefault(_key(row), []).append(row)
+    places = Counter(_key(row) for row in existing)
     rows: list[RawReading] = []
     counts: Counter[str] = Counter()
     differing: list[tuple[RawReading, RawReading]] = []
     for row in existing:
-        match = pending.pop(_key(row), None)
+        match = _match(row, pending.get(_key(row), []), places[_key(row)] == 1)
         if match is None:
             rows.append(row)
             continue
-        if not row.reading:
-            change = "filled"
-        elif Decimal(row.reading) == Decimal(match.reading):
-            change = "unchanged"
-        else:
+        pending[_key(row)].remove(match)
+        stated = {name: getattr(match, name) or getattr(row, name) for name in CONDITIONS}
+        if _differs(row, match):
             change = "replaced"
             differing.append((row, match))
+        else:
+            more = any(stated[name] and not getattr(row, name) for name in CONDITIONS)
+            change = "filled" if more or not row.reading else "unchanged"
         counts[change] += 1
-        rows.append(row if change == "unchanged" else replace(row, reading=match.reading))
+        rows.append(row if change == "unchanged" else replace(row, reading=match.reading, **stated))
     if differing and not overwrite:
         row, match = differing[0]
-        more = f" ({len(differing) - 1} more differ)" if len(differing) > 1 else ""
+        more_rows = f" ({len(differing) - 1} more differ)" if len(differing) > 1 else ""
         raise SessionError(
-            f"{row.setup} {row.posture} of cycle {row.cycle or 1} is {row.reading} mm, but "
-            f"{match.reading} mm in {match.where}{more}; --replace overwrites existing readings",
+            f"{row.setup} {row.posture} of cycle {row.cycle or 1} is {_describe(row)}, but "
+            f"{_describe(match)} in {match.where}{more_rows}; --replace overwrites existing "
+            "readings",
             where=row.where,
         )
-    counts["added"] = len(pending)
-    return [*rows, *pending.values()], counts
+    added = [row for of_place in pending.values() for row in of_place]
+    counts["added"] = len(added)
+    return [*rows, *added], counts
+
+
+def _match(row: RawReading, among: Sequence[RawReading], alone: bool) -> RawReading | None:
+    """The new reading of an existing row: that of its approach, or the only one without."""
+    for other in among:
+        if other.approach == row.approach:
+            return other
+    unstated = alone and len(among) == 1 and not (row.approach and among[0].approach)
+    return among[0] if unstated else None
+
+
+def _differs(row: RawReading, match: RawReading) -> bool:
+    """Whether an existing row has another reading or condition."""
+    if row.reading and Decimal(row.reading) != Decimal(match.reading):
+        return True
+    stated = zip(_stated_conditions(row), _stated_conditions(match), strict=True)
+    return any(one is not None and other is not None and one != other for one, other in stated)
+
+
+def _stated_conditions(row: RawReading) -> tuple[object, ...]:
+    """Approach, temperature and time; None where not stated."""
+    return (
+        row.approach or None,
+        Decimal(row.temperature) if row.temperature else None,
+        parse_time(row.time, row.where) if row.time else None,
+    )
+
+
+def _describe(row: RawReading) -> str:
+    """Reading and conditions of a row, for messages."""
+    temperature = f"{row.temperature} °C" if row.temperature else ""
+    parts = f"{row.reading} mm" if row.reading else "", row.approach, temperature, row.time
+    return ", ".join(part for part in parts if part)
 
 
 def _format_readings(rows: Sequence[RawReading]) -> str:
     """Content of a readings.csv without the optional columns that no row needs."""
-    optional = {
-        "minus": any(r.minus for r in rows),
-        "cycle": any(r.cycle not in ("", "1") for r in rows),
-    }
-    columns = [c for c in COLUMNS if optional.get(c, True)]
-    lines = [",".join(columns)]
-    for r in rows:
-        cells = {
+    cells = [
+        {
             "setup": r.setup,
             "posture": r.posture,
             "minus": r.minus,
             "cycle": r.cycle or "1",
             "reading_mm": r.reading,
+            "approach": r.approach,
+            "temperature_C": r.temperature,
+            "time": r.time,
         }
-        lines.append(",".join(cells[c] for c in columns))
+        for r in rows
+    ]
+    columns = used_columns(cells)
+    lines = [",".join(columns), *(",".join(row[c] for c in columns) for row in cells)]
     return "\n".join(lines) + "\n"

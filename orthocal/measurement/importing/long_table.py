@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from decimal import Decimal, localcontext
 from itertools import chain
 
@@ -65,6 +65,8 @@ class Entry:
     cycle: str
     missing: bool
     """True if the cell has no reading."""
+    conditions: Mapping[str, str] = field(default_factory=dict)
+    """Cells of the conditions, by the fields of `RawReading`."""
     number: str = ""
     """Text of the number without its unit."""
     value: Decimal | None = None
@@ -132,7 +134,9 @@ def make_long_table(
             for name, known in zip(written, (setups, postures, postures), strict=True)
         ]
         setup, posture, minus = meant
-        row = RawReading(where, entry.line, setup, posture, minus, entry.cycle, "")
+        row = RawReading(
+            where, entry.line, setup, posture, minus, entry.cycle, "", **entry.conditions
+        )
         if entry.missing:
             if row.setup in setups and row.posture in postures:
                 missing.append(row)
@@ -197,11 +201,12 @@ def _read_entries(
                     where=table.place(row.line),
                 )
         minus, cycle = (_name(row.cell(i)) for i in (columns.minus, columns.cycle))
+        conditions = _read_conditions(row, columns)
         for r in columns.readings:
             identity = (row.line, r, names["setup"], names["posture"], minus)
             numbered = cycle if r.cycle is None else str(r.cycle)
             if r not in filled_cells:
-                yield Entry(*identity, numbered, missing=True)
+                yield Entry(*identity, numbered, True, conditions)
                 continue
             where = table.place(row.line, r.index)
             number, value, unit = _read_number(row.cell(r.index), where)
@@ -210,7 +215,18 @@ def _read_entries(
                 raise SessionError(
                     f"the reading is in {unit}, and its heading says {stated}", where=where
                 )
-            yield Entry(*identity, numbered, False, number, value, unit or stated)
+            yield Entry(*identity, numbered, False, conditions, number, value, unit or stated)
+
+
+def _read_conditions(row: Row, columns: Columns) -> dict[str, str]:
+    """Cells of the conditions of a row, by the fields of `RawReading`."""
+    temperature = row.cell(columns.temperature).text.strip()
+    value = parse_numeral(temperature, "comma" if "," in temperature else "point")
+    return {
+        "approach": _name(row.cell(columns.approach)),
+        "temperature": temperature if value is None else f"{value:f}",
+        "time": row.cell(columns.time).text.strip(),
+    }
 
 
 def _read_units_row(row: Row, columns: Columns) -> dict[int, UnitName]:

@@ -1,13 +1,14 @@
 """Path of the machine through the postures of a session.
 
-Every posture is approached from one side: on its last motion each drive moves in the same
-direction, so that backlash acts alike in all readings. Each segment of the path is sampled to
-check that the drives reach it, that the tip stays on the rod and that the dial stays in its range.
+A setup begins in its alignment posture, where the operator mounts and aligns the gauge. Every
+posture is approached from one side: on its last motion each drive moves in the same direction, so
+that backlash acts alike in all readings. Each segment of the path is sampled to check that the
+drives reach it, that the tip stays on the rod and that the dial stays in its range.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -18,15 +19,16 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.errors import ClosureError, SessionError
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_assembly
 from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.observation.contacts import locate_contacts
+from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations, drive_table
-from orthocal.observation.sensor_frames import locate_contacts, predict_entries
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Contact
 from orthocal.session.session import Posture, Reading, Session
 from orthocal.units import DEG, MM
 
 Array = NDArray[np.float64]
-Role = Literal["reading", "subtracted", "return"]
+Role = Literal["alignment", "reading", "subtracted", "return"]
 
 APPROACH = 2e-3
 """Length of the approach of a sliding drive, [m]."""
@@ -50,7 +52,9 @@ class Guidance:
     tool: dict[str, Array]
     """Posture to the tool centre point, shape (3,), [m]; empty for a robot without a tool."""
     contacts: dict[str, tuple[list[str], Contact]]
-    """Setup to the postures in which it is read, and its contact there."""
+    """Setup to the postures in which it is aligned or read, and its contact there."""
+    aligned_at: dict[str, str]
+    """Setup to the posture in which its gauge is aligned."""
 
     def touched(self, setup: str, posture: str) -> Array:
         """Contact point of a setup's gauge in a posture, shape (3,), [m]."""
@@ -74,8 +78,15 @@ def guide(session: Session) -> Guidance:
     return Guidance(
         joints=dict(zip(session.postures, shown_joints(robot, commanded), strict=True)),
         tool=tool,
-        contacts=locate_contacts(session),
+        contacts=locate_contacts(with_alignment(session)),
+        aligned_at=session.alignment_postures,
     )
+
+
+def with_alignment(session: Session) -> Session:
+    """A session whose setups also read the postures in which their gauges are aligned."""
+    extra = [Reading(s, p, None, 1, 0.0, None) for s, p in session.alignment_postures.items()]
+    return replace(session, readings=(*session.readings, *extra))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,10 +95,10 @@ class Stop:
 
     posture: str
     role: Role
-    """Posture to read, posture whose reading is subtracted from the next one, or return to the
-    first posture."""
+    """Alignment of the gauge, posture to read, posture whose reading is subtracted from the next
+    one, or return to the first posture."""
     line: int | None
-    """Line of readings.csv; None for the return."""
+    """Line of readings.csv; None for the alignment and the return."""
     cycle: int
     drives: Array
     """Nominal drive coordinates, shape (n_drives,), [m, rad]."""
@@ -103,7 +114,7 @@ class Stop:
     lift: str = ""
     """Reason to hold the plunger up on this path; empty where it may stay on the rod."""
     expected: float = 0.0
-    """Reading of a machine without errors, relative to the first posture, [m]."""
+    """Reading of a machine without errors, relative to the first reading, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,13 +128,10 @@ class SetupMotion:
     """Number of setups."""
     side: int
     """Side of the approach: -1 from smaller drive coordinates, 1 from larger ones."""
+    alignment: Stop | None
+    """Stop in the alignment posture; None if that is the first posture of `stops`."""
     stops: tuple[Stop, ...]
-
-
-class _Approach(NamedTuple):
-    drives: Array
-    start: Array | None
-    end: Array | None
+    """Postures to read, and the first of them again."""
 
 
 class _Path(NamedTuple):
@@ -149,11 +157,16 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
     for i, reading in enumerate(session.readings):
         line = i + 2 if reading.line is None else reading.line
         rows.setdefault(reading.setup, []).append((line, reading))
-    side, approaches = _find_approaches(session)
-    return tuple(
-        SetupMotion(setup, number, len(rows), side, _plan_setup(session, setup, of, approaches))
-        for number, (setup, of) in enumerate(rows.items(), 1)
-    )
+    aligned_at = session.alignment_postures
+    side, stop_at = _find_approaches(session, {aligned_at[setup] for setup in rows})
+    motions = []
+    for number, (setup, rows_of_setup) in enumerate(rows.items(), 1):
+        stops = _list_stops(rows_of_setup, aligned_at[setup], stop_at)
+        if _commands_tool(session.robot):
+            stops = _follow_stops(session, setup, stops)
+        alignment = stops.pop(0) if stops[0].role == "alignment" else None
+        motions.append(SetupMotion(setup, number, len(rows), side, alignment, tuple(stops)))
+    return tuple(motions)
 
 
 def shown_joints(robot: Robot, drives: ArrayLike) -> Array:
@@ -167,96 +180,86 @@ def _commands_tool(robot: Robot) -> bool:
     return robot.tcp is not None and len(robot.tcp.coordinates) == len(robot.drives)
 
 
-def _find_approaches(session: Session) -> tuple[int, dict[str, _Approach]]:
-    """Side from which all postures can be approached, and the approach of each.
+def _find_approaches(session: Session, alignment: set[str]) -> tuple[int, dict[str, Stop]]:
+    """Side from which all postures can be approached, and a stop to read in each posture.
+
+    Args:
+        session: The session.
+        alignment: Names of the alignment postures.
 
     Raises:
         SessionError: If no side serves all postures.
     """
     robot = session.robot
-    used = {p for r in session.readings for p in (r.posture, r.minus) if p is not None}
+    used = alignment | {p for r in session.readings for p in (r.posture, r.minus) if p is not None}
     names = [n for n in session.postures if n in used]
     nominal = np.array([session.postures[n].drives + session.active_offsets for n in names])
     step = np.array([APPROACH if d.unit == "m" else APPROACH_TURN for d in robot.drives])
     assembly = nominal_assembly(robot)
-    refused: ClosureError | None = None
+    refused: list[ClosureError] = []
     for side in (-1, 1):
         drives = nominal + side * step
         failures = find_beyond_travel(robot, drives, names)
         if not failures:
             passive = assembly.close(drives, names=names, failures=failures)
         if failures:
-            refused = refused or next(iter(failures.values()))
+            refused.append(next(iter(failures.values())))
             continue
-        starts: Sequence[Array | None] = [None] * len(names)
-        ends: Sequence[Array | None] = starts
+        ends: Sequence[Array | None] = [None] * len(names)
+        starts = ends
         if _commands_tool(robot) and robot.tcp is not None:
             coordinates = list(robot.tcp.coordinates)
-            starts = list(assembly.tcp(drives, passive)[:, coordinates])
             ends = list(assembly.forward(nominal, names=names)[:, coordinates])
-        approaches = map(_Approach, drives, starts, ends)
-        return side, dict(zip(names, approaches, strict=True))
-    reason = "" if refused is None else f": {refused.reason}"
-    posture = "" if refused is None else refused.posture
+            starts = list(assembly.tcp(drives, passive)[:, coordinates])
+        columns = zip(names, nominal, drives, ends, starts, strict=True)
+        return side, {name: Stop(name, "reading", None, 1, *parts) for name, *parts in columns}
     raise SessionError(
-        f"can be approached neither from below nor from above by {APPROACH / MM:g} mm{reason}",
-        where=f"{session.path or 'session'}: postures.{posture}",
+        f"can be approached neither from below nor from above by {APPROACH / MM:g} mm: "
+        f"{refused[0].reason}",
+        where=f"{session.path or 'session'}: postures.{refused[0].posture}",
     )
 
 
-def _plan_setup(
-    session: Session,
-    setup: str,
-    rows: Sequence[tuple[int, Reading]],
-    approaches: Mapping[str, _Approach],
-) -> tuple[Stop, ...]:
-    """Stops of a setup with the paths between them."""
+def _list_stops(
+    rows: Sequence[tuple[int, Reading]], aligned_at: str, stop_at: Mapping[str, Stop]
+) -> list[Stop]:
+    """Alignment of the gauge, stops in the order of the rows, and the first posture again."""
+    first = rows[0][1].minus or rows[0][1].posture
+    stops = [] if aligned_at == first else [replace(stop_at[aligned_at], role="alignment")]
+    for line, r in rows:
+        if r.minus is not None:
+            subtracted = replace(stop_at[r.minus], role="subtracted", line=line, cycle=r.cycle)
+            stops.append(subtracted)
+        stops.append(replace(stop_at[r.posture], line=line, cycle=r.cycle))
+    if stops[-1].posture != first:
+        stops.append(replace(stop_at[first], role="return"))
+    return stops
+
+
+def _follow_stops(session: Session, setup: str, stops: Sequence[Stop]) -> list[Stop]:
+    """Stops with the paths between them and the predicted readings."""
     robot = session.robot
-    stops = list(_stops(session, rows, approaches))
-    if not _commands_tool(robot):
-        return tuple(stops)
     zero = tool_at_zero(robot)
-    paths: list[_Path] = []
-    position = zero
-    for i, stop in enumerate(stops):
+    checked, paths, position = [], [], zero
+    for stop in stops:
         corners = [np.asarray(stop.approach_point), np.asarray(stop.point)]
-        path = _follow(robot, [position, *corners])
+        path = _sample_path(robot, [position, *corners])
         if path is None:
-            path = _follow(robot, [position, zero, *corners])
-            stops[i] = replace(stop, via_zero=True)
+            path = _sample_path(robot, [position, zero, *corners])
+            stop = replace(stop, via_zero=True)
         if path is None:
             raise SessionError(
                 f"the path to posture '{stop.posture}' of setup '{setup}' leaves the workspace, "
                 "both directly and through the mechanical zero; insert a posture between them",
                 where=str(session.path or "session"),
             )
+        checked.append(stop)
         paths.append(path)
         position = corners[-1]
-    return tuple(_predict(session, setup, stops, paths))
+    return _predict(session, setup, checked, paths)
 
 
-def _stops(
-    session: Session, rows: Sequence[tuple[int, Reading]], approaches: Mapping[str, _Approach]
-) -> Iterator[Stop]:
-    """Stops in the order of the rows; the first posture again at the end."""
-
-    def stop(posture: str, role: Role, line: int | None, cycle: int) -> Stop:
-        approach = approaches[posture]
-        drives = session.postures[posture].drives + session.active_offsets
-        return Stop(
-            posture, role, line, cycle, drives, approach.drives, approach.end, approach.start
-        )
-
-    for line, reading in rows:
-        if reading.minus is not None:
-            yield stop(reading.minus, "subtracted", line, reading.cycle)
-        yield stop(reading.posture, "reading", line, reading.cycle)
-    first = rows[0][1].minus or rows[0][1].posture
-    if rows[-1][1].posture != first:
-        yield stop(first, "return", None, 1)
-
-
-def _follow(robot: Robot, corners: Sequence[Array]) -> _Path | None:
+def _sample_path(robot: Robot, corners: Sequence[Array]) -> _Path | None:
     """Samples of a polyline of tool coordinates; None if the machine does not reach all of it."""
     points = [corners[0][None]]
     for start, end in pairwise(corners):
@@ -274,13 +277,12 @@ def _follow(robot: Robot, corners: Sequence[Array]) -> _Path | None:
 
 def _predict(
     session: Session, setup: str, stops: Sequence[Stop], paths: Sequence[_Path]
-) -> Iterator[Stop]:
+) -> list[Stop]:
     """Stops with predicted readings, and with the reason to lift the plunger where there is one."""
     points, drives, passive = (np.concatenate(part) for part in zip(*paths, strict=True))
     aligned = session.postures[session.alignment_postures[setup]]
     names = [f"{aligned.name} {i}" for i in range(len(points))]  # none is the posture's own
     at_alignment = nominal_assembly(session.robot).close(aligned.drives + session.active_offsets)
-    passive = np.vstack([passive, at_alignment])
     sampled = replace(
         session,
         postures={
@@ -289,15 +291,21 @@ def _predict(
         }
         | {aligned.name: aligned},
         setups={setup: replace(session.setups[setup], aligned_at=aligned.name)},
-        readings=tuple(Reading(setup, n, None, 1, 0.0, None) for n in names),
+        readings=tuple(Reading(setup, n) for n in names),
     )
     observations = build_observations(sampled)
-    predicted = observations.rows(predict_entries(sampled, observations, passive=passive))
+    predicted = observations.rows(
+        predict_readings(
+            sampled, observations=observations, passive=np.vstack([passive, at_alignment])
+        )
+    )
     _, contact = locate_contacts(sampled)[setup]
     ends = np.cumsum([len(path.points) for path in paths]).tolist()
-    relative = predicted - predicted[ends[0] - 1]
+    first = next(i for i, stop in enumerate(stops) if stop.role != "alignment")
+    relative = predicted - predicted[ends[first] - 1]
     limits = session.gauges[session.setups[setup].gauge].range
     room = np.inf if limits is None else 0.5 * (limits[1] - limits[0])
+    finished = []
     for i, (stop, end) in enumerate(zip(stops, ends, strict=True)):
         lift = ""
         if i > 0:  # the gauge is mounted at the first stop
@@ -309,4 +317,5 @@ def _predict(
             elif np.abs(on_path).max() > room:
                 largest = f"{on_path[np.abs(on_path).argmax()] / MM:+.1f}".replace("-", "−")
                 lift = f"the dial would go {largest} mm"
-        yield replace(stop, lift=lift, expected=float(relative[end - 1]))
+        finished.append(replace(stop, lift=lift, expected=float(relative[end - 1])))
+    return finished

@@ -1,4 +1,7 @@
-"""G-code programs that move the machine through a setup and pause (M0) at each reading.
+"""G-code programs that move the machine through a setup and pause (M0) where the operator acts.
+
+The first pause is in the alignment posture, where the gauge is mounted and aligned. Then there is
+one for each reading.
 
 Every motion is in machine coordinates (G53), so that work offsets (G54 to G59.3), G92 and a
 coordinate rotation have no effect. Coordinates are those of nominal kinematics; comments list the
@@ -15,8 +18,9 @@ from numpy.typing import NDArray
 
 from orthocal.errors import ParameterError
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.measurement.motion.motion import SetupMotion, Stop, shown_joints
+from orthocal.measurement.motion.motion import Role, SetupMotion, Stop, shown_joints
 from orthocal.robot.model import Robot
+from orthocal.sensors.rod_indicator import RodByBall
 from orthocal.session.session import Session
 from orthocal.text import comment_safe
 from orthocal.units import DRIVE_UNITS, MM, format_fixed
@@ -37,7 +41,15 @@ FASTEST = 20_000.0
 LARGEST_SHIFT = 1e5
 """Largest coordinate of the machine's origin, [mm]."""
 
-_PREAMBLE = (
+ACTIONS: dict[Role, str] = {
+    "alignment": "",
+    "reading": "read",
+    "subtracted": "set the dial to 0",
+    "return": "first posture again: the dial must show its first reading",
+}
+"""Instructions to the operator at a stop."""
+
+PREAMBLE = (
     "(Start at the mechanical zero, with no gauge mounted)",
     "(Every motion is in machine coordinates: G53 G1 in G90)",
     "(Work offsets G54 to G59.3, G92 and rotation have no effect; G49 cancels the tool length)",
@@ -49,7 +61,11 @@ _PREAMBLE = (
 
 @dataclass(frozen=True, slots=True)
 class ProgramOptions:
-    """Options of measuring programs."""
+    """Options of measuring programs.
+
+    Raises:
+        ParameterError: If a feed or a shift is out of range.
+    """
 
     feed: float = 600.0
     """Feed between postures, [mm/min]."""
@@ -58,12 +74,7 @@ class ProgramOptions:
     shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Machine coordinates (G53) of the world's origin, [mm]."""
 
-    def require_sane(self) -> None:
-        """Refuse feeds and shifts out of range.
-
-        Raises:
-            ParameterError: Naming the option.
-        """
+    def __post_init__(self) -> None:
         for name, feed in (("--feed", self.feed), ("--approach-feed", self.approach_feed)):
             if not 1.0 <= feed <= FASTEST:
                 raise ParameterError(
@@ -87,10 +98,9 @@ def write_program(
     """Program of a setup.
 
     Raises:
-        ParameterError: If a feed or a shift is out of range, or the drives command no tool.
+        ParameterError: If the drives command no tool.
     """
     options = options or ProgramOptions()
-    options.require_sane()
     robot = session.robot
     if robot.tcp is None or any(s.point is None for s in motion.stops):
         raise ParameterError(
@@ -103,13 +113,20 @@ def write_program(
         f"(orthocal: {name}, setup {setup}, {motion.number} of {motion.count})",
         f"({comment_safe(session.setups[motion.setup].sensor.describe(), 120)})",
         f"(Coordinates: nominal kinematics, machine = world + {shift} mm)",
-        *_PREAMBLE,
+        *PREAMBLE,
         f"F{options.feed:g}",
     ]
-    for i, stop in enumerate(motion.stops):
-        following = motion.stops[i + 1] if i + 1 < len(motion.stops) else None
+    ball = isinstance(session.setups[motion.setup].sensor, RodByBall)
+    mount = f"mount the gauge, {'centre its ball on the rod' if ball else 'align it'}"
+    stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
+    for i, stop in enumerate(stops):
+        zero = "set the gauge zero" if stop is motion.stops[0] and stop.role == "reading" else ""
+        actions = (mount if i == 0 else "", zero, ACTIONS[stop.role])
+        instruction = ", then ".join(action for action in actions if action)
         lines += [f"(to {_label(stop)})", *_moves(robot, stop, options)]
-        lines += [f"(MSG, {text})" for text in _messages(robot, stop, following, first=i == 0)]
+        lines.append(f"(MSG, {_label(stop)}; joints {_joints(robot, stop)}; {instruction})")
+        if i + 1 < len(stops) and stops[i + 1].lift:
+            lines.append(f"(MSG, hold the plunger up on the way to {_label(stops[i + 1])})")
         if stop.role != "return":
             lines.append("M0")
     return "\n".join([*lines, "M2", ""])
@@ -132,26 +149,14 @@ def _moves(robot: Robot, stop: Stop, options: ProgramOptions) -> list[str]:
     return lines
 
 
-def _messages(robot: Robot, stop: Stop, following: Stop | None, *, first: bool) -> list[str]:
-    """Instructions to the operator at a stop, and for the path to the next one."""
-    action = {
-        "reading": "read",
-        "subtracted": "set the dial to 0",
-        "return": "first posture again: the dial must show its first reading",
-    }[stop.role]
-    if first:
-        action = f"mount the gauge, set its zero, then {action}"
-    joints = " ".join(
-        format_fixed(float(v) / DRIVE_UNITS[d.unit][1], DECIMALS)
-        for d, v in zip(robot.drives, shown_joints(robot, stop.drives), strict=True)
-    )
-    texts = [f"{_label(stop)}; joints {joints}; {action}"]
-    if following is not None and following.lift:
-        texts.append(f"hold the plunger up on the way to {_label(following)}")
-    return texts
+def _joints(robot: Robot, stop: Stop) -> str:
+    """Joints at a stop, as the controller displays them, in mm or degrees."""
+    shown = zip(robot.drives, shown_joints(robot, stop.drives), strict=True)
+    return " ".join(format_fixed(float(v) / DRIVE_UNITS[d.unit][1], DECIMALS) for d, v in shown)
 
 
 def _label(stop: Stop) -> str:
-    if stop.line is None:
-        return f"posture {comment_safe(stop.posture, LONGEST_NAME)}"
-    return f"line {stop.line}: {comment_safe(stop.posture, LONGEST_NAME)}"
+    """Line of readings.csv and posture of a stop."""
+    kind = "alignment posture" if stop.role == "alignment" else "posture"
+    name = comment_safe(stop.posture, LONGEST_NAME)
+    return f"{kind} {name}" if stop.line is None else f"line {stop.line}: {name}"

@@ -13,9 +13,8 @@ from pathlib import Path
 from rich.console import Group
 
 from orthocal.arguments import require_kind
-from orthocal.assessment.controller_entries import find_entries
-from orthocal.assessment.findings.calibration import decide
-from orthocal.assessment.tool_error import ToolAccuracy, assess_tool, find_excess
+from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.io.files import write_file
@@ -30,9 +29,8 @@ from orthocal.output.report.reading_plots import plot_residuals, plot_setups, pl
 from orthocal.output.report.tool_map import Field, plot_tool_map
 from orthocal.output.scene.drawing import draw_scene
 from orthocal.output.text.accuracy import render_tool
-from orthocal.output.text.answer import render_answer, shows_entries
+from orthocal.output.text.answer import render_answer
 from orthocal.output.text.entries import entry_table, render_meaning
-from orthocal.output.text.explanation import explain_fit
 from orthocal.output.text.heading import render_heading
 from orthocal.output.text.layout import bullets, mm, plain, signed, to_markup
 from orthocal.output.text.sensors import render_parts
@@ -56,9 +54,8 @@ MOST_NAMED = 9
 
 GLOSSARY = (
     "σ: standard deviation of one reading. It comes from repeated cycles, else from the residuals, "
-    "else from the gauge as stated. ± σ: standard deviation of a value from everything that is not "
-    "known, with unmodelled errors at their tolerances. scatter: the part of it from the noise of "
-    "the readings.",
+    "else from the gauge as stated. by noise: the part of ± that is due to the noise of the "
+    "readings.",
     "tolerance: prior standard deviation of an error, from the robot's YAML or --tolerance. told: "
     "share of the prior uncertainty that the readings removed.",
     "before: measured less nominal with the active offsets. after: measured less calibrated. Both "
@@ -130,21 +127,19 @@ def _verdict(calibration: Calibration) -> str:
         f"largest was {mm(calibration.largest_before)} mm and is {mm(calibration.largest_after)} "
         "mm."
     )
-    decision = decide(calibration)
+    found = assessment_of(calibration)
     answer = to_markup(render_answer(calibration, heading=False))
-    meaning = Group()
-    if find_entries(calibration):
-        # what the answer leaves out: where the sliders are, and what is not to be entered
-        told_all = shows_entries(decision) and calibration.only_offsets
-        listed = [] if told_all else [entry_table(calibration)]
-        meaning = Group(*listed, *render_meaning(calibration))
+    # what the answer leaves out: where the sliders are, and what is not to be entered
+    told_all = found.decision.verdict != "reject" and calibration.only_offsets
+    listed = [entry_table(calibration)] if found.entries and not told_all else []
+    meaning = Group(*listed, *render_meaning(calibration))
     return (
         answer
         + heading("Meaning of the values", level=3)
         + to_markup(meaning)
         + paragraph(told)
         + heading("Findings", level=3)
-        + to_markup(bullets(explain_fit(calibration)))
+        + to_markup(bullets([f.words for f in found.findings]))
     )
 
 
@@ -157,7 +152,7 @@ def _tool(calibration: Calibration) -> str:
 
 
 def _maps(calibration: Calibration, accuracy: ToolAccuracy) -> str:
-    excess = find_excess(calibration)
+    excess = calibration.tolerance_scale
     times = f"{excess:.1f} times " if excess > 1.0 else ""
     captions: dict[Field, str] = {
         "now": "Actual less commanded position of the tool, with the offsets that were active "

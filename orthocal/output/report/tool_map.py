@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from orthocal.assessment.controller_entries import find_entries
-from orthocal.assessment.tool_error import ToolAccuracy, assess_remaining, find_excess
+from orthocal.assessment.tool_error import ToolAccuracy, assess_remaining
 from orthocal.calibration.calibration import Calibration
 from orthocal.output.report.figure import Plot, open_figure
 from orthocal.units import MM, UM
@@ -71,7 +71,7 @@ def _error_parts(calibration: Calibration, accuracy: ToolAccuracy, which: Field)
     """Tool errors after alignment, shape (K, 3), or their uncertainty, shape (K, 1), [µm]."""
     if which == "now":
         return accuracy.align(accuracy.deviation) / UM
-    remaining, _ = assess_remaining(calibration, accuracy)
+    remaining = assess_remaining(calibration, accuracy)
     if which == "left" or remaining is None:
         return accuracy.align(accuracy.error_after_offsets) / UM
     variance = np.trace(remaining.aligned_covariance, axis1=1, axis2=2)
@@ -129,7 +129,7 @@ def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Fiel
     label = "size of the tool error [µm]; arrows: its part in the plane"
     if which == "unknown":
         label = "standard deviation in space [µm]"
-        excess = find_excess(calibration)
+        excess = calibration.tolerance_scale
         if excess > 1.0:
             label += f", errors at {excess:.1f} × their tolerances"
     figure.colorbar(

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ParameterError
+from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
-from orthocal.observation.sensor_frames import predict_entries
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session, Setup
 from orthocal.statistics.zeros import project_out_zeros
@@ -104,7 +104,7 @@ def measure_deviations(session: Session) -> tuple[Deviation, ...]:
             for drive, value in zip(session.robot.drives, session.active_offsets, strict=True)
             if value != 0.0
         }
-        predicted = predict_entries(session, observations, active)
+        predicted = predict_readings(session, active, observations=observations)
         entries = observations.values(session.values) - predicted
         deviations = observations.rows(project_out_zeros(entries, observations))
     return _average(

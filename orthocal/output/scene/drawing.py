@@ -262,7 +262,8 @@ def _place_machines(
 ) -> _Machines:
     """Poses of the nominal and of the calibrated machine in every frame."""
     robot, frames, size = measured.robot, drawing.all_frames, drawing.size
-    machine = robot.with_errors(calibration.errors)
+    rigid = {n: v for n, v in calibration.errors.items() if robot.parameters.are_rigid(n)}
+    machine = robot.with_errors(rigid)
     nominal_loops, real_loops = nominal_assembly(robot), Assembly(robot, fixed=calibration.errors)
     timeline = plan_motion([s.drives for s in stops])
     assumed = Timeline(timeline.drives + measured.offsets, timeline.times, timeline.stops)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.kinematics.compiled import zero_poses
+from orthocal.kinematics.robot_functions import reference_poses
 from orthocal.output.scene.deviations import (
     Deviation,
     Measurement,
@@ -218,7 +218,7 @@ def _labelled_setups(
 def _find_contact(drawing: MachineScene, setup: Setup, poses: Mapping[str, Array]) -> Contact:
     """Contact of a sensor with the drawn machine in the first frame."""
     frames = setup.sensor.frames(drawing.robot)
-    at_zero = zero_poses(drawing.robot, frames.at_zero)
+    at_zero = reference_poses(drawing.robot, frames.at_zero)
     in_posture = [poses[f][:1] for f in frames.in_posture]
     return setup.sensor.contact(in_posture, at_zero, drawing.robot)
 

@@ -10,7 +10,6 @@ from orthocal.assessment.tool_error import ToolAccuracy, assess_remaining, asses
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
 from orthocal.output.text.layout import um
-from orthocal.units import MM
 from orthocal.viewer.machine import MachineScene
 from orthocal.viewer.scene import LegendEntry, Scene, round_scale
 from orthocal.viewer.shapes import Colour, css, draw_arrow, material, pose_along
@@ -54,11 +53,11 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     except (ClosureError, RobotError) as e:
         scene.facts.append(f"Tool errors are not shown. {e}.")
         return ""
-    region = f"±{(accuracy.workspace.half_side or 0.0) / MM:.3g} mm"
+    region = accuracy.workspace.words.removeprefix("the workspace ")
     now, entered = (accuracy.align(d) for d in (accuracy.deviation, accuracy.error_after_offsets))
     now_largest, entered_largest = (_largest(d) for d in (now, entered))
     # the standard deviation in space, as in all tables; axes of an ellipsoid are shorter
-    after, excess = assess_remaining(calibration, accuracy)
+    after, excess = assess_remaining(calibration, accuracy), calibration.tolerance_scale
     spread = 0.0 if after is None else after.sizes.headline.largest
     largest = max(now_largest, entered_largest, spread)
     if largest < VANISHING:

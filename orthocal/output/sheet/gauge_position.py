@@ -17,11 +17,8 @@ from orthocal.viewer.motion import place_frames
 
 Array = NDArray[np.float64]
 
-ALONG_AXIS = 0.9999
-"""Cosine above which a direction is named after an axis of the world."""
-
 ABOUT_ALONG = 0.97
-"""The same for the direction of a small offset."""
+"""Cosine above which the direction of a small offset is named after an axis of the world."""
 
 NEAR_HINGE = 0.012
 """Smallest distance of a tip from the end of a rod that needs no warning, [m]."""
@@ -165,21 +162,6 @@ def _find_touched(robot: Robot, setup: Setup) -> tuple[Leg | None, Rod | None]:
             return leg, None
     kind, name = setup.sensor.place
     return (robot.legs.get(name) if kind == "leg" else None), None
-
-
-def axis_name(direction: Array, *, cosine: float = ALONG_AXIS) -> str:
-    """Name of the world axis along a direction, such as −y; "" for other directions."""
-    k = int(np.abs(direction).argmax())
-    if abs(direction[k]) <= cosine * np.linalg.norm(direction):
-        return ""
-    return f"{'+' if direction[k] > 0.0 else '−'}{'xyz'[k]}"
-
-
-def name_direction(direction: Array, *, cosine: float = ALONG_AXIS) -> str:
-    """Name of the world axis along a direction, else the components of its unit vector."""
-    unit = direction / np.linalg.norm(direction)
-    components = ", ".join(f"{round(v, 2) + 0.0:.2f}".replace("-", "−") for v in unit)
-    return axis_name(direction, cosine=cosine) or f"({components})"
 
 
 def name_tip(tip: TouchingTip | None) -> str:

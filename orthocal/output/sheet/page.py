@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib import resources
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.assessment.wording import name_direction
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.kinematics.loop_closure import nominal_assembly
-from orthocal.measurement.motion.motion import SetupMotion, Stop, plan_motion, shown_joints
+from orthocal.measurement.motion.motion import (
+    SetupMotion,
+    Stop,
+    plan_motion,
+    shown_joints,
+    with_alignment,
+)
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
-from orthocal.observation.sensor_frames import locate_contacts
+from orthocal.observation.contacts import locate_contacts
 from orthocal.output.sheet.gauge_position import (
     ABOUT_ALONG,
     GaugePosition,
     find_gauge_position,
-    name_direction,
     name_tip,
 )
 from orthocal.output.sheet.pictures import draw_machine, draw_section
 from orthocal.output.text.layout import counted
 from orthocal.robot.model import Robot
-from orthocal.session.session import Gauge, Reading, Session
+from orthocal.session.session import Gauge, Session
 from orthocal.units import DRIVE_UNITS, MM
 from orthocal.viewer.visuals import load_visuals
 
@@ -54,7 +59,7 @@ def sheet_files(session: Session, *, options: ProgramOptions | None = None) -> d
         programs = {program_name(m): write_program(session, m, options) for m in motions}
     visuals = load_visuals(session.robot)
     links = tuple(dict.fromkeys(v.link for v in visuals))
-    contacts, passive = locate_contacts(_with_alignment(session)), _close_loops(session)
+    contacts, passive = locate_contacts(with_alignment(session)), _close_loops(session)
     setups = []
     for motion in motions:
         gauge = find_gauge_position(session, motion, contacts, passive, links)
@@ -65,12 +70,6 @@ def sheet_files(session: Session, *, options: ProgramOptions | None = None) -> d
     front = _front(session, motions, options, with_programs=bool(programs))
     body = "\n".join([front, "".join(setups), _afterwards()])
     return {SHEET: page(title, style, body), **programs}
-
-
-def _with_alignment(session: Session) -> Session:
-    """A session whose setups also read the postures in which their gauges are aligned."""
-    extra = [Reading(s, p, None, 1, 0.0, None) for s, p in session.alignment_postures.items()]
-    return replace(session, readings=(*session.readings, *extra))
 
 
 def _close_loops(session: Session) -> dict[str, Array]:
@@ -149,9 +148,10 @@ def _programs(options: ProgramOptions | None) -> str:
     origin = f", world origin at ({', '.join(f'{v:g}' for v in shift)}) mm" if any(shift) else ""
     return paragraph(
         f"Programs: G-code in mm, in machine coordinates (G53){origin}. Work offsets, G92 and "
-        "rotation have no effect on them. They cancel the tool length (G49) and stop (M0) at each "
-        "reading: press cycle start to continue. Run the first program without a gauge and with a "
-        "slow override. Keep the machine clear: every program starts from the mechanical zero."
+        "rotation have no effect on them. They cancel the tool length (G49) and stop (M0) in the "
+        "alignment posture and at each reading: press cycle start to continue. Run the first "
+        "program without a gauge and with a slow override. Keep the machine clear: every program "
+        "starts from the mechanical zero."
     )
 
 

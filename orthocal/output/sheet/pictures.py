@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from orthocal.assessment.wording import axis_name, name_direction
 from orthocal.io.html import escape
 from orthocal.output.sheet.gauge_position import (
     ABOUT_ALONG,
     GaugePosition,
-    axis_name,
-    name_direction,
 )
 from orthocal.output.text.layout import short_name
 from orthocal.robot.model import Robot

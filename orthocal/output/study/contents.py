@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.kinematics.workspace import describe_box
 from orthocal.output.study.report import (
     Curve,
     CurveFigure,
@@ -34,7 +35,7 @@ from orthocal.study.linearisation import (
 )
 from orthocal.study.runner import StudyTable
 from orthocal.study.sensitivity import SensitivitySummary, summarise_sensitivity
-from orthocal.units import MM, UM
+from orthocal.units import UM
 
 Array = NDArray[np.float64]
 
@@ -141,7 +142,8 @@ def _accuracy_answer(study: AccuracyStudy, s: AccuracySummary, predicted: float)
         return f"None of the machines could be calibrated ({reasons})."
     sentences = [
         f"Expected tool error after calibration: {_um(s.after)} µm RMS (before: {_um(s.before)} "
-        f"µm), over a ±{study.half_side / MM:.3g} mm cube after aligning the workpiece.",
+        f"µm), over the workspace {describe_box(np.array(study.box))} after aligning the "
+        "workpiece.",
         f"Mean of {counted(s.machines, 'machine')}, standard error {_um(s.standard_error)} µm; "
         f"95 % of the machines are below {_um(s.percentile_95)} µm.",
         "The controller corrects all identified errors.",

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import find_entries
-from orthocal.assessment.findings.residuals import find_tolerances
-from orthocal.assessment.findings.tool import promise
 from orthocal.assessment.remaining_errors import find_remaining_errors
 from orthocal.assessment.tool_error import (
     ErrorSize,
@@ -20,7 +19,9 @@ from orthocal.assessment.tool_error import (
     ToolAccuracy,
     assess_remaining,
     assess_tool,
+    summarise_tool,
 )
+from orthocal.assessment.words.entries import describe_tool_error
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
 from orthocal.output.text.layout import add_row, print_rich, table_of, um
@@ -73,7 +74,7 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
     if not calibration.only_offsets and find_entries(calibration):
         rows.append(("with the offsets entered", accuracy.measure(accuracy.error_after_offsets)))
     rows.append(("not known before", accuracy.before.sizes))
-    remaining, excess = assess_remaining(calibration, accuracy)
+    remaining, excess = assess_remaining(calibration, accuracy), calibration.tolerance_scale
     if accuracy.after is not None:
         rows.append(("not known after", accuracy.after.sizes))
     if remaining is not None and excess > 1.0:
@@ -92,8 +93,10 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
             "were not identified at their tolerances."
         )
     )
-    lines += [Text(found.text) for found in find_tolerances(calibration)]
-    lines += [Text(found.text) for found in promise(calibration, accuracy)]
+    summary = summarise_tool(calibration, accuracy)
+    if summary is not None:
+        keep = assessment_of(calibration).keeps_offsets
+        lines.append(Text(describe_tool_error(summary, keep=keep)))
     lines += [Text(line) for line in describe_remaining(calibration, accuracy)]
     return Group(*lines)
 
@@ -144,7 +147,7 @@ def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
         "robot": calibration.robot_record.name,
         "model": calibration.model,
         "points": len(accuracy.workspace.points),
-        "half_side": accuracy.workspace.half_side,
+        "box": None if accuracy.workspace.box is None else accuracy.workspace.box.tolist(),
         "deviation": all_sizes(accuracy.measure(accuracy.deviation)),
         "offsets_entered": all_sizes(accuracy.measure(accuracy.error_after_offsets)),
         "uncertainty_before": all_sizes(accuracy.before.sizes),

@@ -9,8 +9,8 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from orthocal.assessment.comparison import Comparison
-from orthocal.assessment.findings.comparison import decide_comparison
 from orthocal.output.text.layout import (
+    EXPANDED,
     MANY_ROWS,
     WORST_ROWS,
     add_row,
@@ -39,7 +39,7 @@ def render_comparison(comparison: Comparison, *, all_rows: bool = False) -> Rend
         Text(
             f"{c.independent} independent readings; noise of one {mm(c.noise.sigma)} mm, {source}"
         ),
-        section("Verdict", bullets([f.words for f in decide_comparison(c).findings])),
+        section("Recommendation", bullets([f.words for f in c.assessment.findings])),
         section("Models side by side", _scores(c)),
         section("Estimates", _estimates(c, all_rows)),
         section("What each leaves of the readings", _residuals(c, all_rows)),
@@ -48,21 +48,21 @@ def render_comparison(comparison: Comparison, *, all_rows: bool = False) -> Rend
 
 
 def _scores(comparison: Comparison) -> RenderableType:
-    sizes = ("free", "told", "r.m.s. [mm]", "χ²", "dof", "AICc", "BIC")
+    sizes = ("free", "effective", "RMS [mm]", "χ²", "dof", "AICc", "BIC", "ln evidence")
     table = table_of("model", "", *sizes, "unseen [mm]", "tool [µm]", left=2)
     for result in comparison.results:
         after = None if result.tool is None else result.tool.after
-        checked = comparison.verdict.standing(result.model) != "no check"
+        checked = result.spare > 0
+        evidence = comparison.recommendation.of(result.model)
         for score in (result.linearised, result.exact):
             first = score.method == "linearised"
-            # what can take up every reading is not judged by what it leaves of them
+            # residuals say nothing of a model that can take up every reading
             fits = (
                 plain(score.rms / MM, 4),
                 _short(score.chi_square),
                 f"{score.dof:.1f}",
                 _short(score.aicc if score.dof >= FEWEST_LEFT else math.inf),
                 _short(score.bic),
-                plain(score.unseen_rms / MM, 4),
             )
             add_row(
                 table,
@@ -71,20 +71,19 @@ def _scores(comparison: Comparison) -> RenderableType:
                 str(result.n_free) if first else "",
                 f"{result.effective:.1f}" if first else "",
                 *(fits if checked else ("–",) * len(fits)),
+                f"{evidence:+.1f}" if first and math.isfinite(evidence) else "",
+                plain(score.unseen_rms / MM, 4),
                 "" if after is None or first else um(after.sizes.headline.rms),
             )
     for u in comparison.undetermined:
-        add_row(table, u.model, "", str(u.n_free), "", "not determined", *([""] * 6))
+        add_row(table, u.model, "", str(u.n_free), "", "not determined", *([""] * 8))
     return Group(
         table,
-        Text("–: not comparable: no reading is left to check that model, or too few to spare"),
-        Text("told: effective parameters, those that the readings determine beside tolerances"),
-        Text("AICc, BIC: the lower the better"),
-        Text("unseen: error in predicting the readings of each setup from all others, r.m.s."),
-        Text(
-            "tool: what is not known of its position over the workspace, shift and rotation taken "
-            "out, r.m.s."
-        ),
+        Text("–: no redundant reading checks that model"),
+        Text("effective: number of parameters that the readings determine beside the priors"),
+        Text("AICc, BIC: lower is better; ln evidence, of the complete model 0: higher is better"),
+        Text("unseen: RMS error of predicting each setup from all others"),
+        Text("tool: RMS uncertainty over the workspace, workpiece aligned on the machine"),
     )
 
 
@@ -96,11 +95,15 @@ def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
     small = [r for r in results if r.n_free <= 12]
     named = {n for r in small for n in r.exact.estimates}
     shown = [n for n in names if all_rows or n in named or n.endswith(".offset")]
-    table = table_of("parameter", "model", "linear", "exact", "± σ", "unit", left=2)
+    table = table_of("parameter", "model", "linear", "exact", "±", "unit", left=2)
     parameters = results[0].calibration.robot.parameters
-    spreads = {
+    half = {
         r.model: dict(
-            zip([p.name for p in r.calibration.free], r.calibration.total_std, strict=True)
+            zip(
+                [p.name for p in r.calibration.free],
+                r.calibration.expanded_uncertainties.tolist(),
+                strict=True,
+            )
         )
         for r in results
     }
@@ -111,10 +114,10 @@ def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
                 continue
             linear, exact = (s.estimates[name] for s in (r.linearised, r.exact))
             numbers = [signed(v * p.edge_factor) for v in (linear, exact)]
-            std = plain(spreads[r.model][name] * p.edge_factor)
-            add_row(table, name if first else "", r.model, *numbers, std, p.edge_unit)
+            spread = plain(half[r.model][name] * p.edge_factor)
+            add_row(table, name if first else "", r.model, *numbers, spread, p.edge_unit)
             first = False
-    lines: list[RenderableType] = [table]
+    lines: list[RenderableType] = [table, Text(EXPANDED)]
     if len(shown) < len(names):
         lines.append(Text(f"{len(names) - len(shown)} more; --all lists every parameter."))
     return Group(*lines)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from orthocal.assessment.plausibility import describe_machine
+from orthocal.assessment.plausibility import describe_legs
 from orthocal.calibration.calibration import Calibration
 from orthocal.output.text.layout import counted, list_places, short_name
+from orthocal.units import DRIVE_UNITS
 
 LONGEST_LINE = 150
 """Characters of a line whose length others decide, where there is little room."""
@@ -77,3 +78,20 @@ def _solved(calibration: Calibration, effort: bool) -> str:
     )
     solved = f"Solved: {counted(len(calibration.free), kind)}, {prior}{loss}"
     return f"{solved}{took if effort else ''}"
+
+
+def describe_machine(calibration: Calibration) -> str:
+    """Dimensions of the machine: legs and travel."""
+    travel = {}
+    for name, unit, *ends in calibration.robot_record.travel:
+        word, size = DRIVE_UNITS[unit]
+        low, high = ("∞" if v is None else f"{v / size:g}" for v in ends)
+        travel[name] = f"{low} … {high} {word.replace('deg', '°')}".replace("∞ …", "−∞ …")
+    words = []
+    if calibration.robot_record.legs:
+        words.append(describe_legs(dict(calibration.robot_record.legs)))
+    if len(set(travel.values())) == 1:
+        words.append(f"travel {next(iter(travel.values()))}")
+    else:
+        words.append(f"travel {', '.join(f'{n} {t}' for n, t in travel.items())}")
+    return ", ".join(words)

@@ -8,7 +8,9 @@ from typing import Any
 
 from orthocal.io.tables.cell import column_letters
 from orthocal.io.tables.table import Table
+from orthocal.measurement.files.readings_checks import RawReading
 from orthocal.measurement.files.readings_file import is_house
+from orthocal.measurement.importing.headings import SINGLE
 from orthocal.measurement.importing.import_readings import TableImport
 from orthocal.output.text.layout import counted
 
@@ -89,7 +91,7 @@ def _columns_by_role(result: TableImport) -> list[tuple[str, str]]:
     columns, table = result.columns, result.table
     roles = [
         (role, _describe_column(table, index))
-        for role in ("setup", "posture", "minus", "cycle")
+        for role in SINGLE
         if (index := getattr(columns, role)) is not None
     ]
     readings = [
@@ -158,6 +160,7 @@ def format_import_json(result: TableImport, *, written: bool) -> str:
                 "minus": row.minus or None,
                 "cycle": int(row.cycle or 1),
                 "reading_mm": float(row.reading),
+                **_conditions(row),
             }
             for row in long_table.rows
         ],
@@ -170,3 +173,13 @@ def format_import_json(result: TableImport, *, written: bool) -> str:
         "written": str(result.readings_path) if written else None,
     }
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def _conditions(row: RawReading) -> dict[str, str | float]:
+    """Stated conditions of a row."""
+    conditions = {
+        "approach": row.approach,
+        "temperature_C": float(row.temperature) if row.temperature else "",
+        "time": row.time,
+    }
+    return {name: value for name, value in conditions.items() if value != ""}

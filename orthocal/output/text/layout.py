@@ -38,6 +38,12 @@ LONGEST_NAME = 44
 WIDTH = 100
 """Columns of plain text."""
 
+EXPANDED = (
+    "±: expanded uncertainty (k = 2; Student's factor for 95 % where the noise was estimated from "
+    "few readings), with everything that is not known."
+)
+"""Meaning of ± in tables of values."""
+
 BULLET = "• "
 """Start of an item of a list."""
 

@@ -1,76 +1,85 @@
-"""A plan of measuring as text, as plain data, and as a picture of what more time is worth."""
+"""Measuring plan as text, as plain data, and as a picture of the error over measuring time."""
 
 from __future__ import annotations
 
 import json
 from typing import Any
 
+import numpy as np
 from rich.console import Group, RenderableType
 from rich.padding import Padding
 from rich.text import Text
 
+from orthocal.kinematics.workspace import find_workspace
 from orthocal.output.text.layout import add_row, bullets, counted, plain, section, table_of
+from orthocal.planning.cost_curve import ENOUGH, HOUR, Stage
 from orthocal.planning.expected_error import Criterion, Expected
-from orthocal.planning.marginal_gain import ENOUGH, HOUR, Stage
 from orthocal.planning.plan import MeasuringPlan
 from orthocal.planning.plan_comparison import Alternative
-from orthocal.units import UM
+from orthocal.robot.model import Robot
+from orthocal.units import MM, UM
 
 FORMS: dict[Criterion, str] = {
-    "aligned": "r.m.s., shift and rotation taken out",
-    "relative": "r.m.s., common shift taken out",
-    "absolute": "r.m.s., absolute",
-    "worst": "at the worst point, shift and rotation taken out",
-    "A": "mean variance of the errors in their tolerances",
-    "D": "determinant of the errors' covariance in their tolerances",
-    "E": "worst combination of errors in their tolerances",
+    "aligned": "RMS tool error, workpiece aligned on the machine",
+    "relative": "RMS tool error, translation removed",
+    "absolute": "RMS tool error, absolute",
+    "worst": "tool error at the worst point, workpiece aligned on the machine",
+    "A": "mean variance of the errors, in their tolerances",
+    "D": "determinant of the covariance of the errors, in their tolerances",
+    "E": "largest variance of a combination of errors, in their tolerances",
 }
-"""What each criterion makes small, in words."""
+"""Criteria in words."""
+
+PLAN_BASIS = {"travel_mm": "travel", "workspace_mm": "workspace"}
+"""Keys of plan.json for the properties of the machine on which a plan depends, with words."""
 
 SOME_LOST = 0.01
-"""Share of readings that would not exist, above which that is told."""
+"""Fraction of impossible readings above which the plan says so."""
 
 HELPFUL = 0.1
-"""Part of the error that a help must take off to be one."""
+"""Relative reduction of the error by which another gauge helps."""
 
 NOTICEABLE = 0.02
-"""Part of it below which a help is none: the search for a plan leaves as much."""
+"""Relative reduction below which another gauge is not listed; the search is no better."""
 
 MOST_LISTED = 24
-"""Setups that are listed one by one."""
+"""Largest number of setups that are listed one by one."""
 
 HOW = (
-    "In each setup stand the gauge so that it touches where `section` says, go to its first "
-    "posture, and set the dial to the middle of its range there.",
+    "In each setup mount the gauge so that it touches at `section`. Go to the first posture and "
+    "set the dial to the middle of its range there.",
     "Approach every posture from the same side, from a millimetre before it.",
-    "Read the first posture again at the end of the setup (cycle 2): it tells drift and noise.",
+    "Read the first posture again at the end of the setup (cycle 2). This reveals drift.",
 )
+
+OUT_OF_RANGE = "beyond the dial's range"
 
 
 def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType:
-    """A plan as rich renderables: what it is worth first."""
+    """Plan as rich renderables, its expected tool error first."""
     s, robot = plan.session, plan.session.robot
     read, closing = _counts(plan)
+    first = first_round_words(plan)
     head = Text.assemble(
-        (f"{_um(plan.expected)} µm", "bold"),
-        f" at the tool are to be expected from {counted(read, 'reading')} in "
-        f"{counted(len(s.setups), 'setup')}, about {_hours(plan.minutes)}, instead of "
-        f"{_um(plan.known)} µm without them (r.m.s. over {plan.forecast.workspace.words}, shift "
-        "and rotation taken out).",
+        "Expected tool error: ",
+        (f"{show_um(plan.expected)} µm", "bold"),
+        f" (now {show_um(plan.known)} µm), {plan.forecast.workspace.words.removeprefix('the ')}, "
+        "workpiece aligned on the machine.",
     )
     parts: list[RenderableType] = [
-        Text(f"Plan for {robot.name}, model '{plan.forecast.selection.label}'", style="bold"),
+        Text(
+            f"Plan for {robot.name}, model {plan.forecast.selection.label}: "
+            f"{counted(read, 'reading')} in {counted(len(s.setups), 'setup')}, about "
+            f"{show_duration(plan.minutes)}",
+            style="bold",
+        ),
         Text(),
         head,
-        *([Text(first_round_words(plan))] if first_round_words(plan) else []),
+        *([Text(first)] if first else []),
         Text(_when_enough(plan)),
         section("At equal cost", _alternatives(plan, closing)),
-        section("What would help", bullets(_helps(plan))),
-        *(
-            [section("What it still cannot tell apart", bullets(_remaining(plan)))]
-            if details
-            else []
-        ),
+        section("Other gauges", bullets(_helps(plan))),
+        *([section("Largest remaining errors", bullets(_remaining(plan)))] if details else []),
         section("Setups", _setups(plan)),
         section("How to measure", bullets(list(HOW))),
     ]
@@ -78,23 +87,34 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
 
 
 def first_round_words(plan: MeasuringPlan) -> str:
-    """What is to be expected before any offsets were entered, and what of it can be read."""
+    """Expected error before offsets are entered, and the readings that are impossible then."""
     first = plan.first_round
-    text = f"In a first round, before offsets are entered: {_um(first)} µm."
-    if first.headline.rms < 1.1 * plan.expected.headline.rms:
-        text = ""
+    texts = []
+    if first.headline.rms >= 1.1 * plan.expected.headline.rms:
+        texts.append(f"In the first round, before offsets are entered: {show_um(first)} µm.")
     if first.lost > SOME_LOST:
-        text += (
-            f" With offsets within their tolerances {first.lost:.0%} of the readings would not "
-            "exist then: the tip passes the rod. Enter offsets from a first few, or take a blade."
+        texts.append(
+            f"With offsets within their tolerances the tip misses the rod in {first.lost:.0%} of "
+            "the readings. Enter offsets from a few readings first, or use a blade."
         )
-    return text.strip()
+    return " ".join(texts)
+
+
+def describe_basis(robot: Robot) -> dict[str, Any]:
+    """Properties of a machine on which a plan depends, by the keys of `PLAN_BASIS`, in mm."""
+    travel = np.array([[d.lower, d.upper] for d in robot.drives])
+    return {
+        "travel_mm": np.round(travel / MM, 6).tolist(),
+        "workspace_mm": np.round(find_workspace(robot).limits / MM, 6).tolist(),
+    }
 
 
 def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
-    """A plan as plain data: numbers in µm and minutes."""
+    """Plan as plain data: numbers in µm and minutes."""
 
-    def sizes(e: Expected) -> dict[str, float | None]:
+    def sizes(e: Expected | None) -> dict[str, float | None]:
+        if e is None:
+            return dict.fromkeys(("aligned_um", "relative_um", "absolute_um", "worst_um"))
         a = e.sizes.aligned
         return {
             "aligned_um": None if a is None else a.rms / UM,
@@ -109,23 +129,27 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
             "setups": a.setups,
             "readings": a.readings,
             "minutes": a.minutes,
+            "in_range": a.expected is not None,
             **sizes(a.expected),
         }
 
     def stage(s: Stage) -> dict[str, float]:
-        unit = UM if plan.criterion in ("aligned", "relative", "absolute", "worst") else 1.0
         return {
             "setups": s.setups,
             "readings": s.readings,
             "minutes": s.minutes,
-            "left": s.error / unit,
+            "error": s.error / _unit(plan),
         }
 
     read, closing = _counts(plan)
+    box = plan.forecast.workspace.box
+    basis = describe_basis(plan.session.robot)
     return {
         "robot": plan.session.robot.name,
         "model": plan.forecast.selection.label,
         "criterion": plan.criterion,
+        "travel_mm": basis["travel_mm"],
+        "workspace_mm": None if box is None else np.round(box / MM, 6).tolist(),
         "setups": len(plan.session.setups),
         "readings": read,
         "closing_readings": closing,
@@ -146,13 +170,12 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
 
 
 def plan_json(plan: MeasuringPlan) -> str:
-    """The same as JSON."""
+    """Plan as JSON."""
     return json.dumps(plan_document(plan), indent=1, allow_nan=False) + "\n"
 
 
 def draw_plan(plan: MeasuringPlan) -> str:
-    """What is left over the hours, as an SVG picture."""
-    import numpy as np
+    """Expected error over measuring time, as an SVG picture."""
     from matplotlib.figure import Figure
 
     from orthocal.output.report.figure import (
@@ -166,101 +189,118 @@ def draw_plan(plan: MeasuringPlan) -> str:
     )
 
     stages = [s for s in plan.curve if s.setups]
-    unit = UM if plan.criterion in ("aligned", "relative", "absolute", "worst") else 1.0
+    unit = _unit(plan)
 
     def draw() -> Figure:
-        figure = open_figure(3.2, "What another hour is worth")
+        figure = open_figure(3.2, "Expected error over measuring time")
         axes = figure.subplots()
         hours = [s.minutes / HOUR for s in stages]
-        left = [s.error / unit for s in stages]
-        axes.plot(hours, left, "-", color=AFTER, label="setups, the most telling first")
-        axes.plot(hours, left, ".", color=AFTER)
-        here = next(s for s in stages if s.setups == len(plan.session.setups))
-        axes.plot(here.minutes / HOUR, here.error / unit, "s", color=AFTER, label="this plan")
-        values = list(left)
+        errors = [s.error / unit for s in stages]
+        axes.plot(hours, errors, "-", color=AFTER, label="setups added one by one")
+        axes.plot(hours, errors, ".", color=AFTER)
+        own = plan.stage.error / unit
+        axes.plot(plan.minutes / HOUR, own, "s", color=AFTER, label="this plan")
+        values = [*errors, own]
         if plan.criterion == "aligned":
             for marker, colour, other in zip("o^", (BEFORE, UNSEEN), plan.compared, strict=False):
+                if other.expected is None:
+                    continue
                 size = other.expected.headline.rms / unit
                 values.append(size)
                 axes.plot(other.minutes / HOUR, size, marker, color=colour, label=other.name)
         if plan.enough is not None:
-            axes.axvline(plan.enough.minutes / HOUR, color="#999999", linestyle=":", label="enough")
+            label = f"another hour gains < {ENOUGH:.0%}"
+            axes.axvline(plan.enough.minutes / HOUR, color="#999999", linestyle=":", label=label)
         scale_log(axes, "y", np.array(values))
         axes.set_xlim(left=0.0)
         axes.grid(True)
         axes.set_xlabel("time [h]")
-        axes.set_ylabel("left at the tool [µm]" if unit == UM else "left")
+        axes.set_ylabel("expected tool error [µm]" if unit == UM else "criterion")
         draw_legend(figure, axes)
         return figure
 
-    label = "What is left unknown over the hours of measuring"
+    label = "Expected error over measuring time"
     return f'<?xml version="1.0" encoding="utf-8"?>\n{render_figure("plan", label, draw)}\n'
 
 
+def show_um(expected: Expected) -> str:
+    """Expected tool error, [µm]."""
+    value = expected.headline.rms / UM
+    return plain(value, 0 if value >= 20.0 else 1)
+
+
+def show_duration(minutes: float) -> str:
+    """Duration in minutes or hours."""
+    return f"{minutes:.0f} min" if minutes < 2.0 * HOUR else f"{minutes / HOUR:.1f} h"
+
+
+def _unit(plan: MeasuringPlan) -> float:
+    return UM if plan.criterion in ("aligned", "relative", "absolute", "worst") else 1.0
+
+
 def _counts(plan: MeasuringPlan) -> tuple[int, int]:
-    """Readings, and those that close a setup."""
+    """Numbers of readings, and of those that close a setup."""
     closing = sum(r.cycle > 1 for r in plan.session.readings)
     return len(plan.session.readings) - closing, closing
 
 
 def _when_enough(plan: MeasuringPlan) -> str:
-    """When enough is enough, in a sentence."""
-    enough = plan.enough
+    """Number of setups beyond which another hour gains little, in a sentence."""
     if plan.criterion not in ("aligned", "relative", "absolute", "worst"):
-        return f"Made small: {FORMS[plan.criterion]}."
+        return f"Criterion: {FORMS[plan.criterion]}."
+    enough = plan.enough
     if enough is None:
         last = plan.curve[-1]
         return (
-            f"Another hour still takes more than {ENOUGH:.0%} off, as far as {_hours(last.minutes)}"
-            f" ({counted(last.setups, 'setup')}), which leave {plain(last.error / UM, 1)} µm."
-        )
-    here = plan.curve[len(plan.session.setups)]
-    if enough.minutes <= here.minutes:
-        return (
-            f"That is enough: from {counted(enough.setups, 'setup')} on another hour takes less "
-            f"than {ENOUGH:.0%} off."
+            f"Another hour gains more than {ENOUGH:.0%}, up to {counted(last.setups, 'setup')} "
+            f"({show_duration(last.minutes)}, {plain(last.error / UM, 1)} µm)."
         )
     return (
-        f"Enough is {counted(enough.setups, 'setup')}, {_hours(enough.minutes)}, which leave "
-        f"{plain(enough.error / UM, 1)} µm: from there on another hour takes less than "
-        f"{ENOUGH:.0%} off."
+        f"Beyond {counted(enough.setups, 'setup')} ({show_duration(enough.minutes)}, "
+        f"{plain(enough.error / UM, 1)} µm) another hour gains less than {ENOUGH:.0%}."
     )
 
 
 def _alternatives(plan: MeasuringPlan, closing: int) -> RenderableType:
-    table = table_of("plan", "setups", "readings", "time", "at the tool [µm]", "absolute [µm]")
+    table = table_of("plan", "setups", "readings", "time", "tool error [µm]", "absolute [µm]")
     s = plan.session
     add_row(
         table,
         "this one",
         str(len(s.setups)),
         f"{len(s.readings) - closing} + {closing}",
-        _hours(plan.minutes),
-        _um(plan.expected),
+        show_duration(plan.minutes),
+        show_um(plan.expected),
         plain(plan.expected.sizes.absolute.rms / UM, 0),
     )
     for a in plan.compared:
-        absolute = plain(a.expected.sizes.absolute.rms / UM, 0)
-        time, left = _hours(a.minutes), _um(a.expected)
-        add_row(table, a.name, str(a.setups), str(a.readings), time, left, absolute)
+        absolute, error = "", OUT_OF_RANGE
+        if a.expected is not None:
+            absolute = plain(a.expected.sizes.absolute.rms / UM, 0)
+            error = show_um(a.expected)
+        add_row(
+            table, a.name, str(a.setups), str(a.readings), show_duration(a.minutes), error, absolute
+        )
     return table
 
 
 def _helps(plan: MeasuringPlan) -> list[str]:
-    """What would help, the most first; all that was tried, where nothing does."""
+    """Other gauges that reduce the error, the best first."""
     mine = plan.expected.headline.rms
-    found = sorted(plan.helps, key=lambda a: a.expected.headline.rms)
-    some = [a for a in found if a.expected.headline.rms < (1.0 - NOTICEABLE) * mine]
-    texts = [f"The same readings with {a.name}: {_um(a.expected)} µm." for a in some]
-    if found and found[0].expected.headline.rms > (1.0 - HELPFUL) * mine:
-        tried = "; ".join(a.name for a in found)
-        none = f"None of this takes {HELPFUL:.0%} off"
-        if not some:
-            none = f"Nothing that was tried ({tried}) takes {NOTICEABLE:.0%} off"
-        texts.append(
-            f"{none}: what is left asks for another sensor, such as an indicator at the tool along "
-            "a square."
+    sizes = {a.name: a.expected.headline.rms for a in plan.helps if a.expected is not None}
+    names = sorted(sizes, key=sizes.__getitem__)
+    better = [n for n in names if sizes[n] < (1.0 - NOTICEABLE) * mine]
+    texts = [
+        f"The same readings with {n}: {plain(sizes[n] / UM, 0 if sizes[n] >= 20 * UM else 1)} µm."
+        for n in better
+    ]
+    if names and sizes[names[0]] > (1.0 - HELPFUL) * mine:
+        none = (
+            f"None of these gains {HELPFUL:.0%}"
+            if better
+            else f"None ({'; '.join(names)}) gains {NOTICEABLE:.0%}"
         )
+        texts.append(f"{none}. Less needs another sensor, such as an indicator at the tool.")
     return texts
 
 
@@ -268,13 +308,13 @@ def _remaining(plan: MeasuringPlan) -> list[str]:
     found = []
     for r in plan.find_remaining():
         parts = ", ".join(f"{n} {t:+.1f}" for n, t in r.parts[:5]) or "many small errors"
-        found.append(f"{plain(r.rms / UM, 1)} µm, from {parts} tolerances together.")
+        found.append(f"{plain(r.rms / UM, 1)} µm from this combination, in tolerances: {parts}.")
     return found
 
 
 def _setups(plan: MeasuringPlan) -> RenderableType:
     s = plan.session
-    table = table_of("setup", "what is read", "postures", left=3)
+    table = table_of("setup", "gauge", "postures", left=3)
     for setup in list(s.setups.values())[:MOST_LISTED]:
         postures = [r.posture for r in s.readings if r.setup == setup.name]
         add_row(table, setup.name, setup.sensor.describe(), " ".join(postures))
@@ -282,12 +322,3 @@ def _setups(plan: MeasuringPlan) -> RenderableType:
     if more <= 0:
         return table
     return Group(table, Padding(Text(f"and {more} more"), (0, 0, 0, 2)))
-
-
-def _um(expected: Expected) -> str:
-    value = expected.headline.rms / UM
-    return plain(value, 0 if value >= 20.0 else 1)
-
-
-def _hours(minutes: float) -> str:
-    return f"{minutes:.0f} min" if minutes < 2.0 * HOUR else f"{minutes / HOUR:.1f} h"

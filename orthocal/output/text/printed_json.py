@@ -1,40 +1,41 @@
-"""Results as JSON on stdout: what was found, and beside it the decision and its findings."""
+"""Results as JSON on stdout, each with `decision` and `findings`."""
 
 from __future__ import annotations
 
 import json
 
+from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.comparison import Comparison
-from orthocal.assessment.findings.calibration import decide
-from orthocal.assessment.findings.comparison import decide_comparison
-from orthocal.assessment.findings.decision import Decision
-from orthocal.assessment.findings.validation import decide_validation
 from orthocal.assessment.validation import Validation
+from orthocal.calibration.assessment_record import Assessment
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.file import calibration_document
 
 
 def printed_calibration(calibration: Calibration) -> str:
-    """A calibration as in calibration.json, with `decision` and `findings`, which follow from it.
+    """A calibration as in calibration.json, with `decision` and `findings` at the top level too.
 
-    It loads as a calibration, too; what follows is then found anew.
+    It loads as a calibration.
     """
-    document = {**calibration_document(calibration), **decide(calibration).to_document()}
+    document = {
+        **calibration_document(calibration),
+        **assessment_of(calibration).to_document(),
+    }
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
-def printed_decision(decision: Decision) -> str:
+def printed_assessment(found: Assessment) -> str:
     """A decision and its findings."""
-    return json.dumps(decision.to_document(), indent=1, allow_nan=False) + "\n"
+    return json.dumps(found.to_document(), indent=1, allow_nan=False) + "\n"
 
 
 def printed_comparison(comparison: Comparison) -> str:
-    """A comparison with its `decision` and `findings`."""
-    document = {**json.loads(comparison.to_json()), **decide_comparison(comparison).to_document()}
+    """A comparison with its decision and findings."""
+    document = {**json.loads(comparison.to_json()), **comparison.assessment.to_document()}
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
 def printed_validation(validation: Validation) -> str:
-    """A validation with its `decision` and `findings`."""
-    document = {**json.loads(validation.to_json()), **decide_validation(validation).to_document()}
+    """A validation with its decision and findings."""
+    document = {**json.loads(validation.to_json()), **validation.assessment.to_document()}
     return json.dumps(document, indent=1, allow_nan=False) + "\n"

@@ -1,61 +1,51 @@
-"""What is said while a session is measured: plain text, as wide as there is room."""
+"""Text of the dialogue in which readings are recorded, wrapped to the terminal."""
 
 from __future__ import annotations
 
+import math
 import shlex
 import textwrap
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from orthocal.assessment.wording import counted, joined
+from orthocal.assessment.wording import counted, joined, mm, name_direction
+from orthocal.calibration.assessment_record import Finding
 from orthocal.measurement.motion.motion import Guidance
-from orthocal.measurement.recording.anomalies import Oddity, Slip
-from orthocal.measurement.recording.recording import Recording, Row
+from orthocal.measurement.recording import Recording, Row
 from orthocal.session.session import Session, Setup
 from orthocal.text import printable
 from orthocal.units import DRIVE_UNITS, MM, to_mm
 
-Array = NDArray[np.float64]
-
 GLUE = "\u00a0"
-"""Between words that stay on one line."""
-
-SLIPS: dict[Slip, str] = {
-    "": "",
-    "sign": " With the other sign it would fit.",
-    "too large": " With the decimal point one place further left it would fit.",
-    "too small": " With the decimal point one place further right it would fit.",
-}
+"""Space at which no line ends."""
 
 COMMANDS = {
-    "back": "to the row above; `back 3` to row 3: type what it should be",
+    "back": "correct the row above; `back 3` row 3",
     "again": "read the last row once more, as another cycle; `again 3` row 3",
     "skip": "leave this row empty for now",
-    "drop": "take this row out: it will not be read; `drop 3` row 3",
-    "restart": "read all of this setup anew, if stand or dial has moved",
+    "drop": "delete this row from the session; `drop 3` row 3",
+    "restart": "delete the readings of this setup and read it again, if stand or dial moved",
     "list": "all rows and their readings",
     "show": "this setup and posture once more",
-    "help": "these words",
-    "quit": "leave; all readings are kept, and the same command goes on",
+    "help": "this list",
+    "quit": "end; all readings are kept, and the same command continues",
 }
-"""What may be typed instead of a reading; any beginning of it that is no other's will do."""
+"""Commands instead of a reading; any unique beginning of the name suffices."""
 
 
 def wrap(text: str, width: int, *, indent: str = "", first: str | None = None) -> str:
-    """A paragraph in lines of at most so many columns."""
+    """A paragraph in lines of at most `width` columns."""
     lines = textwrap.wrap(
         printable(text, keep=GLUE),
         max(width, 20),
         initial_indent=indent if first is None else first,
         subsequent_indent=indent,
+        break_on_hyphens=False,
     )
     return "\n".join(lines).replace(GLUE, " ")
 
 
 def show_mm(value: float) -> str:
-    """A reading in mm, with as many decimals as it has; two at least."""
+    """A reading in mm with all its decimals, two at least."""
     whole, _, decimals = f"{to_mm(value) + 0.0:.6f}".partition(".")
     return f"{whole}.{decimals.rstrip('0').ljust(2, '0')}"
 
@@ -66,26 +56,26 @@ def _decimal(value: float, decimals: int = 3) -> str:
 
 
 def describe_session(recording: Recording, *, width: int) -> str:
-    """What there is to measure."""
-    session, rows, redone = recording.session, recording.rows, recording.redone
-    done = sum(row.value is not None for row in rows)
+    """Number of readings, state of the recording, and how to type readings."""
+    session, rows, restored = recording.session, recording.rows, recording.restored
+    done = len(rows) - len(recording.missing)
     title = f"{session.title}: " if session.title else ""
     count = counted(len({r.setup for r in rows}), "setup")
-    state = "nothing is read yet" if not done else f"{done} of them are there"
+    state = "none is recorded yet" if not done else f"{done} are recorded"
     parts = [f"{title}{counted(len(rows), 'reading')} in {count} on {session.robot.name}; {state}."]
-    if redone:
+    if restored:
         parts.append(
-            f"The last recording was cut off; {counted(redone, 'change')} of it "
-            f"{'was' if redone == 1 else 'were'} restored."
+            f"The last recording was interrupted; {counted(restored, 'change')} of it "
+            f"{'was' if restored == 1 else 'were'} restored."
         )
     if recording.edited:
         parts.append(
-            f"{recording.path.name} was changed since the last recording was cut off; it counts as "
-            "it is."
+            f"{recording.path.name} was edited after the last recording was interrupted; its "
+            "content counts."
         )
     parts.append(
-        "Type what the dial shows, in mm; it is on disk before the next question. `help` lists "
-        "what else can be typed."
+        "Type the reading of the dial in mm. It is on disk before the next question. `help` lists "
+        "the commands."
     )
     parts.append("Approach every posture from the same side, from a millimetre before it.")
     return "\n".join(wrap(part, width) for part in parts)
@@ -94,55 +84,44 @@ def describe_session(recording: Recording, *, width: int) -> str:
 def describe_setup(
     session: Session, guidance: Guidance, rows: Sequence[Row], name: str, *, width: int
 ) -> str:
-    """Where the gauge goes, and what to do with its dial."""
+    """Position of the gauge of a setup, and preparation of its dial."""
     setup = session.setups[name]
     names = list(dict.fromkeys(r.setup for r in rows))
-    own = [r for r in rows if r.setup == name]
-    lines = [
-        wrap(
-            f"Setup {name}, {names.index(name) + 1} of {len(names)}: "
-            f"{counted(len(own), 'reading')}",
-            width,
-        )
-    ]
-    begin = own[0].minus or own[0].posture
-    parts = [f"Read: {setup.sensor.describe()}", _stand(guidance, name, begin)]
-    parts += [_gauge(session, setup)]
-    if all(r.minus is not None for r in own):
+    of_setup = [r for r in rows if r.setup == name]
+    aligned = guidance.aligned_at[name]
+    title = (
+        f"Setup {name}, {names.index(name) + 1} of {len(names)}: "
+        f"{counted(len(of_setup), 'reading')}"
+    )
+    parts = [f"Read: {setup.sensor.describe()}", _stand(guidance, name), _gauge(session, setup)]
+    if any(r.value is not None for r in of_setup) and any(r.minus is None for r in of_setup):
         parts.append(
-            "Each row is a difference: read in its first posture less read in its second. Touch "
-            "neither stand nor dial between the two."
-        )
-    elif any(r.value is not None for r in own):
-        parts.append(
-            "There are readings of this setup: neither stand nor dial may have moved since. If one "
-            "has, `restart` and read all of it anew."
+            "This setup has readings: neither stand nor dial may have moved since. If one has, "
+            "`restart` the setup."
         )
     else:
         parts.append(
-            f"Go to {begin} and set the dial to {_middle(session, setup)} there. From then on "
-            "touch neither stand nor dial until the setup is done."
+            f"Go to {aligned}, align the gauge and set the dial to {_middle(session, setup)} there."
+            " From then on touch neither stand nor dial until the setup is complete."
         )
-    lines += [wrap(part, width, indent="  ") for part in parts if part]
+    if all(r.minus is not None for r in of_setup):
+        parts.append(
+            "Each row is a difference: the reading in its first posture minus that in its second."
+        )
+    lines = [wrap(title, width), *(wrap(part, width, indent="  ") for part in parts if part)]
+    if aligned != (of_setup[0].minus or of_setup[0].posture):
+        lines.append(_coordinates(session, guidance, aligned, f"{aligned}: ", width))
     return "\n".join(lines)
 
 
-def _stand(guidance: Guidance, setup: str, posture: str) -> str:
-    direction = guidance.contacts[setup][1].direction
-    at = ", ".join(f"{_decimal(v / MM, 1)}" for v in guidance.touched(setup, posture))
-    side = _way(direction)
+def _stand(guidance: Guidance, setup: str) -> str:
+    aligned = guidance.aligned_at[setup]
+    at = ", ".join(f"{_decimal(v / MM, 1)}" for v in guidance.touched(setup, aligned))
+    side = name_direction(guidance.contacts[setup][1].direction)
     return (
-        f"Stand: on the {side} side, so that the tip touches at ({at}) mm in {posture}. Push the "
-        f"plunger in by hand: the dial has to grow, as it does where the machine moves to {side}."
+        f"Stand: on the {side} side, so that the tip touches at ({at}) mm in {aligned}. Push the "
+        f"plunger in: the dial has to grow, as it does where the machine moves to {side}."
     )
-
-
-def _way(direction: Array) -> str:
-    """A direction in words: an axis with its sign, or a vector."""
-    axis = int(np.abs(direction).argmax())
-    if abs(direction[axis]) > 1.0 - 1e-9:
-        return ("+" if direction[axis] > 0.0 else "-") + "xyz"[axis]
-    return f"({', '.join(f'{_decimal(v, 2)}' for v in direction)})"
 
 
 def _gauge(session: Session, setup: Setup) -> str:
@@ -166,16 +145,16 @@ def _middle(session: Session, setup: Setup) -> str:
 def describe_row(
     session: Session, guidance: Guidance, rows: Sequence[Row], index: int, *, width: int
 ) -> str:
-    """Which reading comes next, and where the machine goes for it."""
+    """Next reading, and the posture of the machine for it."""
     row = rows[index]
-    lines = [
-        wrap(f"{index + 1} of {len(rows)} (line {index + 2} of the table): {row.label}", width)
-    ]
+    lines = [wrap(f"{index + 1} of {len(rows)} (line {row.line} of the table): {row.label}", width)]
     for posture in (row.posture, *([row.minus] if row.minus else [])):
         name = f"{posture}: " if row.minus else ""
         lines.append(_coordinates(session, guidance, posture, name, width))
     if row.value is not None:
-        lines.append(wrap(f"It is {show_mm(row.value)} mm; Enter keeps it.", width, indent="  "))
+        lines.append(
+            wrap(f"Recorded: {show_mm(row.value)} mm; Enter keeps it.", width, indent="  ")
+        )
     return "\n".join(lines)
 
 
@@ -192,51 +171,54 @@ def _coordinates(session: Session, guidance: Guidance, posture: str, name: str, 
     return "\n".join(lines)
 
 
-def acknowledge(rows: Sequence[Row], index: int, *, width: int) -> str:
-    """That a reading is on disk."""
+def confirm_reading(rows: Sequence[Row], index: int, *, width: int) -> str:
+    """Confirmation that a reading is on disk."""
     row = rows[index]
     value = "" if row.value is None else show_mm(row.value)
-    return wrap(f"Kept: row {index + 1}, {row.label}: {value} mm", width, indent="  ")
+    return wrap(f"Recorded: row {index + 1}, {row.label}: {value} mm", width, indent="  ")
 
 
-def describe_oddity(oddity: Oddity, row: Row, guidance: Guidance, *, width: int) -> str:
-    """What is odd about a reading that was kept."""
-    value = row.value or 0.0
-    off, expected = f"{abs(oddity.off(value)) / MM:.3f} mm", f"{_decimal(oddity.expected / MM)}"
-    if oddity.kind == "resolution":
-        text = (
-            f"{show_mm(value)} mm is no multiple of the dial's resolution, "
-            f"{oddity.spread / MM:g} mm."
-        )
-    elif oddity.kind == "cycles":
-        text = (
-            f"It is {off} from its other cycles ({expected} mm): more than the dial's noise "
-            f"explains.{SLIPS[oddity.slip]} Read it once more: `again`."
-        )
-    elif oddity.kind == "drift":
-        text = (
-            f"It is {off} from what {oddity.setup} showed here at first ({expected} mm): stand or "
-            "dial has moved, or the machine has become warmer, or one of the two is mistyped."
-            f"{SLIPS[oddity.slip]} If it stays so on a second look, `restart`."
-        )
-    elif oddity.kind == "unexpected":
-        text = (
-            f"It is {off} from what the other readings let expect, {expected} ± "
-            f"{oddity.spread / MM:.3f} mm; or one of them is wrong, the first of this setup for "
-            f"instance.{SLIPS[oddity.slip]}"
-        )
-    else:
-        side = _way(guidance.contacts[oddity.setup][1].direction)
-        text = (
-            f"The readings of {oddity.setup} fit far better with the other sign: is the dial "
-            f"turned round, or does the stand look from the other side? It belongs on the {side} "
-            "side; pushed in by hand the plunger makes the dial grow."
-        )
-    return wrap(f"{text} It is kept as it is; `back` corrects it.", width, indent="  ", first="! ")
+def describe_prediction(mean: float, std: float, *, width: int) -> str:
+    """Prediction of a reading by the others, with its expanded uncertainty (k = 2).
+
+    Args:
+        mean: Predicted reading, [m].
+        std: Its standard deviation, [m]; infinite without a prediction.
+        width: Columns.
+    """
+    if math.isinf(std):
+        return ""
+    text = f"The other readings predict {_decimal(mean / MM)} ± {mm(2.0 * std)} mm."
+    return wrap(text, width, indent="  ")
+
+
+def describe_warning(finding: Finding, rows: Sequence[Row], *, width: int) -> str:
+    """A finding about the readings so far, in the words of `check`."""
+    indices = find_rows(finding, rows)
+    where = f" ({_spans([i + 1 for i in indices])})" if indices else ""
+    kind = finding.kind.capitalize()
+    return wrap(f"{kind}{where}: {finding.words}", width, indent="  ", first="! ")
+
+
+def find_rows(finding: Finding, rows: Sequence[Row]) -> list[int]:
+    """Indices of the rows with a reading that a finding names, by line or by setup."""
+    lines = {p.line for p in finding.places if p.line is not None}
+    setups = {p.setup for p in finding.places if p.line is None}
+    named = [row.line in lines or row.setup in setups for row in rows]
+    return [i for i, row in enumerate(rows) if named[i] and row.value is not None]
+
+
+def describe_resolved(findings: Sequence[Finding], *, width: int) -> str:
+    """Warnings that the readings no longer support."""
+    names = [
+        " ".join([f.kind, *(n for p in f.places[:1] for n in (p.setup, p.posture) if n)])
+        for f in findings
+    ]
+    return wrap(f"Resolved: {joined(names)}.", width, indent="  ")
 
 
 def list_rows(rows: Sequence[Row], *, width: int) -> str:
-    """All rows, and what was read."""
+    """All rows and their readings."""
     last = len(str(len(rows)))
     return "\n".join(
         wrap(
@@ -250,63 +232,74 @@ def list_rows(rows: Sequence[Row], *, width: int) -> str:
 
 
 def list_commands(*, width: int) -> str:
-    """What can be typed."""
+    """Readings and commands that can be typed."""
     lines = [
         wrap("A reading in mm, such as -0.12 or -0,12; or", width),
         *(
             wrap(f"{name}: {words}", width, indent="    ", first="  ")
             for name, words in COMMANDS.items()
         ),
-        wrap("Ctrl-D and Ctrl-C leave, too. Enter alone keeps what is there.", width),
+        wrap("Ctrl-D and Ctrl-C end, too. Enter alone keeps the recorded reading.", width),
     ]
     return "\n".join(lines)
 
 
-def conclude(session: Session, rows: Sequence[Row], path: str, *, width: int) -> str:
-    """What is missing, and what comes next: a command on a line of its own, however long it is.
+def describe_state(recording: Recording, warnings: Sequence[Finding], *, width: int) -> str:
+    """State of a recording in which no row is asked for, with all its warnings."""
+    skipped = len(recording.missing)
+    state = f"{skipped} skipped." if skipped else "All readings are recorded."
+    if warnings:
+        state += " Check these first:"
+    words = [describe_warning(f, recording.rows, width=width) for f in warnings]
+    return "\n".join([wrap(state, width), *words, wrap("Enter ends; `back` corrects.", width)])
+
+
+def conclude(recording: Recording, warnings: Sequence[Finding], path: str, *, width: int) -> str:
+    """Missing rows and the next command, on a line of its own and not wrapped.
 
     Args:
-        session: What was measured.
-        rows: Its readings.
-        path: Of the session, as it was typed.
+        recording: The recording.
+        warnings: Findings about its readings.
+        path: Path of the session as it was typed.
         width: Columns.
     """
-    missing = [(i, r) for i, r in enumerate(rows) if r.value is None]
-    own = printable(shlex.quote(path))
-    if missing:
+    session, rows = recording.session, recording.rows
+    command = printable(shlex.quote(path))
+    if recording.missing:
         parts = []
-        for setup in dict.fromkeys(r.setup for _, r in missing):
-            of_setup = [i + 1 for i, r in missing if r.setup == setup]
-            every = len(of_setup) == sum(r.setup == setup for r in rows)
-            places = "all" if every else _spans(of_setup)
-            parts.append(f"{setup} {places}")
+        for setup in dict.fromkeys(rows[i].setup for i in recording.missing):
+            numbers = [i + 1 for i in recording.missing if rows[i].setup == setup]
+            every = len(numbers) == sum(r.setup == setup for r in rows)
+            parts.append(f"{setup} {'all' if every else _spans(numbers)}")
+        count = len(recording.missing)
         state = (
-            f"{len(missing)} of {counted(len(rows), 'reading')} "
-            f"{'is' if len(missing) == 1 else 'are'} missing: {joined(parts)}."
+            f"{count} of {counted(len(rows), 'reading')} {'is' if count == 1 else 'are'} missing: "
+            f"{joined(parts)}."
         )
-        return f"{wrap(state, width)}\nGo on with:\n  orthocal record {own}"
-    lines = [f"All {counted(len(rows), 'reading')} are there."]
+        return f"{wrap(state, width)}\nContinue with:\n  orthocal record {command}"
+    lines = [f"All {counted(len(rows), 'reading')} are recorded."]
     if session.controller_offsets is None:
         keys = "offsets_mm" if session.robot.drives[0].unit == "m" else "offsets_deg"
         zeros = ", ".join("0" for _ in session.robot.drives)
         lines.append(
-            "Say in session.yaml which offsets are active in the controller, such as "
-            f"`controller: {{{keys}: [{zeros}]}}`, one number a drive: without it only changes of "
-            "them can be told."
+            "State in session.yaml which offsets are active in the controller, one number per "
+            f"drive, such as `controller: {{{keys}: [{zeros}]}}`. Without them only their changes "
+            "can be calculated."
         )
-    told = "\n".join(wrap(line, width) for line in lines)
-    following = f"Next:\n  orthocal calibrate {own}"
-    if session.controller_offsets is not None and any(session.controller_offsets):
+    following = f"Next:\n  orthocal calibrate {command}"
+    if warnings:
+        following = f"Next: correct or repeat these readings,\n  orthocal record {command}"
+    elif session.controller_offsets is not None and any(session.controller_offsets):
         following = (
-            "Next: whether what was entered is right, by the calibration that it is of,\n"
-            f"  orthocal validate CALIBRATION {own}\n"
-            f"or what to enter now:\n  orthocal calibrate {own}"
+            "Next: validate the offsets that were entered, by their calibration,\n"
+            f"  orthocal validate CALIBRATION {command}\n"
+            f"or identify new ones:\n  orthocal calibrate {command}"
         )
-    return f"{told}\n{following}"
+    return "\n".join([*(wrap(line, width) for line in lines), following])
 
 
 def _spans(numbers: Sequence[int]) -> str:
-    """Numbers of rows: rows 3, 5 to 8."""
+    """Numbers of rows in words: rows 3, 5 to 8."""
     spans: list[list[int]] = []
     for n in numbers:
         if spans and n == spans[-1][-1] + 1:

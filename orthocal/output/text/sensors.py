@@ -7,8 +7,9 @@ from rich.text import Text
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.output.text.layout import add_row, mm, plain, signed, table_of
+from orthocal.statistics.chance import expanded_uncertainty
 
-NOTE = "Identified with the machine; ± of all that is not known, as of its errors."
+NOTE = "Identified with the machine."
 
 
 def render_parts(calibration: Calibration) -> tuple[RenderableType, ...]:
@@ -34,8 +35,9 @@ def _gauges(calibration: Calibration) -> RenderableType:
 
 def _sensors(calibration: Calibration) -> RenderableType:
     table = table_of("of the sensors", "found", "±", "tolerance", "unit")
-    for p, std in zip(calibration.sensors, calibration.sensor_total_std.tolist(), strict=True):
+    for p in calibration.sensors:
         f = p.edge_factor
-        cells = signed(p.value * f), plain(std * f), plain(p.tolerance * f)
+        half = float(expanded_uncertainty(p.std, p.std_scatter, dof=calibration.dof))
+        cells = signed(p.value * f), plain(half * f), plain(p.tolerance * f)
         add_row(table, p.name, *cells, p.edge_unit)
     return Group(table, Text(NOTE))

@@ -6,10 +6,11 @@ from pathlib import Path
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.file import load_calibration
+from orthocal.effects.loading import load_robot
 from orthocal.errors import OrthocalError
 from orthocal.io.files import exists, is_folder
 from orthocal.measurement.files.session_file import load_plan
-from orthocal.robot.loading import load_robot, packaged_robots
+from orthocal.robot.loading import packaged_robots
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Group, RenderableType
 from rich.text import Text
 
 from orthocal.arguments import require_kind
+from orthocal.assessment.assess import assessment_of
 from orthocal.calibration.calibration import Calibration
 from orthocal.output.text.answer import MORE, render_answer
 from orthocal.output.text.layout import bullets, print_rich, section, to_text
@@ -40,14 +42,25 @@ def summarize(
     return to_markup(content)
 
 
-def print_summary(result: Result, *, details: bool = False, all_rows: bool = False) -> None:
-    """Print a calibration, validation, comparison or plan: in colour where there is a terminal."""
-    print_rich(_render(result, details, all_rows))
+def print_summary(
+    result: Result, *, details: bool = False, all_rows: bool = False, saved: Path | None = None
+) -> None:
+    """Print a calibration, validation, comparison or plan: in colour where there is a terminal.
+
+    Args:
+        result: What to print.
+        details: Of a calibration everything; otherwise the short answer.
+        all_rows: List every reading and parameter.
+        saved: Directory in which a calibration was written.
+    """
+    print_rich(_render(result, details, all_rows, saved))
 
 
-def _render(result: Result, details: bool, all_rows: bool) -> RenderableType:
+def _render(
+    result: Result, details: bool, all_rows: bool, saved: Path | None = None
+) -> RenderableType:
     if isinstance(result, Calibration):
-        return render_calibration(result, details=details, all_rows=all_rows)
+        return render_calibration(result, details=details, all_rows=all_rows, saved=saved)
     from orthocal.assessment.comparison import Comparison
     from orthocal.assessment.validation import Validation
     from orthocal.planning.plan import MeasuringPlan
@@ -75,15 +88,18 @@ def _render(result: Result, details: bool, all_rows: bool) -> RenderableType:
 
 
 def render_calibration(
-    calibration: Calibration, *, details: bool = False, all_rows: bool = False
+    calibration: Calibration,
+    *,
+    details: bool = False,
+    all_rows: bool = False,
+    saved: Path | None = None,
 ) -> RenderableType:
-    """A calibration as rich renderables: the short answer, and on demand all the rest."""
-    answer = render_answer(calibration)
+    """A calibration as rich renderables: the short answer, and on demand everything else."""
+    answer = render_answer(calibration, saved=saved)
     if not (details or all_rows):
         return Group(answer, Text(MORE))
     from orthocal.output.text.accuracy import render_tool
     from orthocal.output.text.entries import render_controller
-    from orthocal.output.text.explanation import explain_fit
     from orthocal.output.text.heading import render_origin
     from orthocal.output.text.sensors import render_parts
     from orthocal.output.text.tables import (
@@ -97,11 +113,11 @@ def render_calibration(
         answer,
         section("How it was done", render_origin(calibration)),
         section("What was identified", render_parameters(calibration, all_rows=all_rows)),
-        section("What the readings tell", render_identifiability(calibration, all_rows=all_rows)),
+        section("Identifiability", render_identifiability(calibration, all_rows=all_rows)),
         section("Readings before and after", render_residuals(calibration, all_rows=all_rows)),
         section("How well it fits", render_fit(calibration)),
         *(section("Gauges and sensors", part) for part in render_parts(calibration)),
         section("At the tool", render_tool(calibration)),
-        section("What it means", bullets(explain_fit(calibration))),
+        section("Findings", bullets([f.words for f in assessment_of(calibration).findings])),
         section("What to enter into the controller", render_controller(calibration)),
     )

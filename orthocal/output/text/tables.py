@@ -7,11 +7,13 @@ import math
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from orthocal.assessment.findings.parameters import FEW_NAMES, find_held, find_hidden
+from orthocal.assessment.fit_findings import find_held, find_unresolved
+from orthocal.assessment.words.fit import FEW_NAMES
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.output.text.layout import add_row, choose_rows, counted, mm, plain, signed, table_of
+from orthocal.statistics.chance import expanded_uncertainty
 from orthocal.units import MM, UM
 
 MANY_PARAMETERS = 12
@@ -41,74 +43,70 @@ _SOURCES = {
 
 
 def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> RenderableType:
-    """Every parameter that the readings tell, or all: estimate, ± σ and interval."""
-    c, told = calibration, calibration.prior
+    """Parameters that the readings determine, or all: estimate and expanded uncertainty."""
+    c, prior = calibration, calibration.prior
     linear = c.solver.name == "linearised"
     both = c.solver.tells_linearisation
     profiled = any(p.interval for p in c.free)
-    biased = bool((c.total_std > c.standard_deviations).any())
-    rows = list(zip(c.free, c.total_std.tolist(), c.intervals, strict=True))
+    by_noise = all_rows and any(p.std_scatter < p.std for p in c.free)
     table = table_of(
         "parameter",
         *(["linearised"] if linear else ["linear", "exact"]),
-        "± σ",
-        *(["scatter"] if all_rows and biased else []),
-        *(["told"] if told else []),
-        "95 % interval",
-        *(["profile interval"] if profiled else []),
-        *(["exact − linear"] if both and not (told or profiled) else []),
-        *(["in σ"] if both and not profiled else []),
+        "±",
+        *(["by noise"] if by_noise else []),
+        *(["resolved"] if prior else []),
+        *(["95 % profile interval"] if profiled else []),
+        *(["exact − linear"] if both and not (prior or profiled) else []),
+        *(["in std"] if both and not profiled else []),
         "unit",
     )
     few = all_rows or len(c.free) <= MANY_PARAMETERS
-    listed = [row for row in rows if few or _worth_listing(row[0])]
-    for p, std, interval in listed:
+    uncertainties = c.expanded_uncertainties.tolist()
+    listed = [
+        row for row in zip(c.free, uncertainties, strict=True) if few or _worth_listing(row[0])
+    ]
+    for p, half in listed:
         f = p.edge_factor
+        noise = float(expanded_uncertainty(p.std_scatter, p.std_scatter, dof=c.dof))
         add_row(
             table,
             p.name,
             *([] if linear else [signed(p.linear * f)]),
             signed(p.value * f),
-            "at bound" if p.at_bound else plain(std * f),
-            *([plain(p.std * f)] if all_rows and biased else []),
-            *([_share(p)] if told else []),
-            "" if p.at_bound else _interval(*interval, f),
+            "at bound" if p.at_bound else plain(half * f),
+            *([plain(noise * f)] if by_noise else []),
+            *([_share(p)] if prior else []),
             *([_interval(*p.interval, f) if p.interval else ""] if profiled else []),
-            *([signed((p.value - p.linear) * f, 4)] if both and not (told or profiled) else []),
-            *([_ratio(p.value - p.linear, std)] if both and not profiled else []),
+            *([signed((p.value - p.linear) * f, 4)] if both and not (prior or profiled) else []),
+            *([_ratio(p.value - p.linear, p.std)] if both and not profiled else []),
             p.edge_unit,
         )
-    notes: list[RenderableType] = [table]
-    if len(listed) < len(c.free):
+    return Group(table, *_parameter_notes(c, left_out=len(c.free) - len(listed), by_noise=by_noise))
+
+
+def _parameter_notes(c: Calibration, *, left_out: int, by_noise: bool) -> list[RenderableType]:
+    """Sentences under the table of the parameters."""
+    notes = []
+    if left_out:
         notes.append(
-            Text(
-                f"{len(c.free) - len(listed)} more of which the readings tell less than half; "
-                "--all lists every parameter."
-            )
+            f"{left_out} more of which the readings tell less than half; --all lists every "
+            "parameter."
         )
     held = [p for p in c.parameters if not p.free]
     if held:
         values = ", ".join(f"{p.name} = {p.value * p.edge_factor:g} {p.edge_unit}" for p in held)
-        notes.append(Text(f"Held at known values: {values}"))
-    notes += [Text(found.text) for found in find_held(c)]
-    if biased:
-        words = "scatter: the part of it that the noise of the readings has." if all_rows else ""
-        notes.append(
-            Text(
-                "± σ: one standard deviation from all that is not known, errors of the machine "
-                f"that were not identified at their tolerances. {words}".strip()
-            )
-        )
-    if told:
-        notes.append(
-            Text("told: how much of what the tolerance left open the readings took away (variance)")
-        )
+        notes.append(f"Held at known values: {values}")
+    notes += [found.text for found in find_held(c)]
+    if by_noise:
+        notes.append("by noise: the part of ± that is due to the noise of the readings.")
+    if c.prior:
+        notes.append("resolved: part of the prior variance that the readings removed")
     pairs = c.correlated(above=0.5)
     if pairs:
         words = ", ".join(f"{a} with {b} {r:+.2f}" for a, b, r in pairs[:MOST_PAIRS])
         more = f", and {len(pairs) - MOST_PAIRS} more" if len(pairs) > MOST_PAIRS else ""
-        notes.append(Text(f"Correlations above 0.5: {words}{more}"))
-    return Group(*notes)
+        notes.append(f"Correlations above 0.5: {words}{more}")
+    return [Text(note) for note in notes]
 
 
 def _share(p: ParameterEstimate) -> str:
@@ -137,7 +135,7 @@ def _interval(low: float, high: float, factor: float) -> str:
 
 
 def render_identifiability(calibration: Calibration, *, all_rows: bool = False) -> RenderableType:
-    """What the readings tell, and what they cannot tell apart."""
+    """Identifiable combinations of parameters, and those that the readings cannot separate."""
     found = calibration.identifiability
     count = found.singular_values.size
     taken = found.n_readings - calibration.spare_readings
@@ -164,8 +162,8 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
             f"O5 {o['O5'] / MM:.3g} mm a tolerance: of {counted(found.rank, 'direction')}, and "
             "to be compared only with plans that see as many."
         )
-    hidden = find_hidden(calibration)
-    alike = [f.text for f in hidden if f.kind == "not told apart"]
+    hidden = find_unresolved(calibration)
+    alike = [f.text for f in hidden if f.kind == "inseparable"]
     shown = alike if all_rows else alike[:MOST_GROUPS]
     lines += shown
     if len(shown) < len(alike):

@@ -5,74 +5,55 @@ from __future__ import annotations
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from orthocal.assessment.findings.validation import decide_validation
-from orthocal.assessment.validation import FurtherChange, Validation
+from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.validation import Validation
+from orthocal.output.text.entries import short_entry_table
 from orthocal.output.text.layout import (
     add_row,
     bullets,
     choose_rows,
     mm,
-    plain,
     section,
     signed,
     table_of,
 )
 from orthocal.units import MM
 
-MANY_CHANGES = 12
-"""Parameters above which only those that change most are listed."""
-
 
 def render_validation(validation: Validation, *, all_rows: bool = False) -> RenderableType:
     """A validation as rich renderables."""
+    refit = validation.refit
     table = table_of("", "expected", "achieved", "further fit")
-    rows = (
-        ("r.m.s. [mm]", validation.expected_rms, validation.achieved_rms, validation.refit_rms),
-        (
-            "largest [mm]",
-            validation.expected_largest,
-            validation.achieved_largest,
-            validation.refit_largest,
-        ),
-    )
-    for name, *values in rows:
+    rms = (validation.expected_rms, refit.rms_before, refit.rms_after)
+    largest = (validation.expected_largest, refit.largest_before, refit.largest_after)
+    for name, values in (("RMS [mm]", rms), ("largest [mm]", largest)):
         add_row(table, name, *(mm(v) for v in values))
-    changes = table_of("parameter", "change", "± σ", "unit", "beyond chance (95 % for all)?")
-    for c in _listed(validation, all_rows):
-        add_row(
-            changes,
-            c.name,
-            signed(c.change * c.edge_factor),
-            plain(c.std * c.edge_factor),
-            c.edge_unit,
-            "yes" if c.significant else "no",
-        )
-    return Group(
+    parts = [
         Text("Validation of a calibration", style="bold"),
-        Text(validation.title),
+        Text(refit.session.title),
         section("What it means", bullets(explain_validation(validation))),
-        *(
-            [section("What belongs into the controller", _enter_next(validation))]
-            if validation.mistake is not None
-            else []
-        ),
-        section("Deviations with the identified offsets in the controller", table),
-        section("What a further fit would still change", changes),
-        section("Readings of the new session", _validation_rows(validation, all_rows)),
-    )
+    ]
+    if validation.mistake is not None and validation.enter:
+        parts.append(section("What belongs into the controller", _enter_next(validation)))
+    parts.append(section("Deviations with the calibrated offsets in the controller", table))
+    if assessment_of(refit).entries:
+        parts.append(section("Offsets by a further fit", short_entry_table(refit)))
+    parts.append(section("Readings of the new session", _validation_rows(validation, all_rows)))
+    return Group(*parts)
 
 
 def explain_validation(validation: Validation) -> list[str]:
     """The verdict of a validation and its reasons."""
-    decision = decide_validation(validation)
-    verdict = f"{decision.reason} {decision.action}".strip()
-    others = [f for f in decision.findings[1:] if f.severity == "informs"]
-    return [verdict, *(f.words for f in others)]
+    judged = validation.assessment
+    decision = judged.decision
+    verdict = f"{decision.headline} {decision.reason} {decision.action}".strip()
+    return [verdict, *(f.words for f in judged.findings if f.text not in decision.reason)]
 
 
 def _validation_rows(validation: Validation, all_rows: bool) -> RenderableType:
-    rows, note = choose_rows(validation.rows, all_rows, key=lambda r: abs(r.deviation))
-    cycles = any(r.cycle != 1 for r in validation.rows)
+    residuals = validation.refit.residuals
+    rows, note = choose_rows(residuals, all_rows, key=lambda r: abs(r.deviation))
+    cycles = any(r.cycle != 1 for r in residuals)
     table = table_of(
         "setup",
         "posture",
@@ -99,16 +80,3 @@ def _enter_next(validation: Validation) -> RenderableType:
     for entry in validation.enter:
         add_row(table, entry.drive, signed(entry.enter * entry.edge_factor), entry.edge_unit)
     return table
-
-
-def _listed(validation: Validation, all_rows: bool) -> list[FurtherChange]:
-    """Changes that are listed: all of few, else offsets, what is beyond chance, and the largest."""
-    if all_rows or len(validation.changes) <= MANY_CHANGES:
-        return list(validation.changes)
-    by_size = sorted(validation.changes, key=lambda c: -abs(c.change) / max(c.std, 1e-300))
-    named = {c.name for c in by_size[:5]}
-    return [
-        c
-        for c in validation.changes
-        if c.significant or c.name in named or c.name.endswith(".offset")
-    ]

@@ -48,7 +48,7 @@ def test_one_setup_alone_predicts_nothing(raw_cycles):
 def test_with_a_robust_loss_it_is_the_robust_fit_that_predicts(raw_cycles):
     """Where no residual is large Huber's loss is all but squares, and predicts as they do."""
     wide = SolverOptions(loss=Loss("huber", width=100.0))
-    problem = build_problem(exact(raw_cycles))
+    problem = build_problem(exact(raw_cycles), model="offsets")
     robust = predict_unseen(fit_problem(problem, options=wide))
     squares = predict_unseen(fit_problem(problem))
     assert np.abs(robust - squares).max() < 1e-3 * np.abs(squares).max()

@@ -22,18 +22,18 @@ def test_where_the_problem_is_nearly_linear_it_is_students_interval(raw_cycles):
     result = calibrate(raw_cycles, profile=["x_slide.offset"])
     p = result["x_slide.offset"]
     # that of the readings' scatter, and beside it what errors that were not free may have done
-    student, normal = result.confidence_factor, confidence_factor(np.inf)
-    bias = np.sqrt(result.unmodelled.bias_covariance[0, 0])
-    assert bias > 10.0 * p.std
-    half = np.hypot(student * p.std, normal * bias)
+    student, normal = confidence_factor(result.dof), confidence_factor(np.inf)
+    bias, known = result.unmodelled.bias_covariance[0, 0], result.model_covariance[0, 0]
+    assert bias > 100.0 * known
+    half = np.hypot(student * np.sqrt(known), normal * np.sqrt(bias))
     assert p.interval == pytest.approx((p.value - half, p.value + half), abs=0.01 * half)
-    assert p.interval == pytest.approx(result.intervals[0], abs=0.01 * half)
+    assert half == pytest.approx(result.expanded_uncertainties[0] * normal / 2.0, rel=0.01)
     assert result["y_slide.offset"].interval is None
 
 
 def test_its_ends_cost_what_they_should_by_another_solver(experiment_2):
     """SciPy on the reduced problem, the offset held at the ends of its interval."""
-    fit = fit_problem(build_problem(experiment_2))
+    fit = fit_problem(build_problem(experiment_2, model="offsets"))
     problem, sigma = fit.problem, fit.noise.sigma
     factor = confidence_factor(fit.noise.dof)
 
@@ -53,7 +53,7 @@ def test_its_ends_cost_what_they_should_by_another_solver(experiment_2):
 
 def test_where_the_problem_bends_it_is_not_symmetric(experiment_2):
     """At 99.9 % and three degrees of freedom the interval is 10 mm wide."""
-    fit = fit_problem(build_problem(exact(experiment_2)))
+    fit = fit_problem(build_problem(exact(experiment_2), model="offsets"))
     p = fit.solution.theta[0]
     low, high = profile_interval(fit, "x_slide.offset", level=0.999)
     skew = (high + low - 2 * p) / (high - low)
@@ -77,7 +77,8 @@ def test_beside_a_prior_it_is_that_of_the_posterior(root):
     p = result["x_leg.length"]
     i = [q.name for q in result.free].index(p.name)
     bias = np.sqrt(result.unmodelled.bias_covariance[i, i])
-    half = np.hypot(result.confidence_factor * p.std, confidence_factor(np.inf) * bias)
+    std = np.sqrt(result.model_covariance[i, i])
+    half = np.hypot(confidence_factor(result.dof) * std, confidence_factor(np.inf) * bias)
     assert p.interval == pytest.approx((p.value - half, p.value + half), abs=0.02 * half)
 
 

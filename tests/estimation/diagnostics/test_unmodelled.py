@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fleets import Fleet
+from drawn_machines import DrawnMachines
 from gauges import exact
 from models import JOINTS
 
 from orthocal import Choice, calibrate, load_plan, simulate_session
-from orthocal.assessment.tool_error import RARE
+from orthocal.assessment.judgement import RARE
 from orthocal.calibration import build_record as recording
 from orthocal.estimation.diagnostics.unmodelled import (
     find_other_errors,
@@ -20,7 +20,6 @@ from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchProgram
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
-from orthocal.estimation.solvers.machine_readings import Fleet as Machines
 from orthocal.statistics.distributions import chi_square_tail
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -51,17 +50,17 @@ def test_an_unmodelled_error_moves_the_estimate_by_its_leakage(plan, name, model
 @pytest.fixture(scope="module")
 def machines(plan):
     """Offsets and residuals found on 1,000 machines with all other errors, perfect readings."""
-    offsets = build_problem(plan)
+    offsets = build_problem(plan, model="offsets")
     errors = [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
     others = build_problem(plan, free=errors)
     rng = np.random.default_rng(0)
-    drawn = Machines(others, rng.normal(size=(1000, others.n_free)))
-    assert drawn.close().all()
-    values = drawn.predict()
+    drawn = rng.normal(size=(1000, others.n_free)) * others.theta_scale
+    values, _, reached = others.simulate(drawn)
+    assert reached.all()
     theta = BatchProgram(offsets).solve(values, sigma=1e-5).theta
-    found = Machines(offsets, theta / offsets.theta_scale)
-    assert found.close().all()
-    left = [project_out_zeros(r, offsets.observations) for r in values - found.predict()]
+    found, _, reached = offsets.simulate(theta)
+    assert reached.all()
+    left = [project_out_zeros(r, offsets.observations) for r in values - found]
     return theta, np.array(left)
 
 
@@ -128,21 +127,21 @@ def test_intervals_hold_what_they_say_with_all_errors_at_their_tolerances(
     plan, model, least, monkeypatch
 ):
     """200 sessions: what scatter alone would promise is missed by far, all together is not."""
-    fleet = Fleet(plan, model=model)
+    machines = DrawnMachines(plan, model=model)
     # they hardly change from machine to machine, and take longest to find
-    monkeypatch.setattr(recording, "find_other_errors", lambda *_, **__: fleet.others)
-    known = fleet.machine.free
-    free = [known.index(n) if n in known else -1 for n in fleet.problem.free]
+    monkeypatch.setattr(recording, "find_other_errors", lambda *_, **__: machines.others)
+    known = machines.machine.free
+    free = [known.index(n) if n in known else -1 for n in machines.problem.free]
     hits, scatter_hits, count = 0, 0, 0
     for seed in range(200):
         rng = np.random.default_rng(seed)
-        errors = fleet.draw(rng)
-        fit = fleet.fit(fleet.read(rng, errors))
+        errors = machines.draw(rng)
+        fit = machines.fit(machines.read(rng, errors))
         result = recording.assemble_calibration(fit)
         for p, (low, high), at in zip(result.free, result.intervals, free, strict=True):
             if at >= 0:
                 hits += low <= errors[at] <= high
-                scatter_hits += abs(p.value - errors[at]) < result.confidence_factor * p.std
+                scatter_hits += abs(p.value - errors[at]) < 2.0 * p.std_scatter
                 count += 1
     assert least < hits / count < 0.99
     assert scatter_hits / count < 0.6

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from tolerances import DERIVATIVE, SAME_OPTIMUM, TRUTH_BACK
 
 from orthocal import load_plan, load_session, simulate_session
-from orthocal.errors import SolverError
+from orthocal.errors import OrthocalError, SolverError
 from orthocal.estimation.linear import solve_linearised
 from orthocal.estimation.loss import SQUARES, Loss
 from orthocal.estimation.options import SolverOptions
@@ -40,8 +40,8 @@ def point(program, problem, size, seed=0):
     functions = program.functions()
     n = functions["nlp"].size1_in(0)
     x = size * rng.normal(size=n)
-    passive = np.tile(problem.robot.zero[problem.robot.passive_index], problem.n_postures)
-    scale = np.tile(problem.passive_scale, problem.n_postures)
+    passive = np.tile(problem.robot.zero[problem.robot.passive_index], problem.n_states)
+    scale = np.tile(problem.passive_scale, problem.n_states)
     x[n - passive.size :] += passive / scale + 5.0 * rng.normal(size=passive.size)
     return x, program.pack(sigma=2e-4, left_out=[1, 4])
 
@@ -95,7 +95,7 @@ def test_the_exact_hessian_is_that_of_the_lagrangian(perfect, model, loss, size)
 
 def test_the_gauss_newton_hessian_is_the_exact_one_without_curvature(perfect):
     """At zero residuals and zero multipliers they are the same."""
-    problem = build_problem(perfect, prior=True)
+    problem = build_problem(perfect, prior=True, model="offsets")
     theta = np.array(list(TRUTH.values()))
     passive = problem.close(theta)
     left = problem.values - problem.predict(theta, passive)
@@ -118,7 +118,7 @@ def test_perfect_data_give_the_truth_back_from_any_start(perfect, seed, hessian)
     start = rng.uniform(-0.02, 0.02, 3)
     if seed == 0:
         start = np.array([0.02, -0.02, 0.02])
-    problem = build_problem(perfect)
+    problem = build_problem(perfect, model="offsets")
     program = NonlinearProgram(problem, options=SolverOptions(hessian=hessian))
     solution = program.solve(sigma=1e-5, start=start)
     assert np.abs(solution.theta - list(TRUTH.values())).max() < TRUTH_BACK
@@ -165,9 +165,9 @@ def test_another_solver_finds_the_same(plan, model):
 
 def test_new_readings_do_not_rebuild(plan):
     first, second = (simulate_session(plan, TRUTH, seed=s).session for s in (5, 6))
-    program = NonlinearProgram(build_problem(first))
-    again = program.solve(sigma=1e-5, values=build_problem(second).values)
-    fresh = NonlinearProgram(build_problem(second)).solve(sigma=1e-5)
+    program = NonlinearProgram(build_problem(first, model="offsets"))
+    again = program.solve(sigma=1e-5, values=build_problem(second, model="offsets").values)
+    fresh = NonlinearProgram(build_problem(second, model="offsets")).solve(sigma=1e-5)
     assert np.abs(again.theta - fresh.theta).max() < SAME_OPTIMUM
 
 
@@ -189,7 +189,9 @@ def test_where_gauss_newton_does_not_converge_the_exact_hessian_does(root, exper
 
 def test_not_converged_is_an_error_and_never_a_result(plan):
     session = simulate_session(plan, TRUTH, seed=7).session
-    program = NonlinearProgram(build_problem(session), options=SolverOptions(max_iterations=1))
+    program = NonlinearProgram(
+        build_problem(session, model="offsets"), options=SolverOptions(max_iterations=1)
+    )
     with pytest.raises(SolverError, match="Ipopt did not converge: Maximum_Iterations") as caught:
         program.solve(sigma=1e-5)
     assert caught.value.iterations == 1
@@ -208,5 +210,57 @@ def test_another_robot_is_calibrated_the_same_way(biglide, tmp_path, root):
     plan = exact(load_plan(tmp_path / "plan.yaml"))
     truth = {"x_slide.offset": 0.7e-3, "y_slide.offset": -1.1e-3}
     session = simulate_session(plan, truth, exact=True).session
-    solution = NonlinearProgram(build_problem(session)).solve(sigma=1e-5)
+    solution = NonlinearProgram(build_problem(session, model="offsets")).solve(sigma=1e-5)
     assert np.abs(solution.theta - list(truth.values())).max() < TRUTH_BACK
+
+
+def test_expressions_are_the_observation_model(root):
+    """Balls aligned by eye, all errors: readings, residuals, q, closures, nuisance by name."""
+    problem = build_problem(load_session(root / "examples/workshop"), model="full")
+    program, sigma = NonlinearProgram(problem), 1e-5
+    e = program.expressions()
+    theta = 0.3 * problem.theta_scale * np.random.default_rng(0).normal(size=problem.n_free)
+    x, p = program.begin(theta, sigma=sigma), program.pack(sigma=sigma)
+    o, n = problem.observations, problem.n_machine
+
+    def value(expression):
+        function = ca.Function("f", [e.variables, e.parameters], [expression])
+        return np.asarray(function(x, p).full()).reshape(-1)
+
+    zeros = value(e.zeros)
+    readings = value(e.readings)
+    assert np.abs(readings - zeros[o.zero] - problem.predict(theta)).max() < 1e-13
+    assert np.array_equal(value(e.residuals), problem.values - readings)
+    assert list(e.nuisance) == list(problem.free[n:])
+    assert np.abs(value(ca.vertcat(*e.nuisance.values())) - theta[n:]).max() < 1e-15
+    assert np.abs(value(ca.vertcat(*e.errors.values())) - theta).max() < 1e-15
+    passive = problem.close(theta)
+    assert list(e.passive) == list(e.closures) == list(problem.session.postures)
+    for q, name in zip(passive, problem.session.postures, strict=True):
+        assert np.abs(value(e.passive[name]) - q).max() < 1e-14
+        assert np.abs(value(e.closures[name])).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [({"nonsense": 1}, "nonsense"), ({"tol": "abc"}, "tol"), ({"max_iter": -3}, "max_iter")],
+)
+def test_an_option_that_ipopt_refuses_is_named(experiment_2, options, named, capfd):
+    problem = build_problem(experiment_2, model="offsets")
+    with pytest.raises(OrthocalError, match=f"'{named}'"):
+        NonlinearProgram(
+            problem, options=SolverOptions(ipopt={"mu_strategy": "adaptive", **options})
+        )
+    capfd.readouterr()
+
+
+def test_options_reach_ipopt(experiment_2):
+    problem = build_problem(experiment_2, model="offsets")
+    plain = NonlinearProgram(problem).solve(sigma=1e-5)
+    options = {"mu_strategy": "adaptive", "print_timing_statistics": False}
+    other = NonlinearProgram(problem, options=SolverOptions(ipopt=options)).solve(sigma=1e-5)
+    assert np.abs(plain.theta - other.theta).max() < SAME_OPTIMUM
+    with pytest.raises(SolverError):
+        NonlinearProgram(problem, options=SolverOptions(ipopt={"max_iter": 1})).solve(sigma=1e-5)
+    with pytest.raises(ValueError, match="ipopt has"):
+        SolverOptions(ipopt={"tol": None})

@@ -590,7 +590,14 @@ def test_negative_correlations_are_marked_without_colour(sweep):
 
 
 def test_correlations_need_two_parameters(table1, bound, unknown):
-    single = replace(table1, parameters=table1.parameters[:1], covariance=table1.covariance[:1, :1])
+    one = {key: getattr(table1, key)[:1, :1] for key in ("model_covariance", "noise_covariance")}
+    leakage = table1.unmodelled.leakage[:1]
+    single = replace(
+        table1,
+        parameters=table1.parameters[:1],
+        unmodelled=replace(table1.unmodelled, leakage=leakage),
+        **one,
+    )
     assert parameter_plots.plot_correlations(single) == ""
     assert parameter_plots.plot_correlations(unknown) == ""
     shown = texts(parameter_plots.plot_correlations(bound))

@@ -13,7 +13,8 @@ from rich.panel import Panel
 from rich.text import Text
 
 from orthocal import Choice, calibrate, load_calibration, load_session
-from orthocal.assessment.controller_entries import find_entries
+from orthocal.assessment.assess import expanded_uncertainty
+from orthocal.assessment.words.entries import describe_compensated, describe_tool_error
 from orthocal.calibration.file import write_calibration
 from orthocal.io.html import items, paragraph, table
 from orthocal.output.report.page import _provenance, build_report
@@ -91,11 +92,11 @@ def test_order_of_the_sections(page, read):
 
 def test_values_to_enter_come_first(calibration, read):
     first = read.rows[1:4]
-    for row, entry in zip(first, find_entries(calibration), strict=True):
+    for row, entry in zip(first, calibration.assessment.entries, strict=True):
         assert row[0] == entry.drive
         assert row[2:] == [
             f"{entry.enter * 1e3:+.3f}",
-            f"{entry.std * 1e3:.3f}",
+            f"{expanded_uncertainty(calibration, entry) * 1e3:.3f}",
             "mm",
         ]
 
@@ -155,7 +156,7 @@ def test_full_model_shows_the_error_with_offsets_entered(root):
     page = build_report(found)
     assert "once the offsets above are entered" in page
     read = Reader(page)
-    assert ["drive", "active now", "enter", "± σ", "identified", "unit"] in read.rows
+    assert ["drive", "now", "enter", "±", "identified", "unit"] in read.rows
     assert (
         len([r for r in read.rows if len(r) > 5 and r[0] in {s.name for s in found.setups}]) == 162
     )
@@ -235,26 +236,27 @@ def test_robot_without_a_tool_has_a_report(experiment_2):
 
 def test_calibration_in_a_notebook(calibration):
     read = Reader(calibration._repr_html_())
-    assert read.rows[0] == ["drive", "active now", "enter", "±", "unit"]
-    entry = find_entries(calibration)[0]
+    assert read.rows[0] == ["drive", "now", "enter", "±", "unit"]
+    entry = calibration.assessment.entries[0]
     assert read.rows[1] == [
         "x_slide",
         "+0.000",
         f"{calibration['x_slide.offset'].value * 1e3:+.3f}",
-        f"{entry.std * 1e3:.3f}",
+        f"{expanded_uncertainty(calibration, entry) * 1e3:.3f}",
         "mm",
     ]
     words = " ".join(read.text["p"])
-    assert "Enter these, and measure again. What remains, σ = 0.276 mm of a difference" in words
-    assert "it is error of the model" in words
-    assert "At the tool expect 118 µm" in words
+    decision = calibration.assessment.decision
+    assert f"{decision.headline} {decision.reason}" in words
+    assert describe_tool_error(calibration.assessment.tool) in words
 
 
 def test_calibration_with_many_parameters_lists_what_to_enter(root):
     found = calibrate(load_session(root / "examples/sweep"), "full")
     read = Reader(found._repr_html_())
     assert [r[0] for r in read.rows[1:]] == ["x_slide", "y_slide", "z_slide"]
-    assert "In a controller that knows all errors: 12.7 µm" in " ".join(read.text["p"])
+    compensated = describe_compensated(found.assessment.tool.compensated)
+    assert compensated in " ".join(read.text["p"])
 
 
 def test_session_in_a_notebook(raw_cycles):

@@ -16,10 +16,10 @@ from lxml import etree
 from machines import place
 
 from orthocal import load_plan
+from orthocal.builder.build import make_robot
+from orthocal.builder.machine_file import Counting, Dimensions
 from orthocal.cli.run import main
 from orthocal.output.sheet.page import sheet_files
-from orthocal.robot.builder.build import make_robot
-from orthocal.robot.builder.dimensions import Counting, Sizes
 from orthocal.units import MM
 
 ROUNDED = 1e-3
@@ -28,7 +28,9 @@ ROUNDED = 1e-3
 ROUNDED_PLACE = 0.06
 """Places are shown with one decimal, [mm]."""
 
-SMALL = Sizes(leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004)
+SMALL = Dimensions(
+    leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004
+)
 COUNTING = (Counting(True, 0.0), Counting(False, 0.005), Counting(False, None))
 
 PLAN = """robot: mine
@@ -171,7 +173,7 @@ def test_steps_say_how_to_mount_and_set_the_gauge(page):
     assert "pin of 4 mm diameter, 60 mm wide" in pin
     # the leg moves sideways by more than the range of this dial
     assert "Even a perfect machine shows -32.7 mm in line 6" in blade
-    assert "Lift the plunger on the way to line 6, in&: the dial would go -32.7 mm" in blade
+    assert "Lift the plunger on the way to line 5, line 6, in&: the dial would go -32.7 mm" in blade
     assert "Even a perfect" not in line
     assert "on the (0.71, 0.71, 0.00) side of rod b of leg z" in pin
 
@@ -291,7 +293,7 @@ def test_the_command_writes_beside_the_session_or_elsewhere(monkeypatch, capsys,
     assert "world origin at (0, 0, 50) mm" in (out / "sheet.html").read_text()
     code, _, err = run(monkeypatch, capsys, "sheet", session, "--out", out)
     assert code == 2
-    assert err == f"orthocal: {out}/sheet.html: is there already; --force writes over it\n"
+    assert err == f"orthocal: {out}/sheet.html: exists already; --force overwrites it\n"
     code, _, _ = run(monkeypatch, capsys, "sheet", session, "--out", out, "--force")
     assert code == 0
     assert "Z50" not in (out / "03-zx.ngc").read_text()
@@ -302,7 +304,7 @@ def test_the_command_writes_beside_the_session_or_elsewhere(monkeypatch, capsys,
     [
         (["nowhere"], "nowhere: there is no such file"),
         (["examples/workshop/plan.yaml", "--shift-mm", "1,2"], "--shift-mm: found '1,2'; expected"),
-        (["examples/workshop/plan.yaml", "--shift-mm", "1,2,z"], "--shift-mm: part is 'z'; exp"),
+        (["examples/workshop/plan.yaml", "--shift-mm", "1,2,z"], "--shift-mm: Z is 'z'; expected"),
         (["examples/workshop/plan.yaml", "--feed", "0"], "--feed: found 0; expected 1 to 20000"),
     ],
 )

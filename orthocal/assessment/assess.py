@@ -1,0 +1,241 @@
+"""Assessment of a calibration: one verdict, its findings, what to enter, the tool error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+from numpy.typing import ArrayLike
+
+from orthocal.arguments import require_kind
+from orthocal.assessment.calibrated_tool import find_tool
+from orthocal.assessment.controller_entries import compute_entries
+from orthocal.assessment.fit_findings import find_fit_findings
+from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
+from orthocal.assessment.recommendation import Recommendation, recommend_model
+from orthocal.assessment.tool_error import assess_placed, require_tool, summarise_tool
+from orthocal.assessment.words import entries as words
+from orthocal.assessment.words.comparison import describe_recommendation
+from orthocal.calibration.assessment_record import (
+    Assessment,
+    ControllerEntry,
+    Decision,
+    Finding,
+    FindingKind,
+    ToolErrorSummary,
+    first_of,
+)
+from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.identify import identify
+from orthocal.calibration.refit import restore_session
+from orthocal.errors import ClosureError, RobotError
+from orthocal.estimation.choice import Choice
+from orthocal.estimation.loss import Loss, LossKind
+from orthocal.estimation.options import SolverKind, SolverOptions
+from orthocal.measurement.joining import Given
+from orthocal.session.session import Session
+from orthocal.statistics import chance
+
+EXPLANATIONS: tuple[FindingKind, ...] = (
+    "no redundancy",
+    "model error",
+    "noise from residuals",
+    "gauge overstated",
+    "fits",
+)
+"""Kinds of which the first explains the decision to enter."""
+
+
+KEEPING: dict[FindingKind, str] = {
+    "no offset": words.NOTHING,
+    "no change needed": words.KEEP,
+    "nothing moved": words.KEEP,
+}
+"""Kinds of notes that leave nothing to enter, and their headlines."""
+
+
+def calibrate(
+    sessions: Given | Sequence[Given],
+    choice: Choice | str | None = None,
+    *,
+    loss: Loss | LossKind | None = None,
+    solver: SolverOptions | SolverKind = "ipopt",
+    profile: Sequence[str] = (),
+    start: ArrayLike | None = None,
+) -> Calibration:
+    """Identify the errors of a machine from sessions, and assess the result.
+
+    Args:
+        sessions: The session, or the path to one; or several, which are fitted together.
+        choice: Which errors are free and what is known of them; or the name of a model. By default
+            what the session states, otherwise the complete model with priors.
+        loss: Cost of a residual: `squares` (the default), `huber`, or one with its own width.
+        solver: `ipopt` on the complete program, the reference; `eliminated`, variable projection,
+            the same optimum in less time; `linearised`, as the paper; or one with its own settings.
+        profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
+        start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
+            solution.
+
+    Returns:
+        The calibration with its assessment.
+
+    Raises:
+        NotIdentifiableError: If neither readings nor a prior determine a parameter.
+        SolverError: If the solver does not converge.
+        ClosureError: If the machine cannot reach a posture.
+        ParameterError: If the model or a name is unknown.
+        TypeError: If an argument is of another kind.
+        ValueError: If `start` does not have one number for each free parameter.
+    """
+    calibration, session = identify(
+        sessions, choice, loss=loss, solver=solver, profile=profile, start=start
+    )
+    return replace(calibration, assessment=assess(calibration, session))
+
+
+def assess(
+    calibration: Calibration,
+    session: Session | None = None,
+    *,
+    judgement: Judgement | None = None,
+    recommendation: Recommendation | None = None,
+) -> Assessment:
+    """Judge a calibration: verdict, findings, what to enter, the tool error.
+
+    Args:
+        calibration: The calibration.
+        session: The session, or the joined sessions, that it was made from; by default as the
+            calibration keeps them.
+        judgement: Of that session, if it is known already.
+        recommendation: Of a model for that session, if it is known already.
+
+    Raises:
+        ClosureError: If the machine cannot reach a posture.
+    """
+    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    measured = session or restore_session(calibration)
+    if judgement is None:
+        judgement = judge_session(measured)
+    tool, unreached = _tool(calibration, judgement)
+    entries = compute_entries(calibration, find_tool(calibration))
+    notes = [
+        *find_fit_findings(calibration),
+        *_entry_findings(calibration, entries, tool),
+        *describe_recommendation(
+            recommendation or recommend_model(measured), chosen=calibration.model
+        ),
+        *unreached,
+    ]
+    findings = rank([*judgement.findings, *notes])
+    return Assessment(
+        decision=_decide(findings),
+        findings=findings,
+        entries=entries,
+        tool=tool,
+        tolerance_scale=judgement.tolerance_scale,
+    )
+
+
+def assessment_of(calibration: Calibration) -> Assessment:
+    """The assessment of a calibration: as recorded, otherwise computed."""
+    require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    return calibration.assessment or assess(calibration)
+
+
+def check_session(session: Session, judgement: Judgement | None = None) -> Assessment:
+    """The assessment of readings before anything is calibrated from them."""
+    require_kind(session, Session, expected="a Session, such as load_session(...)")
+    found = judgement or judge_session(session)
+    findings = found.findings
+    if found.verdict == "enter":
+        within = found.tolerance_scale == 1.0
+        findings = rank([*findings, words.sound(len(session.readings), within_tolerances=within)])
+    lead = next((f for f in findings if f.severity != "note"), findings[-1])
+    decision = Decision(
+        found.verdict, words.SESSION_HEADLINES[found.verdict], lead.text, lead.action
+    )
+    return Assessment(decision, findings, (), None, found.tolerance_scale)
+
+
+def _tool(
+    calibration: Calibration, judgement: Judgement
+) -> tuple[ToolErrorSummary | None, list[Finding]]:
+    """The expected tool error, or why it is unknown."""
+    try:
+        accuracy = assess_placed(calibration, require_tool(calibration))
+    except (ClosureError, RobotError) as e:
+        return None, [words.out_of_reach(str(e))]
+    return summarise_tool(calibration, accuracy, scale=judgement.tolerance_scale), []
+
+
+def _entry_findings(
+    calibration: Calibration,
+    entries: Sequence[ControllerEntry],
+    tool: ToolErrorSummary | None,
+) -> list[Finding]:
+    """Findings about the values to enter."""
+
+    def expected(*, keep: bool) -> list[Finding]:
+        return [] if tool is None else [words.tool_error(tool, keep=keep)]
+
+    if not entries:
+        return [words.no_offset(), *expected(keep=True)]
+    found = []
+    if entries[0].active is None:
+        found.append(words.controller_not_stated([e.drive for e in entries]))
+    by_readings = [e for e in entries if e.held is None and math.isfinite(e.std)]
+    large = [e.drive for e in by_readings if is_significant(calibration, e)]
+    small = [e.drive for e in by_readings if e.drive not in large]
+    if small and not large and not _tool_changes(tool):
+        ratio = max((abs(e.change) / e.std for e in by_readings if e.std > 0.0), default=0.0)
+        return [words.no_change_needed(small, ratio, tool), *expected(keep=True), *found]
+    found = [*expected(keep=False), *found]
+    if large:
+        found.append(words.must_change(large))
+    if small:
+        found.append(words.not_significant(small))
+    return found
+
+
+def is_significant(calibration: Calibration, entry: ControllerEntry) -> bool:
+    """Whether a value to enter differs from the active one by more than its uncertainty."""
+    return not abs(entry.change) <= expanded_uncertainty(calibration, entry)
+
+
+def _tool_changes(tool: ToolErrorSummary | None) -> bool:
+    """Whether the tool error changes by more than its uncertainty if the offsets are entered.
+
+    Offsets that are correlated may do so although each of them changes insignificantly. Entering
+    moves the tool by √(now² - entered²); a controller that corrects all errors leaves its
+    uncertainty.
+    """
+    if tool is None:
+        return False
+    moved = math.sqrt(max(tool.now**2 - tool.entered**2, 0.0))
+    return not moved <= chance.COVERAGE * tool.compensated
+
+
+def expanded_uncertainty(calibration: Calibration, entry: ControllerEntry) -> float:
+    """Expanded uncertainty of a value to enter, [unit]: k = 2, Student's factor for few readings.
+
+    The part that is due to the scatter of the readings has Student's factor for 95 % where the
+    noise was estimated from few degrees of freedom; the rest has k = 2.
+    """
+    return float(chance.expanded_uncertainty(entry.std, entry.std_scatter, dof=calibration.dof))
+
+
+def _decide(findings: Sequence[Finding]) -> Decision:
+    """The one decision: the gravest finding decides; nothing against entering means enter."""
+    verdict, lead = verdict_of(findings), findings[0]
+    if verdict != "enter":
+        return Decision(verdict, words.HEADLINES[verdict], lead.text, lead.action)
+    for kind, headline in KEEPING.items():
+        found = first_of(findings, kind)
+        if found is not None:
+            return Decision(verdict, headline, found.text, found.action)
+    why = first_of(findings, *EXPLANATIONS)
+    reason, action = ("", "") if why is None else (why.text, why.action)
+    return Decision(
+        verdict, words.HEADLINES[verdict], reason, f"{words.next_step(None)} {action}".strip()
+    )

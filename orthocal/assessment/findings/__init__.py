@@ -1,1 +1,0 @@
-"""What was found, what follows from it and what to do next: as data, recognised in one place."""

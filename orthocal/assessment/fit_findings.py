@@ -1,0 +1,118 @@
+"""Findings about a fit: what its residuals, noise and parameters show. They only inform."""
+
+from __future__ import annotations
+
+import math
+
+from orthocal.assessment.words import fit as words
+from orthocal.calibration.assessment_record import Finding
+from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.refit import restore_session
+from orthocal.errors import ClosureError, RobotError
+from orthocal.estimation.diagnostics.idealisation import find_idealised
+
+STANDSTILL = 1e-6
+"""Prior standard deviations by which a parameter must move to have moved."""
+
+NOTABLE_IDEALISATION = 1 / 3
+"""Part of a reading's standard deviation from which an idealisation is mentioned."""
+
+
+def find_fit_findings(calibration: Calibration) -> list[Finding]:
+    """All findings about a fit, in the order in which they explain it."""
+    return [
+        *_redundancy(calibration),
+        *_residuals(calibration),
+        *_standstill(calibration),
+        *find_held(calibration),
+        *_linearisation(calibration),
+        *find_unresolved(calibration),
+        *_line(calibration),
+    ]
+
+
+def _redundancy(calibration: Calibration) -> list[Finding]:
+    """Finding about the readings that check the model."""
+    if calibration.spare_readings > 0:
+        return []
+    return [words.no_redundancy(calibration.identifiability.n_readings, len(calibration.free))]
+
+
+def _residuals(calibration: Calibration) -> list[Finding]:
+    """Residuals against the noise of the readings."""
+    noise, stated = calibration.noise, calibration.session.gauge_sigma
+    row = "a difference" if calibration.rows_are_differences else "a reading"
+    factor, larger = calibration.row_factor, calibration.only_offsets
+
+    def excess(reference: float, source: str) -> Finding:
+        return words.model_error(
+            noise.residual_sigma, reference, source=source, row=row, factor=factor, larger=larger
+        )
+
+    if noise.source == "unknown":
+        return [words.noise_unknown()]
+    if noise.source == "gauge":
+        if calibration.spare_readings > 0:
+            return [words.fits_stated_noise(noise.sigma)]
+        return [words.noise_as_stated(noise.sigma)]
+    if noise.source == "cycles":
+        return [words.fits_cycles(noise.cycles_sigma)]
+    if noise.cycles_dof > 0:
+        return [excess(noise.cycles_sigma, "the scatter of repeated readings")]
+    if stated is None:
+        return [words.noise_from_residuals(calibration.sigma)]
+    if noise.leaves_more(stated):
+        return [excess(stated, "the stated noise of the gauge")]
+    if noise.leaves_less(stated):
+        return [words.gauge_overstated(noise.residual_sigma, stated)]
+    return [words.fits_stated_noise(noise.residual_sigma)]
+
+
+def _standstill(calibration: Calibration) -> list[Finding]:
+    """Finding about a fit that moved no parameter."""
+    if any(abs(p.value - p.start) > STANDSTILL * p.tolerance for p in calibration.free):
+        return []
+    if len(calibration.identifiability.unseen) == len(calibration.free):
+        return [words.nothing_depends([p.name for p in calibration.free])]
+    return [words.nothing_deviates(calibration.rms_before)]
+
+
+def find_held(calibration: Calibration) -> list[Finding]:
+    """Parameters that a bound holds."""
+    known = calibration.robot.parameters
+    return [
+        words.held_by_bound(p, offset=known.are_offsets(p.name))
+        for p in calibration.free
+        if p.at_bound is not None
+    ]
+
+
+def _linearisation(calibration: Calibration) -> list[Finding]:
+    """Cost of linearisation, in the parameter where it is most of the standard deviation."""
+    if not calibration.solver.tells_linearisation:
+        return []
+    p = max(calibration.free, key=lambda p: abs(p.value - p.linear) / max(p.std, 1e-300))
+    if math.isnan(p.std) or p.std <= 0.0:
+        return []
+    return [words.linearisation_error(p, abs(p.value - p.linear), p.std)]
+
+
+def find_unresolved(calibration: Calibration) -> list[Finding]:
+    """Parameters that the readings determine only in combination, and those below the noise."""
+    seen = calibration.identifiability
+    found = [words.inseparable(c) for c in seen.alike]
+    if seen.unseen:
+        found.append(words.below_noise(seen.unseen))
+    return found
+
+
+def _line(calibration: Calibration) -> list[Finding]:
+    """Finding about gauges that touch a rod but are modelled by the line between the rods."""
+    sigma = calibration.noise.sigma
+    try:
+        found = find_idealised(restore_session(calibration))
+    except (ClosureError, RobotError):  # the finding of the tool says so
+        return []
+    if found is None or not found.size > NOTABLE_IDEALISATION * sigma:
+        return []
+    return [words.line_assumed(found.size, found.setup, found.touches, sigma)]

@@ -1,0 +1,202 @@
+"""Judgement of sessions: the one place that decides whether readings can be trusted.
+
+It depends on the readings and the robot alone. Every command that takes sessions, and every
+calibration made from them, has the same verdict for the same readings by construction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.assessment.plausibility import (
+    are_finer,
+    find_finer,
+    find_implausible,
+    find_scattered,
+)
+from orthocal.assessment.words import plausibility as words
+from orthocal.assessment.words.anomalies import describe_anomalies, describe_no_change
+from orthocal.calibration.assessment_record import Finding, Severity, Verdict
+from orthocal.hypotheses.families.sessions import detectable_changes
+from orthocal.hypotheses.linear_model import Linearisation, LinearModel
+from orthocal.hypotheses.search import find_anomalies
+from orthocal.measurement.joining import split_sessions
+from orthocal.session.session import Session
+from orthocal.statistics.chance import chance_of_excess
+from orthocal.statistics.noise import estimate_repeatability
+
+Array = NDArray[np.float64]
+
+RARE = 1e-3
+"""Share of the machines within their tolerances that are called worse."""
+
+LARGEST_SCALE = 4.0
+"""Factor of the tolerances beyond which no machine in working order is."""
+
+RESOLVED = 1e-3
+"""Part of the noise by which one prior standard deviation of an offset must move the readings."""
+
+SCALES = np.geomspace(1.0, 30.0, 86)
+"""Factors of the tolerances that are tried."""
+
+LARGEST_DEVIATION = 3.0
+"""Standard deviations from its prediction beyond which a reading is doubtful."""
+
+EXPLAINED = ("finer than the gauge", "residuals too small", "scattered repeats", "sigma too large")
+"""Kinds that an anomaly with a name explains."""
+
+_GRAVITY: dict[Severity, int] = {"reject": 0, "review": 1, "note": 2}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judgement:
+    """Judgement of readings, independent of what is calibrated from them."""
+
+    findings: tuple[Finding, ...]
+    """The gravest first."""
+    tolerance_scale: float
+    """Factor by which the machine's errors exceed their tolerances; 1 if they do not."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict of the gravest finding."""
+        return verdict_of(self.findings)
+
+
+def verdict_of(findings: Sequence[Finding]) -> Verdict:
+    """The verdict that findings amount to: that of the gravest."""
+    severities = {f.severity for f in findings}
+    return "reject" if "reject" in severities else "review" if "review" in severities else "enter"
+
+
+def rank(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Findings, the gravest first, otherwise in their order."""
+    return tuple(sorted(findings, key=lambda f: _GRAVITY[f.severity]))
+
+
+def judge_session(session: Session) -> Judgement:
+    """Judge the readings of a session, or of several that were joined.
+
+    Raises:
+        ClosureError: If the machine cannot reach a posture.
+        RobotError: If the closures of the robot depend on each other.
+    """
+    anomalies = _find_mistakes(session)
+    implausible = [f for f in find_implausible(session) if not (anomalies and f.kind in EXPLAINED)]
+    scale, beyond = 1.0, []
+    if verdict_of([*anomalies, *implausible]) == "enter":
+        scale = find_tolerance_scale(session)
+        if scale > LARGEST_SCALE:
+            beyond = [words.beyond_tolerances(scale, LARGEST_SCALE)]
+        elif scale > 1.0:
+            beyond = [words.above_tolerances(scale)]
+    unchanged = [] if anomalies or not session.joined else [_describe_detectable(session)]
+    return Judgement(rank([*implausible, *anomalies, *unchanged, *beyond]), scale)
+
+
+def find_warnings(session: Session) -> tuple[Finding, ...]:
+    """Findings that a reading may cause while a session is measured, the gravest first.
+
+    They are among those of `judge_session` for the same readings. The others, which concern the
+    robot, the postures and the stated noise, do not depend on a single reading.
+
+    Raises:
+        ClosureError: If the machine cannot reach a posture.
+        RobotError: If the closures of the robot depend on each other.
+    """
+    mistakes = _find_mistakes(session)
+    return rank([*mistakes, *(() if mistakes else find_finer(session))])
+
+
+def is_doubtful(session: Session, row: int, mean: float, std: float) -> bool:
+    """Whether a reading calls for `find_warnings` before its setup is complete.
+
+    Args:
+        session: The readings so far.
+        row: Place of the reading.
+        mean: Prediction of the reading by all others, [m]; NaN without one.
+        std: Its standard deviation, [m].
+    """
+    gauge = session.gauges[session.setups[session.readings[row].setup].gauge]
+    value = session.values[row]
+    return bool(abs(value - mean) > LARGEST_DEVIATION * std or are_finer(value, gauge))
+
+
+def _find_mistakes(session: Session) -> list[Finding]:
+    """Anomalies of a session; without any, gauges whose repeated readings scatter too much."""
+    anomalies = describe_anomalies(session, find_anomalies(session))
+    return anomalies or list(find_scattered(session))
+
+
+def find_tolerance_scale(session: Session) -> float:
+    """Factor by which the machine's errors exceed their tolerances, by maximum likelihood.
+
+    Readings are y ~ N(h, e² J P Jᵀ + G + σ²) with P of all errors but offsets, G of how gauges are
+    mounted. Offsets and gauge zeros are free: home switches are as far off as they are. σ is the
+    stated noise, or the scatter of repeated readings if that is larger. 1 where one in a thousand
+    machines within tolerances shows as much, or nothing is stated of the noise.
+    """
+    scales = [1.0]
+    for part in split_sessions(session):
+        if any(g.sigma is None for g in part.gauges.values()) or len(part.readings) < 2:
+            continue
+        model = LinearModel(part)
+        about = model.most_likely(part.values)
+        deviation = model.entries(part.values[None])[0] - about.expected
+        repeated, _ = estimate_repeatability(model.problem.values, model.problem.observations)
+        noise = max(about.likelihood.sigma, repeated)
+        within, excess, rest, dof = _parts(model, about, deviation, noise)
+        square = float((within**2 / (1.0 + excess)).sum()) + rest
+        if dof < 1 or chance_of_excess(square, dof) >= RARE:
+            continue
+        spread = 1.0 + SCALES[:, None] ** 2 * excess
+        logs = (within**2 / spread + np.log(spread)).sum(axis=1)
+        scales.append(float(SCALES[int(np.argmin(logs))]))
+    return max(scales)
+
+
+def _parts(
+    model: LinearModel, about: Linearisation, deviation: Array, noise: float
+) -> tuple[Array, Array, float, int]:
+    """Independent parts of a deviation, offsets taken out.
+
+    Returns:
+        Parts over the standard deviation that noise and gauges leave, shape (n,); variances that
+        the machine's errors at their tolerances add to the 1 of each, shape (n,); the sum of
+        squares of what neither moves, over the noise; degrees of freedom of all.
+    """
+    directions, problem = about.likelihood.directions, model.problem
+    along = directions @ deviation
+    rest = max(float(deviation @ deviation - along @ along), 0.0) / noise**2
+    slopes = about.sizes[:, None] * about.errors.T / noise  # along each direction, by each error
+    known, n = problem.robot.parameters, problem.n_machine
+    machine = slopes[:, :n]
+    offset = np.array([known.are_offsets(name) for name in problem.free[:n]], dtype=bool)
+    basis, sizes, _ = np.linalg.svd(machine[:, offset])
+    rank = int((sizes > RESOLVED).sum())
+    kept = basis[:, rank:].T
+    gauges, errors = kept @ slopes[:, n:], kept @ machine[:, ~offset]
+    root = np.linalg.cholesky(np.eye(len(kept)) + gauges @ gauges.T)
+    white = np.linalg.solve(root, np.column_stack([kept @ along / noise, errors]))
+    variances, turned = np.linalg.eigh(white[:, 1:] @ white[:, 1:].T)
+    return turned.T @ white[:, 0], np.maximum(variances, 0.0), rest, model.dof - rank
+
+
+def _describe_detectable(session: Session) -> Finding:
+    """The change of an offset between joined sessions that would have been detected."""
+    sizes: dict[str, float] = {}
+    unseen = []
+    detectable = detectable_changes(session)
+    for drive in session.robot.drives:
+        size = detectable.get(drive.name, math.inf)
+        if math.isinf(size):
+            unseen.append(drive.name)
+            continue
+        p = session.robot.parameters[f"{drive.name}.offset"]
+        sizes[p.edge_unit] = max(sizes.get(p.edge_unit, 0.0), size * p.edge_factor)
+    return describe_no_change(sizes, unseen)

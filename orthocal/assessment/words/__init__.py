@@ -1,0 +1,1 @@
+"""Wording of findings: one module per group, no logic."""

@@ -1,0 +1,382 @@
+"""Wording of findings about anomalies in readings and changes between sessions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from orthocal.assessment.wording import joined, lengths, plain, signed, um
+from orthocal.calibration.assessment_record import Finding, Place
+from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
+from orthocal.session.session import Session
+from orthocal.units import MM, UM
+
+MOST_PLACES = 20
+"""Places of a finding that are kept."""
+
+LARGEST_ODDS = 1e6
+"""Odds above which no number is printed."""
+
+UNITS = {25.4: "in inches", 1e3: "in m", 1e-3: "in µm"}
+"""Factor that corrects readings to the unit they were written in; otherwise mm read as inches."""
+
+
+def describe_anomalies(session: Session, result: Anomalies) -> list[Finding]:
+    """Findings of all anomalies, and of readings that they do not explain."""
+    findings = [describe_anomaly(session, result, a) for a in result.found]
+    if not result.explained and (result.found or session.joined):
+        findings.append(_unexplained(session, result))
+    return findings
+
+
+def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding:
+    """One anomaly; or several that are nearly as likely."""
+    e = anomaly.explanation
+    if not e.rows and not any(c.rows for c in anomaly.alternatives):
+        return _between_sessions(session, anomaly)
+    if anomaly.alternatives:
+        return _ambiguous(session, result, anomaly)
+    first = session.readings[e.rows[0]]
+    ways = [_text(session, c) for c in anomaly.causes] or [_text(session, e)]
+    text = f"{session.where(first)}: it looks as if {' or '.join(ways)}."
+    numbers = _numbers(result, anomaly)
+    if anomaly.expected is not None:
+        text += (
+            f" It reads {signed(first.value / MM)} mm; the other readings predict "
+            f"{signed(anomaly.expected / MM)} mm."
+        )
+        numbers |= {
+            "measured_mm": first.value / MM,
+            "expected_mm": anomaly.expected / MM,
+            "cycle": float(first.cycle),
+        }
+    action = "Read it again, or leave it out." if anomaly.causes else _remedy(session, e)
+    text = f"{text} {_odds(result, anomaly)}"
+    return Finding(e.kind, "review", text, action, numbers, _places(session, e))
+
+
+def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding:
+    every = (anomaly.explanation, *anomaly.alternatives)
+    ways = "; ".join(_text(session, e) + _line(session, e) for e in every)
+    return Finding(
+        "ambiguous",
+        "review",
+        f"The readings contradict each other as if one of these had happened: {ways}. "
+        f"{_odds(result, anomaly)}",
+        "Look at these readings, and read again what may be wrong.",
+        _numbers(result, anomaly),
+        tuple(p for e in every for p in _places(session, e)[:1]),
+    )
+
+
+def _unexplained(session: Session, result: Anomalies) -> Finding:
+    before, after = lengths(result.rms_before, result.rms_after)
+    what = "What was found above explains" if result.found else "No single change explains"
+    remains = f" ({before} RMS, {after} RMS once corrected)" if result.found else f" ({before} RMS)"
+    which = "The sessions do" if session.joined else "The readings do"
+    return Finding(
+        "inconsistent readings",
+        "review",
+        f"{which} not fit one machine{remains}. {what} "
+        f"{'only a part' if result.found else 'it'}: several parts may have changed, or several "
+        "readings are wrong.",
+        "Calibrate the last session alone: the values to enter must belong to the machine as it "
+        "is now."
+        if session.joined
+        else "Measure again.",
+    )
+
+
+def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
+    """A machine that changed, or offsets that were entered otherwise than stated."""
+    e = anomaly.explanation
+    text = _text(session, e)
+    text = f"{text[0].upper()}{text[1:]}."
+    others = [_text(session, c) for c in (*anomaly.causes, *anomaly.alternatives) if c != e]
+    if others:
+        text += f" The readings do not distinguish this from: {'; '.join(others)}."
+    numbers = {"log_likelihood_ratio": anomaly.log_evidence}
+    if e.amount is not None:
+        for name in e.parameters:
+            p = session.robot.parameters[name]
+            numbers[f"{name}_by_{p.edge_unit}"] = e.amount * p.edge_factor
+            numbers[f"{name}_std_{p.edge_unit}"] = (e.std or 0.0) * p.edge_factor
+    if e.offsets:
+        for drive, active in zip(session.robot.drives, e.offsets, strict=True):
+            if drive.name in e.drives:
+                numbers[f"{drive.name}_active_{drive.edge_unit}"] = active * drive.edge_factor
+    names = e.drives or e.parameters
+    file = _file_of(session, e.sessions[0])
+    return Finding(
+        e.kind,
+        "review",
+        text,
+        _session_remedy(session, e),
+        numbers,
+        tuple(Place(file=file, parameter=name) for name in names) or (Place(file=file),),
+    )
+
+
+def describe_no_change(sizes: dict[str, float], unseen: Sequence[str]) -> Finding:
+    """Absence of a change between sessions.
+
+    Args:
+        sizes: Smallest change of an offset that would have been detected, by edge unit.
+        unseen: Drives of which no change would have been detected.
+    """
+    if not sizes:
+        return Finding(
+            "change unknown",
+            "note",
+            "Whether the machine changed between the sessions is unknown: the sessions have too "
+            "few setups and postures in common.",
+            "Read some of the same setups and postures in each session.",
+        )
+    words = joined([f"{plain(size)} {unit}" for unit, size in sizes.items()], "or")
+    text = (
+        f"No change between the sessions. A change of one offset by {words} would have been "
+        "detected."
+    )
+    if unseen:
+        text += f" A change of {joined(tuple(unseen), 'or')} would not."
+    return Finding(
+        "no change", "note", text, numbers={f"seen_from_{u}": size for u, size in sizes.items()}
+    )
+
+
+def _numbers(result: Anomalies, anomaly: Anomaly) -> dict[str, float]:
+    return {
+        "before_rms_um": result.rms_before / UM,
+        "after_rms_um": result.rms_after / UM,
+        "log_likelihood_ratio": anomaly.log_evidence,
+    }
+
+
+def _odds(result: Anomalies, anomaly: Anomaly) -> str:
+    """Residuals before and after the correction, and the odds."""
+    odds = math.exp(min(anomaly.log_evidence, math.log(LARGEST_ODDS)))
+    number = f"more than {LARGEST_ODDS:,.0f}" if odds > 0.999 * LARGEST_ODDS else f"{odds:,.0f}"
+    words = f"odds that something is wrong: {number} to 1."
+    stuck = anomaly.explanation.kind == "stuck dial"
+    if stuck or not math.isfinite(result.rms_before + result.rms_after):
+        return f"{words[0].upper()}{words[1:]}"
+    before, after = um(result.rms_before), um(result.rms_after)
+    return f"Residual {before} µm RMS as written, {after} µm once corrected; {words}"
+
+
+def _places(session: Session, e: Explanation) -> tuple[Place, ...]:
+    if not e.rows:
+        return tuple(Place(file=_file_of(session, name)) for name in e.sessions)
+    if e.setups:
+        return tuple(Place(setup=name) for name in e.setups[:MOST_PLACES])
+    return tuple(place_of(session, i) for i in e.rows[:MOST_PLACES])
+
+
+def place_of(session: Session, row: int) -> Place:
+    """File, line, setup and posture of a row."""
+    reading = session.readings[row]
+    file = reading.file or session.readings_path
+    known = reading.line is not None
+    return Place(
+        file=str(file) if known and file is not None else None,
+        line=reading.line,
+        setup=reading.setup,
+        posture=reading.postures,
+    )
+
+
+def _file_of(session: Session, label: str) -> str | None:
+    """The session.yaml of a joined session."""
+    names = list(dict.fromkeys(name.partition("/")[0] for name in session.setups))
+    if len(session.parts) != len(names) or label not in names:
+        return None
+    path = session.parts[names.index(label)].path
+    return None if path is None else str(path)
+
+
+def _line(session: Session, e: Explanation) -> str:
+    return f" ({session.where(session.readings[e.rows[0]])})" if e.rows else ""
+
+
+def _row(session: Session, i: int) -> str:
+    r = session.readings[i]
+    return r.label + (f", cycle {r.cycle}" if r.cycle > 1 else "")
+
+
+def _subject(session: Session, e: Explanation) -> str:
+    """Readings that an explanation concerns, as a noun."""
+    if e.scope == "reading":
+        return _row(session, e.rows[0])
+    if e.scope == "posture":
+        return f"{session.readings[e.rows[0]].label} in all cycles"
+    if e.scope == "cycle":
+        return f"setup {e.names[0]}, cycle {e.cycle}"
+    if e.scope in ("leg", "gauge"):
+        return f"all readings of {e.scope} {e.names[0]}"
+    if e.scope == "session":
+        return "all readings"
+    return f"{'setup' if len(e.setups) == 1 else 'setups'} {joined(e.setups)}"
+
+
+def _text(session: Session, e: Explanation) -> str:
+    """Description of what happened, as a clause."""
+    texts: dict[str, Callable[[], str]] = {
+        "wrong unit": lambda: _written(
+            session, e, UNITS.get(e.factor or 0.0, "in mm and read as inches")
+        ),
+        "decimal point": lambda: _written(session, e, "with a misplaced decimal point"),
+        "reversed sign": lambda: f"the sign of {_subject(session, e)} is reversed",
+        "misread dial": lambda: (
+            f"{_subject(session, e)} was read {abs(e.amount or 0.0) / MM:g} mm too "
+            f"{'high' if (e.amount or 0.0) > 0 else 'low'}, by a turn or a mark of the dial"
+        ),
+        "outlier": lambda: f"{_subject(session, e)} was misread or mistyped",
+        "inconsistent posture": lambda: (
+            f"{_subject(session, e)} was misread or mistyped"
+            if e.scope == "posture"
+            else f"the machine was not in posture {e.names[0]} when that was read"
+        ),
+        "inconsistent setup": lambda: f"setup {e.setups[0]} is not the one that is described",
+        "swapped rows": lambda: f"{_swapped(session, e)} were swapped",
+        "row offset": lambda: _offset(session, e),
+        "stuck dial": lambda: (
+            f"the dial stuck in setup {e.names[0]}: from {_row(session, e.rows[0])} on it shows "
+            f"the same {len(e.rows)} times"
+        ),
+        "displaced gauge": lambda: _displaced(session, e),
+        "drift": lambda: (
+            f"the readings of setup {e.setups[0]} drifted from the first to the last"
+            if len(e.setups) == 1
+            else "the readings of every setup drifted alike from its first to its last"
+        ),
+        "machine changed": lambda: _changed(session, e),
+        "offset of one drive": lambda: (
+            f"the controller's offset of {joined(e.drives)} in session {e.sessions[0]} is not "
+            f"the stated one{_by(session, e)}"
+        ),
+        "offsets not entered": lambda: _entered(e, "was not entered", "were not entered"),
+        "offsets reversed": lambda: _entered(
+            e, "was entered with the wrong sign", "were entered with the wrong sign"
+        ),
+        "offsets entered twice": lambda: _entered(e, "was added twice", "were added twice"),
+        "offsets interchanged": lambda: _entered(e, "was interchanged", "were interchanged"),
+    }
+    return texts[e.kind]()
+
+
+def _written(session: Session, e: Explanation, how: str) -> str:
+    subject = _subject(session, e)
+    be = "were" if subject.startswith(("all", "setups")) else "was"
+    return f"{subject} {be} written {how}"
+
+
+def _displaced(session: Session, e: Explanation) -> str:
+    if e.scope == "cycle":
+        return f"the gauge of setup {e.names[0]} was displaced before cycle {e.cycle}"
+    return (
+        f"the gauge of setup {e.names[0]} was displaced before {_row(session, e.rows[0])}: all "
+        "later readings of that setup are shifted"
+    )
+
+
+def _offset(session: Session, e: Explanation) -> str:
+    first = _row(session, e.rows[0])
+    if e.missing:
+        return (
+            f"{first} was not read, and all later readings of setup {e.names[0]} are one row too "
+            "early"
+        )
+    return (
+        f"the reading before {first} was written twice, and all later readings of setup "
+        f"{e.names[0]} are one row too late"
+    )
+
+
+def _swapped(session: Session, e: Explanation) -> str:
+    half = len(e.rows) // 2
+    names = {
+        "reading": lambda: (
+            f"the readings {_row(session, e.rows[0])} and {_row(session, e.rows[half])}"
+        ),
+        "posture": lambda: f"{e.names[1]} and {e.names[2]} in all cycles of setup {e.names[0]}",
+        "postures": lambda: f"the readings of postures {e.names[0]} and {e.names[1]} in all setups",
+        "setups": lambda: f"the readings of setups {e.setups[0]} and {e.setups[1]}",
+        "legs": lambda: f"the readings of legs {e.names[0]} and {e.names[1]}",
+        "setup": lambda: f"the rows of setup {e.setups[0]}, written in reverse order,",
+    }
+    return names[e.scope]()
+
+
+def _changed(session: Session, e: Explanation) -> str:
+    what = joined(e.drives) or joined(e.parameters)
+    verb = "moved" if e.drives else "changed"
+    return f"the machine changed: {what} {verb}{_by(session, e)} before session {e.sessions[0]}"
+
+
+def _by(session: Session, e: Explanation) -> str:
+    if e.amount is None or not e.parameters:
+        return ""
+    p = session.robot.parameters[e.parameters[0]]
+    spread = "" if e.std is None else f" ± {plain(2.0 * e.std * p.edge_factor)}"
+    return f" by {signed(e.amount * p.edge_factor)}{spread} {p.edge_unit}"
+
+
+def _entered(e: Explanation, one: str, several: str) -> str:
+    which = f"{'offset' if len(e.drives) == 1 else 'offsets'} of {joined(e.drives)}"
+    how = one if len(e.drives) == 1 else several
+    return f"in session {e.sessions[0]} the {which} {how}"
+
+
+def _remedy(session: Session, e: Explanation) -> str:
+    """Action for one explanation."""
+    if e.scope == "reading" and (e.factor is not None or e.kind == "misread dial"):
+        old = session.readings[e.rows[0]].value / MM
+        new = old - (e.amount or 0.0) / MM if e.factor is None else old * e.factor
+        return f"If so, write {new:+.6g} instead of {old:+.6g}."
+    if e.kind == "reversed sign" and e.setups:
+        return (
+            "Look at the mounting of the gauge. If a minus was forgotten, reverse the signs; if "
+            "the gauge measured the other way, reverse `direction`."
+        )
+    if e.factor is not None:
+        return f"If so, multiply these by {e.factor:.6g}."
+    if e.kind == "displaced gauge" and e.scope == "cycle":
+        return f"If so, read cycle {e.cycle} again, or leave it out."
+    if e.kind == "row offset":
+        if e.missing:
+            return "If so, move them down by a row and read what is missing."
+        return "If so, move them up by a row and read the last one again."
+    if e.kind == "inconsistent posture" and e.scope == "postures":
+        return "Check its coordinates, and read it again."
+    remedies = {
+        "inconsistent setup": "Check its leg, direction, section and the mounting of its gauge; "
+        "then read it again, or leave it out.",
+        "swapped rows": "If so, swap them back.",
+        "stuck dial": "Check that the plunger moves freely and touches, and read these again.",
+        "displaced gauge": f"If so, read setup {''.join(e.names[:1])} again, or make a new setup "
+        "of the later readings.",
+        "drift": "Wait until machine and gauge have the same temperature, and return to the first "
+        "posture at the end of the setup.",
+    }
+    return remedies.get(e.kind, "Read it again, or leave it out.")
+
+
+def _session_remedy(session: Session, e: Explanation) -> str:
+    """Action for a change between sessions."""
+    since = e.sessions[0]
+    if e.kind != "machine changed":
+        return (
+            f"Compare the offsets in the controller with `controller.offsets_mm` of session "
+            f"{since}. If the session states the wrong ones, correct them there; otherwise enter "
+            "the right ones and measure again."
+        )
+    apart = (
+        f"Calibrate the sessions from {since} on without those before: the values to enter must "
+        "belong to the machine as it is now."
+    )
+    if not e.drives:
+        return apart
+    return (
+        f"First make sure that all sessions state the active offsets (`controller.offsets_mm`): "
+        f"offsets entered in between look the same. Otherwise: {apart[0].lower()}{apart[1:]}"
+    )

@@ -1,0 +1,127 @@
+"""Wording of findings about a validation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from orthocal.assessment.predictive import FEWEST, Repetition
+from orthocal.assessment.wording import joined, mm
+from orthocal.assessment.words.fit import named
+from orthocal.calibration.assessment_record import Finding, Place
+
+CONFIRMED = "The calibration is confirmed."
+NOT_CONFIRMED = "The calibration is not confirmed."
+UNKNOWN = "Whether the calibration is confirmed is unknown."
+
+AGAIN = "Calibrate again from this session."
+
+
+def nothing_predicted(numbers: Mapping[str, float]) -> Finding:
+    """The calibration had no redundancy, so it predicts nothing."""
+    return Finding(
+        "nothing predicted",
+        "review",
+        "The calibration had no redundant readings, so it predicts no deviations to compare with.",
+        "Calibrate from more readings, then measure again.",
+        numbers,
+    )
+
+
+def larger_than_predicted(
+    achieved: float,
+    expected: float,
+    refit: float | None,
+    *,
+    removed: bool,
+    numbers: Mapping[str, float],
+    place: Place,
+) -> Finding:
+    """Deviations are larger than the calibration predicts.
+
+    Args:
+        achieved: RMS of the deviations, [m].
+        expected: RMS as predicted, [m].
+        refit: RMS residual of a fit of the new readings, [m]; None if an anomaly explains them.
+        removed: Whether that fit removes the deviations.
+        numbers: Numbers of the finding.
+        place: Reading with the largest deviation.
+    """
+    text = (
+        f"The deviations of the new readings are {mm(achieved)} mm RMS. The calibration predicts "
+        f"{mm(expected)} mm."
+    )
+    action = ""
+    if refit is not None:
+        reason, action = (
+            ("the machine has changed, or a gauge was mounted elsewhere than stated", AGAIN)
+            if removed
+            else (
+                "the readings scatter more than before, or something moved during the session",
+                "Check the mounting of the gauge, then read again.",
+            )
+        )
+        text += f" A fit of the new readings leaves {mm(refit)} mm RMS: {reason}."
+    return Finding("larger than predicted", "review", text, action, numbers, (place,))
+
+
+def as_predicted(achieved: float, expected: float, numbers: Mapping[str, float]) -> Finding:
+    """Deviations are as the calibration predicts."""
+    return Finding(
+        "as predicted",
+        "note",
+        f"The deviations of the new readings are {mm(achieved)} mm RMS, as predicted "
+        f"({mm(expected)} mm).",
+        numbers=numbers,
+    )
+
+
+def further_change(
+    achieved: float, expected: float, drives: Sequence[str], numbers: Mapping[str, float]
+) -> Finding:
+    """Deviations are as predicted, and the new readings improve what to enter significantly."""
+    what = f"the offsets of {joined(drives)}" if drives else "the expected tool error"
+    return Finding(
+        "further change",
+        "note",
+        f"The deviations of the new readings are {mm(achieved)} mm RMS, as predicted "
+        f"({mm(expected)} mm). The new readings determine {what} better.",
+        AGAIN,
+        numbers,
+        named(*drives),
+    )
+
+
+def describe_repetition(repetition: Repetition, *, new: bool = False, title: str = "") -> Finding:
+    """Correlation of the residuals of two sessions.
+
+    Args:
+        repetition: The correlation.
+        new: Whether deviations are larger than predicted, so that other residuals are new.
+        title: Title of the other session, where it is named.
+    """
+    r, where = repetition, f" in '{title}'" if title else ""
+    numbers = {"rows": float(r.matched), "correlation": r.correlation, "chance": r.chance}
+    size = f"(correlation {r.correlation:.3f} over {r.matched} rows, by chance {r.chance:.2g})"
+    if r.repeats is None:
+        why = f"the fit absorbs nearly all of the {r.matched} shared rows"
+        why = "too few rows are shared" if r.matched < FEWEST else why
+        text = f"Whether the residuals repeat{where} is unknown: {why}."
+        return Finding("repetition unknown", "note", text, numbers=numbers)
+    if r.repeats:
+        text = (
+            f"The residuals repeat{where} {size}: they are unmodelled errors, which more readings "
+            "of the same kind do not reduce."
+        )
+        return Finding("residuals repeat", "note", text, numbers=numbers)
+    meaning = "they are new in this session" if new else "they look like noise"
+    text = f"The residuals do not repeat{where} {size}: {meaning}."
+    return Finding("residuals differ", "note", text, numbers=numbers)
+
+
+def controller_assumed() -> Finding:
+    """The session does not state the active offsets; the identified ones are assumed."""
+    return Finding(
+        "controller not stated",
+        "note",
+        "The session does not state which offsets were active; the values to enter are assumed.",
+    )

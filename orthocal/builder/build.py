@@ -1,0 +1,268 @@
+"""Robot files of an Orthoglide with given dimensions, made from the packaged ones.
+
+The dimensions are leg length, travel, attachment offset, the two rods of a leg, and the workspace.
+Joints, loops, legs, error parameters and models are those of the packaged robot.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from lxml import etree
+
+from orthocal.builder.machine_file import (
+    AS_DRIVE,
+    MACHINE,
+    Counting,
+    Dimensions,
+    drive_text,
+    find_counting_problem,
+    in_mm,
+    machine_text,
+    read_machine,
+    workspace_text,
+)
+from orthocal.effects.loading import load_robot
+from orthocal.errors import RobotError
+from orthocal.io.files import exists, read_file, write_files
+from orthocal.robot.loading import packaged_robots
+from orthocal.robot.model import Robot
+
+__all__ = ["Counting", "Dimensions", "describe_machine", "make_robot", "remake_robot"]
+
+PATTERN = "orthoglide"
+"""Packaged robot whose files are changed."""
+
+AXES = "xyz"
+
+SLIDER = 0.03
+"""Distance from a leg's hinge on the slider to the centre of the drawn slider, less the attachment
+offset, [m]."""
+
+RAIL = 0.09
+"""Length of a rail beyond the travel, [m]."""
+
+_HEAD = re.compile(r"\A(?:# (?:A machine of the Orthoglide's kind|Made from).*\n)+")
+_DRIVE = r"(?m)^(?P<name> *{axis}_slide: )\{{[^#\n]*zero_mm: [^#\n]*\}}(?P<rest> *(?:#.*)?)$"
+_WORKSPACE = re.compile(r"(?m)^(?P<indent> +)workspace:.*\n(?:(?P=indent) +.*\n)*")
+_ORTHOCAL = re.compile(r"(?m)^orthocal:[^\n]*\n(?: *(?:#.*)?\n)*(?P<indent> +)")
+_RADIUS = re.compile(r"radius_mm: [-+.0-9e]+")
+_TOLERANCES = re.compile(r"(?m)^( *tolerances: \{[^{}\n]*)\}")
+
+
+def describe_machine(
+    dimensions: Dimensions,
+    *,
+    name: str,
+    counting: Sequence[Counting] = (AS_DRIVE,) * 3,
+    where: str = "dimensions",
+    description: str | None = None,
+    tolerances: Mapping[str, float] | None = None,
+) -> dict[str, str]:
+    """Files of a machine: name to text.
+
+    Args:
+        dimensions: Dimensions of the machine.
+        name: Name of its directory and files.
+        counting: Relation of the controller's joints x, y and z to the drives.
+        where: Place for messages.
+        description: YAML of the robot to change; by default the packaged one.
+        tolerances: Names or globs with their unit, such as *.offset_mm, mapped to tolerances that
+            replace the packaged ones; not with a description, which has its own.
+
+    Raises:
+        RobotError: If the dimensions are impossible, or the YAML has no place for one of them.
+    """
+    impossible = dimensions.find_problem()
+    if impossible:
+        raise RobotError(impossible[1], where=where)
+    problem = find_counting_problem(counting)
+    if problem:
+        raise RobotError(problem, where=where)
+    folder = packaged_robots()[PATTERN]
+    urdf, packaged = (
+        read_file(folder / f"{PATTERN}.{kind}", error=RobotError) for kind in ("urdf", "yaml")
+    )
+    pattern = packaged.decode() if description is None else description
+    if tolerances:
+        pattern = _override(pattern, tolerances, f"{name}.yaml")
+    return {
+        f"{name}.yaml": _describe(pattern, dimensions, counting, f"{name}.yaml"),
+        f"{name}.urdf": _draw(urdf, dimensions),
+        MACHINE: machine_text(dimensions, tuple(counting)),
+    }
+
+
+def make_robot(
+    dimensions: Dimensions, folder: Path, *, counting: Sequence[Counting] = (AS_DRIVE,) * 3
+) -> Robot:
+    """Write the directory of a machine, with machine.yaml, and load it.
+
+    Args:
+        dimensions: Dimensions of the machine.
+        folder: Directory; created if it does not exist.
+        counting: Relation of the controller's joints x, y and z to the drives.
+
+    Raises:
+        RobotError: If the dimensions are impossible.
+        OrthocalError: If the directory cannot be written.
+    """
+    name = folder.resolve().name
+    write_files(folder, describe_machine(dimensions, name=name, counting=counting))
+    return load_robot(folder.resolve())
+
+
+def remake_robot(folder: Path, *, check: Callable[[Robot], object] | None = None) -> Robot:
+    """Make URDF and YAML of a machine again from its machine.yaml, and load it.
+
+    Other changes in the YAML stay. Files are written only if the robot loads and passes the check.
+
+    Args:
+        folder: Directory of the machine.
+        check: Raises RobotError for a robot that is not to be written.
+
+    Raises:
+        RobotError: If there is no machine.yaml, its dimensions are impossible, or the YAML has no
+            place for one of them.
+        OrthocalError: If the directory cannot be written.
+    """
+    name = folder.resolve().name
+    dimensions, counting = read_machine(folder / MACHINE)
+    own = folder / f"{name}.yaml"
+    if not exists(own):
+        others = sorted(p.name for p in folder.glob("*.yaml") if p.name != MACHINE)
+        there = f"; there is {', '.join(others[:3])}: was the directory renamed?" if others else ""
+        raise RobotError(f"there is no such file{there}", where=str(own))
+    description = read_file(own, error=RobotError).decode("utf-8", "replace")
+    files = describe_machine(dimensions, name=name, counting=counting, description=description)
+    del files[MACHINE]
+    with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
+        write_files(Path(trial) / name, files)
+        try:
+            robot = load_robot(Path(trial) / name)
+            if check is not None:
+                check(robot)
+        except RobotError as e:
+            where = None if e.where is None else e.where.replace(f"{trial}/{name}", str(folder))
+            raise RobotError(e.problem, where=where) from None
+    write_files(folder, files)
+    return load_robot(folder.resolve())
+
+
+def _draw(pattern: bytes, dimensions: Dimensions) -> str:
+    """URDF with every number that depends on a dimension."""
+    parser = etree.XMLParser(resolve_entities=False, no_network=True)
+    root = etree.fromstring(pattern, parser)
+    half = dimensions.rods_apart / 2.0
+    joints = {j.get("name"): j for j in root.findall("joint")}
+    links = {link.get("name"): link for link in root.findall("link")}
+
+    def place(owner: etree._Element, x: float, y: float, z: float) -> None:
+        owner.find("origin").set("xyz", " ".join(_number(v) for v in (x, y, z)))
+
+    def visual(link: str, index: int) -> etree._Element:
+        return links[link].findall("visual")[index]
+
+    for k in AXES:
+        limit = joints[f"{k}_slide"].find("limit")
+        limit.set("lower", _number(dimensions.lower))
+        limit.set("upper", _number(dimensions.upper))
+        place(joints[f"{k}_swivel"], -dimensions.attachment, 0.0, 0.0)
+        place(joints[f"{k}_bar_a"], 0.0, 0.0, half)
+        place(joints[f"{k}_bar_b"], 0.0, 0.0, -half)
+        place(joints[f"{k}_rod_b_tip_mount"], dimensions.leg, 0.0, 0.0)
+        place(joints[f"{k}_coupler"], dimensions.leg, 0.0, 0.0)
+        place(joints[f"{k}_crossbar_end_mount"], 0.0, 0.0, -dimensions.rods_apart)
+        place(joints[f"{k}_leg_tip_mount"], 0.0, 0.0, -half)
+        place(joints[f"{k}_wrist"], 0.0, 0.0, -half)
+        place(visual(f"{k}_slider", 0), -dimensions.attachment - SLIDER, 0.036, 0.0)
+        place(visual(f"{k}_slider", 1), -dimensions.attachment - 0.005, 0.012, 0.0)
+        _set_cylinder(visual(f"{k}_yoke", 0), length=dimensions.rods_apart + 0.03)
+        for rod in "ab":
+            body, near, far = (visual(f"{k}_rod_{rod}", i) for i in range(3))
+            place(body, dimensions.leg / 2.0, 0.0, 0.0)
+            _set_cylinder(body, length=dimensions.leg, radius=dimensions.rod_radius)
+            place(far, dimensions.leg, 0.0, 0.0)
+            for joint in (near, far):
+                _set_cylinder(
+                    joint, length=4.0 * dimensions.rod_radius, radius=dimensions.rod_radius + 0.0035
+                )
+        place(visual(f"{k}_crossbar", 0), 0.0, 0.0, -half)
+        _set_cylinder(visual(f"{k}_crossbar", 0), length=dimensions.rods_apart + 0.02)
+    for mount in ("platform_mount", "y_foot_end_mount", "z_foot_end_mount"):
+        place(joints[mount], dimensions.attachment, 0.0, 0.0)
+    middle = 0.5 * (dimensions.lower + dimensions.upper) + dimensions.attachment + SLIDER
+    rail = dimensions.upper - dimensions.lower + RAIL
+    for i in range(3):
+        origin = visual("base", i).find("origin")
+        places = origin.get("xyz").split()
+        places[i] = _number(middle)
+        origin.set("xyz", " ".join(places))
+        box = visual("base", i).find("geometry/box")
+        lengths = box.get("size").split()
+        lengths[i] = _number(rail)
+        box.set("size", " ".join(lengths))
+    text = str(etree.tostring(root, encoding="unicode"))
+    return f'<?xml version="1.0"?>\n<!-- {_words(dimensions)} -->\n{text}\n'
+
+
+def _describe(pattern: str, dimensions: Dimensions, counting: Sequence[Counting], file: str) -> str:
+    """YAML with the zeros of the drives, the radii of the rods, the joints and the workspace.
+
+    Raises:
+        RobotError: If the YAML has no place for one of them.
+    """
+    text, found = _RADIUS.subn(f"radius_mm: {in_mm(dimensions.rod_radius)}", _HEAD.sub("", pattern))
+    if not found:
+        raise RobotError("has no rods with a radius_mm", where=file)
+    for axis, joint in zip(AXES, counting, strict=True):
+        line = re.compile(_DRIVE.format(axis=axis))
+        drive = f"{{{drive_text(dimensions, joint)}}}"
+        text, found = line.subn(rf"\g<name>{drive}\g<rest>", text)
+        if found != 1:
+            raise RobotError(
+                f"has no line '{axis}_slide: {{zero_mm: ...}}'; expected one for its zero",
+                where=file,
+            )
+    box = workspace_text(dimensions)
+    if box:  # a workspace in the YAML alone stays
+        text, place = _WORKSPACE.sub("", text), _ORTHOCAL.search(_WORKSPACE.sub("", text))
+        if place is None:
+            raise RobotError("has no key orthocal with others below it", where=file)
+        at = place.start("indent")
+        text = f"{text[:at]}{place['indent']}workspace: {{box_mm: {box}}}\n{text[at:]}"
+    return f"# {_words(dimensions)}\n# Made from {MACHINE}: change dimensions there.\n{text}"
+
+
+def _override(pattern: str, tolerances: Mapping[str, float], file: str) -> str:
+    """YAML with other tolerances of some errors.
+
+    Raises:
+        RobotError: If the YAML has no place for them.
+    """
+    given = ", ".join(f"{json.dumps(name)}: {_number(v)}" for name, v in tolerances.items())
+    text, found = _TOLERANCES.subn(lambda m: f"{m[1]}, overrides: {{{given}}}}}", pattern)
+    if found != 1:
+        raise RobotError(
+            "has no line 'tolerances: {...}'; expected one for other tolerances", where=file
+        )
+    return text
+
+
+def _words(dimensions: Dimensions) -> str:
+    return f"A machine of the Orthoglide's kind: {dimensions.words}."
+
+
+def _set_cylinder(visual: etree._Element, *, length: float, radius: float | None = None) -> None:
+    cylinder = visual.find("geometry/cylinder")
+    cylinder.set("length", _number(length))
+    if radius is not None:
+        cylinder.set("radius", _number(radius))
+
+
+def _number(value: float) -> str:
+    return f"{round(value, 12) + 0.0:.12g}"

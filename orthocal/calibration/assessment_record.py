@@ -1,0 +1,254 @@
+"""The judgement of a calibration as data: findings, one decision, what to enter, the tool error.
+
+It is computed once (`orthocal.assessment.assess`), stored in calibration.json, and only rendered
+by text, JSON, report, scene and exports.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from orthocal.hypotheses.anomaly import AnomalyKind
+from orthocal.io.documents import Number, PositiveInSI
+from orthocal.io.fields import CLOSED, Many, NumberOrNaN, SizeOrNaN
+from orthocal.kinematics.workspace import describe_box
+from orthocal.units import InUnit, Unit
+
+Verdict = Literal["enter", "review", "reject"]
+
+EXIT_CODES: dict[Verdict, int] = {"enter": 0, "review": 3, "reject": 3}
+"""Exit codes of check, calibrate, compare and validate."""
+
+Severity = Literal["reject", "review", "note"]
+"""What a finding does to the verdict: `reject` and `review` decide it, a note does not."""
+
+FindingKind = Literal[
+    # mistakes in readings and changes between sessions (hypotheses)
+    AnomalyKind,
+    "ambiguous",
+    "inconsistent readings",
+    "no change",
+    "change unknown",
+    "scattered repeats",
+    # what no machine or gauge shows
+    "wrong dimensions",
+    "beyond tolerances",
+    "above tolerances",
+    "finer than the gauge",
+    "residuals too small",
+    "sigma too large",
+    "postures too near",
+    "legs differ",
+    # of a fit
+    "no convergence",
+    "noise unknown",
+    "noise from residuals",
+    "noise as stated",
+    "model error",
+    "gauge overstated",
+    "fits",
+    "no redundancy",
+    "nothing moved",
+    "held by a bound",
+    "linearisation error",
+    "inseparable",
+    "below the noise",
+    "line assumed",
+    # of what to enter
+    "no offset",
+    "no change needed",
+    "must change",
+    "not significant",
+    "controller not stated",
+    "tool error",
+    "out of reach",
+    # of a comparison of models
+    "recommended",
+    "not recommended",
+    "not determined",
+    "tolerances differ",
+    "residuals repeat",
+    "residuals differ",
+    "repetition unknown",
+    # of a validation
+    "as predicted",
+    "larger than predicted",
+    "nothing predicted",
+    "further change",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Place of a finding; None where a field does not apply."""
+
+    __pydantic_config__ = CLOSED
+
+    file: str | None = None
+    line: int | None = None
+    setup: str | None = None
+    posture: str | None = None
+    parameter: str | None = None
+    """Name of an error parameter, or of a drive."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finding:
+    """Something that was recognised in readings or in a result."""
+
+    __pydantic_config__ = CLOSED
+
+    kind: FindingKind
+    severity: Severity
+    text: str
+    """What was found, in a sentence or two."""
+    action: str = ""
+    """What to do next; empty if nothing."""
+    numbers: Mapping[str, NumberOrNaN] = field(default_factory=dict)
+    """By name, with the unit as a suffix (_mm, _um); pure numbers without."""
+    places: Many[Place] = ()
+    """Where; the first is the worst."""
+
+    @property
+    def words(self) -> str:
+        """Text and action."""
+        return f"{self.text} {self.action}".strip()
+
+    def to_document(self) -> dict[str, Any]:
+        """Plain data for JSON; null for what is unknown."""
+        return {
+            "kind": self.kind,
+            "severity": self.severity,
+            "text": self.text,
+            "action": self.action,
+            "numbers": {k: v if math.isfinite(v) else None for k, v in self.numbers.items()},
+            "places": [{k: getattr(p, k) for k in Place.__slots__} for p in self.places],
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decision:
+    """Decision: one verdict, its reason, and the next step."""
+
+    __pydantic_config__ = CLOSED
+
+    verdict: Verdict
+    headline: str
+    reason: str
+    """Why, in a sentence or two."""
+    action: str
+    """What to do next; empty if nothing."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 for enter, 3 for review and reject."""
+        return EXIT_CODES[self.verdict]
+
+    def to_document(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            "verdict": self.verdict,
+            "headline": self.headline,
+            "reason": self.reason,
+            "action": self.action,
+            "exit_code": self.exit_code,
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ControllerEntry(InUnit):
+    """Value to enter into the controller for one drive."""
+
+    __pydantic_config__ = CLOSED
+
+    drive: str
+    unit: Unit
+    active: Number | None
+    """Offset now in the controller, [unit]; None if the session does not state it."""
+    identified: Number
+    """Offset of the identified machine, [unit]."""
+    enter: Number
+    """Offset to enter, [unit]; what to add to the present one if that is unknown."""
+    std: SizeOrNaN
+    """Standard deviation of the value to enter, everything unknown included, [unit]."""
+    std_scatter: SizeOrNaN
+    """The part of it that is due to the noise of the readings, [unit]."""
+    held: Literal["known", "lower bound", "upper bound"] | None
+    """What holds it instead of the readings."""
+
+    @property
+    def change(self) -> float:
+        """Value to enter less the active one, [unit]."""
+        return self.enter - (0.0 if self.active is None else self.active)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToolErrorSummary:
+    """Expected RMS error of the tool over the workspace, [m].
+
+    `aligned`: after aligning the workpiece on the machine (translation and rotation removed), which
+    is what counts; `absolute`: in the machine's own coordinates.
+    """
+
+    __pydantic_config__ = CLOSED
+
+    box: Many[tuple[Number, Number]]
+    """Workspace, lowest and highest coordinate about the mechanical zero, [m]."""
+    coordinates: str
+    """Names of the coordinates: xyz."""
+    now: SizeOrNaN
+    """Aligned, with the offsets that are active now."""
+    entered: SizeOrNaN
+    """Aligned, with the offsets to be entered."""
+    compensated: SizeOrNaN
+    """Aligned, with a controller that corrects all identified errors."""
+    entered_absolute: SizeOrNaN
+    now_absolute: SizeOrNaN
+
+    @property
+    def region(self) -> str:
+        """The workspace in words: ±60 mm, or its ranges."""
+        return describe_box(np.array(self.box), self.coordinates)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assessment:
+    """The judgement of a calibration: verdict, findings, what to enter, the tool error."""
+
+    __pydantic_config__ = CLOSED
+
+    decision: Decision
+    findings: Many[Finding]
+    """The gravest first."""
+    entries: Many[ControllerEntry]
+    """What to enter, drive by drive; empty if no offset was identified."""
+    tool: ToolErrorSummary | None
+    """None if the robot has no tool, or nothing determines the noise."""
+    tolerance_scale: PositiveInSI
+    """Factor by which errors that were not identified exceed their tolerances; 1 if they do not."""
+
+    @property
+    def keeps_offsets(self) -> bool:
+        """True if the offsets in the controller need no change."""
+        return bool(self.of_kind("no change needed", "no offset"))
+
+    def of_kind(self, *kinds: FindingKind) -> tuple[Finding, ...]:
+        """Findings of some kinds, in their order."""
+        return tuple(f for f in self.findings if f.kind in kinds)
+
+    def to_document(self) -> dict[str, Any]:
+        """Plain data: `decision` and `findings` of a printed result."""
+        return {
+            "decision": self.decision.to_document(),
+            "findings": [f.to_document() for f in self.findings],
+        }
+
+
+def first_of(findings: Sequence[Finding], *kinds: FindingKind) -> Finding | None:
+    """The first finding of any of some kinds."""
+    return next((f for f in findings if f.kind in kinds), None)

@@ -1,0 +1,143 @@
+"""Identification: from a session to a calibration, before it is assessed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.arguments import require_kind, require_names
+from orthocal.calibration.build_record import assemble_calibration
+from orthocal.calibration.calibration import Calibration
+from orthocal.errors import NotIdentifiableError, ParameterError
+from orthocal.estimation.choice import Choice, choose
+from orthocal.estimation.diagnostics.profile_likelihood import profile_interval
+from orthocal.estimation.fit import Fit, first_sigma, fit_problem
+from orthocal.estimation.linear import linearise_at_reference
+from orthocal.estimation.loss import Loss, LossKind
+from orthocal.estimation.options import SolverKind, SolverOptions
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.kinematics.loop_closure import as_rows
+from orthocal.measurement.joining import Given, gather_sessions, join_sessions
+from orthocal.observation.observations import require_conditions
+from orthocal.session.session import Session
+from orthocal.statistics.identifiability import (
+    find_base_parameters,
+)
+from orthocal.statistics.noise import estimate_repeatability
+
+Array = NDArray[np.float64]
+
+
+MAX_BASE_ROUNDS = 8
+
+
+def identify(
+    sessions: Given | Sequence[Given],
+    choice: Choice | str | None = None,
+    *,
+    loss: Loss | LossKind | None = None,
+    solver: SolverOptions | SolverKind = "ipopt",
+    profile: Sequence[str] = (),
+    start: ArrayLike | None = None,
+) -> tuple[Calibration, Session]:
+    """Identify the errors of a machine from a session, with their uncertainty; not assessed.
+
+    Args:
+        sessions: The session, or the path to one; or several, which are fitted together.
+        choice: Which errors are free, and what is known of them; or the name of a model. By default
+            what the session is for, or offsets.
+        loss: What a residual costs: `squares` (the default), `huber`, or one with its own width.
+        solver: `ipopt` on the whole program, the reference; `eliminated`, the same optimum sooner;
+            `linearised`, as the paper; or one with its own settings.
+        profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
+        start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
+            solution.
+
+    Returns:
+        The calibration, and the session (or the joined sessions) that it is of.
+
+    Raises:
+        NotIdentifiableError: If the readings leave a parameter open and there is no prior.
+        SolverError: If the solver does not converge.
+        ClosureError: If the machine cannot reach a posture.
+        ParameterError: If the model or a name is unknown.
+        SessionError: If a reading lacks a condition that the effect of a free parameter needs.
+        TypeError: If an argument is of another kind.
+        ValueError: If there are not as many free parameters to start from as there are.
+    """
+    session = join_sessions(gather_sessions(sessions))
+    require_names(profile, argument="profile")
+    chosen = choose(choice, session)
+    options = _solver_options(solver, loss)
+    problem = CalibrationProblem(session, chosen.select(session.robot.parameters))
+    require_conditions(session, problem.machine_selection.names)
+    if start is not None:
+        n = problem.n_machine
+        start, _ = as_rows(start, n, "free parameters to start from")
+        if start.shape != (1, n) or not np.isfinite(start).all():
+            raise ValueError(f"expected {n} finite numbers to start from")
+        start = np.append(start[0], np.zeros(problem.n_free - n))
+    whole = None
+    if chosen.base:
+        whole = problem
+        fit = _fit_base(whole, options=options, start=start)
+    else:
+        fit = fit_problem(problem, options=options, start=start)
+    profiled = _match_profiled(fit.problem, profile)
+    intervals = {name: profile_interval(fit, name) for name in profiled}
+    return assemble_calibration(fit, whole=whole, intervals=intervals), session
+
+
+def _solver_options(
+    solver: SolverOptions | SolverKind, loss: Loss | LossKind | None
+) -> SolverOptions:
+    require_kind(solver, (SolverOptions, str), expected="a solver's name, or SolverOptions(...)")
+    require_kind(loss, (Loss, str, type(None)), expected="a loss's name, or Loss(...)")
+    options = solver if isinstance(solver, SolverOptions) else SolverOptions(solver=solver)
+    if loss is None:
+        return options
+    return replace(options, loss=loss if isinstance(loss, Loss) else Loss(loss))
+
+
+def _fit_base(
+    problem: CalibrationProblem, *, options: SolverOptions | None, start: ArrayLike | None
+) -> Fit:
+    """Solve a problem in base parameters: what cannot be told apart is told as one.
+
+    How many there are depends on the noise, and that on what they leave: until both agree.
+    """
+    information = linearise_at_reference(problem).information
+    repeatability = estimate_repeatability(problem.values, problem.observations)
+    sigma = first_sigma(problem.session, repeatability)
+    leads: list[str] = []
+    for _ in range(MAX_BASE_ROUNDS):
+        factor = information.factor[:, : problem.n_machine]
+        machine = problem.machine_selection.parameters
+        found = find_base_parameters(factor, machine, threshold=sigma)
+        if not found:
+            raise NotIdentifiableError(
+                "the readings tell none of the free parameters",
+                parameters=problem.machine_selection.names,
+            )
+        chosen = [c.terms[0][0] for c in found]
+        if chosen == leads:
+            break
+        leads = chosen
+        reduced = CalibrationProblem(problem.session, problem.machine_selection.keep(leads))
+        fit = fit_problem(reduced, options=options, start=start)
+        sigma = max(fit.sigma, sigma)  # no more parameters than before
+    return fit
+
+
+def _match_profiled(problem: CalibrationProblem, patterns: Sequence[str]) -> list[str]:
+    if not patterns:
+        return []
+    found = [n for n in problem.robot.parameters.select(patterns) if n in problem.free]
+    if not found:
+        raise ParameterError(
+            f"{', '.join(patterns)}: no free parameter to find the interval of",
+        )
+    return found

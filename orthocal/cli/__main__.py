@@ -1,7 +1,0 @@
-"""python -m orthocal.cli."""
-
-from __future__ import annotations
-
-from orthocal.cli import main
-
-main()

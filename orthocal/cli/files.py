@@ -1,0 +1,103 @@
+"""Sessions that commands read, and directories that they must not overwrite."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from orthocal.errors import OrthocalError, SessionError
+
+if TYPE_CHECKING:
+    from orthocal.session.session import Session
+
+SIMULATED = "Simulated"
+"""First word of the source of a simulated session."""
+
+FEWEST_DIFFERENT = 4
+"""Number of different values from which equal readings show that a session is a copy."""
+
+
+def load_each_once(paths: Sequence[Path]) -> list[Session]:
+    """Load sessions, and refuse those whose readings would count twice.
+
+    Raises:
+        SessionError: If two sessions are the same, or have the same readings.
+    """
+    from orthocal.measurement.files.session_file import load_session
+
+    sessions: list[Session] = []
+    for path in paths:
+        session = load_session(path)
+        if any(session.sha256 == other.sha256 for other in sessions):
+            raise SessionError(
+                "is the same session as one before it; its readings would count twice",
+                where=str(path),
+            )
+        copied = next((other for other in sessions if _same_readings(session, other)), None)
+        if copied is not None:
+            raise SessionError(
+                f"has the same readings as {copied.path}: a copy that was not measured again?",
+                where=str(session.readings_path or path),
+            )
+        sessions.append(session)
+    return sessions
+
+
+def _same_readings(one: Session, other: Session) -> bool:
+    """True for the same rows with the same values, which two measurements do not give."""
+    rows = [
+        [(r.setup, r.posture, r.minus, r.cycle, r.value) for r in s.readings] for s in (one, other)
+    ]
+    return rows[0] == rows[1] and len({r[-1] for r in rows[0]}) >= FEWEST_DIFFERENT
+
+
+def require_new_files(
+    directory: Path,
+    names: Iterable[str],
+    *,
+    force: bool = False,
+    remedy: str = "--force overwrites it",
+    error: type[OrthocalError] = SessionError,
+) -> None:
+    """Refuse to overwrite files of a directory.
+
+    Args:
+        directory: The directory; it need not exist.
+        names: Names of the files.
+        force: True to allow it.
+        remedy: End of the message.
+        error: Kind of error to raise.
+
+    Raises:
+        OrthocalError: If the directory cannot be written, or of kind `error`, if a file exists.
+    """
+    from orthocal.io.files import exists, require_writable
+
+    require_writable(directory)
+    for name in names:
+        if exists(directory / name) and not force:
+            raise error(f"exists already; {remedy}", where=str(directory / name))
+
+
+def require_no_readings(directory: Path) -> None:
+    """Refuse to overwrite measured readings, even with --force.
+
+    Raises:
+        SessionError: If the session of the directory has readings that were not simulated.
+    """
+    from orthocal.io.files import exists
+    from orthocal.measurement.files.session_file import SESSION, load_rows
+
+    if not exists(directory / SESSION):
+        return
+    try:
+        session, unread = load_rows(directory)
+    except OrthocalError:  # it was not a session
+        return
+    count = len(session.readings) - len(unread)
+    if count and not session.source.startswith(SIMULATED):
+        raise SessionError(
+            f"contains {count} readings, which --force does not overwrite; move them first",
+            where=str(session.readings_path or directory),
+        )

@@ -1,0 +1,69 @@
+"""Offset and scale of each drive.
+
+    really at  (gain + s) ρ + Δρ
+
+for the commanded coordinate ρ, with the offset Δρ (paper, equation 1) and the scale error s; the
+gain of the nominal machine is 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import casadi as ca
+
+from orthocal.effects.protocol import Effect, EffectKeys, Symbols
+from orthocal.io.documents import PositiveNumber
+from orthocal.robot.model import Robot
+from orthocal.robot.parameters import ElementaryError
+from orthocal.units import MM, MRAD, PPM
+
+
+class DriveTolerances(EffectKeys):
+    """Tolerances of the drives, under `orthocal.tolerances`."""
+
+    offset_mm: PositiveNumber = 5.0
+    offset_mrad: PositiveNumber = 10.0
+    scale_ppm: PositiveNumber = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class DriveErrors(Effect):
+    """Offset and scale of each drive."""
+
+    name = "drive"
+    keys = DriveTolerances
+
+    robot: Robot
+    errors: tuple[ElementaryError, ...]
+    """`<drive>.offset` of all drives, then `<drive>.scale`."""
+
+    @classmethod
+    def from_keys(cls, keys: DriveTolerances, robot: Robot) -> Self:
+        """The effect of a robot; arguments as for `Effect.from_keys`."""
+        size = {"m": keys.offset_mm * MM, "rad": keys.offset_mrad * MRAD}
+        offsets = (
+            ElementaryError(
+                f"{d.name}.offset", "offset", d.name, d.unit, size[d.unit], complete=True
+            )
+            for d in robot.drives
+        )
+        scale = keys.scale_ppm * PPM
+        scales = (
+            ElementaryError(f"{d.name}.scale", "scale", d.name, "1", scale, complete=True)
+            for d in robot.drives
+        )
+        return cls(robot, (*offsets, *scales))
+
+    def describe(self) -> str:
+        """Description in a few words."""
+        return "offset and scale of each drive"
+
+    def drives(self, coordinates: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
+        """Actual drive coordinates; arguments as for `Effect.drives`."""
+        offset, scale = (
+            ca.vertcat(*(errors[f"{d.name}.{kind}"] for d in self.robot.drives))
+            for kind in ("offset", "scale")
+        )
+        return (ca.SX(self.robot.drive_gain) + scale) * coordinates + offset

@@ -1,0 +1,115 @@
+"""Elementary errors of placements: joints, and the frames of closures, legs and the tool.
+
+    placement · exp6(δ),  δ = (translation, rotation)
+
+A parameter is one component of the twist δ, in the axes of the joint or frame:
+
+    x_coupler.rx      rotation of the placement of joint x_coupler about its own x axis
+    frame.tcp.z       translation of frame tcp along its own z axis
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import casadi as ca
+import numpy as np
+
+from orthocal.effects.protocol import Effect, EffectKeys, Placement, Symbols, placement_of
+from orthocal.io.documents import PositiveNumber
+from orthocal.robot.frames import hangs_on
+from orthocal.robot.model import Robot, joint_axis
+from orthocal.robot.parameters import AXES, ElementaryError
+from orthocal.units import MM, MRAD
+
+
+class GeometryTolerances(EffectKeys):
+    """Tolerances of placements, under `orthocal.tolerances`."""
+
+    translation_mm: PositiveNumber = 0.1
+    rotation_mrad: PositiveNumber = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class GeometryErrors(Effect):
+    """Elementary errors of the placements of joints and frames."""
+
+    name = "geometry"
+    keys = GeometryTolerances
+
+    robot: Robot
+    errors: tuple[ElementaryError, ...]
+    """Errors of joints, then of the frames in use.
+
+    The component of a motor's placement along or about its own axis is left out: the offset is the
+    same error.
+    """
+
+    @classmethod
+    def from_keys(cls, keys: GeometryTolerances, robot: Robot) -> Self:
+        """The effect of a robot; arguments as for `Effect.from_keys`."""
+        return cls(robot, (*_joint_errors(robot, keys), *_frame_errors(robot, keys)))
+
+    def describe(self) -> str:
+        """Description in a few words."""
+        return "position and orientation of each joint and frame"
+
+    def placements(self, errors: Symbols, conditions: Symbols) -> Mapping[Placement, ca.SX]:
+        """Twists of placements; arguments as for `Effect.placements`."""
+        twists: dict[Placement, ca.SX] = {}
+        for e in self.errors:
+            twists.setdefault(placement_of(self.robot, e), ca.SX(6, 1))[e.axis] += errors[e.name]
+        return twists
+
+
+def _joint_errors(robot: Robot, keys: GeometryTolerances) -> Iterator[ElementaryError]:
+    model, motors = robot.model, {d.name for d in robot.drives}
+    for i in range(1, model.njoints):
+        name = str(model.names[i])
+        own = int(np.abs(joint_axis(model, i)).argmax()) if name in motors else None
+        for axis in range(6):
+            if axis != own:
+                yield _error(name, axis, keys, complete=True, of_frame=False)
+
+
+def _frame_errors(robot: Robot, keys: GeometryTolerances) -> Iterator[ElementaryError]:
+    frames = [f for c in robot.closures for f in (c.frame_a, c.frame_b)]
+    frames += [f for leg in robot.legs.values() for f in (leg.root, leg.tip)]
+    frames += [robot.tcp.frame] if robot.tcp else []
+    parts = _ends_of_loops(robot)
+    for frame in dict.fromkeys(frames):
+        for axis in range(6):
+            yield _error(frame, axis, keys, complete=frame in parts, of_frame=True)
+
+
+def _error(
+    owner: str, axis: int, keys: GeometryTolerances, *, complete: bool, of_frame: bool
+) -> ElementaryError:
+    translation = axis < 3
+    return ElementaryError(
+        name=f"{'frame.' if of_frame else ''}{owner}.{AXES[axis]}",
+        kind="translation" if translation else "rotation",
+        owner=owner,
+        unit="m" if translation else "rad",
+        tolerance=keys.translation_mm * MM if translation else keys.rotation_mrad * MRAD,
+        of_frame=of_frame,
+        axis=axis,
+        complete=complete,
+    )
+
+
+def _ends_of_loops(robot: Robot) -> frozenset[str]:
+    """Frames in which loops end, the parts of a machine among its frames.
+
+    An error of a frame that carries the tool moves the tool alone: it says where on the platform
+    that is. The ends of legs' lines are no parts.
+    """
+    tool: set[int] = set()
+    current = None if robot.tcp is None else robot.frame_id(robot.tcp.frame)
+    while current is not None:
+        tool.add(current)
+        current = hangs_on(robot.model, current)
+    ends = {frame for c in robot.closures for frame in (c.frame_a, c.frame_b)}
+    return frozenset(frame for frame in ends if robot.frame_id(frame) not in tool)

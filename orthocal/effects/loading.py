@@ -1,0 +1,112 @@
+"""Loading robots with their effects and error parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+from pydantic import Field
+
+from orthocal.effects.drive import DriveErrors, DriveTolerances
+from orthocal.effects.geometry import GeometryErrors, GeometryTolerances
+from orthocal.effects.protocol import Effect
+from orthocal.effects.registry import find_effect
+from orthocal.errors import OrthocalError, ParameterError, RobotError
+from orthocal.io.documents import PositiveNumber, validate
+from orthocal.robot.loading import LOADED, load_bare_robot
+from orthocal.robot.model import Robot
+from orthocal.robot.parameters import COMPLETE, ElementaryError, build_parameters
+from orthocal.robot.redundant import find_idle_errors
+
+MODELS: Mapping[str, Sequence[str]] = {"offsets": ("*.offset",), "full": COMPLETE}
+"""Models of each robot whose YAML does not define models of these names."""
+
+
+class ToleranceKeys(GeometryTolerances, DriveTolerances):
+    """Keys under `orthocal.tolerances`: one standard deviation of each kind of error."""
+
+    overrides: dict[str, PositiveNumber] = Field(default_factory=dict)
+    """Parameter name or glob, with the unit as suffix, to value; later ones win."""
+
+
+def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
+    """Load a robot: URDF and YAML, checked against each other, with its loops closed.
+
+    A robot is never changed: the same files give the same one again.
+
+    Args:
+        robot: Name of a robot that comes with orthocal, or path to a robot directory.
+        beside: Directory that a relative path counts from; the working directory by default.
+
+    Raises:
+        RobotError: Naming file and line or key, what was found and what was expected.
+    """
+    return _add_parameters(load_bare_robot(robot, beside=beside))
+
+
+@lru_cache(maxsize=LOADED)
+def _add_parameters(robot: Robot) -> Robot:
+    where, declared = f"{robot.yaml}: orthocal", robot.declared
+    errors: dict[str, ElementaryError] = {}
+    for effect in robot_effects(robot):
+        for error in effect.errors:
+            if errors.setdefault(error.name, error) is not error:
+                raise RobotError(
+                    f"its parameter '{error.name}' exists already",
+                    where=f"{where}.effects.{effect.name}",
+                )
+    elementary, models = tuple(errors.values()), dict(declared.models)
+    for name, patterns in MODELS.items():
+        models.setdefault(name, patterns)
+    try:
+        parameters = build_parameters(
+            elementary,
+            sums=declared.sums,
+            overrides=_read_tolerances(robot).overrides,
+            models=models,
+            find_idle=partial(find_idle_errors, robot, elementary),
+        )
+    except ParameterError as e:
+        raise RobotError(e.problem, where=where) from None
+    return replace(robot, parameters=parameters)
+
+
+@lru_cache(maxsize=2 * LOADED)
+def robot_effects(robot: Robot) -> tuple[Effect, ...]:
+    """Effects of a robot: drive, geometry, and those that its YAML names, in this order.
+
+    Raises:
+        RobotError: If the YAML names an effect that there is not, or one of its keys does not fit.
+    """
+    tolerances = _read_tolerances(robot)
+    effects: list[Effect] = [
+        DriveErrors.from_keys(tolerances, robot),
+        GeometryErrors.from_keys(tolerances, robot),
+    ]
+    for name, data in robot.declared.effects.items():
+        under = f"orthocal.effects.{name}"
+        kind = find_effect(name, where=f"{robot.yaml}: {under}", error=RobotError)
+        keys = validate(kind.keys, data, where=str(robot.yaml), error=RobotError, under=under)
+        try:
+            effects.append(kind.from_keys(keys, robot))
+        except OrthocalError as e:
+            key = ".".join(part for part in (under, e.where) if part)
+            raise RobotError(e.problem, where=f"{robot.yaml}: {key}") from None
+    return tuple(effects)
+
+
+def reading_effects(robot: Robot) -> tuple[Effect, ...]:
+    """Effects of a robot that change what a gauge shows."""
+    return tuple(e for e in robot_effects(robot) if type(e).reading is not Effect.reading)
+
+
+def _read_tolerances(robot: Robot) -> ToleranceKeys:
+    return validate(
+        ToleranceKeys,
+        robot.declared.tolerances,
+        where=str(robot.yaml),
+        error=RobotError,
+        under="orthocal.tolerances",
+    )

@@ -1,0 +1,131 @@
+"""A machine under its effects, as expressions: actual drive coordinates and placement twists."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+
+from orthocal.effects.loading import robot_effects
+from orthocal.effects.protocol import NEUTRAL, Condition, Placement, Symbols, condition_size
+from orthocal.robot.frames import hangs_on
+from orthocal.robot.model import Robot, Rod
+
+SAME_PLACE = 1e-6
+"""Distance of two places along a rod that count as one, as a share of the rod's length."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MachineExpressions:
+    """Drives and placements of a machine as expressions of errors, commands and conditions."""
+
+    actuated: ca.SX
+    """Actual drive coordinates, shape (n_drives,), [m, rad]."""
+    twists: Mapping[Placement, ca.SX]
+    """Twist δ of each placement that effects act on, shape (6,), [m, rad]."""
+
+
+def neutral_conditions(robot: Robot) -> dict[Condition, ca.SX]:
+    """Conditions that are not stated, as constants."""
+    return {name: ca.SX([v] * condition_size(robot, name)) for name, v in NEUTRAL.items()}
+
+
+def express_machine(
+    robot: Robot,
+    commanded: ca.SX,
+    errors: Mapping[str, ca.SX | float],
+    conditions: Mapping[Condition, ca.SX] | None = None,
+) -> MachineExpressions:
+    """Drives and placements of a robot under all of its effects.
+
+    Args:
+        robot: The nominal robot.
+        commanded: Commanded drive coordinates, shape (n_drives,), [m, rad].
+        errors: Parameter name to expression or number, [unit of the parameter]; 0 where absent.
+        conditions: Conditions of the posture; neutral where absent.
+    """
+    elementary: dict[str, ca.SX] = dict.fromkeys(robot.parameters.elementary, ca.SX(1, 1))
+    for name, value in errors.items():
+        for term, coefficient in robot.parameters[name].terms:
+            elementary[term] = elementary[term] + coefficient * value
+    known = {**neutral_conditions(robot), **(conditions or {})}
+    actuated, twists = commanded, dict[Placement, ca.SX]()
+    for effect in robot_effects(robot):
+        own = {e.name: elementary[e.name] for e in effect.errors}
+        needed: Symbols = {name: known[name] for name in effect.conditions}
+        actuated = effect.drives(actuated, own, needed)
+        changes = [effect.placements(own, needed)]
+        for (leg, rod), change in effect.rods(own, needed).items():
+            changes.append(stretch_rod(robot, robot.legs[leg].rods[rod], change))
+        for placement, twist in (item for part in changes for item in part.items()):
+            before = twists.get(placement)
+            twists[placement] = twist if before is None else before + twist
+    return MachineExpressions(actuated, twists)
+
+
+def stretch_rod(robot: Robot, rod: Rod, change: ca.SX) -> dict[Placement, ca.SX]:
+    """Twists of the placements on a rod whose length changes, uniformly along its axis.
+
+    Args:
+        robot: The nominal robot.
+        rod: One of its rods.
+        change: Change of the length, [m].
+    """
+    model = robot.model
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, robot.configuration(robot.zero))
+    root, tip = (data.oMf[robot.frame_id(f)].translation for f in (rod.root, rod.tip))
+    axis = (tip - root) / rod.length
+
+    def share(position: np.ndarray) -> float:
+        return float(axis @ (position - root)) / rod.length
+
+    body = _body_of(robot, rod, {i: share(data.oMi[i].translation) for i in range(model.njoints)})
+    twists: dict[Placement, ca.SX] = {}
+
+    def move(placement: Placement, pose: pin.SE3, carrier: pin.SE3) -> None:
+        part = share(pose.translation) - share(carrier.translation)
+        if abs(part) > SAME_PLACE:
+            local = pose.rotation.T @ axis * part
+            local[np.abs(local) < SAME_PLACE] = 0.0
+            twists[placement] = ca.vertcat(ca.sparsify(ca.SX(local)) * change, ca.SX(3, 1))
+
+    for joint in range(1, model.njoints):
+        if int(model.parents[joint]) == body:
+            # before its motion, in which placements act
+            pose = data.oMi[body] * model.jointPlacements[joint]
+            move(Placement(joint, False), pose, data.oMi[body])
+    for frame in sorted(_used_frames(robot)):
+        if int(model.frames[frame].parentJoint) == body:
+            above = hangs_on(model, frame)
+            carrier = data.oMi[body] if above is None else data.oMf[above]
+            move(Placement(frame, True), data.oMf[frame], carrier)
+    return twists
+
+
+def _body_of(robot: Robot, rod: Rod, share: Mapping[int, float]) -> int:
+    """Joint that moves a rod's link: the last one before its tip, from the root's."""
+    model = robot.model
+    first, joint = (int(model.frames[robot.frame_id(f)].parentJoint) for f in (rod.root, rod.tip))
+    while joint != first and joint > 0 and share[joint] > 1.0 - SAME_PLACE:
+        joint = int(model.parents[joint])
+    return joint
+
+
+def _used_frames(robot: Robot) -> set[int]:
+    """Frames of closures, legs, rods and the tool, with the frames that carry them."""
+    names = [f for c in robot.closures for f in (c.frame_a, c.frame_b)]
+    names += [f for leg in robot.legs.values() for f in (leg.root, leg.tip)]
+    rods = (rod for leg in robot.legs.values() for rod in leg.rods.values())
+    names += [f for rod in rods for f in (rod.root, rod.tip)]
+    names += [robot.tcp.frame] if robot.tcp else []
+    frames: set[int] = set()
+    for name in names:
+        frame: int | None = robot.frame_id(name)
+        while frame is not None:
+            frames.add(frame)
+            frame = hangs_on(robot.model, frame)
+    return frames

@@ -1,0 +1,141 @@
+"""Protocol of an effect: its parameters with priors, how it acts, the conditions it needs.
+
+Each effect is one file. It reads its own keys of the robot's YAML and returns CasADi expressions of
+its parameters and of the conditions of a reading. All derivatives come from these expressions, and
+the same expressions serve the predicted readings, the loop closures and the program for Ipopt.
+
+How the effects that a machine may have beyond its geometry use the protocol:
+
+- Backlash: one error `<drive>.backlash` for each drive, unit m, `positive`. `conditions` is
+  ("approach",), and `drives` returns `coordinates - 0.5 * b * conditions["approach"]`.
+- Periodic error of a screw: errors `<drive>.sine` and `<drive>.cosine`, unit m. `drives` adds
+  `A sin(2πρ/lead) + B cos(2πρ/lead)`; the stated lead is a key. No condition.
+- Thermal expansion: errors `legs.expansion` and `screws.expansion`, unit 1/K, and `conditions` is
+  ("temperature",). With the change of temperature ΔT, `drives` adds `α ΔT (ρ − fixed point)`, and
+  `rods` returns `α ΔT × length` for each rod.
+- Drift of a gauge: `setup_errors` holds one rate for each setup, unit m/s, and `conditions` is
+  ("time",). `reading` adds `rate × time`.
+- Compliance: no error, but stiffnesses as keys. `rods` returns the shortening c F of each rod, with
+  F from the nominal machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Self
+
+import casadi as ca
+from pydantic import BaseModel, ConfigDict
+
+from orthocal.robot.model import Robot
+from orthocal.robot.parameters import ElementaryError
+
+Symbols = Mapping[str, ca.SX]
+"""Names to expressions."""
+
+Condition = Literal["approach", "temperature", "time"]
+"""Condition of a reading: the direction of each drive's last motion, shape (n_drives,), 1 where its
+coordinate grew, -1 where it fell, 0 if unknown; the temperature, [°C]; the time since the first
+reading of the setup, [s]."""
+
+NEUTRAL: dict[Condition, float] = {"approach": 0.0, "temperature": 20.0, "time": 0.0}
+"""Value of a condition that is not stated. The temperature is that of ISO 1."""
+
+
+def condition_size(robot: Robot, name: Condition) -> int:
+    """Numbers of a condition."""
+    return len(robot.drives) if name == "approach" else 1
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Placement of a joint or frame in what carries it."""
+
+    index: int
+    """Index of the joint or frame in the robot's model."""
+    of_frame: bool
+
+
+def placement_of(robot: Robot, error: ElementaryError) -> Placement:
+    """The placement that an error of a joint or frame displaces."""
+    if error.of_frame:
+        return Placement(robot.frame_id(error.owner), True)
+    return Placement(int(robot.model.getJointId(error.owner)), False)
+
+
+class EffectKeys(BaseModel):
+    """Keys of an effect in the robot's YAML, under `orthocal.effects.<name>`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+
+class Effect:
+    """A systematic effect; those methods that do not apply are inherited.
+
+    In expressions `errors` maps the names of the effect's parameters, and `conditions` those of the
+    conditions that it needs.
+    """
+
+    name: ClassVar[str]
+    """Key under `orthocal.effects`."""
+    keys: ClassVar[type[EffectKeys]] = EffectKeys
+    conditions: ClassVar[tuple[Condition, ...]] = ()
+    """Conditions of a reading that its expressions depend on."""
+
+    errors: tuple[ElementaryError, ...] = ()
+    """Parameters of the machine, 0 for the nominal machine, with their tolerances."""
+    setup_errors: tuple[ElementaryError, ...] = ()
+    """Parameters of each setup; the name of the setup comes before theirs."""
+
+    @classmethod
+    def from_keys(cls, keys: Any, robot: Robot) -> Self:  # noqa: ANN401 - an instance of `keys`
+        """The effect of a robot.
+
+        Args:
+            keys: Validated keys.
+            robot: The robot, without error parameters.
+
+        Raises:
+            OrthocalError: If a key does not fit the robot; its `where` is the key.
+        """
+        raise NotImplementedError
+
+    def describe(self) -> str:
+        """Description in a few words."""
+        raise NotImplementedError
+
+    def drives(self, coordinates: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
+        """Actual drive coordinates.
+
+        Args:
+            coordinates: Coordinates after the preceding effects, shape (n_drives,), [m, rad]; those
+                that the controller commands for the first effect.
+            errors: The effect's parameters.
+            conditions: The conditions that it needs.
+
+        Returns:
+            Shape (n_drives,), [m, rad].
+        """
+        return coordinates
+
+    def placements(self, errors: Symbols, conditions: Symbols) -> Mapping[Placement, ca.SX]:
+        """Twists δ of placements, shape (6,) each, [m, rad]; effects on one placement add up."""
+        return {}
+
+    def rods(self, errors: Symbols, conditions: Symbols) -> Mapping[tuple[str, str], ca.SX]:
+        """Leg and rod to the change of the rod's length, [m]; effects on one rod add up."""
+        return {}
+
+    def reading(self, reading: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
+        """What the gauge shows.
+
+        Args:
+            reading: Reading after the preceding effects, [m]; that of the sensor for the first.
+            errors: The effect's parameters of the setup (`setup_errors`).
+            conditions: The conditions that it needs.
+
+        Returns:
+            [m].
+        """
+        return reading

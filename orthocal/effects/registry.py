@@ -1,0 +1,46 @@
+"""Effects that a robot's YAML may name: built in, registered, or from installed packages.
+
+A package offers an effect by an entry point of the group `orthocal.effects`. Its name is that of
+the effect, and its object is the class:
+
+    [project.entry-points."orthocal.effects"]
+    backlash = "my_package.backlash:Backlash"
+"""
+
+from __future__ import annotations
+
+from orthocal.effects.protocol import Effect
+from orthocal.errors import OrthocalError
+from orthocal.runtime.registry import Registry
+
+GROUP = "orthocal.effects"
+"""Group of the entry points by which installed packages offer effects."""
+
+
+def _read_effect(name: str, offered: type[Effect]) -> type[Effect]:
+    if not issubclass(offered, Effect) or offered.name != name:
+        raise TypeError(f"{offered.__qualname__} is not an Effect with name = '{name}'")
+    return offered
+
+
+_EFFECTS = Registry[type[Effect]](GROUP, "effect", _read_effect, {})
+
+
+def register_effect(effect: type[Effect]) -> None:
+    """Register an effect; it replaces one of the same name."""
+    _EFFECTS.register(effect.name, effect)
+
+
+def unregister_effect(name: str) -> None:
+    """Forget a registered effect."""
+    _EFFECTS.unregister(name)
+
+
+def effect_names() -> tuple[str, ...]:
+    """Names of all effects that a robot's YAML may name."""
+    return _EFFECTS.names
+
+
+def find_effect(name: str, *, where: str, error: type[OrthocalError]) -> type[Effect]:
+    """The effect of a name; arguments and errors as for `Registry.find`."""
+    return _EFFECTS.find(name, where=where, error=error)

@@ -1,0 +1,193 @@
+"""Changes between joined sessions: other offsets in the controller than stated, a changed machine.
+
+A session whose offsets E are stated but whose controller holds C shows a machine that is E − C off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations, permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.hypotheses.anomaly import AnomalyKind, Explanation
+from orthocal.hypotheses.hypothesis import Family, MachineShift
+from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.session.session import Session
+
+Array = NDArray[np.float64]
+
+MOST_DRIVES = 6
+"""Drives up to which all choices among them are considered."""
+
+DETECTED = 5.5
+"""Change, over its standard deviation, from which on its evidence is clear."""
+
+ROUNDING = 1e-6
+"""Difference of offsets that counts as none, [m, rad]."""
+
+
+def changes_between_sessions(model: LinearModel) -> Iterator[Family]:
+    """Offsets that are not as stated, and machines that changed; none for a single session."""
+    if len(model.labels) < 2:
+        return
+    offsets = _wrong_offsets(model)
+    if offsets is not None:
+        yield offsets
+    yield from _changed(model)
+
+
+def _wrong_offsets(model: LinearModel) -> Family | None:
+    drives = [d.name for d in model.problem.robot.drives]
+    place, active, labels = model.offsets, model.active, model.labels
+    scale = model.problem.theta_scale
+    tried: list[tuple[AnomalyKind, int, tuple[int, ...], Array]] = []
+    for k in range(len(labels)):
+        before = active[k - 1] if k else np.zeros(len(drives))
+        tried += [(kind, k, moved, c) for kind, moved, c in enter_wrongly(before, active[k])]
+    if not tried or len(place) < len(drives):
+        return None
+
+    def explain(h: int) -> Explanation:
+        kind, k, moved, c = tried[h]
+        return Explanation(
+            kind,
+            "session",
+            drives=tuple(drives[i] for i in moved),
+            offsets=tuple(c.tolist()),
+            sessions=(labels[k],),
+        )
+
+    shifts = []
+    for _, k, _, c in tried:
+        direction = np.zeros(scale.size)
+        for i, name in enumerate(drives):
+            direction[place[name]] = (active[k, i] - c[i]) / scale[place[name]]
+        shifts.append(MachineShift(np.arange(len(labels)) == k, direction))
+    return Family(explain, len(tried), len(tried), shifts=shifts)
+
+
+def enter_wrongly(
+    before: Array, stated: Array
+) -> Iterator[tuple[AnomalyKind, tuple[int, ...], Array]]:
+    """Offsets that may be in a controller instead of those stated.
+
+    Args:
+        before: Offsets that were active before, shape (n_drives,), [m, rad].
+        stated: Offsets that were to be entered, shape (n_drives,), [m, rad].
+
+    Yields:
+        Kind, drives concerned, and the offsets, each set of offsets once.
+    """
+    change, n = stated - before, stated.size
+    ways: tuple[tuple[AnomalyKind, Array], ...] = (
+        ("offsets not entered", before),
+        ("offsets not entered", np.zeros(n)),
+        ("offsets reversed", -stated),
+        ("offsets reversed", before - change),
+        ("offsets entered twice", 2.0 * stated),
+        ("offsets entered twice", before + stated),
+        ("offsets entered twice", stated + change),
+    )
+    seen: set[tuple[int, ...]] = {(0,) * n}
+
+    def is_new(values: Array) -> bool:
+        key = tuple(np.round((values - stated) / ROUNDING).astype(np.int64).tolist())
+        new = key not in seen
+        seen.add(key)
+        return new
+
+    for kind, values in ways:
+        other = np.flatnonzero(np.abs(values - stated) > ROUNDING).tolist()
+        sizes = range(len(other), 0, -1) if n <= MOST_DRIVES else (len(other),)
+        for drives in (d for count in sizes if count for d in combinations(other, count)):
+            entered = stated.copy()
+            entered[list(drives)] = values[list(drives)]
+            if is_new(entered):
+                yield kind, drives, entered
+    if n > MOST_DRIVES:
+        return
+    for order in permutations(range(n)):
+        entered = stated[list(order)]
+        if is_new(entered):
+            moved = np.abs(entered - stated) > ROUNDING
+            yield "offsets interchanged", tuple(np.flatnonzero(moved).tolist()), entered
+
+
+def _changed(model: LinearModel) -> Iterator[Family]:
+    """One parameter that differs from a session on, by an unknown amount."""
+    problem = model.problem
+    parameters, drive_of = problem.robot.parameters, {v: k for k, v in model.offsets.items()}
+    place = {name: i for i, name in enumerate(problem.free[: problem.n_machine])}
+    single: list[tuple[str, Array]] = []
+    other: list[tuple[str, Array]] = []
+    for name, i in place.items():
+        direction = np.zeros(problem.n_free)
+        direction[i] = 1.0 / problem.theta_scale[i]
+        (single if i in drive_of else other).append((name, direction))
+    for p in parameters:
+        if len(p.terms) > 1 and p.name not in place and all(t in place for t, _ in p.terms):
+            direction = np.zeros(problem.n_free)
+            for term, coefficient in p.terms:
+                direction[place[term]] = coefficient / problem.theta_scale[place[term]]
+            other.append((p.name, direction))
+    for directions in (single, other):
+        if directions:
+            yield _steps(model, directions, drive_of, place)
+
+
+def _steps(
+    model: LinearModel,
+    directions: list[tuple[str, Array]],
+    drive_of: dict[int, str],
+    place: dict[str, int],
+) -> Family:
+    labels, active = model.labels, model.active
+    tried = [(k, name, d) for k in range(1, len(labels)) for name, d in directions]
+
+    def explain(h: int) -> Explanation:
+        k, name, _ = tried[h]
+        drive = drive_of.get(place.get(name, -1))
+        entered = drive is not None and bool(np.abs(active[k] - active[k - 1]).max() > ROUNDING)
+        return Explanation(
+            "offset of one drive" if entered else "machine changed",
+            "session",
+            drives=() if drive is None else (drive,),
+            parameters=(name,),
+            sessions=(labels[k],),
+        )
+
+    sessions = np.arange(len(labels))
+    shifts = [MachineShift(sessions >= k, d) for k, _, d in tried]
+    return Family(explain, len(tried), len(tried), shifts=shifts, known=False)
+
+
+def detectable_changes(session: Session) -> dict[str, float]:
+    """Smallest change of each drive's offset between joined sessions that would be detected.
+
+    Args:
+        session: Joined sessions.
+
+    Returns:
+        Drive to size, [SI]; infinite where no change would be. Empty for a single session.
+
+    Raises:
+        ClosureError: If the machine cannot reach a posture.
+    """
+    model = LinearModel(session)
+    if len(model.labels) < 2 or model.dof < 1:
+        return {}
+    problem, offsets = model.problem, model.offsets
+    about = model.linearise(np.zeros(problem.n_free), (), None, slopes=True)
+    sizes = dict.fromkeys(offsets, 0.0)
+    sessions = np.arange(len(model.labels))
+    for drive, i in offsets.items():
+        direction = np.zeros(problem.n_free)
+        direction[i] = 1.0 / problem.theta_scale[i]
+        shifts = [MachineShift(sessions >= k, direction) for k in sessions[1:]]
+        effects = np.array([model.shift_entries(about, s) for s in shifts])
+        information = about.likelihood.information(about.likelihood.products(effects))
+        least = float(information.min())
+        sizes[drive] = DETECTED / np.sqrt(least) if least > 0.0 else np.inf
+    return sizes

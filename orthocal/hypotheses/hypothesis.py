@@ -1,0 +1,200 @@
+"""Families of hypotheses: how rows would change, or which effects would be added, many at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from orthocal.hypotheses.anomaly import Explanation
+from orthocal.session.session import Session
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Sparse: TypeAlias = Any
+"""A scipy.sparse.csr_array; SciPy has no type stubs."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tails:
+    """Patterns that are equal to a base vector from some row of a segment on, and 0 before.
+
+    Products with all of them follow from cumulative sums, in memory linear in the rows.
+    """
+
+    segments: Sequence[tuple[Indices, Array]]
+    """Rows of each segment in the order of measuring, and the base vector on them, [m]."""
+    segment: Indices
+    """Segment of each pattern, ascending, shape (h,)."""
+    start: Indices
+    """Position in the segment from which each pattern is not 0, shape (h,)."""
+
+    def select(self, chosen: slice) -> Tails:
+        """Some of the patterns."""
+        return Tails(self.segments, self.segment[chosen], self.start[chosen])
+
+    def by_segment(self) -> Iterator[tuple[Indices, Indices, Array]]:
+        """Patterns of each segment that has any, with its rows and base vector."""
+        used, begin = np.unique(self.segment, return_index=True)
+        for s, own in zip(used, np.split(np.arange(self.segment.size), begin[1:]), strict=True):
+            yield own, *self.segments[s]
+
+    def to_sparse(self, count: int) -> Sparse:
+        """Patterns as a sparse matrix, shape (h, count)."""
+        rows = [self.segments[s][0][k:] for s, k in zip(self.segment, self.start, strict=True)]
+        base = [self.segments[s][1][k:] for s, k in zip(self.segment, self.start, strict=True)]
+        return sparse_rows(rows, base, count)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patterns:
+    """Vectors over the rows of a session, one per hypothesis: a sparse part plus tails."""
+
+    rows: Sparse
+    """Sparse part, shape (h, n_rows), [m]."""
+    tails: Tails | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of patterns."""
+        return int(self.rows.shape[0])
+
+    def select(self, chosen: slice) -> Patterns:
+        """Some of the patterns."""
+        tails = None if self.tails is None else self.tails.select(chosen)
+        return Patterns(self.rows[chosen], tails)
+
+    def to_sparse(self) -> Sparse:
+        """All patterns written out, shape (h, n_rows)."""
+        if self.tails is None:
+            return self.rows
+        return sparse.csr_array(self.rows + self.tails.to_sparse(self.rows.shape[1]))
+
+    def one(self, index: int) -> Array:
+        """One pattern, dense, shape (n_rows,), [m]."""
+        return np.asarray(self.select(slice(index, index + 1)).to_sparse().toarray()[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MachineShift:
+    """A machine that differs by some errors in some of the sessions."""
+
+    sessions: NDArray[np.bool_]
+    """Sessions in which it differs, shape (n_sessions,)."""
+    direction: Array
+    """Difference of the free parameters, [tolerances]; per unit of the amount where that is
+    unknown. Shape (n_free,)."""
+    unit: float = 1.0
+    """Unit of the amount, [SI]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Family:
+    """Hypotheses of one kind, which share a prior probability equally.
+
+    Each changes rows by known amounts (`edits`), adds an effect of unknown amount (`effects`), adds
+    several effects, each of its own amount (`groups`), declares rows to say nothing (`silent`), or
+    changes the machine between sessions (`shifts`, by a known or an unknown amount).
+    """
+
+    explain: Callable[[int], Explanation]
+    """Explanation of hypothesis number h, without its amount."""
+    count: int
+    size: float
+    """Number of ways in which it could have happened, tested or not."""
+    edits: Patterns | None = None
+    """Corrections of the rows, [m]."""
+    effects: Patterns | None = None
+    """Effects on the rows per unit of an unknown amount."""
+    log_volume: Array | None = None
+    """Logarithm of the factor by which the edit scales a volume of readings, shape (h,)."""
+    groups: Sequence[Sequence[Indices]] = ()
+    """Rows that share an unknown amount, several groups per hypothesis."""
+    silent: Sequence[Indices] = ()
+    """Rows that say nothing."""
+    shifts: Sequence[MachineShift] = ()
+    known: bool = True
+    """Whether the amounts of `shifts` are known."""
+
+
+class Rows:
+    """Rows of a session by setup, cycle and posture.
+
+    Args:
+        session: The session.
+        values: Readings, shape (n_rows,), [m]; those of the session by default.
+    """
+
+    def __init__(self, session: Session, values: Array | None = None) -> None:
+        self.session = session
+        self.values = session.values if values is None else values
+        self.count = len(session.readings)
+        self.single = np.array([r.minus is None for r in session.readings], dtype=bool)
+        """Whether a row is a reading as shown, not a difference."""
+
+    def _by(self, key: Callable[[int], object]) -> dict[object, Indices]:
+        found: dict[object, list[int]] = {}
+        for i in range(self.count):
+            found.setdefault(key(i), []).append(i)
+        return {k: np.array(rows) for k, rows in found.items()}
+
+    @cached_property
+    def setups(self) -> dict[str, Indices]:
+        """Rows of each setup, in the order of the file."""
+        readings = self.session.readings
+        return {str(k): v for k, v in self._by(lambda i: readings[i].setup).items()}
+
+    @cached_property
+    def cycles(self) -> dict[tuple[str, int], Indices]:
+        """Rows of each setup and cycle, in the order of the file."""
+        readings = self.session.readings
+        found = self._by(lambda i: (readings[i].setup, readings[i].cycle))
+        return {k: v for k, v in found.items() if isinstance(k, tuple)}
+
+    @cached_property
+    def repeated(self) -> dict[tuple[str, str, str | None, str | None], Indices]:
+        """Rows of each setup, posture (or difference) and approach, in all cycles."""
+        readings = self.session.readings
+        found = self._by(lambda i: readings[i].place)
+        return {k: v for k, v in found.items() if isinstance(k, tuple)}
+
+    @cached_property
+    def groups(self) -> dict[tuple[str, str], tuple[str, ...]]:
+        """Setups of each leg and of each gauge, where these are several setups but not all."""
+        found: dict[tuple[str, str], list[str]] = {}
+        for name in self.setups:
+            setup = self.session.setups[name]
+            leg = getattr(setup.sensor, "leg", None)
+            if isinstance(leg, str):
+                found.setdefault(("leg", leg), []).append(name)
+            if len(self.session.gauges) > 1:
+                found.setdefault(("gauge", setup.gauge), []).append(name)
+        every = len(self.setups)
+        return {k: tuple(v) for k, v in found.items() if 1 < len(v) < every}
+
+    def of_setups(self, setups: Sequence[str]) -> Indices:
+        """Rows of some setups."""
+        return np.concatenate([self.setups[name] for name in setups])
+
+    def posture(self, row: int) -> str:
+        """Posture of a row, or the difference of two."""
+        return self.session.readings[row].postures
+
+
+def sparse_rows(rows: Sequence[Indices], values: Sequence[Array], count: int) -> Sparse:
+    """Sparse matrix with given entries in each row, shape (len(rows), count)."""
+    sizes = np.array([len(r) for r in rows], dtype=np.int64)
+    columns = np.concatenate([*rows, np.empty(0, dtype=np.int64)]).astype(np.int64)
+    data = np.concatenate([*values, np.empty(0)]).astype(np.float64)
+    indptr = np.concatenate([[0], np.cumsum(sizes)])
+    return sparse.csr_array((data, columns, indptr), shape=(len(rows), count))
+
+
+def marks(rows: Sequence[Indices], count: int) -> Patterns:
+    """Patterns that are 1 on given rows."""
+    return Patterns(sparse_rows(rows, [np.ones(len(r)) for r in rows], count))

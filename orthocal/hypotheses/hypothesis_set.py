@@ -1,0 +1,182 @@
+"""Sets of hypotheses: their terms, how they were scored, and how two sets compare."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.hypotheses.anomaly import Explanation
+from orthocal.hypotheses.hypothesis import MachineShift
+from orthocal.hypotheses.likelihood import Score
+from orthocal.hypotheses.linear_model import Linearisation
+from orthocal.session.session import Session
+
+Array = NDArray[np.float64]
+
+MOST_ALTERNATIVES = 8
+"""Alternatives of an anomaly that are listed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Term:
+    """One hypothesis of a set."""
+
+    explanation: Explanation
+    prior: float
+    """Logarithm of its prior probability, with its factor on volumes."""
+    change: Array | None = None
+    """Correction of the rows, shape (n_rows,), [m]."""
+    effects: Array | None = None
+    """Effects of unknown amounts on the rows, shape (k, n_rows)."""
+    silent: NDArray[np.int64] | None = None
+    """Rows that say nothing."""
+    shift: MachineShift | None = None
+    known: bool = True
+    """Whether the amount of the shift is known."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HypothesisSet:
+    """A set of hypotheses, linearised where it leads."""
+
+    terms: tuple[Term, ...]
+    score: Score
+    about: Linearisation
+    remaining: Array
+    """Deviation of the corrected entries, shape (n_entries,), [m]."""
+    corrected: Array
+    """Corrected rows, shape (n_rows,), [m]."""
+    amounts: tuple[Array, ...]
+    """Unknown amounts of each term, [m]; of machine shifts in units of their direction."""
+    stds: tuple[Array, ...]
+    """Standard deviations of the amounts."""
+
+    @property
+    def log_posterior(self) -> float:
+        """Logarithm of marginal likelihood times prior probability."""
+        return self.score.log_likelihood + sum(t.prior for t in self.terms)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Number of hypotheses and of rows concerned: the simpler set is the smaller one."""
+        return len(self.terms), sum(len(t.explanation.rows) for t in self.terms)
+
+
+def negative_log_posterior(state: HypothesisSet) -> float:
+    """Negative logarithm of marginal likelihood times prior, to sort the most likely first."""
+    return -state.log_posterior
+
+
+def split_amounts(terms: Sequence[Term], amounts: Array) -> tuple[Array, ...]:
+    """Amounts of each term, from those of all effects followed by all silent rows."""
+    sizes = [
+        len(t.effects) if t.effects is not None else int(t.shift is not None and not t.known)
+        for t in terms
+    ]
+    silent = [0 if t.silent is None else len(t.silent) for t in terms]
+    at, after = np.cumsum([0, *sizes]), np.cumsum([sum(sizes), *silent])
+    return tuple(
+        amounts[after[i] : after[i + 1]] if silent[i] else amounts[at[i] : at[i + 1]]
+        for i in range(len(terms))
+    )
+
+
+def correct_rows(rows: Array, terms: Sequence[Term], amounts: Sequence[Array]) -> Array:
+    """Rows without the effects of unknown amounts."""
+    corrected = rows.copy()
+    for t, a in zip(terms, amounts, strict=True):
+        if t.effects is not None:
+            corrected -= a @ t.effects
+        elif t.silent is not None:
+            corrected[t.silent] -= a
+    return corrected
+
+
+def explain_with_amounts(state: HypothesisSet) -> list[Explanation]:
+    """Explanations of all terms with the amounts that were estimated."""
+    result = []
+    for term, amounts, stds in zip(state.terms, state.amounts, state.stds, strict=True):
+        e = term.explanation
+        unit = 1.0 if term.shift is None else term.shift.unit
+        single = term.effects is not None and len(term.effects) == 1 and e.kind != "row offset"
+        if single or (term.shift is not None and not term.known):
+            e = replace(e, amount=float(amounts[0] * unit), std=float(stds[0] * unit))
+        result.append(e)
+    return result
+
+
+def is_same_place(one: HypothesisSet, other: HypothesisSet) -> bool:
+    """True if two sets concern the same rows, hypothesis by hypothesis."""
+    if len(one.terms) != len(other.terms):
+        return False
+    unmatched = _unmatched(one.terms, other.terms)
+    return not unmatched[0] and not unmatched[1]
+
+
+def share_rows(one: Term, other: Term) -> bool:
+    """True if two hypotheses concern a common row."""
+    return bool(set(one.explanation.rows) & set(other.explanation.rows))
+
+
+def distinct_terms(terms: Sequence[Term]) -> list[Term]:
+    """Hypotheses that share no row with one before."""
+    found: list[Term] = []
+    used: set[int] = set()
+    for t in terms:
+        if not used & set(t.explanation.rows):
+            found.append(t)
+            used |= set(t.explanation.rows)
+    return found
+
+
+def _unmatched(one: Sequence[Term], other: Sequence[Term]) -> tuple[list[Term], list[Term]]:
+    """Hypotheses of each of two sets that none of the other set agrees with."""
+
+    def without(a: Sequence[Term], b: Sequence[Term]) -> list[Term]:
+        return [t for t in a if not any(t.explanation.agrees_with(u.explanation) for u in b)]
+
+    return without(one, other), without(other, one)
+
+
+def is_local(session: Session, state: HypothesisSet, near: Sequence[HypothesisSet]) -> bool:
+    """True if alternatives concern only setups of the chosen hypotheses."""
+
+    def setups(s: HypothesisSet) -> set[str]:
+        return {session.readings[i].setup for t in s.terms for i in t.explanation.rows}
+
+    return all(setups(s) <= setups(state) for s in near)
+
+
+def find_alternatives(
+    term: Term, near: Sequence[tuple[HypothesisSet, HypothesisSet]]
+) -> tuple[tuple[Explanation, ...], tuple[Explanation, ...]]:
+    """Other causes in the same rows, and alternatives elsewhere, the most likely first.
+
+    Args:
+        term: A hypothesis.
+        near: Sets of hypotheses as they were chosen, each with one that is nearly as likely.
+    """
+    e = term.explanation
+    causes: dict[tuple[object, ...], Explanation] = {}
+    alternatives: dict[Explanation, None] = {}
+    for chosen, s in sorted(near, key=lambda pair: negative_log_posterior(pair[1])):
+        if not any(t is term for t in chosen.terms):
+            continue
+        mine, others = _unmatched(chosen.terms, s.terms)
+        if any(t is term for t in mine):
+            if others:
+                found = [
+                    c
+                    for t, c in zip(s.terms, explain_with_amounts(s), strict=True)
+                    if any(t is o for o in others)
+                ]
+                alternatives.update(dict.fromkeys(found))
+            continue
+        for cause in explain_with_amounts(s):
+            if set(cause.rows) == set(e.rows) and e.agrees_with(cause) and cause.kind != e.kind:
+                amount = cause.amount if cause.kind == "misread dial" else None
+                causes.setdefault((cause.kind, cause.factor, amount), cause)
+    return tuple(causes.values()), tuple(alternatives)[:MOST_ALTERNATIVES]

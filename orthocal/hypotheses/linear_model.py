@@ -1,0 +1,380 @@
+"""Linearised complete model of a session: all errors of the machine and of its sensors at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from orthocal.errors import ClosureError
+from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.selection import select_parameters
+from orthocal.estimation.weighting import SIGMA_WITHOUT_WORD, first_noise
+from orthocal.hypotheses.hypothesis import MachineShift, Patterns, Sparse, Tails
+from orthocal.hypotheses.likelihood import Likelihood, Products, build_likelihood
+from orthocal.session.session import Session
+from orthocal.statistics.noise import noise_floor
+from orthocal.statistics.zeros import project_out_zeros
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+MOST_ROUNDS = 2
+"""Relinearisations per hypothesis."""
+
+NEAR = 0.2
+"""Change of the errors, in tolerances, below which a linearisation is kept."""
+
+FURTHEST = 6.0
+"""Errors, in tolerances, beyond which a hypothesis is not relinearised."""
+
+MOST_STEPS = 8
+"""Gauss-Newton steps to the most likely machine."""
+
+SETTLED = 0.02
+"""Change of the errors, in tolerances, below which the most likely machine is found."""
+
+LEAST_SIGMA = 1e-9
+"""Least standard deviation of a reading, [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearisation:
+    """Linearised model about one machine, gauge zeros projected out.
+
+    With K sessions each may have a machine that differs by known errors (`shifts`).
+    """
+
+    expected: Array
+    """Predictions for the reference machine, to first order, shape (n_entries,), [m]."""
+    slopes: Array
+    """∂h per tolerance of each error, shape (n_entries, n_free), [m]; empty where no hypothesis
+    needs them."""
+    likelihood: Likelihood
+    errors: Array
+    """Errors per principal direction, shape (n_free, r), [tolerances]."""
+    sizes: Array
+    """Singular values, shape (r,), [m]."""
+    theta: Array
+    """Errors at the point of linearisation less the reference, shape (n_free,), [tolerances]."""
+    passive: Array
+    """Passive coordinates there, shape (n_states, n_passive), [m, rad]."""
+
+    def errors_for(
+        self, deviation: Array, *, tolerance_scale: float = 1.0, noise_scale: float = 1.0
+    ) -> Array:
+        """Most likely errors for a deviation, shape (n_free,), [tolerances]."""
+        e2 = tolerance_scale**2
+        variance = e2 * self.sizes**2 + (noise_scale * self.likelihood.sigma) ** 2
+        along = self.likelihood.directions @ deviation
+        return np.asarray(self.errors @ (e2 * self.sizes / variance * along))
+
+
+class LinearModel:
+    """Predictions and derivatives of a session for all errors of the machine and its sensors.
+
+    All calls of the calibration problem by the hypothesis engine are here.
+
+    Args:
+        session: A session, or several joined ones.
+        model: Name of the model of the errors that the machine may have; all by default.
+
+    Raises:
+        RobotError: If closures of the robot depend on each other.
+        ParameterError: If the model is unknown.
+    """
+
+    def __init__(self, session: Session, model: str | None = None) -> None:
+        parameters = session.robot.parameters
+        names = machine_errors(session.robot) if model is None else parameters.select_model(model)
+        selection = select_parameters(parameters, free=names, prior=True)
+        problem = CalibrationProblem(session, selection)
+        self.problem = problem.with_noise(first_noise(session, problem.observations))
+        o = self.problem.observations
+        self.stated = session.gauge.sigma is not None
+        floor = noise_floor(session.gauge.sigma or SIGMA_WITHOUT_WORD, session.gauge.resolution)
+        self.sigma = max(floor, LEAST_SIGMA)
+        """Standard deviation of a reading of the first gauge, in whose metres all entries are."""
+        self.dof = o.size - o.n_zeros
+        self.labels, self.session_of_entry = label_sessions(session, o.setup)
+        self._counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
+        ones = np.ones(o.size)
+        self._incidence = sparse.csr_array(
+            (ones, (np.arange(o.size), o.zero)), shape=(o.size, o.n_zeros)
+        )
+
+    @property
+    def offsets(self) -> dict[str, int]:
+        """Drive to the place of its offset among the free parameters."""
+        place = {name: i for i, name in enumerate(self.problem.free)}
+        drives = self.problem.robot.drives
+        return {d.name: place[f"{d.name}.offset"] for d in drives if f"{d.name}.offset" in place}
+
+    @property
+    def active(self) -> Array:
+        """Offsets stated as active in the controller, shape (n_sessions, n_drives), [m, rad]."""
+        session = self.problem.session
+        own = [
+            session.active_offsets if s.active is None else s.active
+            for s in session.setups.values()
+        ]
+        setups = self.problem.observations.setup
+        first = [
+            int(setups[np.argmax(self.session_of_entry == k)]) for k in range(len(self.labels))
+        ]
+        return np.array([own[i] for i in first])
+
+    @cached_property
+    def to_entries(self) -> Sparse:
+        """Entries per row of the session, in the first gauge's metres, (n_rows, n_entries)."""
+        o = self.problem.observations
+        rows = np.arange(o.plus.size)
+        if (o.minus < 0).all():
+            return sparse.csr_array(
+                (1.0 / self.problem.noise[o.plus], (rows, o.plus)), shape=(rows.size, o.size)
+            )
+        blocks = [o.values(row) / self.problem.noise for row in np.eye(rows.size)]
+        return sparse.csr_array(np.array(blocks))
+
+    def entries(self, rows: Array) -> Array:
+        """Entries of rows, zeros projected out, shape (h, n_entries), [m].
+
+        Args:
+            rows: Shape (h, n_rows), [m].
+        """
+        return self.project(np.asarray(self.to_entries.T @ rows.T).T)
+
+    def project(self, entries: Array) -> Array:
+        """Vectors over the entries with their gauge zeros projected out, shape (h, n_entries)."""
+        o = self.problem.observations
+        return np.asarray(project_out_zeros(np.ascontiguousarray(entries.T), o).T)
+
+    def linearise(
+        self, theta: Array, shifts: Sequence[MachineShift], start: Array | None, *, slopes: bool
+    ) -> Linearisation:
+        """Linearise the model.
+
+        Args:
+            theta: Errors less the reference, shape (n_free,), [tolerances].
+            shifts: Known differences of the machine in some of the sessions.
+            start: Passive coordinates to start from.
+            slopes: Whether to keep the derivatives.
+
+        Raises:
+            ClosureError: If the machine cannot reach a posture.
+        """
+        problem, o = self.problem, self.problem.observations
+        n = len(self.labels)
+        each = np.array(
+            [
+                sum((s.direction for s in shifts if s.sessions[k]), np.zeros_like(theta))
+                for k in range(n)
+            ]
+        )
+        expected, jacobian, passive = np.empty(o.size), np.empty((o.size, theta.size)), start
+        machines, which = np.unique(each, axis=0, return_inverse=True)
+        which = which.ravel()
+        for m, shift in enumerate(machines):
+            at = problem.reference + (theta + shift) * problem.theta_scale
+            passive = problem.close(at, start=passive)
+            prediction, slope = problem.linearise(at, passive)
+            if len(machines) == 1:
+                expected, jacobian = prediction, slope
+            else:
+                own = which[self.session_of_entry] == m
+                expected[own], jacobian[own] = prediction[own], slope[own]
+        jacobian = project_out_zeros(jacobian, o)
+        likelihood, vectors, sizes = build_likelihood(
+            jacobian, sigma=self.sigma, dof=self.dof, stated=self.stated
+        )
+        return Linearisation(
+            project_out_zeros(expected, o) - jacobian @ theta,
+            jacobian if slopes else np.empty((o.size, 0)),
+            likelihood,
+            vectors,
+            sizes,
+            theta,
+            np.asarray(passive),
+        )
+
+    def most_likely(self, rows: Array) -> Linearisation:
+        """Linearise about the most likely machine, with the tolerances as prior.
+
+        Args:
+            rows: Readings, shape (n_rows,), [m].
+
+        Raises:
+            ClosureError: If the nominal machine cannot reach a posture.
+        """
+        return self._approach(self.entries(rows[None])[0], np.zeros(self.problem.observations.size))
+
+    def predict_row(self, rows: Array, row: int) -> tuple[float, float]:
+        """Predictive distribution of a reading, conditional on all other readings.
+
+        y_i | y_j, j ≠ i, about the machine that is most likely by the others, with errors at their
+        tolerances, noise as stated and free gauge zeros. A reading that says nothing is the sum of
+        its prediction and an effect of unknown amount.
+
+        Args:
+            rows: Readings, shape (n_rows,), [m]; the value of the predicted one does not matter.
+            row: Place of the predicted reading.
+
+        Returns:
+            Mean and standard deviation, [m]; NaN and infinity for a reading that no other one
+            predicts, such as the first of a setup.
+
+        Raises:
+            ClosureError: If the nominal machine cannot reach a posture.
+        """
+        entries, effect = self.entries(np.array([rows, np.arange(rows.size) == row]))
+        about = self._approach(entries, effect)
+        amount, std = about.likelihood.estimate_amount(entries - about.expected, effect)
+        return (math.nan if math.isinf(std) else float(rows[row]) - amount), std
+
+    def _approach(self, entries: Array, effect: Array) -> Linearisation:
+        """Linearise about the most likely machine, beside an effect of unknown amount.
+
+        Gauss-Newton steps end when the errors change by less than SETTLED tolerances, or before the
+        first machine that cannot reach a posture. Readings are not linear over offsets of some mm.
+
+        Args:
+            entries: Readings, zeros projected out, shape (n_entries,), [m].
+            effect: Effect per unit, zeros projected out, shape (n_entries,); 0 for none.
+        """
+        about = self.linearise(np.zeros(self.problem.n_free), (), None, slopes=False)
+        for _ in range(MOST_STEPS):
+            deviation = entries - about.expected
+            amount, _ = about.likelihood.estimate_amount(deviation, effect)
+            errors = about.errors_for(deviation - amount * effect)
+            if not np.abs(errors - about.theta).max(initial=0.0) > SETTLED:
+                break
+            try:
+                about = self.linearise(errors, (), about.passive, slopes=False)
+            except (ClosureError, np.linalg.LinAlgError):
+                break
+        return about
+
+    def shift_entries(self, about: Linearisation, shift: MachineShift) -> Array:
+        """Effect of a machine shift on the entries, zeros projected out, (n_entries,), [m]."""
+        moved = np.asarray(about.slopes @ shift.direction)
+        changed = np.where(shift.sessions[self.session_of_entry], moved, 0.0)
+        return np.asarray(self.project(changed[None])[0])
+
+    def products(
+        self, patterns: Patterns, about: Linearisation, deviation: Array
+    ) -> tuple[Products, Array]:
+        """Products of patterns over the rows with the principal directions and a deviation.
+
+        Args:
+            patterns: Over the rows, shape (h, n_rows), [m].
+            about: The linearisation.
+            deviation: Shape (n_entries,), zeros projected out, [m].
+
+        Returns:
+            The products; and the inner products with the deviation, shape (h,), [m²].
+        """
+        directions = about.likelihood.directions
+        if patterns.tails is not None and not self._has_single_zeros:
+            patterns = Patterns(patterns.to_sparse())
+        entries = sparse.csr_array(patterns.rows @ self.to_entries)
+        sums = np.asarray((entries @ self._incidence).toarray())
+        along = np.asarray(entries @ directions.T)
+        square = np.asarray(entries.multiply(entries).sum(axis=1)).ravel()
+        cross = np.asarray(entries @ deviation)
+        if patterns.tails is not None:
+            tails, o = patterns.tails, self.problem.observations
+            square += 2.0 * self._overlap(tails, entries)
+            for own, rows, base in tails.by_segment():
+                at, zero = o.plus[rows], o.zero[o.plus[rows[0]]]
+                values, start = base / self.problem.noise[at], tails.start[own]
+
+                def tail(x: Array, start: Indices = start) -> Array:
+                    return np.asarray(np.cumsum(x[::-1], axis=0)[::-1][start])
+
+                along[own] += tail(values[:, None] * directions[:, at].T)
+                square[own] += tail(values**2)
+                cross[own] += tail(values * deviation[at])
+                sums[own, zero] += tail(values)
+        square = square - (sums**2) @ (1.0 / self._counts)
+        return Products(along, np.maximum(square, 0.0)), cross
+
+    def inner(self, patterns: Patterns, others: Patterns) -> Array:
+        """Inner products of patterns, pair by pair, zeros projected out, shape (h,), [m²].
+
+        Args:
+            patterns: Over the rows, shape (h, n_rows).
+            others: The same number, without tails.
+        """
+        if patterns.tails is not None and not self._has_single_zeros:
+            patterns = Patterns(patterns.to_sparse())
+        one, other = patterns.rows @ self.to_entries, others.rows @ self.to_entries
+        result = np.asarray(one.multiply(other).sum(axis=1)).ravel()
+        sums = (one @ self._incidence).toarray()
+        if patterns.tails is not None:
+            tails, o = patterns.tails, self.problem.observations
+            result = result + self._overlap(tails, sparse.csr_array(other))
+            for own, rows, base in tails.by_segment():
+                at = o.plus[rows]
+                total = np.cumsum((base / self.problem.noise[at])[::-1])[::-1]
+                sums[own, o.zero[at[0]]] += total[tails.start[own]]
+        return np.asarray(
+            result - (sums * (other @ self._incidence).toarray()) @ (1 / self._counts)
+        )
+
+    def _overlap(self, tails: Tails, entries: Sparse) -> Array:
+        """Inner products of tails with sparse vectors over the entries, pair by pair."""
+        o = self.problem.observations
+        result = np.zeros(tails.segment.size)
+        position = np.full(o.size, -1)
+        base = np.zeros(o.size)
+        start = np.repeat(tails.start, np.diff(entries.indptr))
+        pattern = np.repeat(np.arange(result.size), np.diff(entries.indptr))
+        for own, rows, values in tails.by_segment():
+            at = o.plus[rows]
+            position[at], base[at] = np.arange(rows.size), values / self.problem.noise[at]
+            chosen = slice(entries.indptr[own[0]], entries.indptr[own[-1] + 1])
+            columns = entries.indices[chosen]
+            shared = np.where(position[columns] >= start[chosen], base[columns], 0.0)
+            shared = entries.data[chosen] * shared
+            np.add.at(result, pattern[chosen], shared)
+            position[at], base[at] = -1, 0.0
+        return result
+
+    @property
+    def _has_single_zeros(self) -> bool:
+        """True if all rows are single readings, so that the rows of a setup share one zero."""
+        return bool((self.problem.observations.minus < 0).all())
+
+    def rms(self, rows: Array, about: Linearisation) -> float:
+        """RMS residual of a machine within its tolerances, to first order, [m]."""
+        deviation = self.entries(rows[None])[0] - about.expected
+        errors = about.errors_for(deviation)
+        along = about.sizes * (about.errors.T @ errors)
+        left = (deviation - along @ about.likelihood.directions) * self.problem.noise
+        return float(np.sqrt(np.mean(self.problem.observations.rows(left) ** 2)))
+
+
+def label_sessions(session: Session, setup: Indices) -> tuple[tuple[str, ...], Indices]:
+    """Names of joined sessions, and the session of each entry.
+
+    Args:
+        session: The session.
+        setup: Setup of each entry, shape (n_entries,).
+
+    Returns:
+        Names of the sessions with readings, a single "" where none were joined; and the place
+        among them, shape (n_entries,).
+    """
+    if not session.joined:
+        return ("",), np.zeros(setup.size, dtype=np.int64)
+    of_setup = [name.partition("/")[0] for name in session.setups]
+    read = {of_setup[i] for i in np.unique(setup)}
+    labels = tuple(n for n in dict.fromkeys(of_setup) if n in read)
+    place = np.array([labels.index(n) if n in labels else -1 for n in of_setup])
+    return labels, place[setup]

@@ -1,0 +1,399 @@
+"""LLVM backend: CasADi functions executed for several points at once.
+
+A CasADi function of scalar expressions is a list of instructions. An interpreter in machine code,
+compiled by llvmlite for the present processor, executes each instruction for LANES points at once.
+It does the operations of CasADi's virtual machine in the same order, correctly rounded or by the C
+library, and therefore gives the same numbers in about a tenth of the time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.util import find_spec
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.runtime import disk_cache
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+LANES = 16
+"""Points for which an instruction is executed at once."""
+
+MIN_CACHED = 1000
+"""Instructions of a function from which its program is cached on disk."""
+
+_COMPUTED = {
+    "ASSIGN": "{y} = select i1 true, {row} {a}, {row} {a}",
+    "ADD": "{y} = fadd {row} {a}, {b}",
+    "SUB": "{y} = fsub {row} {a}, {b}",
+    "MUL": "{y} = fmul {row} {a}, {b}",
+    "DIV": "{y} = fdiv {row} {a}, {b}",
+    "NEG": "{y} = fneg {row} {a}",
+    "SQ": "{y} = fmul {row} {a}, {a}",
+    "TWICE": "{y} = fadd {row} {a}, {a}",
+    "INV": "{y} = fdiv {row} {one}, {a}",
+    "SQRT": "{y} = call {row} @llvm.sqrt.v{lane}f64({row} {a})",
+    "FABS": "{y} = call {row} @llvm.fabs.v{lane}f64({row} {a})",
+    "IF_ELSE_ZERO": "{p} = fcmp une {row} {a}, {zero}\n{y} = select {flags} {p}, {row} {b}, "
+    "{row} {zero}",
+    "SIGN": "{p} = fcmp olt {row} {a}, {zero}\n{q} = fcmp ogt {row} {a}, {zero}\n"
+    "{r} = select {flags} {q}, {row} {one}, {row} {a}\n"
+    "{y} = select {flags} {p}, {row} {minus}, {row} {r}",
+}
+_COMPARED = {
+    "LT": "{p} = fcmp olt {row} {a}, {b}",
+    "LE": "{p} = fcmp ole {row} {a}, {b}",
+    "EQ": "{p} = fcmp oeq {row} {a}, {b}",
+    "NE": "{p} = fcmp une {row} {a}, {b}",
+    "NOT": "{p} = fcmp oeq {row} {a}, {zero}",
+    "AND": "{q} = fcmp une {row} {a}, {zero}\n{r} = fcmp une {row} {b}, {zero}\n"
+    "{p} = and {flags} {q}, {r}",
+    "OR": "{q} = fcmp une {row} {a}, {zero}\n{r} = fcmp une {row} {b}, {zero}\n"
+    "{p} = or {flags} {q}, {r}",
+}
+_CALLED = {"SIN": 1, "COS": 1, "TAN": 1, "ASIN": 1, "ACOS": 1, "ATAN": 1, "ATAN2": 2}
+"""Functions of the C library and their number of arguments."""
+
+OPERATIONS = ("CONST", "INPUT", "OUTPUT", *_COMPUTED, *_COMPARED, *_CALLED)
+"""CasADi's names of the operations; an instruction holds an index into this tuple."""
+
+_CODES = {getattr(ca, f"OP_{name}"): code for code, name in enumerate(OPERATIONS)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Program:
+    """The instructions of a function."""
+
+    table: NDArray[np.int32]
+    """Operation, result and two operands of each instruction, shape (n, 4)."""
+    constants: Array
+    """Values of constant instructions, 0 elsewhere, shape (n,)."""
+    n_work: int
+    """Work variables."""
+    output_starts: Indices
+    """Start of each output among the nonzeros of all, shape (n_out + 1,)."""
+
+
+@lru_cache(maxsize=1)
+def is_installed() -> bool:
+    """True if llvmlite is installed (extra `fast`)."""
+    return find_spec("llvmlite") is not None
+
+
+def load_program(function: ca.Function, *, key: str | None = None) -> Program | None:
+    """The instructions of a function, from disk or listed now; None if one of them is unknown.
+
+    Args:
+        function: A function of SX expressions.
+        key: Key of the function on disk; not cached without one.
+    """
+    if key is None or function.n_instructions() < MIN_CACHED:
+        return list_instructions(function)
+    key = f"instructions {_CODES}\n{key}"
+    program = _decode(disk_cache.load(key), function)
+    if program is None and (program := list_instructions(function)) is not None:
+        arrays = program.table, program.constants, np.array(program.n_work), program.output_starts
+        disk_cache.store(key, b"".join(a.tobytes() for a in arrays))
+    return program
+
+
+def _decode(content: bytes | None, function: ca.Function) -> Program | None:
+    """A program as cached on disk; None if it does not fit the function."""
+    n, outputs = function.n_instructions(), function.n_out()
+    if content is None or len(content) != 24 * n + 8 * (outputs + 2):
+        return None
+    table, constants, rest = np.split(np.frombuffer(content, np.uint8), [16 * n, 24 * n])
+    n_work, *starts = rest.view(np.int64)
+    return Program(
+        table.view(np.int32).reshape(n, 4),
+        constants.view(np.float64),
+        int(n_work),
+        np.array(starts, dtype=np.int64),
+    )
+
+
+def list_instructions(function: ca.Function) -> Program | None:
+    """The instructions of a function; None if one of them is unknown."""
+    count = function.n_instructions()
+    output_starts = np.cumsum([0, *(function.nnz_out(i) for i in range(function.n_out()))])
+    starts = output_starts.tolist()
+    rows, constants = [], np.zeros(count)
+    for k in range(count):
+        operation = function.instruction_id(k)
+        code = _CODES.get(operation)
+        if code is None:
+            return None
+        results = function.instruction_output(k)
+        if operation == ca.OP_CONST:
+            constants[k] = function.instruction_constant(k)
+            rows.append((code, results[0], 0, 0))
+            continue
+        operands = function.instruction_input(k)
+        if operation == ca.OP_OUTPUT:
+            rows.append((code, starts[results[0]] + results[1], operands[0], 0))
+        else:
+            rows.append((code, results[0], operands[0], operands[-1]))
+    table = np.array(rows, dtype=np.int32).reshape(-1, 4)
+    return Program(table, constants, int(function.sz_w()) + 1, output_starts)
+
+
+def run(program: Program, inputs: Sequence[Array], count: int) -> list[Array] | None:
+    """Execute a program at points.
+
+    Args:
+        program: The program.
+        inputs: Shape (n_rows, n) each; each row holds for count/n_rows successive points.
+        count: Number of points.
+
+    Returns:
+        Nonzeros of each output, shape (count, nnz); None if the interpreter cannot be compiled.
+    """
+    interpreter = compile_interpreter()
+    if interpreter is None:
+        return None
+    arrays = [np.ascontiguousarray(a) for a in inputs]
+    # of each input: address, numbers in a row, points of a row
+    layout = np.array(
+        [
+            [a.ctypes.data for a in arrays],
+            [a.shape[1] for a in arrays],
+            [max(count // max(len(a), 1), 1) for a in arrays],
+        ],
+        dtype=np.int64,
+    )
+    n_out = int(program.output_starts[-1])
+    result, work = np.empty((count, n_out)), np.empty((program.n_work, LANES))
+    if count:
+        interpreter(
+            program.table.ctypes.data,
+            len(program.table),
+            program.constants.ctypes.data,
+            *(row.ctypes.data for row in layout),
+            len(arrays),
+            count,
+            result.ctypes.data,
+            n_out,
+            work.ctypes.data,
+        )
+    return [result[:, a:b] for a, b in itertools.pairwise(program.output_starts.tolist())]
+
+
+class Interpreter:
+    """The compiled interpreter; its machine code lives as long as the engine.
+
+    Its arguments are addresses of arrays, and numbers:
+
+        table      int32, shape (n, 4): operation, result, first and second operand; of an input its
+                   index and its column in place of operands, of an output its column in place of
+                   the result
+        n          number of instructions
+        constants  shape (n,)
+        inputs     addresses of the inputs, shape (n_in,)
+        strides    numbers from a row of each input to the next, int64
+        shares     successive points for which a row of each input holds, int64
+        n_in
+        points     number of points
+        outputs    shape (points, n_out)
+        n_out
+        work       shape (n_work, LANES)
+    """
+
+    def __init__(self, engine: object, address: int) -> None:
+        self._engine = engine
+        number, pointer = ctypes.c_int64, ctypes.c_void_p
+        kinds = (pointer, number, *(pointer,) * 4, number, number, pointer, number, pointer)
+        self._run = ctypes.CFUNCTYPE(None, *kinds)(address)
+
+    def __call__(self, *arguments: int) -> None:
+        """Execute a program."""
+        self._run(*arguments)
+
+
+@lru_cache(maxsize=1)
+def compile_interpreter() -> Interpreter | None:
+    """The interpreter, compiled once; None if that fails on this machine."""
+    from llvmlite import binding
+
+    try:
+        library = ctypes.CDLL(None)  # symbols of this process, the C library among them
+        for name in map(str.lower, _CALLED):
+            function = ctypes.cast(getattr(library, name), ctypes.c_void_p)
+            binding.add_symbol(name, function.value)
+        binding.initialize_native_target()
+        binding.initialize_native_asmprinter()
+        features = binding.get_host_cpu_features().flatten()
+        target = binding.Target.from_default_triple().create_target_machine(
+            cpu=binding.get_host_cpu_name(), features=features, opt=2
+        )
+        module = binding.parse_assembly(_Source(LANES).text())
+        module.verify()
+        engine = binding.create_mcjit_compiler(module, target)
+        engine.finalize_object()
+        return Interpreter(engine, engine.get_function_address("run"))
+    except (RuntimeError, AttributeError, TypeError, OSError):
+        return None
+
+
+class _Source:
+    """Source of the interpreter in LLVM's intermediate representation."""
+
+    def __init__(self, lane: int) -> None:
+        self._lane, self._row = lane, f"<{lane} x double>"
+        self._lines: list[str] = []
+        self._names = 0
+
+    def text(self) -> str:
+        """The complete source."""
+        row, size = self._row, self._lane
+        declared = [
+            f"declare {row} @llvm.{name}.v{size}f64({row})\n" for name in ("sqrt", "fabs")
+        ] + [
+            f"declare double @{name.lower()}({', '.join(['double'] * count)})\n"
+            for name, count in _CALLED.items()
+        ]
+        self._put("define void @run(ptr %table, i64 %n, ptr %constants, ptr %inputs, ptr %strides,")
+        self._put("ptr %shares, i64 %n_in, i64 %points, ptr %outputs, i64 %n_out, ptr %work) {")
+        self._put("entry:")
+        begins = self._new(f"alloca ptr, i64 {self._new(f'mul i64 %n_in, {size}')}")
+        ends = self._new(f"alloca ptr, i64 {size}")
+        last = self._new("sub i64 %points, 1")
+        blocks = self._new(f"udiv i64 {self._new(f'add i64 %points, {size - 1}')}, {size}")
+        with self._loop(blocks) as block:
+            first = self._new(f"mul i64 {block}, {size}")
+            with self._loop(str(size)) as lane:
+                self._find_point(first, lane, last, begins, ends)
+            with self._loop("%n") as k:
+                self._execute(k, begins, ends)
+        self._put("ret void\n}")
+        return "".join(declared) + "\n".join(self._lines) + "\n"
+
+    def _find_point(self, first: str, lane: str, last: str, begins: str, ends: str) -> None:
+        """Addresses a lane reads and writes; a lane beyond the last point repeats the last."""
+        there = self._new(f"add i64 {first}, {lane}")
+        within = self._new(f"icmp slt i64 {there}, {last}")
+        point = self._new(f"select i1 {within}, i64 {there}, i64 {last}")
+        end = self._at("%outputs", self._new(f"mul i64 {point}, %n_out"), "double")
+        self._store("ptr", end, self._at(ends, lane, "ptr"))
+        with self._loop("%n_in") as i:
+            share, stride = (
+                self._load("i64", self._at(of, i, "i64")) for of in ("%shares", "%strides")
+            )
+            row = self._new(f"udiv i64 {point}, {share}")
+            array = self._load("ptr", self._at("%inputs", i, "ptr"))
+            begin = self._at(array, self._new(f"mul i64 {row}, {stride}"), "double")
+            place = self._new(f"add i64 {self._new(f'mul i64 {i}, {self._lane}')}, {lane}")
+            self._store("ptr", begin, self._at(begins, place, "ptr"))
+
+    def _execute(self, k: str, begins: str, ends: str) -> None:
+        """Execute one instruction for all lanes."""
+        entry = self._new(f"mul i64 {k}, 4")
+        code, *places = (
+            self._load("i32", self._at("%table", self._new(f"add i64 {entry}, {j}"), "i32"))
+            for j in range(4)
+        )
+        to, a, b = (self._new(f"sext i32 {v} to i64") for v in places)
+        to_row, a_row, b_row = (
+            self._at("%work", self._new(f"mul i64 {v}, {self._lane}"), "double") for v in (to, a, b)
+        )
+        done, labels = self._label(), [self._label() for _ in OPERATIONS]
+        cases = " ".join(f"i32 {i}, label %{label}" for i, label in enumerate(labels))
+        self._put(f"switch i32 {code}, label %{done} [ {cases} ]")
+        for name, label in zip(OPERATIONS, labels, strict=True):
+            self._put(f"{label}:")
+            if name == "INPUT":
+                first = self._new(f"mul i64 {a}, {self._lane}")
+                for lane in range(self._lane):
+                    place = self._at(begins, self._new(f"add i64 {first}, {lane}"), "ptr")
+                    value = self._load("double", self._at(self._load("ptr", place), b, "double"))
+                    self._store("double", value, self._at(to_row, str(lane), "double"))
+            elif name == "OUTPUT":
+                for lane in range(self._lane):
+                    value = self._load("double", self._at(a_row, str(lane), "double"))
+                    end = self._load("ptr", self._at(ends, str(lane), "ptr"))
+                    self._store("double", value, self._at(end, to, "double"))
+            elif name == "CONST":
+                value = self._load("double", self._at("%constants", k, "double"))
+                one = self._new(f"insertelement {self._row} poison, double {value}, i32 0")
+                same = f"<{self._lane} x i32> zeroinitializer"
+                row = self._new(f"shufflevector {self._row} {one}, {self._row} poison, {same}")
+                self._store(self._row, row, to_row)
+            elif name in _CALLED:
+                rows = [a_row, b_row][: _CALLED[name]]
+                self._call(name.lower(), to_row, rows)
+            else:
+                self._compute(name, to_row, a_row, b_row)
+            self._put(f"br label %{done}")
+        self._put(f"{done}:")
+
+    def _compute(self, name: str, to_row: str, a_row: str, b_row: str) -> None:
+        form = _COMPUTED.get(name) or _COMPARED[name]
+        operands = {"a": self._load(self._row, a_row)}
+        if "{b}" in form:
+            operands["b"] = self._load(self._row, b_row)
+        names = {v: self._name() for v in "ypqr"}
+        numbers = {
+            v: f"<{', '.join([f'double {number}'] * self._lane)}>"
+            for v, number in (("zero", "0.0"), ("one", "1.0"), ("minus", "-1.0"))
+        }
+        types = {"row": self._row, "flags": f"<{self._lane} x i1>", "lane": self._lane}
+        self._put(form.format(**names, **operands, **numbers, **types))
+        if name in _COMPARED:
+            self._put(f"{names['y']} = uitofp <{self._lane} x i1> {names['p']} to {self._row}")
+        self._store(self._row, names["y"], to_row)
+
+    def _call(self, function: str, to_row: str, rows: Sequence[str]) -> None:
+        with self._loop(str(self._lane)) as lane:
+            values = [self._load("double", self._at(row, lane, "double")) for row in rows]
+            arguments = ", ".join(f"double {v}" for v in values)
+            result = self._new(f"call double @{function}({arguments})")
+            self._store("double", result, self._at(to_row, lane, "double"))
+
+    @contextmanager
+    def _loop(self, count: str) -> Iterator[str]:
+        """Repeat the enclosed code for 0, 1, ... count − 1."""
+        before, head, body, end = (self._label() for _ in range(4))
+        index, following, on = (self._name() for _ in range(3))
+        last = self._label()
+        self._put(f"br label %{before}\n{before}:\nbr label %{head}\n{head}:")
+        self._put(f"{index} = phi i64 [ 0, %{before} ], [ {following}, %{last} ]")
+        self._put(f"{on} = icmp ult i64 {index}, {count}")
+        self._put(f"br i1 {on}, label %{body}, label %{end}\n{body}:")
+        yield index
+        self._put(f"br label %{last}\n{last}:\n{following} = add i64 {index}, 1")
+        self._put(f"br label %{head}\n{end}:")
+
+    def _at(self, array: str, index: str, kind: str) -> str:
+        return self._new(f"getelementptr {kind}, ptr {array}, i64 {index}")
+
+    def _load(self, kind: str, place: str) -> str:
+        align = ", align 8" if kind == self._row else ""
+        return self._new(f"load {kind}, ptr {place}{align}")
+
+    def _store(self, kind: str, value: str, place: str) -> None:
+        align = ", align 8" if kind == self._row else ""
+        self._put(f"store {kind} {value}, ptr {place}{align}")
+
+    def _new(self, what: str) -> str:
+        name = self._name()
+        self._put(f"{name} = {what}")
+        return name
+
+    def _name(self) -> str:
+        self._names += 1
+        return f"%v{self._names}"
+
+    def _label(self) -> str:
+        self._names += 1
+        return f"b{self._names}"
+
+    def _put(self, line: str) -> None:
+        self._lines.append(line)

@@ -1,0 +1,334 @@
+"""Compiled functions of a robot: loop closures, tool and frames, with their derivatives.
+
+Their inputs are the actual drive coordinates, the passive coordinates and the placements with
+errors (see `ErrorMap`). Another machine, session, model or choice of free errors is therefore
+another evaluation, not another function. Derivatives follow the geometry: a joint or an error that
+acts in a frame X moves another frame b by the twist Ad(b⁻¹ X) ξ. That takes several times less work
+than differentiating the expressions, and is as exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.kinematics.backend.batch_function import BatchFunction
+from orthocal.kinematics.error_map import ErrorMap, error_map
+from orthocal.kinematics.function_cache import cached_function, cached_per_robot, function_key
+from orthocal.kinematics.se3 import log6, log6_jacobian
+from orthocal.kinematics.symbolic import Pose, SymbolicTree
+from orthocal.robot.frames import hangs_on
+from orthocal.robot.model import Closure, Robot, closure_row_units, joint_axis
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _MotionSource:
+    """A frame in which a joint or an error acts."""
+
+    pose: Pose
+    joint: int | None
+    first: int | None
+    """First of its components among the twists of the moved placements."""
+
+
+class RobotFunctions:
+    """Expressions of a robot, and compiled functions of them.
+
+    Args:
+        robot: The nominal robot.
+        passive: Values of the passive coordinates; symbols by default.
+        placements: Symbols of the placements to share with other functions; new ones by default.
+
+    Attributes:
+        actuated: Symbol of the actual drive coordinates, shape (n_drives,), [m, rad].
+        passive: Symbol of the passive coordinates, shape (n_passive,), [m, rad].
+        placements: Symbol of the moved placements, shape (12 n_moved,), [1, m].
+    """
+
+    def __init__(
+        self, robot: Robot, *, passive: ca.SX | None = None, placements: ca.SX | None = None
+    ) -> None:
+        self.robot = robot
+        self.errors: ErrorMap = error_map(robot)
+        moved = self.errors.moved
+        self.actuated = ca.SX.sym("actuated", len(robot.drives))
+        self.passive = (
+            ca.SX.sym("passive", robot.passive_index.size) if passive is None else passive
+        )
+        self.placements = (
+            ca.SX.sym("placements", 12 * len(moved)) if placements is None else placements
+        )
+        coordinates = ca.SX(robot.model.nv, 1)
+        coordinates[robot.drive_index.tolist()] = self.actuated
+        coordinates[robot.passive_index.tolist()] = self.passive
+        joints: dict[int, Pose] = {}
+        frames: dict[int, Pose] = {}
+        for k, m in enumerate(moved):
+            v = self.placements[12 * k : 12 * k + 12]
+            (frames if m.of_frame else joints)[m.index] = Pose(ca.reshape(v[:9], 3, 3), v[9:])
+        self.tree = SymbolicTree(
+            robot.model, coordinates, joint_placements=joints, frame_placements=frames
+        )
+        self._first = {(m.index, m.of_frame): 6 * k for k, m in enumerate(moved)}
+        self._positions: dict[int, BatchFunction] = {}
+        self._poses: dict[int, BatchFunction] = {}
+
+    @property
+    def symbols(self) -> list[ca.SX]:
+        """Actuated and passive coordinates, placements."""
+        return [self.actuated, self.passive, self.placements]
+
+    @cached_property
+    def reference(self) -> RobotFunctions:
+        """Functions in the reference posture, with separate drive symbols.
+
+        Passive joints have their nominal values: they do not move frames that hang on drives alone.
+        """
+        zero = ca.SX(self.robot.zero[self.robot.passive_index])
+        return RobotFunctions(self.robot, passive=zero, placements=self.placements)
+
+    @property
+    def n_twists(self) -> int:
+        """Number of components of the twists of all moved placements."""
+        return 6 * len(self.errors.moved)
+
+    # ---- loops
+
+    @cached_property
+    def closure(self) -> ca.SX:
+        """Residual g of all closures, shape (closure_rows,), [m]; rotations times the length."""
+        errors = []
+        for c in self.robot.closures:
+            a, b = (self.tree.frame_pose(self.robot.frame_id(f)) for f in (c.frame_a, c.frame_b))
+            relative = a.relative(b)
+            translation = c.kind == "3d"
+            error = relative.position if translation else log6(relative.rotation, relative.position)
+            errors.append(error[list(c.rows)])
+        return ca.vertcat(ca.SX(0, 1), *errors) * closure_row_units(self.robot)
+
+    @cached_property
+    def _closure_derivatives(self) -> tuple[ca.SX, ca.SX]:
+        """∂g by joint coordinates, (closure_rows, nv), and by twists, (closure_rows, n_twists)."""
+        blocks = [self._closure_blocks(closure) for closure in self.robot.closures]
+        scale = ca.diag(ca.SX(closure_row_units(self.robot)))
+        nv = self.robot.model.nv
+        by_joints = ca.vertcat(ca.SX(0, nv), *(joints for joints, _ in blocks))
+        by_twists = ca.vertcat(ca.SX(0, self.n_twists), *(twists for _, twists in blocks))
+        return ca.sparsify(scale @ by_joints), ca.sparsify(scale @ by_twists)
+
+    @cached_property
+    def closure_by_passive(self) -> BatchFunction:
+        """(actuated, passive, placements) to g and ∂g by the passive coordinates."""
+
+        def outputs() -> list[ca.SX]:
+            by_joints, _ = self._closure_derivatives
+            return [self.closure, by_joints[:, self.robot.passive_index.tolist()]]
+
+        return self._batch("closure_by_passive", outputs, matrices=(1,))
+
+    @cached_property
+    def closure_and_tool(self) -> BatchFunction:
+        """(actuated, passive, placements) to g, ∂g by actuated and passive; the tool likewise."""
+
+        def outputs() -> list[ca.SX]:
+            rows = [self.wrench_row(frame, force=ca.SX(np.eye(3)[i]))[0] for i in range(3)]
+            g, _ = self._closure_derivatives
+            tool = self.tree.frame_pose(frame).position
+            return [self.closure, *self.split(g), tool, *self.split(ca.vertcat(*rows))]
+
+        frame = self._tool_frame()
+        return self._batch("closure_and_tool", outputs, matrices=(1, 2, 4, 5))
+
+    @cached_property
+    def closure_jacobian(self) -> BatchFunction:
+        """(actuated, passive, placements) to g and ∂g by actuated, by passive and by twists.
+
+        The last output has the nonzeros of `twist_pattern`.
+        """
+        return self._batch("closure_jacobian", self._jacobian_outputs, matrices=(1, 2), sparse=(3,))
+
+    @cached_property
+    def twist_pattern(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns of the nonzeros of ∂g by twists, column by column."""
+        return self.closure_jacobian.pattern("y3")
+
+    @cached_property
+    def closure_expressions(self) -> ca.Function:
+        """The closure Jacobian with all outputs sparse, for use in other expressions."""
+        return self._function("closure_expressions", self._jacobian_outputs, sparse=(0, 1, 2, 3))
+
+    def _jacobian_outputs(self) -> list[ca.SX]:
+        joints, twists = self._closure_derivatives
+        return [self.closure, *self.split(joints), twists]
+
+    # ---- frames
+
+    def position(self, frame: str) -> BatchFunction:
+        """(actuated, passive, placements) to the position of a frame, [m]."""
+        index = self.robot.frame_id(frame)
+        if index not in self._positions:
+            self._positions[index] = self._batch(
+                f"frame_{index}", lambda: [self.tree.frame_pose(index).position]
+            )
+        return self._positions[index]
+
+    def pose(self, frame: str) -> BatchFunction:
+        """(actuated, passive, placements) to the pose of a frame, shape (4, 4), [1, m]."""
+        index = self.robot.frame_id(frame)
+        if index not in self._poses:
+            self._poses[index] = self._batch(f"pose_{index}", lambda: [self._homogeneous(index)])
+        return self._poses[index]
+
+    def _homogeneous(self, frame: int) -> ca.SX:
+        pose = self.tree.frame_pose(frame)
+        return ca.vertcat(ca.horzcat(pose.rotation, pose.position), ca.SX([[0, 0, 0, 1]]))
+
+    @cached_property
+    def tool_jacobian(self) -> BatchFunction:
+        """(actuated, passive, placements) to the tool and ∂ by actuated, passive and twists."""
+
+        def outputs() -> list[ca.SX]:
+            rows = [self.wrench_row(frame, force=ca.SX(np.eye(3)[i])) for i in range(3)]
+            joints = self.split(ca.vertcat(*(j for j, _ in rows)))
+            twists = ca.vertcat(*(t for _, t in rows))
+            return [self.tree.frame_pose(frame).position, *joints, twists]
+
+        frame = self._tool_frame()
+        return self._batch("tool_jacobian", outputs, matrices=(1, 2, 3))
+
+    def _tool_frame(self) -> int:
+        """Index of the tool's frame."""
+        return self.robot.frame_id("" if self.robot.tcp is None else self.robot.tcp.frame)
+
+    def wrench_row(
+        self, frame: int, *, force: ca.SX, moment: ca.SX | None = None
+    ) -> tuple[ca.SX, ca.SX]:
+        """Derivatives of f · p + m · φ of a frame, p its position, φ its rotation in the world.
+
+        Args:
+            frame: Index of the frame.
+            force: f, shape (3,).
+            moment: m, shape (3,); none by default.
+
+        Returns:
+            By the joint coordinates, shape (1, nv), and by the twists of the moved placements,
+            shape (1, n_twists).
+        """
+        position = self.tree.frame_pose(frame).position
+        joints, twists = ca.SX(1, self.robot.model.nv), ca.SX(1, self.n_twists)
+        for source in self._sources(frame).values():
+            to_source = source.pose.rotation.T
+            torque = ca.cross(position - source.pose.position, force)
+            if moment is not None:
+                torque += moment
+            block = ca.vertcat(to_source @ force, to_source @ torque).T
+            self._place(joints, twists, source, block)
+        return joints, twists
+
+    def _closure_blocks(self, closure: Closure) -> tuple[ca.SX, ca.SX]:
+        """∂g of one closure: its rows are forces and moments on frame b, in the world."""
+        a, b = self.robot.frame_id(closure.frame_a), self.robot.frame_id(closure.frame_b)
+        pose_a, pose_b = self.tree.frame_pose(a), self.tree.frame_pose(b)
+        rows = list(closure.rows)
+        if closure.kind == "3d":
+            forces, moments = pose_a.rotation[:, rows].T, ca.SX(len(rows), 3)
+        else:
+            relative = pose_a.relative(pose_b)
+            outer = log6_jacobian(relative.rotation, relative.position)[rows, :]
+            forces, moments = outer[:, :3] @ pose_b.rotation.T, outer[:, 3:] @ pose_b.rotation.T
+        joints = ca.SX(len(rows), self.robot.model.nv)
+        twists = ca.SX(len(rows), self.n_twists)
+        sources_a, sources_b = self._sources(a), self._sources(b)
+        for key in (*sources_b, *sources_a):
+            if key in sources_a and key in sources_b:
+                continue  # moves both alike
+            sign, source = (1.0, sources_b[key]) if key in sources_b else (-1.0, sources_a[key])
+            arm = pose_b.position - source.pose.position
+            torque = moments - forces @ ca.skew(arm)
+            to_source = sign * source.pose.rotation
+            block = ca.horzcat(forces @ to_source, torque @ to_source)
+            self._place(joints, twists, source, block)
+        return joints, twists
+
+    def _sources(self, frame: int) -> dict[tuple[int, bool], _MotionSource]:
+        """Joints that move a frame, and errors of joints and of the frames it hangs on."""
+        sources = {
+            (i, False): _MotionSource(self.tree.joint_base(i), i, self._first.get((i, False)))
+            for i in self.tree.joints_to(frame)
+        }
+        current: int | None = frame
+        while current is not None:
+            key = (current, True)
+            if key in self._first:
+                sources[key] = _MotionSource(self.tree.frame_pose(current), None, self._first[key])
+            current = hangs_on(self.robot.model, current)
+        return sources
+
+    def _place(self, joints: ca.SX, twists: ca.SX, source: _MotionSource, block: ca.SX) -> None:
+        """Add the effect of a unit twist in a source's frame to the source's columns."""
+        if source.first is not None:
+            twists[:, source.first : source.first + 6] += block
+        if source.joint is not None:
+            model = self.robot.model
+            joint = model.joints[source.joint]
+            if joint.nv == 1:
+                axis = ca.sparsify(ca.SX(joint_axis(model, source.joint)))
+            else:
+                axis = ca.vertcat(ca.SX.eye(3), ca.SX(3, 3))  # a translation joint
+            joints[:, joint.idx_v : joint.idx_v + joint.nv] += block @ axis
+
+    def split(self, by_joints: ca.SX) -> list[ca.SX]:
+        """Columns of the actuated and of the passive coordinates, of shape (n, nv)."""
+        index = self.robot.drive_index.tolist(), self.robot.passive_index.tolist()
+        return [by_joints[:, columns] for columns in index]
+
+    def _batch(
+        self,
+        name: str,
+        outputs: Callable[[], list[ca.SX]],
+        *,
+        matrices: tuple[int, ...] = (),
+        sparse: tuple[int, ...] = (),
+    ) -> BatchFunction:
+        return BatchFunction(
+            self._function(name, outputs, sparse=sparse),
+            matrices=[f"y{i}" for i in matrices],
+            sparse=[f"y{i}" for i in sparse],
+            key=function_key(self.robot, name),
+        )
+
+    def _function(
+        self, name: str, outputs: Callable[[], list[ca.SX]], *, sparse: tuple[int, ...]
+    ) -> ca.Function:
+        """A cached function of the symbols; outputs are expressed only if it is not cached."""
+
+        def build() -> ca.Function:
+            values = [y if i in sparse else ca.densify(y) for i, y in enumerate(outputs())]
+            inputs = ["actuated", "passive", "placements"]
+            labels = [f"y{i}" for i in range(len(values))]
+            return ca.Function(name, self.symbols, values, inputs, labels)
+
+        return cached_function(self.robot, name, build)
+
+
+@cached_per_robot(maxsize=8)
+def robot_functions(robot: Robot) -> RobotFunctions:
+    """The functions of a robot, built once."""
+    return RobotFunctions(robot)
+
+
+def reference_poses(robot: Robot, frames: Sequence[str]) -> list[Array]:
+    """Poses of frames of the nominal machine in its reference posture, (4, 4) each, [1, m]."""
+    functions = robot_functions(robot)
+    errors = functions.errors
+    placements = errors.placements(np.zeros(len(errors.names)))
+    zero = robot.drive_zero[None], robot.zero[robot.passive_index][None]
+    return [functions.pose(frame)(*zero, placements)[0][0] for frame in frames]

@@ -1,0 +1,238 @@
+"""Exponential and logarithm of SE(3) and their Jacobians, for NumPy arrays and CasADi expressions.
+
+A twist is (translation v, rotation ω), as in Pinocchio. All coefficients belong to one family,
+
+    α_n(θ²) = Σ_k (−θ²)^k/(n + 2k)!,  α_1 = sin θ/θ,  α_2 = (1 − cos θ)/θ²,  θ = |ω|,
+
+whose series near 0 keeps every function safe to differentiate there. Arrays may have any leading
+batch dimensions. Sources: Chirikjian, Stochastic Models, Information Theory, and Lie Groups,
+volume 2, 2012, section 10.8; Barfoot, State Estimation for Robotics, 2017, section 7.1.5.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias, overload
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Operand: TypeAlias = Any
+"""A NumPy array or a CasADi expression."""
+
+SERIES_BELOW = 0.25
+"""Squared angle below which coefficients come from their series, [rad²]."""
+
+SERIES_TERMS = 9
+"""Terms of a series: the first omitted one is below 1e-21 at SERIES_BELOW."""
+
+LOGARITHM_SERIES_ABOVE = 0.999
+"""Cosine above which the logarithm's coefficients come from their series."""
+
+_ARCSINE = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
+_BERNOULLI = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
+
+
+class _Operations(NamedTuple):
+    """Operations that NumPy and CasADi spell differently; vectors are columns."""
+
+    where: Callable[[Any, Any, Any], Any]
+    sqrt: Callable[[Any], Any]
+    sin: Callable[[Any], Any]
+    cos: Callable[[Any], Any]
+    arctan2: Callable[[Any, Any], Any]
+    skew: Callable[[Any], Any]
+    inverse_skew: Callable[[Any], Any]
+    transpose: Callable[[Any], Any]
+    trace: Callable[[Any], Any]
+
+
+@overload
+def exp6(twist: Array) -> tuple[Array, Array]: ...
+@overload
+def exp6(twist: ca.SX) -> tuple[ca.SX, ca.SX]: ...
+def exp6(twist: Operand) -> tuple[Operand, Operand]:
+    """Exponential of a twist.
+
+        R = I + α₁ [ω] + α₂ [ω]²,  p = v + α₂ ω × v + α₃ ω × (ω × v)
+
+    Args:
+        twist: Shape (..., 6), [m, rad]; an expression of shape (6,).
+
+    Returns:
+        Rotation, shape (..., 3, 3), and position, shape (..., 3), [m].
+    """
+    m, v, w = _split(twist)
+    if m is _CASADI and w.is_zero():
+        return ca.SX.eye(3), v
+    a, b, c = _coefficients(m, m.transpose(w) @ w, 3)
+    hat = m.skew(w)
+    cross = hat @ v
+    rotation = np.eye(3) + a * hat + b * (hat @ hat)
+    position = v + b * cross + c * (hat @ cross)
+    return (rotation, position) if m is _CASADI else (rotation, position[..., 0])
+
+
+@overload
+def log6(rotation: Array, position: Array) -> Array: ...
+@overload
+def log6(rotation: ca.SX, position: ca.SX) -> ca.SX: ...
+def log6(rotation: Operand, position: Operand) -> Operand:
+    """Logarithm of a pose, for rotations by less than π.
+
+        ω = (θ/sin θ) ½ vee(R − Rᵀ)
+        v = p − ½ ω × p + (1/θ² − (1 + cos θ)/(2 θ sin θ)) ω × (ω × p)
+
+    Args:
+        rotation: Shape (..., 3, 3).
+        position: Shape (..., 3), [m].
+
+    Returns:
+        Twist, shape (..., 6), [m, rad].
+    """
+    m = _CASADI if isinstance(rotation, ca.SX) else _NUMPY
+    p = position if m is _CASADI else np.asarray(position)[..., None]
+    half = 0.5 * m.inverse_skew(rotation - m.transpose(rotation))
+    cosine = 0.5 * (m.trace(rotation) - 1.0)
+    sine2 = m.transpose(half) @ half
+    near = cosine > LOGARITHM_SERIES_ABOVE
+    sine = m.sqrt(m.where(near, 1.0, sine2))
+    safe_cosine = m.where(near, 0.0, cosine)
+    angle = m.arctan2(sine, safe_cosine)
+    w = m.where(near, _polynomial(sine2, _ARCSINE), angle / sine) * half
+    far = 1.0 / angle**2 - (1.0 + safe_cosine) / (2.0 * angle * sine)
+    beta = m.where(near, _polynomial(m.transpose(w) @ w, _BERNOULLI), far)
+    hat = m.skew(w)
+    cross = hat @ p
+    v = p - 0.5 * cross + beta * (hat @ cross)
+    if m is _CASADI:
+        return ca.vertcat(v, w)
+    return np.concatenate([v, w], axis=-2)[..., 0]
+
+
+@overload
+def right_jacobian(twist: Array) -> Array: ...
+@overload
+def right_jacobian(twist: ca.SX) -> ca.SX: ...
+def right_jacobian(twist: Operand) -> Operand:
+    """Right Jacobian T of the exponential: exp6(ξ + dξ) = exp6(ξ) exp6(T dξ) to first order.
+
+        T = [[A, Q], [0, A]],  A = I − α₂ W + α₃ W²,  W = [ω],  V = [v]
+        Q = −½ V + α₃ (W V + V W − W V W) − α₄ (W² V + V W² − 3 W V W)
+            + ½ (α₄ − 3 α₅) (W V W² + W² V W)
+
+    Args:
+        twist: ξ, shape (..., 6), [m, rad]; an expression of shape (6,).
+
+    Returns:
+        Shape (..., 6, 6).
+    """
+    m, v, w = _split(twist)
+    _, a2, a3, a4, a5 = _coefficients(m, m.transpose(w) @ w, 5)
+    hat_v, hat_w = m.skew(v), m.skew(w)
+    wv, vw, ww = hat_w @ hat_v, hat_v @ hat_w, hat_w @ hat_w
+    wvw = wv @ hat_w
+    rotation = np.eye(3) - a2 * hat_w + a3 * ww
+    coupling = (
+        -0.5 * hat_v
+        + a3 * (wv + vw - wvw)
+        - a4 * (hat_w @ wv + vw @ hat_w - 3.0 * wvw)
+        + 0.5 * (a4 - 3.0 * a5) * (wvw @ hat_w + hat_w @ wvw)
+    )
+    if m is _CASADI:
+        return ca.blockcat([[rotation, coupling], [ca.SX(3, 3), rotation]])
+    result = np.zeros((*twist.shape, 6))
+    result[..., :3, :3] = result[..., 3:, 3:] = rotation
+    result[..., :3, 3:] = coupling
+    return result
+
+
+def log6_jacobian(rotation: ca.SX, position: ca.SX) -> ca.SX:
+    """Derivative of log6(M exp6(ξ)) by ξ at 0, as Pinocchio's Jlog6, shape (6, 6)."""
+    r, p = ca.SX.sym("r", 3, 3), ca.SX.sym("p", 3)
+    twist = log6(r, p)
+    by_rotation, by_position = ca.jacobian(twist, ca.vec(r)), ca.jacobian(twist, p) @ r
+    rotations = [ca.vec(r @ ca.skew(ca.SX(np.eye(3)[k]))) for k in range(3)]
+    result = ca.horzcat(by_position, by_rotation @ ca.horzcat(*rotations))
+    return ca.Function("log6_jacobian", [r, p], [result])(rotation, position)
+
+
+def skew(vectors: Array) -> Array:
+    """Cross-product matrices [v] of vectors, shape (..., 3, 3) of (..., 3)."""
+    result = np.zeros((*vectors.shape, 3))
+    x, y, z = (vectors[..., i] for i in range(3))
+    result[..., 0, 1], result[..., 0, 2] = -z, y
+    result[..., 1, 0], result[..., 1, 2] = z, -x
+    result[..., 2, 0], result[..., 2, 1] = -y, x
+    return result
+
+
+def _coefficients(m: _Operations, square: Operand, count: int) -> list[Operand]:
+    """α_1 to α_count of the squared angle."""
+    near = square < SERIES_BELOW
+    safe = m.where(near, 1.0, square)
+    angle = m.sqrt(safe)
+    sine, cosine = m.sin(angle), m.cos(angle)
+    far = (
+        sine / angle,
+        (1.0 - cosine) / safe,
+        (angle - sine) / (safe * angle),
+        (0.5 * safe - 1.0 + cosine) / (safe * safe),
+        (safe * angle / 6.0 - angle + sine) / (safe * safe * angle),
+    )
+    return [m.where(near, _series(square, n), far[n - 1]) for n in range(1, count + 1)]
+
+
+def _series(square: Operand, first: int) -> Operand:
+    """Σ (−θ²)^k/(first + 2k)!."""
+    coefficients = (1.0 / math.factorial(first + 2 * k) for k in range(SERIES_TERMS))
+    return _polynomial(-square, tuple(coefficients))
+
+
+def _polynomial(x: Operand, coefficients: tuple[float, ...]) -> Operand:
+    """Σ c_k x^k by Horner's rule."""
+    total = 0.0 * x
+    for coefficient in reversed(coefficients):
+        total = total * x + coefficient
+    return total
+
+
+def _split(twist: Operand) -> tuple[_Operations, Operand, Operand]:
+    """Operations, and translation and rotation as columns."""
+    if isinstance(twist, ca.SX):
+        return _CASADI, twist[:3], twist[3:]
+    columns = np.asarray(twist, dtype=np.float64)[..., None]
+    return _NUMPY, columns[..., :3, :], columns[..., 3:, :]
+
+
+def _inverse_skew(matrices: Array) -> Array:
+    """Columns v of cross-product matrices [v], shape (..., 3, 1)."""
+    parts = [matrices[..., 2, 1], matrices[..., 0, 2], matrices[..., 1, 0]]
+    return np.stack(parts, axis=-1)[..., None]
+
+
+_NUMPY = _Operations(
+    where=np.where,
+    sqrt=np.sqrt,
+    sin=np.sin,
+    cos=np.cos,
+    arctan2=np.arctan2,
+    skew=lambda column: skew(column[..., 0]),
+    inverse_skew=_inverse_skew,
+    transpose=lambda a: np.swapaxes(a, -1, -2),
+    trace=lambda a: np.trace(a, axis1=-2, axis2=-1)[..., None, None],
+)
+_CASADI = _Operations(
+    where=ca.if_else,
+    sqrt=ca.sqrt,
+    sin=ca.sin,
+    cos=ca.cos,
+    arctan2=ca.atan2,
+    skew=ca.skew,
+    inverse_skew=ca.inv_skew,
+    transpose=lambda a: a.T,
+    trace=ca.trace,
+)

@@ -1,0 +1,492 @@
+"""Recording of readings: rows in the order of measuring, each change on disk before it counts.
+
+A change is appended to a journal beside the readings.csv and synced; then the CSV is replaced. Each
+line of the journal holds the digests of the CSV before and after its change. If the process is
+killed or the power fails, the CSV is that of some change, and the later changes of the journal are
+applied again. A recording that ends in order closes its journal: from then on the CSV counts,
+edited or not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from orthocal.errors import OrthocalError, OutputError, SessionError
+from orthocal.io.documents import Number, read_yaml, validate
+from orthocal.io.files import exists, read_file, sync_folder, write_file
+from orthocal.io.journal import Journal, open_journal_file
+from orthocal.measurement.files.readings_checks import check_conditions, check_range
+from orthocal.measurement.files.schema import LARGEST_READING_MM, MOST_READINGS
+from orthocal.measurement.files.session_file import load_rows
+from orthocal.measurement.files.write_session import readings_table
+from orthocal.runtime.interrupts import postponed_interrupt
+from orthocal.session.session import Conditions, Reading, Session
+from orthocal.units import MM, to_mm
+
+FORMAT = "orthocal/recording/1"
+
+SUFFIX = ".journal"
+"""Suffix of the journal, after the name of the CSV."""
+
+LONGEST_LINE = 2**16
+"""Largest length of a line of the journal, [bytes]: it names two rows at most."""
+
+CLOSED: dict[str, Any] = {"closed": True}
+"""Last line of a recording that ended in order."""
+
+DECIMALS = 9
+"""Decimals of a recorded reading in mm."""
+
+FIRST_LINE = 2
+"""Line of the first row of a readings.csv, after the header."""
+
+BUSY = "these readings are being recorded by another process; one at a time"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A row of the readings.csv."""
+
+    setup: str
+    posture: str
+    minus: str | None
+    cycle: int
+    value: float | None
+    """Reading, [m]; None before it is read."""
+    line: int | None = None
+    """Line of the CSV."""
+    conditions: Conditions | None = None
+    """As planned or stated; None for a difference, or where nothing is stated."""
+
+    @property
+    def key(self) -> Key:
+        """Setup, postures, cycle and known approach, which identify the row."""
+        place = self.setup, self.posture, self.minus, self.cycle
+        return place if self.reading.approach is None else (*place, self.reading.approach)
+
+    @property
+    def place(self) -> tuple[str, str, str | None, str | None]:
+        """Setup, postures and approach, which all cycles of the row share."""
+        return self.reading.place
+
+    @property
+    def label(self) -> str:
+        """Setup and postures in words, and the cycle from the second on."""
+        return self.reading.label + (f", cycle {self.cycle}" if self.cycle != 1 else "")
+
+    @property
+    def reading(self) -> Reading:
+        """The row as a reading of a session; 0 before it is read."""
+        return Reading(
+            self.setup,
+            self.posture,
+            self.minus,
+            self.cycle,
+            self.value or 0.0,
+            self.line,
+            conditions=self.conditions,
+        )
+
+
+Cycle = Annotated[int, Field(ge=1, lt=10**9)]
+Key = tuple[str, str, str | None, Cycle] | tuple[str, str, str | None, Cycle, str]
+"""Setup, posture, posture that is taken off, cycle, and the approach where one is known."""
+
+
+class Change(BaseModel):
+    """A change of the rows."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+    done: Literal["read", "emptied", "added", "dropped"]
+    """A value was read for a row; all rows of its setup were emptied; a row was added after it; it
+    was deleted."""
+    rows: Annotated[list[Key], Field(min_length=1, max_length=2)]
+    """The row, and the added one."""
+    reading_mm: Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)] | None = (
+        None
+    )
+    conditions: Conditions | None = None
+    """Stated with the value; those that are None stay what they were."""
+
+
+class _JournalLine(Change):
+    at: str
+    before: str
+    after: str
+
+
+def change_rows(rows: Sequence[Row], change: Change) -> tuple[Row, ...]:
+    """Rows after a change.
+
+    Raises:
+        SessionError: If the row does not exist, or the added one does.
+    """
+    indices = {row.key: i for i, row in enumerate(rows)}
+    changed = list(rows)
+    key, *added = change.rows
+    if key not in indices:
+        raise SessionError(f"there is no row {' '.join(str(k) for k in key if k)}")
+    index = indices[key]
+    if change.done == "read":
+        if change.reading_mm is None:
+            raise SessionError("the reading is missing")
+        row = changed[index]
+        conditions = _merge_conditions(row.conditions, change.conditions)
+        row = replace(row, value=change.reading_mm * MM, conditions=conditions)
+        if row.key != key and row.key in indices:
+            raise SessionError(f"{row.label} exists already")
+        changed[index] = row
+    elif change.done == "emptied":
+        changed = [_emptied(r) if r.setup == key[0] else r for r in changed]
+    elif change.done == "dropped":
+        del changed[index]
+    else:
+        if len(added) != 1 or added[0] in indices:
+            raise SessionError("the added row exists already, or is not named")
+        setup, posture, minus, cycle, *approach = added[0]
+        conditions = Conditions(approach[0]) if approach else None
+        new = Row(setup, posture, minus, cycle, None, conditions=conditions)
+        changed.insert(index + 1, new)
+    return tuple(replace(row, line=i) for i, row in enumerate(changed, FIRST_LINE))
+
+
+def _merge_conditions(planned: Conditions | None, stated: Conditions | None) -> Conditions | None:
+    """Conditions as planned, with those that are stated in their place."""
+    if planned is None or stated is None:
+        return planned or stated
+    return Conditions(
+        stated.approach or planned.approach,
+        planned.temperature if stated.temperature is None else stated.temperature,
+        stated.time or planned.time,
+    )
+
+
+def _emptied(row: Row) -> Row:
+    """The row before it was read: only its approach is planned."""
+    approach = None if row.conditions is None else row.conditions.approach
+    return replace(row, value=None, conditions=Conditions(approach) if approach else None)
+
+
+class Recording:
+    """A session that is being measured, locked against other recordings.
+
+    Args:
+        session: The session as it was when the recording began.
+        rows: Its rows in the order of measuring.
+        journal: Journal of the changes.
+        digest: Digest of the CSV on disk.
+        restored: Number of changes that a killed recording had not written to the CSV.
+        edited: Whether the CSV is none of those that the killed recording wrote.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        rows: Sequence[Row],
+        journal: Journal,
+        *,
+        digest: str,
+        restored: int = 0,
+        edited: bool = False,
+    ) -> None:
+        self.session = session
+        self.rows = tuple(rows)
+        self.restored = restored
+        self.edited = edited
+        self._journal = journal
+        self._digest = digest
+
+    @property
+    def path(self) -> Path:
+        """The readings.csv."""
+        return _csv_of(self.session)
+
+    @property
+    def missing(self) -> tuple[int, ...]:
+        """Indices of the rows without a reading."""
+        return tuple(i for i, row in enumerate(self.rows) if row.value is None)
+
+    def measured(self, *, without: Collection[int] = ()) -> Session:
+        """The session with the rows that were read; gauges stay aligned as planned.
+
+        Args:
+            without: Indices of rows to be left out.
+        """
+        readings = tuple(row.reading for row in self.rows)
+        session = replace(self.session, readings=readings, sha256="")
+        if not self.missing and not without:
+            return session
+        return session.select(
+            [
+                readings[i]
+                for i, row in enumerate(self.rows)
+                if row.value is not None and i not in without
+            ]
+        )
+
+    def next_empty(self, skipped: frozenset[Key] = frozenset()) -> int | None:
+        """Index of the first row without a reading, except those that are skipped."""
+        return next((i for i in self.missing if self.rows[i].key not in skipped), None)
+
+    def read(self, index: int, value: float, conditions: Conditions | None = None) -> None:
+        """Record a reading; it is on disk when this returns.
+
+        Args:
+            index: Index of the row.
+            value: Reading, [m].
+            conditions: Conditions of the reading; those that are None stay as planned.
+
+        Raises:
+            SessionError: If it is beyond the range of the gauge, or the row cannot have the
+                conditions.
+            OutputError: If it cannot be written.
+        """
+        row = self.rows[index]
+        gauge = self.session.gauges[self.session.setups[row.setup].gauge]
+        check_range(to_mm(value), gauge, row.minus is not None, row.label)
+        if conditions is not None:
+            check_conditions(conditions, self.session.robot, row.minus is not None, row.label)
+        reading = round(to_mm(value), DECIMALS)
+        self._apply(Change(done="read", rows=[row.key], reading_mm=reading, conditions=conditions))
+
+    def repeat(self, index: int) -> int:
+        """Add another cycle of a row after it, and return its index.
+
+        A repeated difference must not follow from others of its cycle, nor share the cycle with
+        readings of another form. It gets a new cycle.
+
+        Raises:
+            SessionError: If there are too many rows.
+            OutputError: If it cannot be written.
+        """
+        row = self.rows[index]
+        if len(self.rows) >= MOST_READINGS:
+            raise SessionError(f"there are {MOST_READINGS} rows already, the largest number")
+        of_setup = [r for r in self.rows if r.setup == row.setup]
+        cycle = 1 + max(r.cycle for r in of_setup if row.minus is not None or r.place == row.place)
+        if any(r.cycle == cycle and (r.minus is None) != (row.minus is None) for r in of_setup):
+            cycle = 1 + max(r.cycle for r in of_setup)
+        self._apply(Change(done="added", rows=[row.key, replace(_emptied(row), cycle=cycle).key]))
+        return index + 1
+
+    def drop(self, index: int) -> None:
+        """Delete a row.
+
+        Raises:
+            SessionError: If it is the only one.
+            OutputError: If it cannot be written.
+        """
+        if len(self.rows) == 1:
+            raise SessionError("it is the only row; a session has at least one")
+        self._apply(Change(done="dropped", rows=[self.rows[index].key]))
+
+    def empty(self, index: int) -> None:
+        """Delete all readings of a row's setup, to be read again; the journal keeps them.
+
+        Raises:
+            OutputError: If it cannot be written.
+        """
+        self._apply(Change(done="emptied", rows=[self.rows[index].key]))
+
+    def close(self) -> None:
+        """Close the journal: from now on the CSV counts."""
+        with suppress(OutputError):
+            self._journal.append(CLOSED)
+
+    def _apply(self, change: Change) -> None:
+        rows = change_rows(self.rows, change)
+        content = _table(rows)
+        with postponed_interrupt():
+            line = change.model_dump(mode="json", exclude_none=True, by_alias=True) | {
+                "rows": [list(key) for key in change.rows],
+                "at": datetime.now(UTC).isoformat(timespec="seconds"),
+                "before": self._digest,
+                "after": _digest(content),
+            }
+            self._journal.append(line)
+            _write(self.path, content)
+            self.rows, self._digest = rows, _digest(content)
+
+
+@contextmanager
+def open_recording(path: str | Path) -> Iterator[Recording]:
+    """Open a session for recording; a plan without readings gets its rows.
+
+    Args:
+        path: The session.yaml, or its directory.
+
+    Raises:
+        SessionError: If it does not load.
+        OrthocalError: If another process records it, or its journal is damaged.
+        OutputError: If its directory cannot be written to.
+    """
+    session, unread = load_rows(path)
+    csv = _csv_of(session)
+    _files_to_add(session, unread)  # refused before anything is written
+    with open_journal_file(
+        csv.with_name(csv.name + SUFFIX), busy=BUSY, longest=LONGEST_LINE
+    ) as journal:
+        lines = _read_lines(journal)
+        if _is_outdated(session):  # another process may have written before the lock
+            session, unread = load_rows(path)
+        for file, content in _files_to_add(session, unread).items():
+            write_file(file, content)
+        if session.readings_path is None:
+            session, unread = load_rows(path)
+        rows = _rows(session.readings, unread)
+        table = read_file(csv, error=SessionError)
+        pending, edited = _find_pending(lines, _digest(table))
+        for where, change in pending:
+            try:
+                rows = change_rows(rows, change)
+            except SessionError as e:
+                raise OrthocalError(f"does not fit {csv.name}: {e.problem}", where=where) from None
+        if pending:
+            table = _table(rows)
+            _write(csv, table)
+            session, _ = load_rows(path)
+        recording = Recording(
+            session, rows, journal, digest=_digest(table), restored=len(pending), edited=edited
+        )
+        try:
+            yield recording
+        finally:
+            recording.close()
+
+
+def _files_to_add(session: Session, unread: frozenset[int]) -> dict[Path, bytes]:
+    """Files that make a plan a session: its rows, then the YAML that names them."""
+    if session.readings_path is not None or session.path is None:
+        return {}
+    csv, table = _csv_of(session), _table(_rows(session.readings, unread))
+    return {csv: table, session.path: _yaml_with_readings(session.path, csv, table)}
+
+
+def _yaml_with_readings(file: Path, csv: Path, table: bytes) -> bytes:
+    """Content of a session.yaml with the key `readings` appended, otherwise unchanged.
+
+    Args:
+        file: The session.yaml, without readings.
+        csv: Path of the new readings.csv beside it.
+        table: Content of the readings.csv.
+
+    Raises:
+        SessionError: If the readings.csv exists with other rows, or the key cannot be appended.
+    """
+    if exists(csv) and read_file(csv, error=SessionError) != table:
+        raise SessionError(
+            f"holds other rows than {file.name} plans and would be overwritten; move it away, or "
+            f"add `readings: {csv.name}` to {file.name}",
+            where=str(csv),
+        )
+    content = read_file(file, error=SessionError)
+    extended = content.rstrip() + f"\nreadings: {csv.name}\n".encode()
+    expected = read_yaml(file, error=SessionError, content=content) | {"readings": csv.name}
+    try:
+        document = read_yaml(file, error=SessionError, content=extended)
+    except SessionError:
+        document = None
+    if document != expected:
+        raise SessionError(
+            f"is missing; add `readings: {csv.name}` to it", where=f"{file}: readings"
+        )
+    return extended
+
+
+def _is_outdated(session: Session) -> bool:
+    """Whether the files of a session differ from those that were loaded."""
+    if session.path is None or session.readings_path is None:
+        return True
+    parts = (read_file(f, error=SessionError) for f in (session.path, session.readings_path))
+    return _digest(b"\0".join(parts)) != session.sha256
+
+
+def _write(csv: Path, content: bytes) -> None:
+    write_file(csv, content)
+    sync_folder(csv.parent)
+
+
+def _csv_of(session: Session) -> Path:
+    if session.readings_path is not None:
+        return session.readings_path
+    return (session.path or Path("session.yaml")).parent / "readings.csv"
+
+
+def _rows(readings: Sequence[Reading], unread: frozenset[int]) -> tuple[Row, ...]:
+    return tuple(
+        Row(
+            r.setup,
+            r.posture,
+            r.minus,
+            r.cycle,
+            None if i in unread else r.value,
+            r.line,
+            r.conditions,
+        )
+        for i, r in enumerate(readings)
+    )
+
+
+def _table(rows: Sequence[Row]) -> bytes:
+    """Content of the readings.csv."""
+    readings, values = [r.reading for r in rows], [r.value for r in rows]
+    return readings_table(readings, values, decimals=DECIMALS).encode()
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _read_lines(journal: Journal) -> list[tuple[str, _JournalLine]]:
+    """Changes since a recording ended in order; a new journal gets its header."""
+    lines: list[tuple[str, _JournalLine]] = []
+    has_header = False
+    for where, data in journal.entries():
+        if not has_header and (data is None or data.get("format") != FORMAT):
+            raise OrthocalError(
+                "is not the journal of a recording; move it away, and the readings count as they "
+                "are",
+                where=str(journal.path),
+            )
+        if data == CLOSED:
+            lines.clear()
+        elif has_header:
+            try:
+                line = validate(_JournalLine, data, where=where, error=OrthocalError)
+            except OrthocalError:
+                raise OrthocalError(
+                    "is not a line of a recording: the journal is damaged; move it away, and the "
+                    "readings count as they are",
+                    where=where,
+                ) from None
+            lines.append((where, line))
+        has_header = True
+    if not has_header:
+        journal.append({"format": FORMAT})
+    return lines
+
+
+def _find_pending(
+    lines: Sequence[tuple[str, _JournalLine]], digest: str
+) -> tuple[Sequence[tuple[str, _JournalLine]], bool]:
+    """Changes that the CSV does not have yet, and whether it was edited since.
+
+    Args:
+        lines: Lines of the journal.
+        digest: Digest of the CSV.
+    """
+    if not lines or lines[-1][1].after == digest:
+        return [], False
+    for i in range(len(lines) - 1, -1, -1):
+        if lines[i][1].before == digest:
+            return lines[i:], False
+    return [], True

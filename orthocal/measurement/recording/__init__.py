@@ -1,1 +1,0 @@
-"""Recording of readings at the machine, one at a time."""

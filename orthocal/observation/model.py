@@ -1,0 +1,687 @@
+"""The observation model: predicted readings h(q, θ, ν) and their derivatives.
+
+A reading depends on the geometry of the machine (errors θ), on the passive coordinates q that close
+the loops, and on nuisance parameters ν of its sensor. Gauge zeros are not part of the model. Near
+closed loops, g(q, θ) ≈ 0, the implicit function theorem gives
+
+    dq = −g_q⁻¹ (g + g_θ dθ),  J = h_θ − h_q g_q⁻¹ g_θ
+
+Everything takes batches: S machines that differ in their errors, in K postures with any number of
+readings each. One machine is a batch of one. Simulation, solvers, predictive distributions, plans
+and studies all use this module.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.kinematics.error_map import ErrorMap, MachineGeometry
+from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.robot_functions import RobotFunctions, robot_functions
+from orthocal.observation.manual_alignment import ManualAlignment, list_alignments, virtual_session
+from orthocal.observation.observations import Observations, build_observations
+from orthocal.observation.sensor_groups import (
+    NuisanceParameters,
+    SensorGroup,
+    group_sensors,
+    nuisance_parameters,
+)
+from orthocal.session.session import Session
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+MAX_POSTURES, MAX_READINGS = 64, 640
+"""Postures and readings of one block: its Jacobians stay in the processor's cache."""
+
+MAX_PREDICTED = 4096
+"""Readings of all machines that are predicted together, for the memory of their inputs."""
+
+MIN_SPARSE_ROWS = 400
+"""Rows from which a product with a sparse matrix is faster than with a dense one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FreeParameters:
+    """Scaled free parameters θ̂: machine errors first, then nuisance parameters."""
+
+    columns: Array
+    """Elementary errors of one unit of each machine parameter, (n_errors, n_machine), [SI]."""
+    nuisance_scale: Array
+    """One unit of each nuisance parameter, shape (n_nuisance,), [SI]."""
+    pattern: _ClosurePattern
+    """Nonzeros of ∂g by the twists that the machine parameters move."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Block:
+    """Loop closures with the same number of readings and the same conditions of placements."""
+
+    states: Indices
+    """Shape (k,)."""
+    entries: Indices
+    """Entries of each state, shape (k, m)."""
+    variant: int
+    """Index of the conditions of placements."""
+    members: tuple[tuple[int, Indices, Indices], ...]
+    """Sensor groups: index; positions in `entries`, flat; and positions in the group, (n,) each."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Closures:
+    """Derivatives of the loop closures of a block, for S machines."""
+
+    residual: Array
+    """g, shape (S, k, n_rows), [m]."""
+    inverse: Array
+    """g_q⁻¹, shape (S, k, n_passive, n_rows)."""
+    by_drive_errors: Array
+    """Shape (S, k, n_rows, n_drive_errors)."""
+    by_twists: Array
+    """Nonzeros in the order of the model's pattern, shape (S, k, nnz)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Readings:
+    """Readings of a block and their derivatives, for S machines; shape (S, k m, ...)."""
+
+    value: Array
+    by_drive_errors: Array
+    """By the errors of the drives, in the posture and in the reference posture."""
+    by_passive: Array
+    by_nuisance: Array
+    by_twists: tuple[tuple[Indices, Indices, Array], ...]
+    """Of each sensor group: positions, (n,), columns, (nnz,), and nonzeros, (S, n, nnz)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ClosurePattern:
+    """Nonzeros of ∂g by the twists that free parameters move, sorted by rows of g."""
+
+    used: Indices
+    """Columns of the twists that free parameters move."""
+    place: Indices
+    """Position of each twist column among the used ones, -1 for others, shape (n_twists,)."""
+    chosen: Indices
+    """Their positions among all nonzeros."""
+    rows: Indices
+    columns: Indices
+    """Row and column of each, shape (nnz,)."""
+
+    @staticmethod
+    def of(functions: RobotFunctions, columns: Array) -> _ClosurePattern:
+        moved = functions.errors.twists_moved_by(columns).reshape(-1, 6).any(axis=1)
+        used = np.flatnonzero(np.repeat(moved, 6))
+        place = np.full(functions.n_twists, -1)
+        place[used] = np.arange(used.size)
+        rows, twists = functions.twist_pattern
+        chosen = np.flatnonzero(place[twists] >= 0)
+        chosen = chosen[np.argsort(rows[chosen], kind="stable")]
+        return _ClosurePattern(used, place, chosen, rows[chosen], twists[chosen])
+
+    def dense(self, nonzeros: Array, n_rows: int) -> Array:
+        """Matrices of nonzeros, shape (S, k, n_rows, n_used) of (S, k, nnz)."""
+        result: Array = np.zeros((*nonzeros.shape[:2], n_rows * self.used.size))
+        result[:, :, self.rows * self.used.size + self.place[self.columns]] = nonzeros
+        return result.reshape(*nonzeros.shape[:2], n_rows, self.used.size)
+
+    def times(self, nonzeros: Array, twists: Array, n_rows: int) -> Array:
+        """∂g · ξ, shape (S, k, n_rows), of nonzeros, (S, k, nnz), and twists, (S, n_twists)."""
+        n_sets = max(len(twists), len(nonzeros))
+        result = np.zeros((n_sets, nonzeros.shape[1], n_rows))
+        for row, part in self._row_parts(n_rows):
+            result[..., row] = (nonzeros[..., part] @ twists[:, self.columns[part], None])[..., 0]
+        return result
+
+    def subtract(self, twists: Array, nonzeros: Array, forces: Array) -> None:
+        """Subtract λ · ∂g, summed over postures, from (S, n_twists), in place.
+
+        Args:
+            twists: Shape (S, n_twists).
+            nonzeros: Shape (S, k, nnz).
+            forces: λ, shape (S, k, n_rows).
+        """
+        for row, part in self._row_parts(forces.shape[2]):
+            product = forces[:, None, :, row] @ nonzeros[:, :, part]
+            twists[:, self.columns[part]] -= product[:, 0]  # no column twice in a row
+
+    def _row_parts(self, n_rows: int) -> Iterator[tuple[int, slice]]:
+        """Rows that have nonzeros, and the slice of each."""
+        starts = np.searchsorted(self.rows, np.arange(n_rows + 1)).tolist()
+        for row, (first, end) in enumerate(itertools.pairwise(starts)):
+            if end > first:
+                yield row, slice(first, end)
+
+
+class ObservationModel:
+    """Readings of a session's entries as functions of errors and nuisance parameters.
+
+    Args:
+        session: Setups, postures and robot; the values of its readings do not matter.
+        observations: The entries to predict; those of the session's readings by default.
+
+    Attributes:
+        states: Loop closures; one for each posture, unless effects on the kinematics need
+            conditions of its readings (`States`).
+        nuisance: Nuisance parameters of the session's sensors.
+    """
+
+    def __init__(self, session: Session, observations: Observations | None = None) -> None:
+        self.session = session
+        self.observations = build_observations(session) if observations is None else observations
+        self.functions: RobotFunctions = robot_functions(session.robot)
+        self.nuisance: NuisanceParameters = nuisance_parameters(session)
+        self.states = self.observations.states
+
+    @cached_property
+    def groups(self) -> tuple[SensorGroup, ...]:
+        """Entries by the expression of their sensors."""
+        return group_sensors(self.session, self.observations)
+
+    @cached_property
+    def alignment(self) -> ManualAlignment:
+        """Nuisance parameters at which the operator aligned the gauges, as functions of errors.
+
+        Raises:
+            ClosureError: If the nominal machine cannot reach a posture of alignment.
+        """
+        errors = self.functions.errors
+        slopes = np.zeros((len(self.nuisance.parameters), len(errors.names)))
+        start = np.zeros(len(self.nuisance.parameters))
+        alignments = list_alignments(self.session, self.nuisance)
+        if alignments:
+            index = [a.parameter for a in alignments]
+            by_errors = nominal_sensitivity(virtual_session(self.session, alignments))
+            offsets = errors.columns([f"{d.name}.offset" for d in self.session.robot.drives])
+            active = np.array([a.active for a in alignments])
+            slopes[index] = by_errors
+            start[index] = -((by_errors @ offsets) * active).sum(axis=1)
+        return ManualAlignment(slopes, start)
+
+    def parametrise(self, columns: Array, nuisance_scale: Array) -> FreeParameters:
+        """Free parameters for `linearise`; arguments as the fields of `FreeParameters`."""
+        pattern = _ClosurePattern.of(self.functions, columns)
+        return FreeParameters(columns, nuisance_scale, pattern)
+
+    def predict(
+        self,
+        errors: Array,
+        passive: Array,
+        nuisance: Array | None = None,
+        *,
+        aligned: bool = True,
+    ) -> Array:
+        """Readings with gauge zeros at 0.
+
+        Args:
+            errors: Elementary errors, shape (n_errors,), or (S, n_errors) for a batch, [SI].
+            passive: Passive coordinates with closed loops, shape (n_states, n_passive), with S in
+                front for a batch, [m, rad].
+            nuisance: Nuisance parameters as deviations from the manual alignment, shape
+                (n_nuisance,), with S in front for a batch, [SI]; 0 by default.
+            aligned: Add the manual alignment to the nuisance parameters.
+
+        Returns:
+            Shape (n_entries,), with S in front for a batch, [m].
+        """
+        at, q, nu = self._batch(errors, passive, nuisance, aligned=aligned)
+        variants, n_sets = self.geometries(at), len(at)
+        result = np.empty((n_sets, self.observations.size))
+        actuated = variants[0].drives(self.states.commands)
+        for group in self.groups:
+            size = max(1, MAX_PREDICTED // n_sets)
+            for first in range(0, group.entries.size, size):
+                part = np.arange(first, min(first + size, group.entries.size))
+                states = self.observations.state[group.entries[part]]
+                geometry = variants[group.variant]
+                reference = geometry.drives(self.reference_commands[group.variant])
+                (h,) = group.reading.value(
+                    *self._inputs(
+                        group, part, geometry, actuated[:, states], q[:, states], reference, nu
+                    )
+                )
+                result[:, group.entries[part]] = h.reshape(n_sets, part.size)
+        return result if errors.ndim > 1 else result[0]
+
+    def linearise(
+        self,
+        errors: Array,
+        passive: Array,
+        nuisance: Array | None = None,
+        *,
+        free: FreeParameters,
+        noise: Array | None = None,
+        dense: bool = True,
+        aligned: bool = True,
+    ) -> Linearisation:
+        """Readings to first order about machines and passive coordinates near closed loops.
+
+        Args:
+            errors: As for `predict`.
+            passive: As for `predict`; the loops need not be closed exactly.
+            nuisance: As for `predict`.
+            free: The free parameters.
+            noise: Divisor of each entry's reading, shape (n_entries,); 1 by default.
+            dense: Compute the Jacobian. Without it, products with its transpose are available:
+                they take one small product a posture, however many parameters there are.
+            aligned: As for `predict`.
+
+        Raises:
+            LinAlgError: If a posture is singular.
+        """
+        at, q, nu = self._batch(errors, passive, nuisance, aligned=aligned)
+        alignment = self.alignment.slopes if aligned else np.zeros((nu.shape[1], at.shape[1]))
+        divisor = np.ones(self.observations.size) if noise is None else noise
+        return Linearisation(
+            self, at, q, nu, free=free, alignment=alignment, noise=divisor, dense=dense,
+            batch=errors.ndim > 1,
+        )  # fmt: skip
+
+    def _batch(
+        self, errors: Array, passive: Array, nuisance: Array | None, *, aligned: bool
+    ) -> tuple[Array, Array, Array]:
+        """Errors, passive coordinates and nuisance parameters with a leading dimension."""
+        at, n = np.atleast_2d(errors), len(self.nuisance.parameters)
+        q = passive if passive.ndim == 3 else np.broadcast_to(passive, (len(at), *passive.shape))
+        nu = self.alignment(at) if aligned else np.zeros((len(at), n))
+        return at, q, nu if nuisance is None else nu + np.atleast_2d(nuisance)
+
+    def _inputs(
+        self,
+        group: SensorGroup,
+        part: Indices,
+        geometry: MachineGeometry,
+        actuated: Array,
+        passive: Array,
+        reference: Array,
+        nuisance: Array,
+    ) -> tuple[Array, ...]:
+        """Inputs of a sensor's functions for part of its group on all machines."""
+        n_sets, n = len(actuated), part.size
+        return (
+            actuated.reshape(n_sets * n, -1),
+            passive.reshape(n_sets * n, -1),
+            geometry.placements,
+            reference[:, group.setups[part]].reshape(n_sets * n, -1),
+            np.tile(group.constants[part], (n_sets, 1)),
+            nuisance[:, group.nuisance[part]].reshape(n_sets * n, -1),
+        )
+
+    def geometries(self, errors: Array) -> list[MachineGeometry]:
+        """Geometry of machines under the conditions of each variant of placements."""
+        map_ = self.functions.errors
+        return [map_.geometry(errors, command) for command in self.states.variant_commands]
+
+    @cached_property
+    def reference_commands(self) -> Array:
+        """Commands of the reference posture, shape (n_variants, n_setups, n_command).
+
+        The drives are at the mechanical zero as each setup knew it. Placements have the conditions
+        of the variant; other conditions are neutral.
+        """
+        map_, variants = self.functions.errors, self.states.variant_commands
+        commands = map_.command(self.session.zero_drives)
+        of_placements = map_.of_placements
+        return np.where(of_placements, variants[:, None], commands)
+
+    def blocks(self, n_sets: int) -> tuple[_Block, ...]:
+        """All states with readings, by variant and number of readings, for a batch of machines."""
+        o = self.observations
+        group, place = np.zeros((2, o.size), dtype=np.int64)
+        for i, g in enumerate(self.groups):
+            group[g.entries], place[g.entries] = i, np.arange(g.entries.size)
+        order = np.argsort(o.state, kind="stable")
+        states, starts, counts = np.unique(o.state[order], return_index=True, return_counts=True)
+        variant = self.states.variant[states]
+        blocks = []
+        for v, m in sorted(set(zip(variant.tolist(), counts.tolist(), strict=True))):
+            chosen = np.flatnonzero((counts == m) & (variant == v))
+            size = max(1, min(MAX_POSTURES, MAX_READINGS // m) // n_sets)
+            for first in range(0, chosen.size, size):
+                at = chosen[first : first + size]
+                entries = order[starts[at][:, None] + np.arange(m)]
+                flat = entries.reshape(-1)
+                where = ((int(i), np.flatnonzero(group[flat] == i)) for i in np.unique(group[flat]))
+                members = tuple((i, w, place[flat[w]]) for i, w in where)
+                blocks.append(_Block(states[at], entries, v, members))
+        return tuple(blocks)
+
+    @cached_property
+    def _single_blocks(self) -> tuple[_Block, ...]:
+        return self.blocks(1)
+
+
+class Linearisation:
+    """Readings of a batch of machines to first order.
+
+    Shapes are those of a batch of S machines; S is absent where one machine was linearised.
+
+    Args:
+        model: The observation model.
+        errors: Elementary errors, shape (S, n_errors), [SI].
+        passive: Passive coordinates, shape (S, n_states, n_passive), [m, rad].
+        nuisance: Nuisance parameters, shape (S, n_nuisance), [SI].
+        free: The free parameters.
+        alignment: Derivative of the nuisance parameters by errors, shape (n_nuisance, n_errors).
+        noise: Divisor of each entry's reading, shape (n_entries,).
+        dense: Compute the Jacobian.
+        batch: Keep the leading dimension of results.
+
+    Attributes:
+        reading: h at the given passive coordinates, shape (S, n_entries), [m].
+        opening: Change of h when the loops are closed, to first order, shape (S, n_entries), [m].
+        correction: Change of the passive coordinates that closes the loops, shape (S, n_states,
+            n_passive), [m, rad].
+        jacobian: dh/dθ̂ with the loops closed, shape (S, n_entries, n_free), [m per unit of θ̂]; only
+            if dense.
+    """
+
+    def __init__(
+        self,
+        model: ObservationModel,
+        errors: Array,
+        passive: Array,
+        nuisance: Array,
+        *,
+        free: FreeParameters,
+        alignment: Array,
+        noise: Array,
+        dense: bool,
+        batch: bool,
+    ) -> None:
+        self._model, self._free, self._noise, self._batch = model, free, noise, batch
+        self._by_errors = alignment @ free.columns
+        self._geometries = model.geometries(errors)
+        geometry, references = self._geometries[0], model.reference_commands
+        self._actuated = geometry.drives(model.states.commands)
+        _, self._by_drive_errors = geometry.drive_derivatives(model.states.commands)
+        self._reference = [geometry.drives(commands) for commands in references]
+        self._by_reference = [geometry.drive_derivatives(commands)[1] for commands in references]
+        self._pattern = free.pattern
+        map_, n_sets, n = model.functions.errors, len(errors), model.observations.size
+        self._twists = [
+            _TwistChain(map_, errors, command, free, sparse=n_sets == 1 and n >= MIN_SPARSE_ROWS)
+            for command in model.states.variant_commands
+        ]
+        self._by_machine = free.columns[map_.drive_errors]
+        n_machine, n_nuisance = free.columns.shape[1], free.nuisance_scale.size
+        reading, opening = np.empty((n_sets, n)), np.empty((n_sets, n))
+        correction = np.zeros_like(passive, dtype=np.float64)
+        jacobian = np.empty((n_sets, n, n_machine + n_nuisance)) if dense else np.empty((0, 0, 0))
+        self._blocks: list[tuple[_Block, _Closures, _Readings | None]] = []
+        for block in model._single_blocks if n_sets == 1 else model.blocks(n_sets):
+            closures = self._evaluate_closures(block, passive)
+            readings = self._evaluate_readings(block, passive, nuisance)
+            dq = -(closures.inverse @ closures.residual[..., None])[..., 0]
+            correction[:, block.states] = dq
+            k, m = block.entries.shape
+            entries = block.entries.reshape(-1)
+            by_passive = readings.by_passive.reshape(n_sets, k, m, -1)
+            reading[:, entries] = readings.value
+            opening[:, entries] = (by_passive @ dq[..., None]).reshape(n_sets, k * m)
+            if dense:
+                rows = self._machine_rows(block, closures, readings)
+                jacobian[:, entries, :n_machine] = rows
+                jacobian[:, entries, n_machine:] = readings.by_nuisance
+            self._blocks.append((block, closures, None if dense else readings))
+        if dense:
+            aligned = np.flatnonzero(self._by_errors.any(axis=1))
+            by_nuisance = jacobian[:, :, n_machine:]
+            if aligned.size:
+                jacobian[:, :, :n_machine] += by_nuisance[:, :, aligned] @ self._by_errors[aligned]
+            by_nuisance *= free.nuisance_scale
+        if (noise != 1.0).any():
+            reading, opening = reading / noise, opening / noise
+            jacobian = jacobian / noise[:, None] if dense else jacobian
+        self.reading, self.opening = self._squeeze(reading), self._squeeze(opening)
+        self.correction = self._squeeze(correction)
+        self._jacobian = self._squeeze(jacobian) if dense else None
+
+    @property
+    def jacobian(self) -> Array:
+        """dh/dθ̂ with the loops closed, shape (S, n_entries, n_free), [m per unit of θ̂]."""
+        if self._jacobian is None:
+            raise ValueError("linearised without a Jacobian; expected dense=True")
+        return self._jacobian
+
+    def follow(self, change: Array) -> Array:
+        """Change of the passive coordinates that closes the loops after a change of θ̂.
+
+        Args:
+            change: dθ̂, shape (S, n_free); many changes of one machine are possible, too.
+
+        Returns:
+            Shape (S, n_states, n_passive), [m, rad]; it includes `correction`.
+        """
+        d = np.atleast_2d(change)
+        machine = d[:, : self._free.columns.shape[1], None]
+        twists = [chain.follow(machine) for chain in self._twists]
+        drive_errors = (self._by_machine @ machine)[:, None]
+        correction = self.correction if self._batch else self.correction[None]
+        result = np.array(np.broadcast_to(correction, (len(d), *correction.shape[1:])))
+        for block, closures, _ in self._blocks:
+            opened = (closures.by_drive_errors @ drive_errors)[..., 0]
+            moved = twists[block.variant]
+            opened += self._pattern.times(closures.by_twists, moved, opened.shape[2])
+            result[:, block.states] -= (closures.inverse @ opened[..., None])[..., 0]
+        return result if change.ndim > 1 else result[0]
+
+    def transposed_product(self, forces: Array) -> Array:
+        """Jᵀ f without the Jacobian (the adjoint method).
+
+            Σ f dh = (f h_θ − λ g_θ) dθ,  g_qᵀ λ = h_qᵀ f
+
+        Args:
+            forces: f, shape (S, n_entries).
+
+        Returns:
+            Shape (S, n_free).
+        """
+        f_all = np.atleast_2d(forces) / self._noise
+        n_sets, n_twists = len(f_all), self._model.functions.n_twists
+        of_variant = np.zeros((len(self._twists), n_sets, n_twists))
+        drive_errors = np.zeros((n_sets, len(self._by_machine)))
+        nuisance = np.zeros((n_sets, self._free.nuisance_scale.size))
+        for block, closures, readings in self._blocks:
+            if readings is None:
+                raise ValueError("linearised with a Jacobian; expected dense=False")
+            k, m = block.entries.shape
+            entries = block.entries.reshape(-1)
+            f = f_all[:, entries]
+            rows = f.reshape(n_sets, k, 1, m)
+            on_passive = rows @ readings.by_passive.reshape(n_sets, k, m, -1)
+            multiplier = (on_passive @ closures.inverse)[:, :, 0]
+            drive_errors += (f[:, None] @ readings.by_drive_errors)[:, 0]
+            drive_errors -= (multiplier[:, :, None] @ closures.by_drive_errors)[:, :, 0].sum(axis=1)
+            twists = of_variant[block.variant]
+            for where, columns, nonzeros in readings.by_twists:
+                twists[:, columns] += (f[:, None, where] @ nonzeros)[:, 0]
+            self._pattern.subtract(twists, closures.by_twists, multiplier)
+            nuisance += (f[:, None] @ readings.by_nuisance)[:, 0]
+        machine = drive_errors @ self._by_machine
+        for chain, twists in zip(self._twists, of_variant, strict=True):
+            machine += chain.transposed_product(twists)
+        machine += nuisance @ self._by_errors
+        return self._squeeze(np.hstack([machine, nuisance * self._free.nuisance_scale]))
+
+    def _evaluate_closures(self, block: _Block, passive: Array) -> _Closures:
+        n_sets, k = len(passive), block.states.size
+        outputs = self._model.functions.closure_jacobian(
+            self._actuated[:, block.states].reshape(n_sets * k, -1),
+            passive[:, block.states].reshape(n_sets * k, -1),
+            self._geometries[block.variant].placements,
+        )
+        g, g_a, g_q, nonzeros = (v.reshape(n_sets, k, *v.shape[1:]) for v in outputs)
+        by_drive_errors = g_a @ self._by_drive_errors[:, block.states]
+        return _Closures(g, _inverse(g_q), by_drive_errors, nonzeros[:, :, self._pattern.chosen])
+
+    def _evaluate_readings(self, block: _Block, passive: Array, nuisance: Array) -> _Readings:
+        model, (k, m) = self._model, block.entries.shape
+        n_sets, actuated, q = len(passive), self._actuated, passive[:, block.states]
+        n_drive_errors = self._by_drive_errors.shape[-1]
+        result = _Readings(
+            np.empty((n_sets, k * m)),
+            np.zeros((n_sets, k * m, n_drive_errors)),
+            np.zeros((n_sets, k * m, q.shape[2])),
+            np.zeros((n_sets, k * m, nuisance.shape[1])),
+            (),
+        )
+        by_twists = []
+        for index, where, place in block.members:
+            group, at = model.groups[index], where // m
+            states, setups = block.states[at], group.setups[place]
+            inputs = model._inputs(
+                group,
+                place,
+                self._geometries[block.variant],
+                actuated[:, states],
+                q[:, at],
+                self._reference[block.variant],
+                nuisance,
+            )
+            outputs = group.reading.jacobian(*inputs)
+            h, h_a, h_q, nonzeros, h_r, h_nu = (v.reshape(n_sets, where.size, -1) for v in outputs)
+            by_drive_errors = h_a[:, :, None] @ self._by_drive_errors[:, states]
+            by_drive_errors += h_r[:, :, None] @ self._by_reference[block.variant][:, setups]
+            result.value[:, where] = h[..., 0]
+            result.by_drive_errors[:, where] = by_drive_errors[:, :, 0]
+            result.by_passive[:, where] = h_q
+            result.by_nuisance[:, where[:, None], group.nuisance[place]] = h_nu
+            _, columns = group.reading.jacobian.pattern("by_twists")
+            by_twists.append((where, columns, nonzeros))
+        return replace(result, by_twists=tuple(by_twists))
+
+    def _machine_rows(self, block: _Block, closures: _Closures, readings: _Readings) -> Array:
+        """Dh by the machine's parameters with the loops closed, shape (S, k m, n_machine)."""
+        (k, m), n_sets, used = block.entries.shape, len(readings.value), self._pattern.used
+        pull = -(readings.by_passive.reshape(n_sets, k, m, -1) @ closures.inverse)
+        by_drive_errors = readings.by_drive_errors.reshape(n_sets, k, m, -1)
+        by_drive_errors = by_drive_errors + pull @ closures.by_drive_errors
+        rows = (by_drive_errors @ self._by_machine).reshape(n_sets, k * m, -1)
+        if used.size:
+            twists = np.zeros((n_sets, k * m, used.size))
+            for where, columns, nonzeros in readings.by_twists:
+                kept = np.flatnonzero(self._pattern.place[columns] >= 0)
+                at = self._pattern.place[columns[kept]]
+                twists[:, where[:, None], at] = nonzeros[:, :, kept]
+            dense = self._pattern.dense(closures.by_twists, pull.shape[-1])
+            twists += (pull @ dense).reshape(n_sets, k * m, -1)
+            rows += self._twists[block.variant](twists)
+        return rows
+
+    def _squeeze(self, values: Array) -> Array:
+        return values if self._batch else values[0]
+
+
+class _TwistChain:
+    """Chain rule from the twists of placements to the machine parameters, for S machines.
+
+    Args:
+        map_: The error map.
+        errors: Elementary errors of the machines, shape (S, n_errors), [SI].
+        command: Command with the conditions of the placements, shape (n_command,).
+        free: The free parameters.
+        sparse: Multiply rows with a sparse matrix; for one machine.
+    """
+
+    def __init__(
+        self, map_: ErrorMap, errors: Array, command: Array, free: FreeParameters, *, sparse: bool
+    ) -> None:
+        self._used, self._columns = free.pattern.used, free.columns
+        self._map, self._errors, self._command = map_, errors, command
+        self._sparse = sparse and self._used.size > 0
+        self._inner = map_.twist_columns(errors, free.columns, command)
+        self._right = np.zeros((1, len(map_.moved), 6, 6))
+        if self._used.size:
+            self._right = map_.right_jacobians(errors, command)
+
+    @cached_property
+    def _matrix(self) -> Any:  # noqa: ANN401 - SciPy has no types
+        """∂ξ/∂θ̂ of the twists that parameters move, (S, n_used, n), or sparse and transposed."""
+        jacobian = self._map.jacobian(
+            self._errors, self._columns, command=self._command, right=self._right
+        )
+        matrix = jacobian.twists[:, self._used]
+        if not self._sparse:
+            return matrix
+        from scipy.sparse import csr_array
+
+        return csr_array(matrix[0].T)
+
+    def __call__(self, rows: Array) -> Array:
+        """Rows by machine parameters, (S, n, n_machine), of rows by twists, (S, n, n_used)."""
+        if self._sparse:
+            return np.asarray((self._matrix @ np.ascontiguousarray(rows[0].T)).T[None])
+        return np.asarray(rows @ self._matrix)
+
+    def follow(self, change: Array) -> Array:
+        """Twists ∂ξ of changes of machine parameters, shape (D, n_twists) of (D, n_machine, 1)."""
+        inner = (self._inner @ change).reshape(len(change), -1, 6, 1)
+        return np.asarray((self._right @ inner).reshape(len(change), -1))
+
+    def transposed_product(self, twists: Array) -> Array:
+        """Forces on machine parameters, (S, n_machine), of forces on twists, (S, n_twists)."""
+        local = (twists.reshape(len(twists), -1, 1, 6) @ self._right).reshape(len(twists), 1, -1)
+        return np.asarray((local @ self._inner)[:, 0])
+
+
+def predict_readings(
+    session: Session,
+    errors: Mapping[str, float] | None = None,
+    *,
+    observations: Observations | None = None,
+    passive: Array | None = None,
+    nuisance: Array | None = None,
+) -> Array:
+    """Readings of a machine with known errors, gauge zeros at 0, shape (n_entries,), [m].
+
+    Args:
+        session: Postures, setups and robot.
+        errors: Parameter name to value, [unit of the parameter].
+        observations: The entries to predict; those of the session's readings by default.
+        passive: Passive coordinates of every state, shape (n_states, n_passive), [m, rad]; solved
+            here by default.
+        nuisance: Nuisance parameters in the order of `nuisance_parameters`, [SI]; 0 by default.
+
+    Raises:
+        ClosureError: If the machine cannot reach a posture.
+    """
+    model, closure = (
+        ObservationModel(session, observations),
+        LoopClosure(session.robot, fixed=errors),
+    )
+    if passive is None:
+        passive = closure.close(model.states.commands, names=model.states.names)
+    return model.predict(closure.errors(), passive, nuisance)
+
+
+def nominal_sensitivity(session: Session) -> Array:
+    """Derivative of a session's readings by all elementary errors, on the nominal machine.
+
+    Returns:
+        Shape (n_entries, n_errors), [m per SI unit of the error].
+
+    Raises:
+        ClosureError: If the nominal machine cannot reach a posture.
+    """
+    model, closure = ObservationModel(session), LoopClosure(session.robot)
+    n = len(model.functions.errors.names)
+    free = model.parametrise(np.eye(n), np.ones(len(model.nuisance.parameters)))
+    passive = closure.close(model.states.commands, names=model.states.names)
+    linear = model.linearise(closure.errors(), passive, free=free, aligned=False)
+    return linear.jacobian[:, :n]
+
+
+def _inverse(matrices: ArrayLike) -> Array:
+    """Inverses of square matrices, shape (..., n, n); pseudo-inverses of others."""
+    m: Array = np.asarray(matrices)
+    if m.shape[-2] == m.shape[-1]:
+        return np.asarray(np.linalg.inv(m))
+    return np.asarray(np.linalg.pinv(m, rcond=1e-10))

@@ -1,0 +1,82 @@
+"""Expected tool error over measuring time, and the time beyond which more readings gain little."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from orthocal.errors import ParameterError
+from orthocal.planning.equipment import Equipment
+from orthocal.planning.selection import SetupSearch
+
+ENOUGH = 0.05
+"""Relative reduction of the error by another hour below which a plan has enough readings."""
+
+HOUR = 60.0
+
+LONGER = 2.0
+"""Factor by which the curve goes beyond the duration of the plan."""
+
+MOST_SETUPS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """Expected error after a number of setups."""
+
+    setups: int
+    readings: int
+    minutes: float
+    error: float
+    """Value of the criterion, [m] or tolerances."""
+
+
+def compute_curve(
+    search: SetupSearch, each: int, planned: int, equipment: Equipment
+) -> tuple[Stage, ...]:
+    """Expected error after each setup, added one after the other.
+
+    It depends on the number of setups of the plan in its length alone.
+
+    Args:
+        search: Candidates and prior information.
+        each: Readings of each setup.
+        planned: Setups of the plan.
+        equipment: Equipment, for the duration.
+    """
+    stages = [Stage(0, 0, 0.0, search.error_of(search.prior))]
+    fewest = min(math.ceil(LONGER * planned), MOST_SETUPS)
+    try:
+        for n, plan in enumerate(search.grow([each] * MOST_SETUPS), 1):
+            stages.append(Stage(n, n * each, equipment.minutes(n, n * (each + 1)), plan.error))
+            if n >= fewest and find_enough(stages) is not None:
+                break
+    except ParameterError:  # a setup of that many readings is not possible
+        pass
+    return tuple(stages)
+
+
+def scale_curve(curve: Sequence[Stage], factor: float, rest: float) -> tuple[Stage, ...]:
+    """Curve with the error of what is not identified, times a factor.
+
+    Args:
+        curve: Errors to first order about the nominal machine.
+        factor: Expected error of machines within their tolerances over that of the nominal one.
+        rest: Error of what is not identified, [m].
+    """
+    return tuple(replace(s, error=factor * math.hypot(s.error, rest)) for s in curve)
+
+
+def find_enough(curve: Sequence[Stage]) -> Stage | None:
+    """First stage after which another hour gains less than ENOUGH; None if there is none."""
+    minutes, errors = [s.minutes for s in curve], [s.error for s in curve]
+    for stage in curve[1:]:
+        if stage.minutes + HOUR > minutes[-1]:
+            return None
+        later = float(np.interp(stage.minutes + HOUR, minutes, errors))
+        if later > (1.0 - ENOUGH) * stage.error:
+            return stage
+    return None

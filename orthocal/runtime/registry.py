@@ -1,0 +1,73 @@
+"""Kinds of something by name: built in, registered, or from installed packages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib.metadata import entry_points
+from typing import Any, Generic, TypeVar
+
+from orthocal.errors import OrthocalError
+
+Kind = TypeVar("Kind")
+
+
+class Registry(Generic[Kind]):
+    """Kinds by name; those of installed packages are loaded when they are needed.
+
+    Args:
+        group: Group of the entry points by which packages offer kinds; their names are the kinds.
+        noun: Name of what a kind is, for messages.
+        read: Kind of a name and the object that a package offers; raises what it likes for an
+            object that is none.
+        built_in: Kinds of orthocal.
+    """
+
+    def __init__(
+        self,
+        group: str,
+        noun: str,
+        read: Callable[[str, Any], Kind],
+        built_in: Mapping[str, Kind],
+    ) -> None:
+        self._group, self._noun, self._read = group, noun, read
+        self._kinds = dict(built_in)
+
+    def register(self, name: str, kind: Kind) -> None:
+        """Add a kind; it replaces one of the same name."""
+        self._kinds[name] = kind
+
+    def unregister(self, name: str) -> None:
+        """Forget a kind, if there is one of this name."""
+        self._kinds.pop(name, None)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all kinds, with those of installed packages."""
+        offered = (e.name for e in entry_points(group=self._group))
+        return tuple(dict.fromkeys([*self._kinds, *offered]))
+
+    def find(self, name: object, *, where: str, error: type[OrthocalError]) -> Kind:
+        """The kind of a name.
+
+        Args:
+            name: The name, from a document.
+            where: File and key, for messages.
+            error: Kind of error to raise.
+
+        Raises:
+            OrthocalError: If the kind is unknown, or its package cannot be loaded.
+        """
+        if isinstance(name, str) and name in self._kinds:
+            return self._kinds[name]
+        point = next((e for e in entry_points(group=self._group) if e.name == name), None)
+        if point is None:
+            expected = f"expected one of {', '.join(self.names)}" if self.names else "there is none"
+            raise error(f"found {name!r}; {expected}", where=where)
+        package = "" if point.dist is None else f" of package {point.dist.name}"
+        try:
+            return self._read(point.name, point.load())
+        except Exception as e:  # whatever foreign code raises is this one problem
+            raise error(
+                f"the {self._noun} '{name}'{package} cannot be loaded: {type(e).__name__}: {e}",
+                where=where,
+            ) from None

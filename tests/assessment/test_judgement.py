@@ -1,0 +1,302 @@
+"""One verdict for the same readings, whichever command asks."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+import pytest
+from commands import run_orthocal
+from drawn_machines import DrawnMachines
+
+from orthocal import (
+    Choice,
+    Gauge,
+    assess_tool,
+    calibrate,
+    check_session,
+    compare_models,
+    load_calibration,
+    load_plan,
+    load_session,
+    simulate_session,
+    validate_calibration,
+    write_session,
+)
+from orthocal.assessment.judgement import judge_session
+from orthocal.calibration.assessment_record import EXIT_CODES, Finding, FindingKind, Severity
+from orthocal.output.text.printed_json import printed_calibration, printed_validation
+
+UNITS = ("_mm", "_um", "_mrad", "_deg")
+
+PURE = {
+    *("cycle", "finer", "ratio", "tolerance_scale", "log_likelihood_ratio", "log_evidence"),
+    *("independent_readings", "parameters", "chance", "part_of_std", "readings"),
+    *("largest_change_over_std",),
+}
+"""Numbers of findings without a unit."""
+
+
+@pytest.fixture(scope="module")
+def plan(root):
+    return load_plan(root / "examples/raw-cycles/plan.yaml")
+
+
+@pytest.fixture(scope="module")
+def cycles(root):
+    return load_session(root / "examples/raw-cycles")
+
+
+@pytest.fixture(scope="module")
+def workshop(root):
+    return load_session(root / "examples/workshop")
+
+
+@pytest.fixture(scope="module")
+def table1(root):
+    names = ("1-printed", "1-corrected", "2", "3")
+    return {n: load_session(root / f"examples/table1/experiment-{n}") for n in names}
+
+
+def reverse(session, setup):
+    signs = np.array([-1.0 if r.setup == setup else 1.0 for r in session.readings])
+    return session.with_values(signs * session.values)
+
+
+def change(session, row, value):
+    values = session.values.copy()
+    values[row] = value
+    return session.with_values(values)
+
+
+def swap(session, one, other):
+    values = session.values.copy()
+    values[[one, other]] = values[[other, one]]
+    return session.with_values(values)
+
+
+def displace(session, setup, by):
+    rows = [i for i, r in enumerate(session.readings) if r.setup == setup]
+    values = session.values.copy()
+    values[rows[len(rows) // 2 :]] += by
+    return session.with_values(values)
+
+
+def spoilt(cycles, workshop, table1):
+    """Sessions by what is wrong with them, with the verdict that they deserve."""
+    largest = int(np.abs(cycles.values).argmax())
+    return {
+        "sound": (cycles, "enter"),
+        "workshop": (workshop, "enter"),
+        "experiment 2": (table1["2"], "enter"),
+        "experiment 3": (table1["3"], "enter"),
+        "experiment 1 as printed": (table1["1-printed"], "reject"),
+        "experiment 1 corrected": (table1["1-corrected"], "reject"),
+        "reversed setup": (reverse(cycles, "zx"), "review"),
+        "reversed sign": (change(cycles, largest, -cycles.values[largest]), "review"),
+        "decimal point": (change(cycles, largest, 0.1 * cycles.values[largest]), "review"),
+        "inches": (cycles.with_values(np.round(cycles.values / 25.4, 7)), "review"),
+        "swapped rows": (swap(cycles, 1, 2), "review"),
+        "displaced gauge": (displace(cycles, "yx", 0.2e-3), "review"),
+    }
+
+
+CASES = [
+    *("sound", "workshop", "experiment 2", "experiment 3", "experiment 1 as printed"),
+    *("experiment 1 corrected", "reversed setup", "reversed sign", "decimal point", "inches"),
+    *("swapped rows", "displaced gauge"),
+]
+
+
+@pytest.fixture(scope="module")
+def cases(cycles, workshop, table1):
+    return spoilt(cycles, workshop, table1)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_command_has_the_same_verdict(cases, case, tmp_path):
+    session, expected = cases[case]
+    write_session(session, tmp_path / "session")
+    verdicts = {}
+
+    def run(*words):
+        return run_orthocal(tmp_path, *words)
+
+    for command in (
+        ("check", tmp_path / "session"),
+        ("calibrate", tmp_path / "session", "--out", tmp_path / "calibrated"),
+        ("calibrate", tmp_path / "session", "--model", "full", "--solver", "eliminated"),
+        ("compare", tmp_path / "session", "--models", "offsets"),
+    ):
+        done = run(*command, "--json")
+        decision = json.loads(done.stdout)["decision"]
+        assert done.returncode == decision["exit_code"] == EXIT_CODES[decision["verdict"]]
+        verdicts[" ".join(map(str, command))] = decision["verdict"]
+    assert set(verdicts.values()) == {expected}
+    exported = run("export", tmp_path / "calibrated", "--to", "yaml", "--out", tmp_path / "out")
+    assert exported.returncode == (0 if expected == "enter" else 3)
+    assert (tmp_path / "out").exists() == (expected == "enter")
+    anyway = ["--anyway"] if expected != "enter" else []
+    words = ["export", tmp_path / "calibrated", "--to", "yaml", "--out", tmp_path / "anyway"]
+    assert run(*words, *anyway).returncode == 0
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_judgement_does_not_depend_on_the_model(cases, case):
+    session, expected = cases[case]
+    found = [f for f in judge_session(session).findings if f.severity != "note"]
+    for model in ("offsets", "full"):
+        calibration = calibrate(session, model, solver="eliminated")
+        own = [f for f in calibration.assessment.findings if f.severity != "note"]
+        assert [f.to_document() for f in own] == [f.to_document() for f in found]
+        assert calibration.assessment.decision.verdict == expected
+
+
+def test_findings_have_known_kinds_units_and_load_again(cases, tmp_path):
+    for case, (session, _) in cases.items():
+        calibration = calibrate(session, solver="eliminated")
+        document = json.loads(printed_calibration(calibration))
+        for finding in document["findings"]:
+            assert finding["kind"] in get_args(FindingKind)
+            assert finding["severity"] in get_args(Severity)
+            assert finding["text"].endswith((".", "?"))
+            for name in finding["numbers"]:
+                assert name in PURE or name.endswith(UNITS), name
+            for place in finding["places"]:
+                assert any(v is not None for v in place.values())
+        path = tmp_path / f"{case}.json"
+        path.write_text(json.dumps(document))
+        loaded = load_calibration(path)
+        assert loaded.assessment.to_document() == calibration.assessment.to_document()
+
+
+NOTES = {
+    "model error": lambda c, t: calibrate(t["2"]),
+    "no redundancy": lambda c, t: calibrate(c, "full", solver="eliminated"),
+    "noise unknown": lambda c, t: calibrate(
+        replace(t["2"], readings=t["2"].readings[1:4]).with_gauge(Gauge(None, None, None))
+    ),
+    "no offset": lambda c, t: calibrate(c, Choice(free=["x_leg.length"])),
+    "no change needed": lambda c, t: calibrate(t["3"]),
+    "fits": lambda c, t: calibrate(c),
+}
+
+
+@pytest.mark.parametrize("kind", NOTES)
+def test_notes_never_change_the_verdict(kind, cycles, table1):
+    found = NOTES[kind](cycles, table1).assessment
+    assert found.of_kind(kind)
+    assert found.decision.verdict == "enter"
+    assert all(f.severity == "note" for f in found.findings)
+
+
+def test_an_offset_at_a_bound_is_to_be_reviewed(cycles):
+    bounds = {"x_slide.offset_m": (-1e-3, 0.5e-3)}
+    found = calibrate(cycles, Choice("offsets", bounds=bounds)).assessment
+    (held,) = found.of_kind("held by a bound")
+    assert held.numbers == {"value_mm": pytest.approx(0.5)}
+    assert found.decision.verdict == "review"
+
+
+def test_two_gauges_are_each_held_to_their_own_resolution(workshop):
+    """Dials of 0.005 and 0.0001 mm: no reading is finer than the dial that shows it."""
+    fine = replace(workshop.gauge, resolution=1e-7, sigma=1e-6)
+    coarse = replace(workshop.gauge, resolution=5e-6)
+    names = list(workshop.setups)
+    setups = {
+        n: replace(s, gauge="fine" if i % 2 else "coarse")
+        for i, (n, s) in enumerate(workshop.setups.items())
+    }
+    values = [
+        round(r.value / (1e-7 if names.index(r.setup) % 2 else 5e-6))
+        * (1e-7 if names.index(r.setup) % 2 else 5e-6)
+        + (1e-7 if names.index(r.setup) % 2 else 0.0)
+        for r in workshop.readings
+    ]
+    both = replace(workshop, gauges={"coarse": coarse, "fine": fine}, setups=setups).with_values(
+        values
+    )
+    assert "finer than the gauge" not in {f.kind for f in judge_session(both).findings}
+
+
+def test_the_tool_error_is_that_of_the_accuracy(workshop):
+    calibration = calibrate(workshop, solver="eliminated")
+    tool, accuracy = calibration.assessment.tool, assess_tool(calibration)
+    known = accuracy.after.sizes.headline.rms
+    left = accuracy.measure(accuracy.error_after_offsets).headline.rms
+    assert tool.entered == pytest.approx(math.hypot(left, known), rel=1e-9)
+    assert tool.compensated == pytest.approx(known, rel=1e-9)
+    assert tool.region == "±60 mm"
+
+
+def test_a_robot_without_a_tool_is_out_of_reach(table1):
+    bare = replace(table1["2"], robot=replace(table1["2"].robot, tcp=None))
+    found = calibrate(bare).assessment
+    assert found.decision.verdict == "enter"
+    assert found.of_kind("out of reach")
+    assert found.tool is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sound_machines_are_never_accused(plan, seed):
+    """Before their offsets were entered and, with all other errors as they are, after."""
+    machines = DrawnMachines(plan, model="full")
+    drawn = machines.draw(np.random.default_rng(70 + seed))
+    for scale in (1.0, 0.0):
+        values = np.where(machines.is_offset, scale * drawn, drawn)
+        errors = machines.machine.split_errors(values)
+        session = simulate_session(plan, errors, seed=seed).session
+        found = check_session(session)
+        assert [f.kind for f in found.findings if f.severity != "note"] == []
+        assert found.decision.verdict == "enter"
+
+
+def test_a_validation_is_decided(table1, plan):
+    confirmed = validate_calibration(calibrate(table1["2"]), table1["3"])
+    found = confirmed.assessment
+    assert (found.decision.verdict, found.decision.exit_code) == ("enter", 0)
+    (lead,) = found.of_kind("as predicted")
+    assert lead.numbers["achieved_rms_mm"] == pytest.approx(0.213, abs=0.001)
+    assert found.of_kind("residuals repeat")
+    assert found.of_kind("controller not stated")
+    errors = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
+    calibration = calibrate(simulate_session(plan, errors, seed=1).session)
+    again = simulate_session(plan, errors, seed=2).session  # nothing was entered
+    refused = validate_calibration(calibration, replace(again, controller_offsets=None))
+    found = refused.assessment
+    assert (found.decision.verdict, found.decision.exit_code) == ("review", 3)
+    (cause,) = found.of_kind("offsets not entered")
+    assert {p.parameter for p in cause.places} == {"x_slide", "y_slide", "z_slide"}
+    assert cause.numbers["x_slide_active_mm"] == 0.0
+    document = json.loads(printed_validation(refused))
+    assert document["decision"]["verdict"] == "review"
+    assert document["mistake"]["kind"] == "offsets not entered"
+    few = tuple(r for r in table1["2"].readings if r.setup in ("yx", "xy", "xz"))
+    blind = validate_calibration(calibrate(replace(table1["2"], readings=few)), table1["3"])
+    assert blind.assessment.of_kind("nothing predicted")
+    assert blind.assessment.decision.exit_code == 3
+
+
+EVIDENCE = {"workshop": -43.8, "raw-cycles": 11.8, "table1/experiment-2": -117.1}
+"""ln evidence of offsets against the complete model, at the stated noise."""
+
+
+@pytest.mark.parametrize("name", EVIDENCE)
+def test_one_recommendation_for_calibrate_and_compare(name, root):
+    session = load_session(root / "examples" / name)
+    compared = compare_models(session, models=["offsets", "full"])
+    assert compared.recommendation.of("offsets") == pytest.approx(EVIDENCE[name], abs=0.5)
+    recommended = "offsets" if name == "raw-cycles" else "full"
+    assert compared.recommendation.model == recommended
+    (first,) = compared.assessment.of_kind("recommended")
+    (second,) = calibrate(session).assessment.of_kind("recommended")
+    assert recommended in first.text
+    assert recommended in second.text
+
+
+def test_unknown_numbers_are_null():
+    document = Finding("fits", "note", "It fits.", numbers={"a_mm": math.nan}).to_document()
+    assert document["numbers"] == {"a_mm": None}

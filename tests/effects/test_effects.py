@@ -1,0 +1,488 @@
+"""Effects beyond offsets and placements: their parameters, how they act, their identification."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import datetime, timedelta
+
+import casadi as ca
+import numpy as np
+import pytest
+from derivatives import assert_derivative, central_differences
+from gauges import exact
+from slack import Slack
+from tolerances import CLOSED, DERIVATIVE, KINEMATICS, SAME_OPTIMUM
+
+from orthocal import (
+    Choice,
+    calibrate,
+    load_calibration,
+    load_plan,
+    load_robot,
+    load_session,
+    restore_session,
+    simulate_session,
+    write_calibration,
+    write_session,
+)
+from orthocal.effects import registry
+from orthocal.effects.loading import robot_effects
+from orthocal.effects.machine import stretch_rod
+from orthocal.errors import ParameterError, RobotError, SessionError
+from orthocal.estimation.options import SolverOptions
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.estimation.solvers.variable_projection import VariableProjection
+from orthocal.kinematics.error_map import error_map
+from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.sensitivity import ToolSensitivity
+from orthocal.measurement.joining import join_sessions
+from orthocal.observation.model import predict_readings
+from orthocal.observation.observations import build_observations
+from orthocal.robot.loading import packaged_robots
+from orthocal.sensors.compiled import reading_conditions
+
+KEYS = "slack: {slack_mm: 0.04, lead_mm: 10}"
+
+TRUTH = {
+    "x_slide.offset": 0.4e-3,
+    "y_slide.offset": -0.3e-3,
+    "z_slide.offset": 0.2e-3,
+    "x_slide.slack": 30e-6,
+    "y_slide.slack": 12e-6,
+    "z_slide.slack": 45e-6,
+    "x_slide.wave": 8e-6,
+    "y_slide.wave": -5e-6,
+    "z_slide.wave": 3e-6,
+    "rods.growth": 9e-6,
+}
+FREE = ("*.offset", "*.slack", "*.wave", "rods.growth")
+
+PLAN = """robot: machine
+gauge: {sigma_mm: 0.001, range_mm: [-20, 20]}
+postures:
+  zero: {tcp_mm: [0, 0, 0]}
+"""
+"""Postures and setups follow."""
+
+FIRST = datetime(2025, 3, 14, 9, 26)
+ALONG = (-100, -47, 23, 60)
+
+
+@pytest.fixture(autouse=True)
+def known():
+    registry.register_effect(Slack)
+    yield
+    registry.unregister_effect("slack")
+
+
+def write_robot(folder, effects):
+    """The packaged robot with further effects in its YAML."""
+    source = packaged_robots()["orthoglide"]
+    folder.mkdir(parents=True)
+    shutil.copy(source / "orthoglide.urdf", folder / "machine.urdf")
+    text = (source / "orthoglide.yaml").read_text()
+    written = text.replace("\n  tcp: ", f"\n  effects: {{{effects}}}\n  tcp: ")
+    assert written != text
+    (folder / "machine.yaml").write_text(written)
+    return folder
+
+
+def write_plan(folder, *, effects=KEYS, conditions=True):
+    """Six setups, each read along its own leg, approached from both sides while it gets warmer."""
+    write_robot(folder / "machine", effects)
+    postures, setups = PLAN, "setups:\n"
+    columns = ",approach,temperature_C,time" if conditions else ",cycle"
+    rows = [f"setup,posture,reading_mm{columns}"]
+    for leg in range(3):
+        for d in ALONG:
+            at = [d if i == leg else 7.0 * (i - leg) for i in range(3)]
+            postures += f"  {'xyz'[leg]}_{d}: {{tcp_mm: {at}}}\n"
+    for leg, direction in ((a, b) for a in range(3) for b in range(3) if a != b):
+        setup = "xyz"[direction] + "xyz"[leg]
+        setups += f"  {setup}: {{leg: {'xyz'[leg]}, direction: {'xyz'[direction]}, section: "
+        setups += "{fraction: 0.5}}\n"
+        for i, posture in enumerate(["zero", *(f"{'xyz'[leg]}_{d}" for d in ALONG)]):
+            for cycle, letter in enumerate("pn", start=1):
+                k = len(rows)
+                approach = "".join(letter if j == leg else "pn"[(i + j) % 2] for j in range(3))
+                time = (FIRST + timedelta(minutes=k)).isoformat()
+                stated = f",{approach},{19 + 0.25 * (k % 40)},{time}"
+                rows.append(f"{setup},{posture},0.0{stated if conditions else f',{cycle}'}")
+    (folder / "session.yaml").write_text(f"{postures}{setups}readings: readings.csv\n")
+    (folder / "readings.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    registry.register_effect(Slack)
+    return write_plan(tmp_path_factory.mktemp("slack") / "plan")
+
+
+@pytest.fixture(scope="module")
+def plan(folder):
+    return load_plan(folder)
+
+
+@pytest.fixture(scope="module")
+def problem(plan):
+    return build_problem(plan, free=FREE, prior=True)
+
+
+def point(problem, size=0.7):
+    """Free parameters away from the nominal machine, in SI."""
+    rng = np.random.default_rng(2)
+    theta = size * problem.theta_scale * rng.normal(size=problem.n_free)
+    theta[:3] *= 0.1
+    return np.maximum(theta, problem.selection.lower)
+
+
+# ---- parameters and keys
+
+
+def test_its_parameters_are_those_of_the_robot(plan):
+    parameters = plan.robot.parameters
+    assert parameters["x_slide.slack"].tolerance == 0.04e-3
+    assert parameters["rods.growth"].unit == "1/K"
+    assert parameters.read_quantity("rods.growth_ppm_per_K", 3.0) == ("rods.growth", 3e-6)
+    assert [e.name for e in robot_effects(plan.robot)] == ["drive", "geometry", "slack"]
+    assert not any(n.endswith((".slack", "growth")) for n in parameters.select_model("full"))
+    assert all(effect.describe() for effect in robot_effects(plan.robot))
+
+
+def test_a_machine_without_further_effects_has_the_parameters_as_before(orthoglide):
+    assert [e.name for e in robot_effects(orthoglide)] == ["drive", "geometry"]
+    assert error_map(orthoglide).conditions == ()
+
+
+@pytest.mark.parametrize(
+    ("effects", "key"),
+    [
+        ("slack: {slack: 3}", "orthocal.effects.slack.slack"),
+        ("slack: {slack_mm: -1}", "orthocal.effects.slack.slack_mm"),
+        ("slack: {lead_mm: 0.5}", "orthocal.effects.slack.lead_mm"),
+        ("slack: 3", "orthocal.effects.slack"),
+        ("slag: {}", "orthocal.effects.slag"),
+    ],
+)
+def test_keys_that_do_not_fit_are_refused(tmp_path, effects, key):
+    folder = write_robot(tmp_path / "machine", effects)
+    with pytest.raises(RobotError) as caught:
+        load_robot(folder)
+    assert caught.value.where == f"{folder / 'machine.yaml'}: {key}"
+
+
+def test_a_parameter_of_another_effect_is_refused(tmp_path):
+    class Other(Slack):
+        name = "other"
+
+    registry.register_effect(Other)
+    try:
+        with pytest.raises(RobotError) as caught:
+            load_robot(write_robot(tmp_path / "machine", "slack: {}, other: {}"))
+    finally:
+        registry.unregister_effect("other")
+    assert caught.value.where.endswith("orthocal.effects.other")
+
+
+def test_effects_of_installed_packages_are_found(tmp_path, monkeypatch, root):
+    registry.unregister_effect("slack")
+    info = tmp_path / "site/probe_effects-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: probe-effects\nVersion: 1.0\n")
+    points = "slack = installed_slack:Slack\nbroken = installed_slack:SlackKeys\n"
+    (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\n{points}")
+    shutil.copy(root / "tests/effects/slack.py", tmp_path / "site/installed_slack.py")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    robot = load_robot(write_robot(tmp_path / "machine", KEYS))
+    assert type(robot_effects(robot)[-1]).__module__ == "installed_slack"
+    assert "broken" in registry.effect_names()
+    with pytest.raises(RobotError, match="the effect 'broken' of package probe-effects"):
+        load_robot(write_robot(tmp_path / "other", "broken: {}"))
+
+
+def test_placements_cannot_express_it(plan):
+    with pytest.raises(ParameterError, match=r"x_slide\.slack"):
+        plan.robot.with_errors({"x_slide.slack": 1e-5})
+    assert not plan.robot.parameters.are_rigid("x_slide.slack")
+
+
+def test_an_error_that_is_never_negative_has_a_bound(plan, problem):
+    of_slack = np.array([n.endswith(".slack") for n in problem.free])
+    assert (problem.selection.lower[of_slack] == 0.0).all()
+    assert np.isneginf(problem.selection.lower[~of_slack]).all()
+    bounded = build_problem(plan, free=FREE, bounds={"*.slack": (-1.0, 1e-4)}).selection
+    assert (bounded.lower[of_slack] == 0.0).all()
+
+
+# ---- loop closures and conditions
+
+
+def test_each_posture_under_other_conditions_is_another_loop_closure(plan, folder, tmp_path):
+    o = build_observations(plan)
+    approach, temperature = o.conditions["approach"], o.conditions["temperature"]
+    read = {
+        (p, tuple(a), t)
+        for p, a, t in zip(o.posture, approach.tolist(), temperature[:, 0].tolist(), strict=True)
+    }
+    assert o.states.posture.size == len(read)
+    assert len(o.states.variant_commands) == len({t for *_, t in read})
+    assert (o.states.posture[o.state] == o.posture).all()
+    assert len(set(o.states.names)) == o.states.posture.size
+    at = o.states.commands[o.state]
+    assert np.array_equal(at[:, 3:6], approach)
+    assert np.array_equal(at[:, 6:], temperature)
+    assert (o.states.posture[o.states.first_of_posture] == np.arange(len(plan.postures))).all()
+    # without an effect that needs them there is one for each posture
+    shutil.copytree(folder, tmp_path / "plain")
+    text = (tmp_path / "plain/session.yaml").read_text()
+    (tmp_path / "plain/session.yaml").write_text(text.replace("machine", "orthoglide", 1))
+    plain = build_observations(load_plan(tmp_path / "plain"))
+    assert np.array_equal(plain.states.posture, np.arange(len(plan.postures)))
+    assert np.array_equal(plain.state, plain.posture)
+    assert np.array_equal(plain.conditions["approach"], approach)
+
+
+def test_conditions_that_are_not_stated_are_neutral(tmp_path):
+    session = load_plan(write_plan(tmp_path / "plan", conditions=False))
+    o = build_observations(session)
+    assert o.states.posture.size == len(session.postures)
+    moved = {n: v for n, v in TRUTH.items() if n.endswith(("slack", "growth"))}
+    found = predict_readings(session, moved)
+    assert np.array_equal(found, predict_readings(session, {}))
+
+
+def test_time_counts_from_the_first_reading_of_the_setup(plan):
+    o = build_observations(plan)
+    for setup in np.unique(o.setup):
+        seconds = o.conditions["time"][o.setup == setup, 0]
+        assert np.array_equal(seconds, 60.0 * np.arange(seconds.size))
+
+
+def test_a_rod_that_grows_is_a_longer_leg(plan):
+    """All rods of the legs by the same length, as the errors of geometry have it."""
+    longer = 10.0 * 20e-6  # [m/m], at 30 °C
+    lengths = {f"{k}_leg.length": longer * plan.robot.legs[k].rods["a"].length for k in "xyz"}
+    drives = plan.robot.drive_zero + 0.02
+    warm = np.r_[drives, 0.0, 0.0, 0.0, 30.0]
+    grown = LoopClosure(plan.robot, fixed={"rods.growth": 20e-6}).forward(warm)
+    assert np.abs(grown - LoopClosure(plan.robot, fixed=lengths).forward(drives)).max() < CLOSED
+    cold = LoopClosure(plan.robot, fixed={"rods.growth": 20e-6}).forward(drives)
+    assert np.abs(cold - LoopClosure(plan.robot).forward(drives)).max() < CLOSED
+
+
+def test_the_placements_on_a_rod_are_those_that_it_carries(orthoglide):
+    model, rods = orthoglide.model, orthoglide.legs["x"].rods
+    change = ca.SX.sym("change")
+    (inner,) = stretch_rod(orthoglide, rods["a"], change)
+    assert (model.names[inner.index], inner.of_frame) == ("x_coupler", False)
+    (outer,) = stretch_rod(orthoglide, rods["b"], change)
+    assert outer.of_frame
+    assert "x_rod_b_tip" in model.frames[outer.index].name
+
+
+def test_a_gauge_shows_conditions_that_an_effect_adds(plan):
+    (sensor, *_) = (s.sensor for s in plan.setups.values())
+    assert reading_conditions(plan.robot, sensor) == ("approach", "temperature", "time")
+
+
+# ---- derivatives
+
+
+def predictor(problem):
+    return lambda theta: problem.predict(theta, problem.close(theta))
+
+
+def test_the_jacobian_is_that_of_the_readings(problem):
+    theta, scale = point(problem), problem.theta_scale
+    _, jacobian = problem.linearise(theta)
+    predict = predictor(problem)
+    numeric = central_differences(lambda t: predict(t * scale), theta / scale, step=1e-3)
+    size = np.maximum(np.abs(numeric).max(axis=0), 1e-9)
+    assert (np.abs(jacobian - numeric) / size).max() < 10 * DERIVATIVE
+    assert (np.abs(jacobian).max(axis=0) > 0.0).all()
+
+
+def test_batches_adjoint_and_first_order_agree_with_the_jacobian(problem):
+    thetas = np.array([point(problem, size) for size in (0.2, 0.6)])
+    passive = problem.close(thetas)
+    readings, jacobians = problem.linearise(thetas, passive)
+    batch = problem.linearisation(thetas, passive, dense=False)
+    rng = np.random.default_rng(5)
+    forces = rng.normal(size=readings.shape)
+    expected = np.einsum("sn,snp->sp", forces, jacobians)
+    assert np.abs(batch.transposed_product(forces) - expected).max() < KINEMATICS
+    change = 1e-4 * rng.normal(size=thetas.shape)
+    for i, theta in enumerate(thetas):
+        alone, jacobian = problem.linearise(theta, passive[i])
+        assert np.abs(jacobians[i] - jacobian).max() < KINEMATICS
+        assert np.abs(readings[i] - problem.predict(theta, passive[i])).max() < KINEMATICS
+        closed = problem.close(theta + change[i] * problem.theta_scale)
+        assert np.abs(passive[i] + batch.follow(change)[i] - closed).max() < 1e-9
+        assert np.abs(alone - readings[i]).max() < KINEMATICS
+
+
+def test_the_derivatives_of_the_error_map_are_exact(plan):
+    """Twists and drives under conditions, by every error and by the commanded coordinates."""
+    map_ = error_map(plan.robot)
+    rng = np.random.default_rng(1)
+    errors = 1e-3 * rng.normal(size=len(map_.names))
+    command = np.r_[plan.robot.drive_zero + 0.01, 1.0, -1.0, 1.0, 27.0]
+    twists = map_.twist_columns(errors, np.eye(errors.size), command)
+    assert_derivative(twists, lambda e: map_.twists_of(e, command), errors)
+    assert map_.twists_moved_by(np.eye(errors.size)[:, map_.names.index("rods.growth"), None]).sum()
+    geometry = map_.geometry(errors, command)
+    by_commands, by_errors = geometry.drive_derivatives(command)
+
+    def drives(values):
+        return map_.actuate(np.r_[values[:3], command[3:]][None], values[3:][None])[0]
+
+    exact_by = np.hstack([by_commands, by_errors])
+    assert_derivative(exact_by, drives, np.r_[command[:3], geometry.drive_errors])
+
+
+def test_the_tool_follows_its_derivatives_and_comes_back(plan):
+    free = ("x_slide.slack", "y_slide.wave", "z_slide.scale", "x_coupler.rx")
+    at = {"x_slide.wave": 2e-3, "y_slide.wave": 1e-3, "x_coupler.rx": 1e-3}
+    drives = np.array([[0.011, -0.02, 0.007]]) + plan.robot.drive_zero
+    by = ToolSensitivity(plan.robot, free=free, values=at)(drives)[0]
+    assert_derivative(
+        by,
+        lambda t: LoopClosure(plan.robot, free=free, fixed=at).forward(drives[0], theta=t),
+        np.array([at.get(n, 0.0) for n in free]),
+    )
+    closure = LoopClosure(plan.robot, fixed=at)
+    assert np.abs(closure.inverse(closure.forward(drives)) - drives).max() < CLOSED
+
+
+@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
+def test_the_program_has_exact_derivatives(problem, hessian):
+    program = NonlinearProgram(problem, options=SolverOptions(hessian=hessian))
+    f, theta = program.functions(), point(problem)
+    x, p = program.begin(theta, sigma=1e-4), program.pack(sigma=1e-4)
+    rng = np.random.default_rng(4)
+    along = rng.normal(size=(x.size, 6))
+    along /= np.linalg.norm(along, axis=0)
+    lam = rng.normal(size=f["nlp"].size1_out(1))
+    gradient = np.asarray(f["grad_f"](x, p)[1]).ravel()
+    jacobian = np.asarray(f["jac_g"](x, p)[1].full())
+
+    def both(t):
+        objective, closure = f["nlp"](x + along @ t, p)
+        return np.r_[float(objective), np.asarray(closure).ravel()]
+
+    numeric = central_differences(both, np.zeros(6), step=1e-4)
+    found = np.vstack([gradient @ along, jacobian @ along])
+    scale = np.maximum(1.0, np.abs(numeric).max(axis=1, keepdims=True))
+    assert (np.abs(found - numeric) / scale).max() < DERIVATIVE
+    if hessian == "exact":
+
+        def slope(t):
+            gradient = np.asarray(f["grad_f"](x + along @ t, p)[1]).ravel()
+            return gradient + np.asarray(ca.mtimes(f["jac_g"](x + along @ t, p)[1].T, lam)).ravel()
+
+        upper = np.asarray(f["hess_lag"](x, p, 1.0, lam).full())
+        hessian = upper + np.triu(upper, 1).T
+        numeric = central_differences(slope, np.zeros(6), step=1e-4)
+        size = max(1.0, np.abs(numeric).max())
+        assert np.abs(hessian @ along - numeric).max() / size < DERIVATIVE
+
+
+# ---- identification
+
+
+@pytest.fixture(scope="module")
+def simulated(plan):
+    return simulate_session(plan, TRUTH, seed=6, sigma=0.2e-6)
+
+
+def solutions(problem, sigma):
+    options = SolverOptions(hessian="exact")
+    programs = (
+        VariableProjection(problem),
+        NonlinearProgram(problem),
+        NonlinearProgram(problem, options=options),
+    )
+    return [program.solve(sigma=sigma) for program in programs]
+
+
+def test_all_solvers_identify_it_alike(simulated):
+    problem = build_problem(simulated.session, free=FREE, prior=True)
+    found = solutions(problem, 0.2e-6)
+    for other in found[1:]:
+        off = np.abs(other.theta - found[0].theta) / problem.theta_scale
+        assert off.max() < SAME_OPTIMUM / 1e-4
+        assert other.objective == pytest.approx(found[0].objective, rel=1e-9)
+    truth = {**TRUTH, **simulated.unknowns}
+    expected = np.array([truth.get(n, 0.0) for n in problem.free])
+    _, jacobian = problem.linearise(found[0].theta)
+    zeros = problem.zero_incidence
+    centred = jacobian - zeros @ (np.linalg.pinv(zeros) @ jacobian)
+    std = np.sqrt(np.diag(np.linalg.inv(centred.T @ centred / 0.2e-6**2 + np.eye(problem.n_free))))
+    off = (found[0].theta - expected) / problem.theta_scale / std
+    assert np.abs(off).max() < 4.0
+    told = [problem.free.index(n) for n in TRUTH if n.endswith(("slack", "growth"))]
+    assert (std[told] < 0.2).all()
+
+
+def test_a_batch_is_solved_as_each_of_its_sets(simulated):
+    problem = build_problem(simulated.session, free=FREE, prior=True)
+    rng = np.random.default_rng(8)
+    values = problem.values + 1e-6 * rng.normal(size=(3, problem.observations.size))
+    batch = BatchProgram(problem).solve(values, sigma=1e-6)
+    for row, theta in zip(values, batch.theta, strict=True):
+        alone = VariableProjection(problem).solve(sigma=1e-6, values=row)
+        assert (np.abs(theta - alone.theta) / problem.theta_scale).max() < 1e-6
+
+
+def test_at_its_bound_it_stays(plan):
+    """Without slack half of the estimates would be negative."""
+    exact_plan = exact(plan)
+    without = {n: v for n, v in TRUTH.items() if not n.endswith("slack")}
+    session = simulate_session(exact_plan, without, seed=3, sigma=1e-6).session
+    problem = build_problem(session, free=FREE, prior=True)
+    projected, program, _ = solutions(problem, 1e-6)
+    of_slack = [i for i, n in enumerate(problem.free) if n.endswith("slack")]
+    assert (projected.theta[of_slack] >= 0.0).all()
+    assert (projected.at_bound[of_slack] == program.at_bound[of_slack]).all()
+    assert (projected.at_bound[of_slack] == -1).any()
+
+
+def test_a_calibration_holds_it_and_its_conditions(simulated, tmp_path):
+    result = calibrate(simulated.session, Choice(free=FREE), solver="eliminated")
+    assert result["x_slide.slack"].value == pytest.approx(
+        30e-6, abs=4 * result["x_slide.slack"].std
+    )
+    write_calibration(result, tmp_path / "calibration.json")
+    again = load_calibration(tmp_path / "calibration.json")
+    restored = restore_session(again)
+    for r, s in zip(restored.readings, simulated.session.readings, strict=True):
+        assert r.conditions == s.conditions
+    assert again["rods.growth"].unit == "1/K"
+
+
+def test_joined_sessions_share_the_machine_and_not_the_gauge(simulated):
+    joined = join_sessions([simulated.session, simulated.session])
+    problem = build_problem(joined, free=FREE, prior=True)
+    assert sum(n.endswith(".creep") for n in problem.free) == 12
+    assert sum(n == "rods.growth" for n in problem.free) == 1
+    found = solutions(problem, 0.2e-6)[:2]
+    assert (np.abs(found[0].theta - found[1].theta) / problem.theta_scale).max() < 1e-5
+
+
+def test_readings_without_the_condition_are_refused(tmp_path):
+    folder = write_plan(tmp_path / "plan", conditions=False)
+    session = simulate_session(load_plan(folder), {"x_slide.offset": 1e-4}, seed=1).session
+    with pytest.raises(SessionError, match="needs the approach"):
+        calibrate(session, Choice(free=FREE))
+    assert calibrate(session, "offsets", solver="eliminated").free
+
+
+def test_a_session_from_files_is_the_same(simulated, folder, tmp_path):
+    write_session(simulated.session, tmp_path / "out", decimals=12)
+    again = load_session(tmp_path / "out")
+    one, other = (build_problem(s, free=FREE, prior=True) for s in (simulated.session, again))
+    assert np.abs(one.values - other.values).max() < 1e-12
+    assert np.array_equal(one.states.commands, other.states.commands)

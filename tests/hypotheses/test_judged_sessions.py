@@ -1,0 +1,178 @@
+"""Findings of reversed setups and of changes between sessions, as every command states them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from folders import session_folder
+
+from orthocal import (
+    calibrate,
+    check_session,
+    join_sessions,
+    load_plan,
+    load_session,
+    simulate_session,
+    write_session,
+)
+from orthocal.hypotheses.families.sessions import detectable_changes
+from orthocal.hypotheses.search import find_anomalies
+
+ERRORS = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.7e-3, "x_coupler.rz": 0.8e-3}
+ENTERED = [0.9e-3, -0.5e-3, 0.3e-3]
+
+
+def reverse(session, setup):
+    values = [-r.value if r.setup == setup else r.value for r in session.readings]
+    return session.with_values(values)
+
+
+@pytest.mark.parametrize(
+    ("session", "setup"),
+    [
+        *(("raw-cycles", s) for s in ("yx", "zx", "xy", "zy", "xz", "yz")),
+        ("sweep", "zy_50"),
+        ("lines", "yx"),
+    ],
+)
+def test_a_reversed_setup_is_named(root, session, setup):
+    right = load_session(session_folder(root, session))
+    assert check_session(right).decision.verdict == "enter"
+    found = check_session(reverse(right, setup))
+    assert found.decision.verdict == "review"
+    (finding,) = found.of_kind("reversed sign", "ambiguous")  # or single readings of it
+    assert {p.setup for p in finding.places} == {setup}
+
+
+@pytest.mark.parametrize("number", ["1-printed", "1-corrected", "2", "3"])
+def test_one_difference_per_setup_does_not_determine_its_sign(root, number):
+    session = load_session(root / f"examples/table1/experiment-{number}")
+    for setup in (None, *session.setups):
+        given = session if setup is None else reverse(session, setup)
+        assert not check_session(given).of_kind("reversed sign")
+
+
+def test_the_main_loop_walked_twice_finds_no_anomaly(root):
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    first = calibrate(simulate_session(plan, ERRORS, seed=1).session)
+    offsets = [e.enter for e in first.assessment.entries]
+    second = calibrate(simulate_session(plan.with_controller(offsets), ERRORS, seed=2).session)
+    assert [c.assessment.decision.verdict for c in (first, second)] == ["enter"] * 2
+    assert second.assessment.tool.now < 0.5 * first.assessment.tool.now
+
+
+@pytest.fixture(scope="module")
+def days(root, tmp_path_factory):
+    """Monday; Tuesday with offsets entered; Wednesday after slide x moved by 0.2 mm."""
+    directory = tmp_path_factory.mktemp("days")
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    entered = plan.with_controller(ENTERED)
+    moved = {**ERRORS, "x_slide.offset": 1.4e-3}
+    for i, (name, read, errors) in enumerate(
+        (("monday", plan, ERRORS), ("tuesday", entered, ERRORS), ("wednesday", entered, moved))
+    ):
+        write_session(simulate_session(read, errors, seed=i).session, directory / name)
+    return directory
+
+
+def test_a_moved_slide_is_named_with_its_amount_and_session(days):
+    calibration = calibrate([days / n for n in ("monday", "tuesday", "wednesday")])
+    decision = calibration.assessment.decision
+    assert (decision.verdict, decision.exit_code) == ("review", 3)
+    (finding,) = calibration.assessment.of_kind("machine changed")
+    amount, std = (finding.numbers[f"x_slide.offset_{n}_mm"] for n in ("by", "std"))
+    assert abs(amount - 0.2) < 3.0 * std
+    assert 0.003 < std < 0.025
+    assert finding.places[0].file == str(days / "wednesday/session.yaml")
+    assert finding.places[0].parameter == "x_slide"
+    assert "x_slide moved" in finding.text
+    assert "wednesday" in finding.action
+
+
+def test_without_a_change_the_detectable_one_is_stated(days):
+    found = check_session(join_sessions([load_session(days / n) for n in ("monday", "tuesday")]))
+    assert found.decision.verdict == "enter"
+    (finding,) = found.of_kind("no change")
+    assert 0.03 < finding.numbers["seen_from_mm"] < 0.12
+    alone = check_session(load_session(days / "monday"))
+    assert not alone.of_kind("no change", "change unknown", "machine changed")
+
+
+def test_changes_above_the_stated_limit_are_found_and_small_ones_are_not(root):
+    """Eight machines: 1.5 times the stated limit is always found, 0.4 times never."""
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    for seed in range(8):
+        drive = ("x_slide", "y_slide", "z_slide")[seed % 3]
+        first = simulate_session(plan, ERRORS, seed=seed).session
+        limit = detectable_changes(join_sessions([first, first]))[drive]
+        for factor, kinds in ((1.5, ["machine changed"]), (0.4, [])):
+            name = f"{drive}.offset"
+            errors = {**ERRORS, name: ERRORS.get(name, 0.0) + factor * limit}
+            second = simulate_session(plan, errors, seed=100 + seed).session
+            found = find_anomalies(join_sessions([first, second])).found
+            assert [a.explanation.kind for a in found] == kinds
+
+
+def test_two_moved_slides_are_both_named(root):
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml").with_controller(ENTERED)
+    moved = {"x_slide.offset": 1.5e-3, "y_slide.offset": -0.95e-3}
+    sessions = [
+        simulate_session(plan, errors, seed=i).session
+        for i, errors in enumerate((ERRORS, {**ERRORS, **moved}))
+    ]
+    found = find_anomalies(join_sessions(sessions)).found
+    assert {a.explanation.drives for a in found} == {("x_slide",), ("y_slide",)}
+    for a in found:
+        size = {"x_slide": 0.3e-3, "y_slide": -0.25e-3}[a.explanation.drives[0]]
+        assert abs(a.explanation.amount - size) < 4.0 * a.explanation.std
+
+
+def test_a_tilted_slide_is_no_moved_slide(root):
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    sessions = [
+        simulate_session(plan, errors, seed=i).session
+        for i, errors in enumerate((ERRORS, {**ERRORS, "x_slide.rz": 3e-3}))
+    ]
+    (found, *_) = find_anomalies(join_sessions(sessions)).found
+    assert not found.explanation.drives
+    assert found.explanation.parameters[0].startswith("x_")
+
+
+def test_a_wrong_reading_is_no_change(days):
+    joined = join_sessions([load_session(days / n) for n in ("monday", "tuesday")])
+    values = joined.values
+    values[70] += 0.3e-3
+    (found,) = find_anomalies(joined.with_values(values)).found
+    assert found.explanation.rows == (70,)
+
+
+def test_without_a_stated_noise_no_change_is_claimed(root):
+    """Differences without a σ, as many as there are parameters."""
+    session = load_session(root / "examples/table1/experiment-2")
+    silent = session.with_gauge(replace(session.gauge, sigma=None))
+    few = replace(silent, readings=silent.readings[:2])
+    found = check_session(join_sessions([silent, few]))
+    assert found.decision.verdict == "enter"
+    assert not found.of_kind("machine changed", "inconsistent readings")
+
+
+@pytest.mark.slow
+def test_amounts_of_changes_have_the_stated_standard_deviation(root):
+    """30 machines with a slide moved by 0.2 mm: the right drive, z scores of unit variance."""
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    scores = []
+    for seed in range(30):
+        drive, size = ("x_slide", "y_slide", "z_slide")[seed % 3], 0.2e-3 * (-1) ** seed
+        name = f"{drive}.offset"
+        pair = (ERRORS, {**ERRORS, name: ERRORS.get(name, 0.0) + size})
+        sessions = [
+            simulate_session(plan, errors, seed=1000 + 2 * seed + i).session
+            for i, errors in enumerate(pair)
+        ]
+        (found,) = find_anomalies(join_sessions(sessions)).found
+        assert found.explanation.drives == (drive,)
+        scores.append((found.explanation.amount - size) / found.explanation.std)
+    assert 0.6 < np.std(scores) < 1.4
+    assert abs(np.mean(scores)) < 0.6

@@ -1,0 +1,152 @@
+"""Marginal likelihoods against dense normal densities and numerical integration."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import Covariance, multivariate_normal
+
+from orthocal.hypotheses.likelihood import (
+    AMOUNTS,
+    NOISE_SCALES,
+    TOLERANCE_SCALES,
+    Products,
+    build_likelihood,
+    log_of_sum,
+)
+
+N, ERRORS, SIGMA = 7, 3, 0.8
+CONSTANT = N / 2.0 * np.log(2.0 * np.pi)
+"""Left out of all densities alike."""
+
+
+@pytest.fixture(scope="module")
+def case():
+    rng = np.random.default_rng(4)
+    jacobian = rng.normal(size=(N, ERRORS))
+    likelihood, _, _ = build_likelihood(jacobian, sigma=SIGMA, dof=N, stated=True)
+    return jacobian, likelihood, rng.normal(size=(5, N)), rng.normal(size=(5, N))
+
+
+def covariances(jacobian, n=N):
+    return [
+        e**2 * jacobian @ jacobian.T + (s * SIGMA) ** 2 * np.eye(n)
+        for e in TOLERANCE_SCALES
+        for s in NOISE_SCALES
+    ]
+
+
+def log_normal(deviation, covariance):
+    """Logarithm of a normal density, by SciPy."""
+    factor = Covariance.from_cholesky(np.linalg.cholesky(covariance))
+    return multivariate_normal(np.zeros(len(covariance)), factor).logpdf(deviation)
+
+
+def dense(jacobian, likelihood, deviation, effects=None):
+    """Σ w N(y; 0, e² J Jᵀ + s² σ² + τ² W Wᵀ) over all e, s and τ, by SciPy."""
+    logs = []
+    for weight, covariance in zip(likelihood.weights, covariances(jacobian), strict=True):
+        for tau in AMOUNTS if effects is not None else (0.0,):
+            more = 0.0 if effects is None else (tau * SIGMA) ** 2 * effects.T @ effects
+            share = 0.0 if effects is None else np.log(AMOUNTS.size)
+            density = log_normal(deviation, covariance + more)
+            logs.append(weight - share + density)
+    return float(log_of_sum(np.array(logs))) + CONSTANT
+
+
+def test_prior_weights_add_up_to_one(case):
+    assert np.exp(case[1].weights).sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("rows", [N, 3 * N])
+def test_principal_directions_reproduce_the_covariance(rows):
+    """Of wide and of tall Jacobians, which are decomposed by different ways."""
+    jacobian = np.random.default_rng(1).normal(size=(rows, ERRORS))
+    likelihood, errors, sizes = build_likelihood(jacobian, sigma=SIGMA, dof=rows, stated=True)
+    r = likelihood.directions
+    assert r @ r.T == pytest.approx(np.eye(ERRORS), abs=1e-12)
+    assert (r.T * sizes) @ errors.T == pytest.approx(jacobian)
+    assert (r.T * likelihood.variances) @ r == pytest.approx(jacobian @ jacobian.T)
+
+
+def test_many_deviations_equal_dense_densities(case):
+    jacobian, likelihood, deviations, _ = case
+    found = likelihood.score(likelihood.products(deviations))
+    assert found == pytest.approx([dense(jacobian, likelihood, d) for d in deviations])
+
+
+def test_an_effect_of_unknown_amount_is_a_variance(case):
+    jacobian, likelihood, deviations, effects = case
+    cross = (deviations * effects).sum(axis=1)
+    found = likelihood.score(likelihood.products(deviations), likelihood.products(effects), cross)
+    expected = [
+        dense(jacobian, likelihood, d, w[None]) for d, w in zip(deviations, effects, strict=True)
+    ]
+    assert found == pytest.approx(expected)
+    one = likelihood.score_set(deviations[0], [effects[:1]])
+    assert one.log_likelihood == pytest.approx(expected[0])
+
+
+def test_an_unknown_amount_is_integrated_over(case):
+    _, likelihood, deviations, effects = case
+
+    def density(b):
+        products: Products = likelihood.products((deviations[0] - b * effects[0])[None])
+        return np.exp(likelihood.score(products)[0])
+
+    total = 0.0
+    for tau in AMOUNTS * SIGMA:
+        value, _ = quad(
+            lambda b, tau=tau: density(b) * np.exp(-0.5 * (b / tau) ** 2) / tau,
+            *(-12.0, 12.0),
+            epsabs=0.0,
+            limit=200,
+        )
+        total += value / np.sqrt(2.0 * np.pi) / AMOUNTS.size
+    found = likelihood.score_set(deviations[0], [effects[:1]])
+    assert found.log_likelihood == pytest.approx(np.log(total), abs=1e-4)
+
+
+def test_a_group_of_effects_shares_one_prior(case):
+    jacobian, likelihood, deviations, effects = case
+    found = likelihood.score_set(deviations[0], [effects[:2]])
+    assert found.log_likelihood == pytest.approx(
+        dense(jacobian, likelihood, deviations[0], effects[:2])
+    )
+    assert found.amounts.shape == (2,)
+
+
+def test_separate_effects_average_over_their_own_priors(case):
+    jacobian, likelihood, deviations, effects = case
+    logs = []
+    for weight, covariance in zip(likelihood.weights, covariances(jacobian), strict=True):
+        for one in AMOUNTS:
+            for other in AMOUNTS:
+                scaled = SIGMA * np.array([[one], [other]]) * effects[:2]
+                full = covariance + scaled.T @ scaled
+                density = log_normal(deviations[0], full)
+                logs.append(weight - 2.0 * np.log(AMOUNTS.size) + density)
+    found = likelihood.score_set(deviations[0], [effects[:1], effects[1:2]])
+    assert found.log_likelihood == pytest.approx(float(log_of_sum(np.array(logs))) + CONSTANT)
+
+
+def test_silent_rows_leave_the_density_of_the_others(case):
+    jacobian, likelihood, deviations, _ = case
+    kept, silent = [0, 2, 3, 5, 6], [1, 4]
+    found = likelihood.score_set(deviations[0], (), np.eye(N)[silent])
+    logs = [
+        weight + log_normal(deviations[0][kept], c[np.ix_(kept, kept)])
+        for weight, c in zip(likelihood.weights, covariances(jacobian), strict=True)
+    ]
+    assert found.log_likelihood == pytest.approx(float(log_of_sum(np.array(logs))) + CONSTANT)
+
+
+def test_an_amount_without_prior_is_that_of_weighted_least_squares(case):
+    jacobian, likelihood, deviations, effects = case
+    inverse = np.linalg.inv(jacobian @ jacobian.T + SIGMA**2 * np.eye(N))
+    information = effects[0] @ inverse @ effects[0]
+    amount, std = likelihood.estimate_amount(deviations[0], effects[0])
+    assert amount == pytest.approx(effects[0] @ inverse @ deviations[0] / information)
+    assert std == pytest.approx(information**-0.5)
+    assert likelihood.estimate_amount(deviations[0], np.zeros(N)) == (0.0, np.inf)

@@ -1,0 +1,156 @@
+"""Prediction of a reading by the others: against dense conditioning, and drawn machines."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from orthocal import load_plan, load_session
+from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.estimation.problem import build_problem
+from orthocal.hypotheses.linear_model import MOST_STEPS, SETTLED, LinearModel
+from orthocal.observation.simulate import limits_of, show_readings
+from orthocal.session.session import Reading
+from orthocal.units import MM
+
+ZERO = 1.0
+"""Standard deviation of a free gauge zero in the dense covariance, [m]: 10⁵ times the noise."""
+
+ROUNDING = 1e-5
+"""Relative error of conditioning with variances of ZERO² and of the noise side by side."""
+
+CHANCE = (0.7, 1.3)
+"""Range of the standard deviation of 60 scores: three standard errors of it."""
+
+
+def part(session, count):
+    return session.select(session.readings[:count])
+
+
+def with_two_gauges(session):
+    gauges = {"coarse": session.gauge, "fine": replace(session.gauge, sigma=1e-6, resolution=None)}
+    setups = {
+        n: replace(s, gauge="fine" if i % 2 else "coarse")
+        for i, (n, s) in enumerate(session.setups.items())
+    }
+    return replace(session, gauges=gauges, setups=setups)
+
+
+def with_known_zero(session, name):
+    return replace(
+        session, setups=session.setups | {name: replace(session.setups[name], zero="known")}
+    )
+
+
+def condition(session, row):
+    """Mean and standard deviation of a reading, from the covariance of all rows written out."""
+    problem = LinearModel(session).problem
+    o = problem.observations
+    of_rows = o.rows(np.eye(o.size))
+    gauges = [session.gauges[session.setups[r.setup].gauge] for r in session.readings]
+    sigma = np.zeros(o.size)
+    for i, gauge in enumerate(gauges):
+        for entry in (o.plus[i], o.minus[i]):
+            if entry >= 0:
+                sigma[entry] = math.hypot(gauge.sigma, (gauge.resolution or 0.0) / math.sqrt(12.0))
+    zeros = problem.zero_incidence[:, ~o.zero_known] * ZERO
+    others = np.delete(np.arange(len(session.readings)), row)
+    theta = np.zeros(problem.n_free)
+    for _ in range(MOST_STEPS):
+        reading, jacobian = problem.linearise(problem.reference + theta * problem.theta_scale)
+        jacobian = of_rows @ (jacobian * problem.noise[:, None])
+        mean = of_rows @ (reading * problem.noise) - jacobian @ theta
+        spread = of_rows @ np.hstack([zeros, np.diag(sigma)])
+        covariance = jacobian @ jacobian.T + spread @ spread.T
+        known = np.linalg.solve(covariance[np.ix_(others, others)], (session.values - mean)[others])
+        if np.abs(jacobian[others].T @ known - theta).max() < SETTLED:
+            break
+        theta = jacobian[others].T @ known
+    gain = np.linalg.solve(covariance[np.ix_(others, others)], covariance[others, row])
+    variance = covariance[row, row] - gain @ covariance[others, row]
+    return mean[row] + covariance[row, others] @ known, math.sqrt(variance)
+
+
+CASES = {
+    "next of a few": (lambda root: part(load_session(root / "examples/workshop"), 11), 10),
+    "one before": (lambda root: part(load_session(root / "examples/workshop"), 11), 4),
+    "repeated": (lambda root: part(load_session(root / "examples/raw-cycles"), 23), 22),
+    "differences": (lambda root: load_session(root / "examples/table1/experiment-2"), 3),
+    "two gauges": (lambda root: with_two_gauges(load_session(root / "examples/workshop")), 16),
+    "known zero": (
+        lambda root: with_known_zero(part(load_session(root / "examples/workshop"), 7), "xy"),
+        6,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_prediction_equals_dense_conditioning(root, case):
+    make, row = CASES[case]
+    session = make(root)
+    if session.gauge.sigma is None:
+        session = session.with_gauge(replace(session.gauge, sigma=5e-6))
+    mean, std = LinearModel(session).predict_row(session.values, row)
+    expected, spread = condition(session, row)
+    assert mean == pytest.approx(expected, abs=ROUNDING * spread)
+    assert std == pytest.approx(spread, rel=ROUNDING)
+    other = session.values.copy()
+    other[row] += 0.1 * MM
+    again = LinearModel(session.with_values(other)).predict_row(other, row)
+    assert again == pytest.approx((mean, std), rel=1e-9)
+
+
+def test_repeated_readings_predict_their_mean(root):
+    """Hand-solved: with a free zero the mean of the others, to σ √(1 + 1/n)."""
+    plan = load_plan(root / "examples/raw-cycles")
+    rows = [r for r in plan.readings if (r.setup, r.posture) == ("yx", "x_max")]
+    session = plan.select(rows).with_values(np.array([0.1, 0.12, 0.7]) * MM)
+    mean, std = LinearModel(session).predict_row(session.values, 2)
+    assert mean == pytest.approx(0.11 * MM, abs=1e-12)
+    assert std == pytest.approx(np.hypot(0.01, 0.01 / np.sqrt(12.0)) * MM * np.sqrt(1.5))
+
+
+def test_the_first_reading_of_a_setup_has_no_prediction(root):
+    session = part(load_session(root / "examples/workshop"), 7)
+    for only in (session, part(session, 1)):
+        mean, std = LinearModel(only).predict_row(only.values, len(only.readings) - 1)
+        assert math.isnan(mean)
+        assert math.isinf(std)
+
+
+def test_a_difference_is_predicted_without_any_other(root):
+    plan = load_plan(root / "examples/raw-cycles")
+    session = replace(plan, readings=(Reading("yx", "x_max", "x_min", 1, 0.0, None),))
+    mean, std = LinearModel(session).predict_row(session.values, 0)
+    assert mean == pytest.approx(0.0, abs=1e-9)
+    assert 0.5 * MM < std < 5.0 * MM  # the offsets' 2 mm, a part of which the gauge sees
+
+
+def draw_sessions(plan, count, seed):
+    """Sessions of machines within their tolerances, closed exactly, in the range of the dial."""
+    problem = build_problem(plan, free=machine_errors(plan.robot), prior=True)
+    theta = np.random.default_rng(seed).normal(size=(count, problem.n_free))
+    o = problem.observations
+    entries, _, closed = problem.simulate(problem.reference + theta * problem.theta_scale)
+    limits = [limits_of(plan, r) for r in plan.readings]
+    for k in np.flatnonzero(closed & np.isfinite(entries).all(axis=1)).tolist():
+        rng = np.random.default_rng((seed, k))
+        values = o.rows(show_readings(plan, o, entries[k], rng=rng)[0])
+        if all(low <= v <= high for (low, high), v in zip(limits, values, strict=True)):
+            yield plan.with_values(values)
+
+
+def test_readings_scatter_about_their_predictions_as_stated(root):
+    plan = load_plan(root / "examples/workshop")
+    scores = []
+    for session in draw_sessions(plan, 30, 5):
+        for count in (6, 12, 18):
+            read = part(session, count)
+            mean, std = LinearModel(read).predict_row(read.values, count - 1)
+            scores.append((read.values[-1] - mean) / std)
+    assert len(scores) >= 60
+    assert CHANCE[0] < np.std(scores) < CHANCE[1]
+    assert abs(np.mean(scores)) < 0.3

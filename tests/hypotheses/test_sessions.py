@@ -1,0 +1,226 @@
+"""Anomalies between joined sessions, and of sessions in unusual form."""
+
+from __future__ import annotations
+
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_mistakes import sound_session
+
+from orthocal import draw_errors, load_plan, load_session, simulate_session
+from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.hypotheses.families.sessions import enter_wrongly
+from orthocal.hypotheses.search import find_anomalies
+from orthocal.measurement.joining import join_sessions
+
+ENTERED = np.array([0.63e-3, 1.66e-3, -3.22e-3])
+"""Offsets that the second session states, [m]."""
+
+
+@pytest.fixture(scope="module")
+def plan(root):
+    return load_plan(root / "examples/workshop/plan.yaml")
+
+
+def measure_twice(plan, active, *, before=(0.0, 0.0, 0.0), changed=0.0, seed=1):
+    """Two sessions of one machine: with some offsets entered, and with others than stated.
+
+    Args:
+        plan: The readings of both.
+        active: Offsets in the controller of the second session, which states `ENTERED`.
+        before: Offsets in the controller of the first session, which states them.
+        changed: Change of the offset of the second drive between the sessions, [m].
+        seed: Of the machine and its readings.
+    """
+    robot = plan.robot
+    errors = draw_errors(robot, machine_errors(robot), seed=seed)
+    names = [f"{d.name}.offset" for d in robot.drives]
+    errors.update(zip(names, ENTERED + 10e-6, strict=True))
+    second = dict(errors)
+    for name, stated, value in zip(names, ENTERED, active, strict=True):
+        second[name] += stated - value
+    second[names[1]] += changed
+    sessions = [
+        simulate_session(plan.with_controller(before), errors, seed=seed).session,
+        simulate_session(plan.with_controller(ENTERED), second, seed=seed + 100).session,
+    ]
+    return join_sessions(sessions)
+
+
+@pytest.mark.parametrize(
+    ("active", "kind", "drives"),
+    [
+        (0.0 * ENTERED, "offsets not entered", (0, 1, 2)),
+        (-ENTERED, "offsets reversed", (0, 1, 2)),
+        (2.0 * ENTERED, "offsets entered twice", (0, 1, 2)),
+        (ENTERED[[0, 2, 1]], "offsets interchanged", (1, 2)),
+        (ENTERED * [1.0, 1.0, 0.0], "offsets not entered", (2,)),
+        (np.add(ENTERED, (0.0, 0.8e-3, 0.0)), "offset of one drive", (1,)),
+    ],
+)
+def test_offsets_that_are_not_as_stated_are_named(plan, active, kind, drives):
+    session = measure_twice(plan, active)
+    found = find_anomalies(session)
+    (anomaly,) = found.found
+    e = anomaly.explanation
+    assert (e.kind, e.sessions) == (kind, ("session-2",))
+    assert e.drives == tuple(plan.robot.drives[i].name for i in drives)
+    if e.offsets:
+        assert np.array(e.offsets) == pytest.approx(active, abs=1e-9)
+    else:  # the machine is less off than it would be with the offsets that are stated
+        assert e.amount == pytest.approx(-0.8e-3, abs=0.2e-3)
+    assert found.explained
+
+
+BEFORE = np.array([-0.5e-3, -1.0e-3, 0.3e-3])
+"""Offsets that are active already when a machine is calibrated for the second time, [m]."""
+
+WAYS = {
+    "previous ones": ("offsets not entered", BEFORE),
+    "none": ("offsets not entered", 0.0 * BEFORE),
+    "sign": ("offsets reversed", -ENTERED),
+    "sign of the change": ("offsets reversed", 2.0 * BEFORE - ENTERED),
+    "twice": ("offsets entered twice", 2.0 * ENTERED),
+    "added to the previous ones": ("offsets entered twice", BEFORE + ENTERED),
+    "change added": ("offsets entered twice", 2.0 * ENTERED - BEFORE),
+    "cyclic": ("offsets interchanged", ENTERED[[1, 2, 0]]),
+}
+"""Offsets in the controller instead of `ENTERED` where `BEFORE` were active."""
+
+
+@pytest.mark.parametrize(
+    ("way", "drives"),
+    [
+        *((way, (0, 1, 2)) for way in WAYS),
+        *((way, drives) for way in WAYS if way != "cyclic" for drives in ((1,), (0, 2))),
+    ],
+)
+def test_ways_to_enter_offsets_wrongly_in_place_of_others(root, way, drives):
+    kind, values = WAYS[way]
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    active = ENTERED.copy()
+    active[list(drives)] = values[list(drives)]
+    (anomaly,) = find_anomalies(measure_twice(plan, active, before=BEFORE)).found
+    e = anomaly.explanation
+    assert (e.kind, e.sessions) == (kind, ("session-2",))
+    assert e.drives == tuple(plan.robot.drives[i].name for i in drives)
+    assert np.array(e.offsets) == pytest.approx(active, abs=1e-9)
+    assert anomaly.between_sessions
+
+
+def test_sessions_of_one_machine_with_the_stated_offsets_are_not_accused(plan):
+    assert find_anomalies(measure_twice(plan, ENTERED)).found == ()
+
+
+def test_wrong_offsets_are_listed_once_each():
+    before, stated = np.zeros(3), np.array([1e-3, 1e-3, 2e-3])
+    ways = list(enter_wrongly(before, stated))
+    entered = {tuple(np.round(c, 9)) for _, _, c in ways}
+    assert len(entered) == len(ways)
+    assert tuple(stated) not in entered
+    assert {kind for kind, _, _ in ways} == {
+        "offsets not entered",
+        "offsets reversed",
+        "offsets entered twice",
+        "offsets interchanged",
+    }
+    assert list(enter_wrongly(before, before)) == []
+
+
+def place(session, row):
+    r = session.readings[row]
+    return r.setup, r.posture, r.minus, r.cycle
+
+
+def test_permuting_rows_changes_no_anomaly_but_those_about_order(root):
+    session = load_session(root / "examples/raw-cycles")
+    row = next(i for i, r in enumerate(session.readings) if r.value > 0.4e-3 and r.cycle == 2)
+    values = session.values
+    values[row] *= -1.0
+    session = session.with_values(values)
+    order = np.random.default_rng(3).permutation(len(values))
+    shuffled = replace(session, readings=tuple(session.readings[i] for i in order))
+    one, other = find_anomalies(session), find_anomalies(shuffled)
+    (first,), (second,) = one.found, other.found
+    assert first.explanation.kind == second.explanation.kind == "reversed sign"
+    assert place(session, first.explanation.rows[0]) == place(shuffled, second.explanation.rows[0])
+    assert second.log_evidence == pytest.approx(first.log_evidence, abs=1e-6)
+    assert second.expected == pytest.approx(first.expected, abs=1e-9)
+
+
+def test_a_half_read_session_is_searched_as_far_as_it_goes(root):
+    session = load_session(root / "examples/raw-cycles")
+    half = session.select(session.readings[: len(session.readings) // 2])
+    assert find_anomalies(half).found == ()
+    values = half.values
+    values[5] += 1e-3
+    (anomaly,) = find_anomalies(half.with_values(values)).found
+    assert anomaly.explanation.rows == (5,)
+    for count in (0, 1, 2, 3):
+        some = session.select(session.readings[:count]) if count else None
+        assert some is None or find_anomalies(some).found == ()
+
+
+def test_one_reversed_reading_of_three_is_no_reversed_setup(root):
+    """At most an alternative: the smaller change comes first."""
+    plan = load_plan(root / "examples/workshop/plan.yaml")
+    named = 0
+    for seed in range(4):
+        session = sound_session(plan, seed, entered=False)
+        for row in (3, 8, 13):
+            values = session.values
+            values[row] *= -1.0
+            for a in find_anomalies(session.with_values(values)).found:
+                assert row in a.explanation.rows
+                assert not a.explanation.setups
+                named += a.explanation.rows == (row,)
+    assert named > 4
+
+
+def test_each_reading_is_held_to_the_noise_of_its_own_gauge(root):
+    """A change of 0.1 mm is seen by a fine dial in another setup, not by a coarse one."""
+    session = load_session(root / "examples/raw-cycles")
+    names = list(session.setups)
+    coarse = replace(session.gauge, sigma=0.2e-3, resolution=0.1e-3)
+    fine = replace(session.gauge, sigma=2e-6, resolution=1e-6)
+    setups = {
+        n: replace(s, gauge="coarse" if n == names[0] else "fine")
+        for n, s in session.setups.items()
+    }
+    for first in ("coarse", "fine"):
+        gauges = {"coarse": coarse, "fine": fine}
+        ordered = {first: gauges[first], **gauges}
+        mixed = replace(session, gauges=ordered, setups=setups)
+        row = next(i for i, r in enumerate(mixed.readings) if r.setup == names[0])
+        values = mixed.values
+        values[row] += 0.1e-3
+        found = find_anomalies(mixed.with_values(values)).found
+        assert not any(row in a.explanation.rows for a in found)
+
+
+@pytest.mark.slow
+def test_memory_is_linear_in_the_readings(root):
+    """Twice the readings of a setup take twice the memory, and no family leaves them out."""
+    session = load_session(root / "examples/raw-cycles")
+    name = next(iter(session.setups))
+    own = [r for r in session.readings if r.setup == name and r.cycle == 1]
+    rng = np.random.default_rng(0)
+    peaks = []
+    for count in (1500, 3000, 6000):
+        readings = [
+            replace(r, cycle=c + 1, value=r.value + 1e-5 * float(rng.normal()))
+            for c in range(count // len(own))
+            for r in own
+        ]
+        values = np.array([r.value for r in readings])
+        values[count // 3] += 1e-3
+        large = session.select(readings).with_values(values)
+        tracemalloc.start()
+        found = find_anomalies(large)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert [a.explanation.rows for a in found.found] == [(count // 3,)]
+    assert peaks[1] < 2.5 * peaks[0]
+    assert peaks[2] < 2.5 * peaks[1]

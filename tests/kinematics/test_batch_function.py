@@ -1,0 +1,166 @@
+"""Both backends of batch functions give the same numbers, bit by bit."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from orthocal import load_plan
+from orthocal.kinematics.backend import batch_function, llvm
+from orthocal.kinematics.backend.batch_function import BatchFunction
+from orthocal.kinematics.robot_functions import robot_functions
+from orthocal.observation.observations import build_observations
+from orthocal.observation.sensor_groups import group_sensors
+
+BACKENDS = ("casadi", "llvm")
+
+
+def points(robot, count):
+    rng = np.random.default_rng(0)
+    errors = robot_functions(robot).errors
+    drives = robot.drive_zero + 0.02 * rng.normal(size=(count, len(robot.drives)))
+    passive = robot.zero[robot.passive_index]
+    passive = passive + 0.2 * rng.normal(size=(count, passive.size))
+    return drives, passive, errors.placements(1e-2 * rng.normal(size=len(errors.names)))
+
+
+def assert_same(found, expected):
+    for ours, theirs in zip(found, expected, strict=True):
+        assert ours.shape == theirs.shape
+        assert np.array_equal(ours, theirs, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", ["orthoglide", "fivebar", "biglide"])
+@pytest.mark.parametrize("count", [0, 1, llvm.LANES - 1, llvm.LANES, 2 * llvm.LANES + 1])
+def test_both_backends_give_the_same_numbers(request, name, count):
+    robot = request.getfixturevalue(name)
+    functions, where = robot_functions(robot), points(robot, count)
+    tested = [functions.closure_by_passive, functions.closure_jacobian]
+    if robot.tcp is not None:
+        tested += [functions.closure_and_tool, functions.tool_jacobian]
+    for function in tested:
+        found, expected = (function.evaluate(*where, backend=b) for b in BACKENDS)
+        assert_same(found, expected)
+        assert_same(function(*where), expected)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_row_of_an_input_holds_for_successive_points(orthoglide, backend):
+    function, where = robot_functions(orthoglide).closure_by_passive, points(orthoglide, 44)
+    rng = np.random.default_rng(3)
+    for rows in (1, 11, 44):
+        placements = where[2] + 1e-4 * rng.normal(size=(rows, where[2].size))
+        repeated = np.repeat(placements, 44 // rows, axis=0)
+        expected = function.evaluate(*where[:2], repeated, backend=backend)
+        assert_same(function.evaluate(*where[:2], placements, backend=backend), expected)
+
+
+@pytest.mark.parametrize("count", [llvm.LANES - 3, 101])
+def test_every_operation_is_casadis(count):
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    results = [
+        *(x + y, x - y, x * y, x / y, -x, x**2, 2.0 * x, 1.0 / x, ca.sqrt(ca.fabs(x)), ca.sin(x)),
+        *(ca.cos(x), ca.tan(x), ca.asin(x / 9), ca.acos(x / 9), ca.atan(x), ca.atan2(x, y)),
+        *(x < y, x <= y, x == y, x != y, ca.logic_not(x), ca.logic_and(x, y)),
+        *(ca.logic_or(x, y), ca.if_else(x < y, x, y), ca.sign(x), ca.SX(3.5), x),
+    ]
+    function = ca.Function("all", [x, y], [ca.densify(ca.vertcat(*results))])
+    assert llvm.list_instructions(function) is not None
+    rng = np.random.default_rng(1)
+    values = rng.normal(size=(2, 101, 1))
+    values[1, ::3], values[0, ::5] = values[0, ::3], 0.0
+    values[1, ::10] = 0.0
+    values = values[:, :count]
+    batch = BatchFunction(function)
+    assert_same(*(batch.evaluate(*values, backend=b) for b in BACKENDS))
+
+
+@pytest.mark.parametrize("count", [0, 1, 12])
+def test_numpy_executes_short_functions_to_the_same_numbers(count):
+    x, y = ca.SX.sym("x", 2), ca.SX.sym("y", 2)
+    values = [x + y, x - y, x * y, x / y, -x, x**2, 2.0 * x, 1.0 / x, ca.sqrt(ca.fabs(x)), 3.0 * x]
+    outputs = [ca.vertcat(*values, 3.5), ca.diag(x)]
+    batch = BatchFunction(ca.Function("short", [x, y], outputs), matrices=["o1"])
+    rng = np.random.default_rng(4)
+    for rows in {1, max(count // 3, 1), max(count, 1)}:
+        where = rng.normal(size=(count, 2)), rng.normal(size=(rows, 2))
+        expected = batch.evaluate(*where, backend="casadi")
+        assert_same(batch.evaluate(*where, backend="numpy"), expected)
+        assert_same(batch(*where), expected)
+
+
+def test_numpy_leaves_other_functions_to_casadi(monkeypatch):
+    """Long ones, and those whose operations it may round otherwise."""
+    monkeypatch.setattr(batch_function, "_run_numpy", None)
+    x = ca.SX.sym("x")
+    long = x
+    for _ in range(batch_function.MAX_SHORT):
+        long = long * x + 1.0
+    for expression in (ca.sin(x), long):
+        batch = BatchFunction(ca.Function("other", [x], [expression]))
+        assert_same(batch(np.ones((3, 1))), batch.evaluate(np.ones((3, 1)), backend="casadi"))
+
+
+@pytest.mark.parametrize("example", ["raw-cycles", "workshop"])
+def test_the_instructions_of_all_readings_are_known(root, example):
+    """Line between rods, and ball on a rod: others would be evaluated ten times slower."""
+    session = load_plan(root / "examples" / example / "plan.yaml")
+    for group in group_sensors(session, build_observations(session)):
+        for batch in (group.reading.value, group.reading.jacobian):
+            assert llvm.list_instructions(batch.function) is not None
+
+
+def test_a_function_with_an_unknown_instruction_is_left_to_casadi():
+    x = ca.SX.sym("x")
+    function = ca.Function("unknown", [x], [ca.erf(x)])
+    assert llvm.list_instructions(function) is None
+    (found,) = BatchFunction(function).evaluate(np.ones((50, 1)), backend="llvm")
+    assert found[0, 0] == float(ca.erf(1.0))
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_the_backend_depends_on_the_call_alone(orthoglide, monkeypatch, installed):
+    batch, enough = robot_functions(orthoglide).closure_by_passive, batch_function.MIN_POINTS
+    assert batch.function.n_instructions() * enough > batch_function.MIN_OPERATIONS
+    used = []
+    monkeypatch.setattr(llvm, "is_installed", lambda: installed)
+    monkeypatch.setattr(llvm, "run", lambda *_: used.append("llvm"))
+    for count, expected in ((enough, installed), (enough - 1, False), (enough, installed)):
+        used.clear()
+        batch(*points(orthoglide, count))
+        assert bool(used) == expected
+
+
+def test_casadi_stands_in_where_the_interpreter_cannot_be_compiled(orthoglide, monkeypatch):
+    function, where = robot_functions(orthoglide).closure_by_passive, points(orthoglide, 3)
+    expected = function.evaluate(*where, backend="casadi")
+    monkeypatch.setattr(llvm, "compile_interpreter", lambda: None)
+    assert_same(function.evaluate(*where, backend="llvm"), expected)
+
+
+def test_instructions_are_cached_on_disk(orthoglide, tmp_path, monkeypatch):
+    monkeypatch.setenv("ORTHOCAL_CACHE", str(tmp_path / "cache"))
+    function = robot_functions(orthoglide).closure_by_passive.function
+    assert function.n_instructions() > llvm.MIN_CACHED
+    list_instructions, expected, listed = llvm.list_instructions, None, []
+    expected = list_instructions(function)
+
+    def counted(function):
+        listed.append(function)
+        return list_instructions(function)
+
+    monkeypatch.setattr(llvm, "list_instructions", counted)
+    for _ in range(3):
+        found = llvm.load_program(function, key="a key")
+        assert len(listed) == 1
+        assert found.n_work == expected.n_work
+        for name in ("table", "constants", "output_starts"):
+            ours, theirs = getattr(found, name), getattr(expected, name)
+            assert ours.dtype == theirs.dtype
+            assert np.array_equal(ours, theirs)
+    # content of another length is not used, whatever its checksum says
+    content = llvm.disk_cache.load
+    monkeypatch.setattr(llvm.disk_cache, "load", lambda key: content(key)[:-8])
+    assert np.array_equal(llvm.load_program(function, key="a key").table, expected.table)
+    assert len(listed) == 2

@@ -1,0 +1,240 @@
+"""The loop closure solver against closed forms and Pinocchio, in batches, and its refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tolerances import CLOSED, CLOSED_FORM
+
+from orthocal.errors import ClosureError, RobotError
+from orthocal.kinematics import loop_closure
+from orthocal.kinematics import orthoglide as closed_form
+from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
+from orthocal.kinematics.robot_functions import robot_functions
+
+LENGTH = 0.31025
+
+
+def reachable_points(count, seed=1):
+    """Random points in the machine's branch and within the drives' travel."""
+    rng = np.random.default_rng(seed)
+    found = np.empty((0, 3))
+    while len(found) < count:
+        points = rng.uniform(-0.15, 0.08, (count, 3))
+        joints = closed_form.inverse(points, length=LENGTH)
+        inside = np.all((joints > 0.12) & (joints < 0.39), axis=1)
+        found = np.vstack([found, points[inside]])
+    return found[:count]
+
+
+def test_closed_loops_equal_the_closed_forms_on_ten_thousand_points(orthoglide):
+    points = reachable_points(10_000)
+    joints = closed_form.inverse(points, length=LENGTH)
+    closure = LoopClosure(orthoglide)
+    assert np.abs(closure.forward(joints) - points).max() < CLOSED_FORM
+    assert np.abs(closed_form.direct(joints, length=LENGTH) - points).max() < CLOSED_FORM
+    assert np.abs(closure.inverse(points[:2000]) - joints[:2000]).max() < CLOSED_FORM
+
+
+def test_offsets_and_lengths_act_as_in_the_closed_forms(orthoglide):
+    rng = np.random.default_rng(2)
+    points = reachable_points(200, seed=3)
+    offsets = rng.uniform(-0.005, 0.005, 3)
+    stretch = 0.0007
+    errors = {f"{k}_slide.offset": v for k, v in zip("xyz", offsets, strict=True)}
+    errors.update({f"{k}_leg.length": stretch for k in "xyz"})
+    joints = closed_form.inverse(points, length=LENGTH + stretch, offsets=offsets)
+    # a longer leg reaches further in from the same slider: the platform's own offset is unchanged
+    assert (
+        np.abs(LoopClosure(orthoglide, fixed=errors).forward(joints) - points).max() < CLOSED_FORM
+    )
+
+
+def test_batches_equal_pinocchios_own_newton(orthoglide):
+    names = orthoglide.parameters.select_model("full")
+    rng = np.random.default_rng(4)
+    scale = np.array([orthoglide.parameters[n].tolerance for n in names])
+    values = 5.0 * scale * rng.normal(size=len(names))
+    joints = closed_form.inverse(reachable_points(20, seed=5), length=LENGTH)
+    passive = LoopClosure(orthoglide, free=names).close(joints, theta=values)
+    machine = orthoglide.with_errors(dict(zip(names, values, strict=True)))
+    for d, ours in zip(joints, passive, strict=True):
+        theirs = machine.close_with_pinocchio(d, orthoglide.zero[orthoglide.passive_index])
+        assert np.abs(ours - theirs).max() < CLOSED
+
+
+def test_closures_hold_at_the_solution(orthoglide):
+    joints = closed_form.inverse(reachable_points(50, seed=6), length=LENGTH)
+    for d, p in zip(joints, LoopClosure(orthoglide).close(joints), strict=True):
+        residual, jacobian = orthoglide.evaluate_constraints(d, p)
+        assert np.abs(residual).max() < CLOSED
+        assert np.linalg.matrix_rank(jacobian[:, orthoglide.passive_index]) == 18
+
+
+def test_the_zero_posture_is_as_well_conditioned_as_designed(orthoglide):
+    from orthocal.robot.model import closure_row_units
+
+    passive = orthoglide.zero[orthoglide.passive_index]
+    _, jacobian = orthoglide.evaluate_constraints(orthoglide.drive_zero, passive)
+    scaled = jacobian[:, orthoglide.passive_index] * closure_row_units(orthoglide)[:, None]
+    values = np.linalg.svd(scaled, compute_uv=False)
+    assert 1 / 30 < values[-1] / values[0] < 1 / 10
+
+
+def test_a_robot_with_redundant_closure_rows_closes(fivebar):
+    """Gepetto's three keys only: a planar loop with all six rows, three of them dependent."""
+    assert fivebar.closure_rows == 6
+    motors = np.array([[0.0, 0.0], [0.2, -0.1], [-0.4, 0.3]])
+    passive = nominal_closure(fivebar).close(motors)
+    for d, p in zip(motors, passive, strict=True):
+        residual, _ = fivebar.evaluate_constraints(d, p)
+        assert np.abs(residual).max() < CLOSED
+
+
+@pytest.mark.parametrize(
+    "motors", [(0.2, -0.1), (0.174, 1.74), (-0.434, 1.561), (1.253, 1.651), (-1.091, 0.493)]
+)
+def test_large_motions_keep_the_elbows_where_they_were(fivebar, motors):
+    """The apex stays on its side of the elbows; plain Newton from zero turns all but the first."""
+    import pinocchio as pin
+
+    first = -0.1 + (-0.05 + 0.08j) * np.exp(1j * motors[0])
+    second = 0.1 + (0.05 + 0.08j) * np.exp(1j * motors[1])
+    between = second - first
+    height = np.sqrt(abs(0.15 + 0.07j) ** 2 - abs(between) ** 2 / 4)
+    apex = (first + second) / 2 + 1j * between / abs(between) * height
+    passive = nominal_closure(fivebar).close(motors)
+    data = fivebar.model.createData()
+    q = fivebar.configuration(fivebar.joint_coordinates(motors, passive))
+    pin.framesForwardKinematics(fivebar.model, data, q)
+    reached = data.oMf[fivebar.frame_id("end_a")].translation
+    assert np.abs(reached - [apex.real, apex.imag, 0.0]).max() < CLOSED_FORM
+
+
+def test_another_robot_goes_the_same_way(biglide):
+    points = np.random.default_rng(8).uniform(-0.05, 0.05, (100, 2))
+    joints = np.sqrt(0.2**2 - points[:, ::-1] ** 2) + points
+    closure = nominal_closure(biglide)
+    assert np.abs(closure.inverse(points) - joints).max() < CLOSED_FORM
+    assert np.abs(closure.forward(joints)[:, :2] - points).max() < CLOSED_FORM
+
+
+def test_far_postures_stay_in_the_branch_the_machine_is_built_in(orthoglide):
+    """Plain Newton from the mechanical zero would assemble some of these the other way."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-0.19, 0.19, (2000, 3))
+    joints = closed_form.inverse(points, length=LENGTH)
+    joints = joints[np.all((joints > 0.12) & (joints < 0.39), axis=1)]
+    expected = closed_form.direct(joints, length=LENGTH, root=-1)
+    assert np.abs(nominal_closure(orthoglide).forward(joints) - expected).max() < CLOSED_FORM
+
+
+def test_an_unreachable_posture_is_named_with_what_stays_open(orthoglide):
+    joints = np.array([[0.31025] * 3, [0.7, 0.3, 0.3]])
+    with pytest.raises(ClosureError, match="posture 'far' cannot be reached") as caught:
+        nominal_closure(orthoglide).close(joints, names=["near", "far"])
+    assert caught.value.posture == "far"
+    assert caught.value.residual > 0.01
+
+
+def test_coordinates_that_are_not_numbers_are_refused(orthoglide):
+    with pytest.raises(ClosureError, match="posture 'here' has coordinates that are not numbers"):
+        nominal_closure(orthoglide).close([[np.nan, 0.3, 0.3]], names=["here"])
+
+
+def test_a_singular_posture_is_refused(biglide):
+    """Sliders so far out that both rods lie on one line: the tool is free across it."""
+    far = 0.2 * np.sqrt(2.0)
+    with pytest.raises(ClosureError, match="posture 'line' is singular"):
+        nominal_closure(biglide).close([[far, far]], names=["line"])
+
+
+def test_underdriven_loops_are_singular(root, tmp_path):
+    folder = tmp_path / "loose"
+    folder.mkdir()
+    urdf = (root / "tests/robots/fivebar/fivebar.urdf").read_text()
+    (folder / "loose.urdf").write_text(urdf)
+    (folder / "loose.yaml").write_text(
+        "closed_loop: [[end_a, end_b]]\ntype: ['3d']\nname_mot: [motor_a, motor_b]\n"
+    )
+    from orthocal import load_robot
+
+    with pytest.raises(ClosureError, match="leave 1 of 3 passive motions free"):
+        LoopClosure(load_robot(folder)).close([0.1, 0.1])
+
+
+def test_a_robot_without_a_tool_has_no_forward(fivebar):
+    with pytest.raises(RobotError, match="no tool centre point"):
+        nominal_closure(fivebar).forward([0.0, 0.0])
+
+
+OPEN = 1e-12
+"""Loops in metres that count as closed: some hundred roundings of a machine of a third of one."""
+
+
+def draw_machines(robot, *, offset, size=1e-3, seed=0, count=6):
+    """Elementary errors of machines, some drives with larger offsets; commanded postures."""
+    rng = np.random.default_rng(seed)
+    names = robot_functions(robot).errors.names
+    errors = size * rng.normal(size=(count, len(names)))
+    drives = [i for i, n in enumerate(names) if n.endswith(".offset")]
+    errors[:, drives] += offset * rng.normal(size=(count, len(drives)))
+    return names, errors, robot.drive_zero + 0.02 * rng.normal(size=(5, len(robot.drives)))
+
+
+@pytest.mark.parametrize("name", ["orthoglide", "biglide"])
+@pytest.mark.parametrize("offset", [0.0, 0.01])
+def test_a_batch_of_machines_is_closed_as_pinocchio_has_them(request, name, offset):
+    robot = request.getfixturevalue(name)
+    names, errors, postures = draw_machines(robot, offset=offset)
+    passive = LoopClosure(robot).close(postures, errors=errors)
+    tools = LoopClosure(robot).tcp(postures, passive, errors=errors)
+    for own, q, tool in zip(errors, passive, tools, strict=True):
+        values = dict(zip(names, own.tolist(), strict=True))
+        machine, alone = robot.with_errors(values), LoopClosure(robot, fixed=values)
+        for drives, joints in zip(postures, q, strict=True):
+            residual, _ = machine.evaluate_constraints(drives, joints)
+            assert np.abs(residual).max(initial=0.0) < OPEN
+        assert np.abs(alone.close(postures) - q).max() < CLOSED
+        assert np.abs(alone.forward(postures) - tool).max() < CLOSED
+
+
+@pytest.mark.parametrize("points", [loop_closure.MAX_POINTS, 7])
+def test_a_machine_out_of_reach_spoils_no_other(orthoglide, monkeypatch, points):
+    """Also where a batch is split: 7 postures are one machine."""
+    monkeypatch.setattr(loop_closure, "MAX_POINTS", points)
+    _, errors, postures = draw_machines(orthoglide, offset=0.0)
+    alone = LoopClosure(orthoglide).close(postures, errors=errors[:3])
+    far = np.array(errors)
+    far[3:] += 0.5  # no machine
+    for many in (far, np.where(np.arange(len(errors))[:, None] < 3, errors, np.nan)):
+        failures = {}
+        with np.errstate(all="ignore"):
+            passive = LoopClosure(orthoglide).close(postures, errors=many, failures=failures)
+        assert {i // len(postures) for i in failures} == {3, 4, 5}
+        assert np.isnan(passive[3:]).any(axis=(1, 2)).all()
+        assert np.abs(passive[:3] - alone).max() < OPEN
+
+
+def test_a_batch_has_the_safeguards_of_one_machine(biglide):
+    """The posture is singular with the first machine's drives, regular with the second's."""
+    far = 0.2 * np.sqrt(2.0)
+    free = tuple(f"{d.name}.offset" for d in biglide.drives)
+    closure = LoopClosure(biglide, free=free)
+    with pytest.raises(ClosureError, match="posture 'line' is singular"):
+        closure.close([[far, far]], theta=np.zeros((2, 2)), names=["line"])
+    failures = {}
+    theta = np.array([[0.0, 0.0], [-0.05, -0.05]])
+    passive = closure.close([[far, far]], theta=theta, names=["line"], failures=failures)
+    assert list(failures) == [0]
+    assert np.isnan(passive[0]).all()
+    assert np.isfinite(passive[1]).all()
+
+
+def test_a_solution_does_not_depend_on_earlier_calls(orthoglide):
+    drives = orthoglide.drive_zero + np.array([[0.01, -0.02, 0.015]])
+    start = orthoglide.zero[orthoglide.passive_index] + 0.05
+    fresh = LoopClosure(orthoglide).close(drives, start=start)
+    used = LoopClosure(orthoglide)
+    used.close(drives)
+    assert np.array_equal(used.close(drives, start=start), fresh)

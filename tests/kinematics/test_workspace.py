@@ -1,0 +1,103 @@
+"""Workspace of a robot: stated in its YAML, by default, and of a machine that must reach it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from orthocal import load_robot
+from orthocal.builder.build import make_robot
+from orthocal.builder.machine_file import Dimensions
+from orthocal.errors import ClosureError, RobotError
+from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.workspace import box_workspace, even_grid, find_workspace, gauss_box
+
+BOX = ((-0.05, 0.06), (-0.06, 0.05), (-0.07, 0.04))
+
+
+def make(folder, box=BOX):
+    return make_robot(Dimensions(workspace=box), folder / "mine")
+
+
+def test_a_stated_workspace_is_read_from_the_yaml(tmp_path):
+    robot = make(tmp_path)
+    found = find_workspace(robot)
+    assert np.array_equal(found.limits, BOX)
+    assert found.half_side is None
+    assert found.words == "the workspace x −50…60, y −60…50, z −70…40 mm"
+    assert found.points.min(axis=0) == pytest.approx([-0.05, -0.06, -0.07])
+    assert found.points.max(axis=0) == pytest.approx([0.06, 0.05, 0.04])
+    assert found.requested is None
+
+
+def test_the_default_is_a_cube_of_60_mm(orthoglide):
+    assert orthoglide.workspace is None
+    assert find_workspace(orthoglide).words == "the workspace ±60 mm"
+
+
+def test_rules_over_a_box_are_exact_for_polynomials(orthoglide):
+    """Mean of x² y over the box, by its antiderivative; all rules lie within the limits."""
+    low, high = np.array(BOX).T
+    square = (high[0] ** 3 - low[0] ** 3) / (3.0 * (high[0] - low[0]))
+    mean = square * 0.5 * (low[1] + high[1])
+    for space in (box_workspace(orthoglide, BOX), gauss_box(orthoglide, BOX)):
+        x, y, _ = space.points.T
+        assert space.weights @ (x**2 * y) == pytest.approx(mean, rel=1e-12)
+        assert (space.points >= low - 1e-12).all()
+        assert (space.points <= high + 1e-12).all()
+    grid = even_grid(orthoglide, BOX, points_a_side=3)
+    assert grid[0] == pytest.approx(low)
+    assert grid[-1] == pytest.approx(high)
+
+
+def test_a_stated_workspace_out_of_reach_is_refused(tmp_path):
+    """Drives end 79.75 mm beyond the zero."""
+    with pytest.raises(RobotError, match=r"orthocal\.workspace\.box_mm") as e:
+        find_workspace(make(tmp_path, ((-0.09, 0.09),) * 3))
+    assert str(e.value).endswith("it reaches ±79 mm")
+
+
+def test_a_machine_that_reaches_less_has_a_smaller_box_of_the_same_shape(tmp_path):
+    """It shrinks towards the mechanical zero, and its words name both."""
+    robot = make(tmp_path)
+
+    def reach(points):
+        if np.abs(points).max() > 0.0351:
+            raise ClosureError("is out of reach", posture="a corner")
+
+    found = find_workspace(robot, reach)
+    assert found.limits == pytest.approx(np.array(BOX) * 0.5)
+    assert found.requested is robot.workspace
+    assert found.words == (
+        "the workspace x −25…30, y −30…25, z −35…20 mm (the machine does not reach x −50…60, "
+        "y −60…50, z −70…40 mm)"
+    )
+    assert find_workspace(robot, nominal_assembly(robot).inverse).requested is None
+
+
+def test_a_machine_that_hardly_moves_has_no_workspace(tmp_path):
+    def reach(points):
+        raise ClosureError("is out of reach", posture="a corner")
+
+    with pytest.raises(ClosureError, match="no region around it"):
+        find_workspace(make(tmp_path), reach)
+
+
+@pytest.mark.parametrize(
+    ("box", "message"),
+    [
+        ("[[-50, 50]]", "workspace.box_mm: has 1 ranges; expected one for each coordinate of"),
+        ("[[50, -50], [-50, 50], [-50, 50]]", "found [50, -50]; expected [least, largest], in mm"),
+        ("[[-50, 50], [-50, 50], [-50]]", "workspace.box_mm"),
+        ("[[-50, 50], [-50, 50], [-50, far]]", "workspace.box_mm"),
+    ],
+)
+def test_an_invalid_workspace_is_named_by_file_and_key(tmp_path, box, message):
+    yaml = make(tmp_path).yaml
+    good = "[[-50, 60], [-60, 50], [-70, 40]]"
+    assert good in yaml.read_text()
+    yaml.write_text(yaml.read_text().replace(good, box))
+    with pytest.raises(RobotError) as e:
+        load_robot(yaml.parent)
+    assert str(yaml) in str(e.value)
+    assert message in str(e.value)

@@ -1,0 +1,98 @@
+"""Known gauge zeros: absolute readings, by all solvers, from file to record and back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gauges import exact
+
+from orthocal import calibrate, load_plan, simulate_session
+from orthocal.calibration.refit import restore_session
+from orthocal.errors import SessionError
+from orthocal.estimation.fit import fit_problem
+from orthocal.estimation.options import SolverOptions
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.choice import build_program
+from orthocal.measurement.files.session_file import load_session
+from orthocal.measurement.files.write_session import write_session
+
+TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
+SIGMA = 5e-6
+
+
+@pytest.fixture(params=[(), ("yx",), None], ids=["free", "one known", "all known"])
+def session(request, root):
+    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
+    known = plan.setups if request.param is None else request.param
+    setups = {n: replace(s, zero="known" if n in known else "free") for n, s in plan.setups.items()}
+    return simulate_session(replace(plan, setups=setups), TRUTH, sigma=SIGMA, seed=2).session
+
+
+@pytest.mark.parametrize("loss", ["squares", "huber"])
+def test_solvers_agree_and_keep_known_zeros_at_0(session, loss):
+    from orthocal.estimation.loss import Loss
+
+    problem = build_problem(session, model="offsets")
+    o = problem.observations
+    known = np.array([session.setups[s].zero == "known" for s in o.zero_setup])
+    assert np.array_equal(o.zero_known, known)
+    assert o.n_free_zeros == len(known) - known.sum()
+    found = {}
+    for kind in ("ipopt", "eliminated"):
+        options = SolverOptions(solver=kind, loss=Loss(loss))
+        found[kind] = build_program(problem, options).solve(sigma=SIGMA)
+        assert (found[kind].zeros[known] == 0.0).all()
+    batch = BatchProgram(problem, options=SolverOptions(solver="eliminated", loss=Loss(loss)))
+    together = batch.solve(problem.values[None], sigma=SIGMA)
+    for theta in (found["ipopt"].theta, together.theta[0]):
+        assert np.abs(theta - found["eliminated"].theta).max() < 1e-8
+    truth = np.array([TRUTH[n] for n in problem.free])
+    assert np.abs(found["eliminated"].theta - truth).max() < 50e-6
+
+
+def test_an_absolute_reading_is_one_more_equation(root):
+    """One posture alone determines nothing with free zeros, the offsets with known ones."""
+    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
+    readings = tuple(r for r in plan.readings if r.posture == "x_max")
+    setups = {n: replace(s, zero="known") for n, s in plan.setups.items()}
+    free = build_problem(replace(plan, readings=readings), model="offsets")
+    known = build_problem(replace(plan, readings=readings, setups=setups), model="offsets")
+    from orthocal.statistics.zeros import project_out_zeros
+
+    ranks = []
+    for problem in (free, known):
+        _, jacobian = problem.linearise(problem.reference)
+        rows = project_out_zeros(jacobian, problem.observations)
+        ranks.append(int(np.linalg.matrix_rank(rows, tol=1e-9)))
+    assert ranks[0] == 0
+    assert ranks[1] == 2
+
+
+def test_degrees_of_freedom_count_free_zeros_only(session):
+    fit = fit_problem(build_problem(session, model="offsets"))
+    known = sum(s.zero == "known" for s in session.setups.values())
+    free = len(session.setups) - known
+    assert fit.noise.residual_dof == pytest.approx(len(session.readings) - free - 3)
+
+
+def test_a_known_zero_survives_files_and_records(session, tmp_path):
+    write_session(session, tmp_path / "again")
+    again = load_session(tmp_path / "again")
+    record = restore_session(calibrate(session, "offsets"))
+    for other in (again, record):
+        assert {n: s.zero for n, s in other.setups.items()} == {
+            n: s.zero for n, s in session.setups.items()
+        }
+
+
+def test_another_word_is_refused(root, tmp_path):
+    text = (root / "examples/raw-cycles/plan.yaml").read_text()
+    text = text.replace("yx: {leg: x,", "yx: {zero: fixed, leg: x,")
+    assert "zero: fixed" in text
+    (tmp_path / "plan.yaml").write_text(text)
+    with pytest.raises(SessionError) as caught:
+        load_plan(tmp_path / "plan.yaml")
+    assert "setups.yx.zero" in str(caught.value)

@@ -1,0 +1,139 @@
+"""The observation model: batches against single machines, derivatives against differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from derivatives import assert_derivative
+from gauges import exact
+from tool_coordinate import ToolCoordinate
+
+from orthocal import load_plan, load_session
+from orthocal.estimation.problem import build_problem
+from orthocal.observation.model import predict_readings
+from orthocal.sensors import registry
+
+SEVERAL_SENSORS = """robot: orthoglide
+title: tool, a line and a rod
+gauges:
+  fine: {sigma_mm: 0.002, range_mm: [-200, 200]}
+  dial: {sigma_mm: 0.01, resolution_mm: 0.01}
+postures:
+  zero: {tcp_mm: [0, 0, 0]}
+  x_max: {tcp_mm: [60, 0, 0]}
+  x_min: {tcp_mm: [-100, 0, 0]}
+  corner: {tcp_mm: [50, -40, 30]}
+setups:
+  tx: {sensor: tool, tool: x, slope_tolerance: 0.002, dial: d, gauge: fine}
+  ty: {sensor: tool, tool: y, slope_tolerance: 0.002, dial: d, gauge: fine}
+  tz: {sensor: tool, tool: z, slope_tolerance: 0.003, gauge: fine}
+  line: {leg: x, direction: y, section: {fraction: 0.5}, gauge: dial}
+  rod: {leg: x, direction: z, section: {fraction: 0.4}, gauge: dial, touches: a,
+    tip: {blade: {width_mm: 50, radius_mm: 0.5}}}
+"""
+
+
+@pytest.fixture(params=["sweep", "workshop", "several sensors"])
+def problem(request, root, tmp_path):
+    """Lines, balls aligned by eye, and three kinds of sensor with different noise."""
+    if request.param == "sweep":
+        yield build_problem(exact(load_session(root / "examples/sweep")), model="full")
+    elif request.param == "workshop":
+        yield build_problem(load_plan(root / "examples/workshop/plan.yaml"), model="full")
+    else:
+        registry.register_sensor(ToolCoordinate)
+        (tmp_path / "plan.yaml").write_text(SEVERAL_SENSORS)
+        yield build_problem(load_plan(tmp_path / "plan.yaml"), model="full").with_noise(
+            np.random.default_rng(0).uniform(0.5, 2.0, 20)
+        )
+        registry.unregister_sensor(ToolCoordinate.kind)
+
+
+def draw(problem, count=3, size=0.5):
+    """Parameters of machines, and passive coordinates near closed loops."""
+    rng = np.random.default_rng(1)
+    theta = size * rng.normal(size=(count, problem.n_free)) * problem.theta_scale
+    readings, passive, reached = problem.simulate(theta)
+    assert reached.all()
+    return theta, readings, passive, rng
+
+
+def test_a_batch_equals_its_machines_one_by_one(problem):
+    theta, readings, passive, rng = draw(problem)
+    near = passive + 1e-5 * rng.normal(size=passive.shape)
+    linear = problem.linearisation(theta, near)
+    change = 1e-3 * rng.normal(size=theta.shape)
+    follow = linear.follow(change)
+    for i, own in enumerate(theta):
+        assert np.abs(problem.close(own) - passive[i]).max() < 1e-12
+        assert np.abs(problem.predict(own) - readings[i]).max() < 1e-12
+        alone = problem.linearisation(own, near[i])
+        assert np.abs(linear.reading[i] - alone.reading).max() < 1e-15
+        assert np.abs(linear.opening[i] - alone.opening).max() < 1e-15
+        scale = np.abs(alone.jacobian).max()
+        assert np.abs(linear.jacobian[i] - alone.jacobian).max() < 1e-12 * scale
+        assert np.abs(follow[i] - alone.follow(change[i])).max() < 1e-14
+
+
+def test_simulation_and_problem_predict_the_same_readings(problem):
+    theta, readings, _, _ = draw(problem, count=1)
+    own, n = theta[0], problem.n_machine
+    errors = dict(zip(problem.free[:n], own[:n].tolist(), strict=True))
+    nuisance = own[n:] if own.size > n else None
+    alone = predict_readings(problem.session, errors, nuisance=nuisance) / problem.noise
+    assert np.abs(readings[0] - alone).max() < 1e-12
+    reading, _ = problem.linearise(own)
+    assert np.abs(reading - alone).max() < 1e-12
+
+
+def test_the_jacobian_is_that_of_central_differences(problem):
+    theta, _, passive, _ = draw(problem, count=1)
+    reading, jacobian = problem.linearise(theta, passive)
+    assert_derivative(
+        jacobian[0] * 1e3,
+        lambda t: problem.predict(t * problem.theta_scale) * 1e3,
+        theta[0] / problem.theta_scale,
+        step=1e-3,
+        tolerance=1e-6,  # steps of a thousandth of a tolerance, third order
+    )
+    si_reading, si = problem.linearise(theta, passive, units="SI")
+    assert np.array_equal(si_reading, reading)
+    assert np.allclose(si * problem.theta_scale, jacobian, rtol=1e-14, atol=0.0)
+
+
+def test_the_adjoint_is_the_transposed_jacobian(problem):
+    theta, readings, passive, rng = draw(problem)
+    near = passive + 1e-5 * rng.normal(size=passive.shape)
+    forces = rng.normal(size=readings.shape)
+    dense = problem.linearisation(theta, near)
+    adjoint = problem.linearisation(theta, near, dense=False)
+    assert np.array_equal(adjoint.reading, dense.reading)
+    assert np.array_equal(adjoint.correction, dense.correction)
+    expected = (forces[:, None] @ dense.jacobian)[:, 0]
+    scale = np.abs(expected).max()
+    assert np.abs(adjoint.transposed_product(forces) - expected).max() < 1e-12 * scale
+    with pytest.raises(ValueError, match="dense=True"):
+        _ = adjoint.jacobian
+    with pytest.raises(ValueError, match="dense=False"):
+        dense.transposed_product(forces)
+
+
+def test_opening_and_follow_close_the_loops_to_first_order(problem):
+    theta, _, passive, rng = draw(problem, count=1)
+    for size in (1e-4, 1e-5):
+        near = passive + size * rng.normal(size=passive.shape)
+        linear = problem.linearisation(theta, near)
+        left = np.abs(near + linear.correction - passive).max()
+        assert left < 100.0 * size**2
+        predicted = linear.reading + linear.opening - problem.predict(theta, passive)
+        assert np.abs(predicted).max() < 100.0 * size**2
+
+
+def test_a_machine_out_of_reach_spoils_no_other(root):
+    problem = build_problem(exact(load_session(root / "examples/sweep")), model="offsets")
+    theta = np.array([[1e-3, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 1e-3]])
+    readings, passive, reached = problem.simulate(theta)
+    assert reached.tolist() == [True, False, True]
+    assert np.isnan(passive[1]).any()
+    for i in (0, 2):
+        assert np.abs(readings[i] - problem.predict(theta[i])).max() < 1e-12

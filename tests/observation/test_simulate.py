@@ -1,0 +1,121 @@
+"""Simulated sessions: labelled, repeatable, and with the noise that was asked for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gauges import exact
+from tolerances import KINEMATICS
+
+from orthocal import draw_errors, load_plan, load_session, simulate_session
+from orthocal.errors import ParameterError, SessionError
+from orthocal.observation.model import predict_readings
+from orthocal.observation.observations import build_observations
+from orthocal.observation.simulate import collect_errors, load_errors, truth_document
+
+ERRORS = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
+
+
+@pytest.fixture(scope="module")
+def plan(root):
+    return load_plan(root / "examples/raw-cycles/plan.yaml")
+
+
+def test_exact_readings_are_the_predictions_from_where_a_setup_begins(plan):
+    """A dial is set in the first posture of its setup, wherever in the world that is."""
+    simulated = simulate_session(plan, ERRORS, exact=True)
+    o = build_observations(plan)
+    predicted = predict_readings(plan, ERRORS, observations=o)
+    for i, name in enumerate(plan.setups):
+        own = o.setup == i
+        assert simulated.session.values[own][0] == 0.0
+        shown = predicted[own] - predicted[own][0]
+        assert np.abs(simulated.session.values[own] - shown).max() < KINEMATICS
+        assert simulated.zeros[name] == -predicted[own][0]
+
+
+def test_a_dial_is_set_where_it_stands_also_on_displaced_lines(root):
+    """At the coordinate of a line displaced by 20 mm no dial of ±5 mm could be read."""
+    lines = load_plan(root / "tests/sessions/lines/plan.yaml")
+    session = simulate_session(lines, ERRORS, seed=1).session
+    first = {r.setup: r.value for r in reversed(session.readings)}
+    assert max(abs(v) for v in first.values()) < 0.25e-3
+
+
+def test_it_says_that_it_is_simulated(plan):
+    session = simulate_session(plan, ERRORS, seed=5).session
+    assert session.title.startswith("Simulated: ")
+    assert "Simulated by orthocal, not measured (seed 5)" in session.source
+
+
+def test_one_seed_one_session(plan):
+    a, b, c = (simulate_session(plan, ERRORS, seed=s).session.values for s in (1, 1, 2))
+    assert np.array_equal(a, b)
+    assert not np.array_equal(a, c)
+
+
+def test_noise_zeros_and_rounding_are_as_asked(plan):
+    fine = exact(plan).with_gauge(replace(plan.gauge, resolution=None))
+    predicted = predict_readings(plan, ERRORS)
+    residuals = []
+    for seed in range(40):
+        simulated = simulate_session(fine, ERRORS, seed=seed)
+        zero = np.array([simulated.zeros[r.setup] for r in plan.readings])
+        residuals.append(simulated.session.values - predicted - zero)
+    spread = np.std(residuals)
+    assert abs(spread / 0.01e-3 - 1.0) < 4.0 / np.sqrt(2 * 40 * 54)  # four standard errors
+    rounded = simulate_session(plan, ERRORS).session.values / 0.01e-3
+    assert np.abs(rounded - np.round(rounded)).max() < 1e-9
+
+
+def test_the_shipped_session_is_what_its_truth_gives(root, plan):
+    """Whoever runs the command in the plan's comment gets the files that are there."""
+    errors = load_errors(root / "examples/raw-cycles/machine.yaml", plan.robot)
+    simulated = simulate_session(plan, errors, seed=1)
+    shipped = load_session(root / "examples/raw-cycles")
+    assert np.abs(simulated.session.values - shipped.values).max() < KINEMATICS
+    assert truth_document(simulated) == (root / "examples/raw-cycles/truth.yaml").read_text()
+    assert load_errors(root / "examples/raw-cycles/truth.yaml", plan.robot) == errors
+
+
+def test_drawn_errors_have_their_tolerances(orthoglide):
+    draws = [draw_errors(orthoglide, ["*", "!frame.*"], seed=s) for s in range(60)]
+    scaled = np.array(
+        [[v / orthoglide.parameters[n].tolerance for n, v in d.items()] for d in draws]
+    )
+    assert abs(scaled.std() - 1.0) < 4.0 / np.sqrt(2 * scaled.size)
+    assert abs(scaled.mean()) < 4.0 / np.sqrt(scaled.size)
+
+
+def test_errors_are_drawn_then_read_then_given(tmp_path, orthoglide):
+    file = tmp_path / "errors.yaml"
+    file.write_text("errors: {x_slide.offset_mm: 1, y_slide.offset_mm: 2}\n")
+    found = collect_errors(
+        orthoglide, file=file, single=["y_slide.offset_mm=3"], draw="offsets", seed=4
+    )
+    assert found["x_slide.offset"] == 1e-3
+    assert found["y_slide.offset"] == 3e-3
+    assert (
+        found["z_slide.offset"] == draw_errors(orthoglide, ["*.offset"], seed=4)["z_slide.offset"]
+    )
+
+
+def test_readings_beyond_the_gauge_are_refused(plan):
+    with pytest.raises(SessionError, match=r"the simulated reading .* the gauge's range ends at"):
+        simulate_session(plan, {"x_slide.offset": 25e-3, "y_slide.offset": -25e-3})
+
+
+def test_no_errors_are_an_error(orthoglide):
+    with pytest.raises(ParameterError, match="give them by --errors"):
+        collect_errors(orthoglide)
+
+
+def test_errors_are_drawn_with_the_tolerances_given(orthoglide):
+    patterns = ["*.offset", "x_coupler.*"]
+    own = draw_errors(orthoglide, patterns, seed=4)
+    other = draw_errors(orthoglide, patterns, seed=4, tolerances={"*.offset_m": 2e-3})
+    for name, value in own.items():
+        factor = 0.4 if name.endswith(".offset") else 1.0
+        assert other[name] == pytest.approx(factor * value)

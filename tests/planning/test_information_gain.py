@@ -1,0 +1,135 @@
+"""Gains of readings, against posterior covariances."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from orthocal.planning.candidates import AlignedParameter, CandidateSetup
+from orthocal.planning.information_gain import Pairs, SetupGain
+
+SIGMA, STATE, READINGS = 0.5, 5, 7
+
+
+def draw(seed):
+    """A kind of setup, what others say of the state, and what the state does."""
+    rng = np.random.default_rng(seed)
+    slopes, own = rng.normal(size=(READINGS, STATE)), rng.normal(size=(READINGS, 2))
+    h = rng.uniform(0.0, 3.0, READINGS)
+    together = np.abs(h[:, None] - h[None]) < 1.2
+    spread = own @ own.T + 1.0
+    kind = CandidateSetup("k", np.arange(READINGS), slopes, spread, together)
+    says = rng.normal(size=(STATE, STATE))
+    return kind, says @ says.T + np.eye(STATE), rng.normal(size=(STATE, 2))
+
+
+def left(kind, information, root, rows):
+    """tr(T C) with these readings, by the inverse of all that is said."""
+    rows = list(rows)
+    spread = kind.covariance[np.ix_(rows, rows)] + SIGMA**2 * np.eye(len(rows))
+    slopes = kind.jacobian[rows]
+    whole = information + slopes.T @ np.linalg.inv(spread) @ slopes
+    return np.trace(root.T @ np.linalg.inv(whole) @ root)
+
+
+@pytest.fixture(params=range(6))
+def drawn(request):
+    kind, information, root = draw(request.param)
+    taking = SetupGain.of(
+        kind, np.linalg.inv(information), np.linalg.inv(information) @ root, SIGMA
+    )
+    return kind, information, root, taking
+
+
+def test_a_gain_is_the_reduction_of_the_error(drawn):
+    kind, information, root, taking = drawn
+    for rows in ([2], [0, 3], [1, 4, 6, 2]):
+        taken = left(kind, information, root, []) - left(kind, information, root, rows)
+        assert taking.gain(rows) == pytest.approx(taken, rel=1e-9)
+
+
+def test_the_gain_of_one_further_reading(drawn):
+    kind, information, root, taking = drawn
+    rows = [5, 1]
+    gains = taking.further_gains(rows)
+    for more in set(range(READINGS)) - set(rows):
+        taken = left(kind, information, root, rows) - left(kind, information, root, [*rows, more])
+        assert gains[more] == pytest.approx(taken, rel=1e-9)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_readings_are_completed_greedily(drawn, count):
+    kind, information, root, taking = drawn
+    for _, pair in taking.best_pairs(Pairs.of(kind, count), 3):
+        gain, chosen = taking.complete(pair, count)
+        expected = list(pair)
+        while len(expected) < count:
+            rest = [r for r in np.flatnonzero(kind.reachable[pair[0]]) if r not in expected]
+            expected.append(min(rest, key=lambda r: left(kind, information, root, [*expected, r])))
+        assert list(chosen) == expected
+        taken = left(kind, information, root, []) - left(kind, information, root, chosen)
+        assert gain == pytest.approx(taken, rel=1e-9)
+
+
+@pytest.mark.parametrize("count", [2, 4, 6])
+def test_best_pairs_have_the_largest_gains_and_share_no_reading(drawn, count):
+    """Two readings beside a zero of which nothing is known are worth their difference."""
+    kind, _, _, taking = drawn
+
+    def worth(pair):
+        i, j = pair
+        across = taking.effect[i] - taking.effect[j]
+        spread = taking.spread
+        scatter = spread[i, i] + spread[j, j] - 2.0 * spread[i, j] + 2.0 * SIGMA**2
+        return float(across @ across) / scatter
+
+    left = [
+        p
+        for p in permutations(range(READINGS), 2)
+        if kind.reachable[p] and kind.reachable[p[0]].sum() >= count
+    ]
+    found = taking.best_pairs(Pairs.of(kind, count), 3)
+    for gain, pair in found:
+        assert gain == pytest.approx(max(map(worth, left)), rel=1e-12)
+        assert pair in left
+        left = [p for p in left if not set(p) & set(pair)]
+    assert len(found) == 3 or not left
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_gains_with_the_gauge_aligned_in_the_first_posture(seed):
+    """What a hand sets by the machine is elsewhere with each beginning: low rank against anew."""
+    kind, information, root = draw(seed)
+    rng = np.random.default_rng(seed)
+    by_hand = tuple(
+        AlignedParameter(rng.normal(size=READINGS), rng.normal(size=(READINGS, STATE)))
+        for _ in range(2)
+    )
+    kind, covariance = replace(kind, aligned=by_hand), np.linalg.inv(information)
+    found = SetupGain.of(kind, covariance, covariance @ root, SIGMA).best_pairs(
+        Pairs.of(kind, 3), 3
+    )
+    assert len({first for _, (first, _) in found}) == len(found) > 0
+    for gain, (first, second) in found:
+        begun = SetupGain.of(kind.begun(first), covariance, covariance @ root, SIGMA)
+        again = SetupGain.of(kind, covariance, covariance @ root, SIGMA).begun(first)
+        assert again.spread == pytest.approx(begun.spread, abs=1e-10)
+        assert again.effect == pytest.approx(begun.effect, abs=1e-10)
+        assert again.variance == pytest.approx(begun.variance, abs=1e-10)
+        across = begun.effect[first] - begun.effect[second]
+        ends = begun.spread[[first, second]][:, [first, second]]
+        scatter = ends[0, 0] + ends[1, 1] - 2.0 * ends[0, 1] + 2.0 * SIGMA**2
+        assert gain == pytest.approx(float(across @ across) / scatter, rel=1e-10)
+        for rows in ([first, second], [first, (second + 1) % READINGS, second]):
+            exact = begun.gain(rows)
+            (whole,) = SetupGain.of(kind, covariance, covariance @ root, SIGMA).gains(
+                np.array([rows])
+            )
+            assert whole == pytest.approx(exact, rel=1e-10)
+        alone = kind.only([first, second]).begun(0)
+        assert alone.jacobian == pytest.approx(
+            kind.begun(first).jacobian[[first, second]], abs=1e-14
+        )

@@ -1,0 +1,339 @@
+"""Conditions of readings: in files, joined sessions, recordings, imports and records."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta, timezone
+
+import numpy as np
+import pytest
+
+from orthocal import (
+    Choice,
+    calibrate,
+    import_readings,
+    load_calibration,
+    load_plan,
+    load_session,
+    reading_table,
+    restore_session,
+    write_calibration,
+    write_import,
+    write_session,
+)
+from orthocal.assessment.plausibility import find_scattered
+from orthocal.cli import main
+from orthocal.errors import CalibrationFileError, SessionError
+from orthocal.measurement.importing.import_readings import TableOptions
+from orthocal.measurement.joining import join_sessions, split_sessions
+from orthocal.measurement.recording import SUFFIX, Change, open_recording
+from orthocal.observation.observations import build_observations
+from orthocal.session.session import Conditions
+from orthocal.statistics.noise import estimate_repeatability
+from orthocal.units import MM
+
+SESSION = """robot: orthoglide
+calibration: {model: offsets}
+gauge: {sigma_mm: 0.005, range_mm: [-5, 5]}
+postures:
+  zero: {tcp_mm: [0, 0, 0]}
+  x_max: {tcp_mm: [60, 0, 0]}
+  x_min: {tcp_mm: [-100, 0, 0]}
+  y_max: {tcp_mm: [0, 60, 0]}
+setups:
+  yx: {leg: x, direction: y, section: {fraction: 0.5}}
+  xy: {leg: y, direction: x, section: {fraction: 0.5}}
+readings: readings.csv
+"""
+
+TABLE = """setup,posture,cycle,reading_mm,approach,temperature_C,time
+yx,zero,1,0.01,ppp,21.5,2025-03-14T09:26:53+01:00
+yx,zero,1,0.03,npp,21.5,2025-03-14T09:27:53+01:00
+yx,x_max,1,-0.43,puu,,2025-03-14T09:29:00+01:00
+yx,x_min,1,0.12,,22.25,
+yx,x_min,2,0.13,,,
+xy,zero,1,0.2,uuu,,
+xy,y_max,1,-0.3,,20,2025-03-14T11:00:00+01:00
+"""
+
+BERLIN = timezone(timedelta(hours=1))
+
+
+def write(folder, table=TABLE):
+    folder.mkdir(exist_ok=True)
+    (folder / "session.yaml").write_text(SESSION)
+    (folder / "readings.csv").write_text(table)
+    return folder
+
+
+@pytest.fixture
+def session(tmp_path):
+    return load_session(write(tmp_path / "first"))
+
+
+# ---- files
+
+
+def test_each_reading_has_its_own(session):
+    stated = [r.conditions for r in session.readings]
+    time = datetime(2025, 3, 14, 9, 26, 53, tzinfo=BERLIN)
+    assert stated[0] == Conditions("ppp", 21.5, time)
+    assert stated[2].temperature is None
+    assert stated[3] == Conditions(temperature=22.25)
+    assert stated[4] is None
+    assert [r.approach for r in session.readings] == ["ppp", "npp", "puu", None, None, None, None]
+
+
+def test_they_are_written_as_they_were_read(session, tmp_path):
+    write_session(session, tmp_path / "second")
+    assert (tmp_path / "second/readings.csv").read_text() == TABLE.replace(
+        ",0.2,", ",0.20,"
+    ).replace(",-0.3,", ",-0.30,")
+    again = load_session(tmp_path / "second")
+    assert [r.conditions for r in again.readings] == [r.conditions for r in session.readings]
+
+
+def test_columns_that_no_row_needs_are_not_written(session, tmp_path):
+    plain = replace(
+        session, readings=tuple(replace(r, conditions=None) for r in session.readings[1:])
+    )
+    write_session(plain, tmp_path / "second")
+    header = (tmp_path / "second/readings.csv").read_text().partition("\n")[0]
+    assert header == "setup,posture,cycle,reading_mm"
+
+
+def test_a_spreadsheet_may_have_saved_them(tmp_path):
+    table = (
+        "setup;posture;reading_mm;approach;temperature_C;time\n"
+        "yx;zero;0,01;ppp;21,5;2025-03-14 09:26\nyx;zero;0,02;npp;;\n"
+    )
+    found = load_session(write(tmp_path / "first", table)).readings
+    assert found[0].conditions == Conditions("ppp", 21.5, datetime(2025, 3, 14, 9, 26))
+    assert found[1].value == pytest.approx(0.02e-3)
+
+
+def test_times_without_zone_stay_so(tmp_path):
+    table = "setup,posture,reading_mm,time\nyx,zero,0.01,2025-03-14T09:26:53.5\n"
+    found = load_session(write(tmp_path / "first", table))
+    assert found.readings[0].conditions.time == datetime(2025, 3, 14, 9, 26, 53, 500_000)
+    write_session(found, tmp_path / "second")
+    assert "2025-03-14T09:26:53.500000" in (tmp_path / "second/readings.csv").read_text()
+
+
+def test_times_with_and_without_zone_do_not_mix(tmp_path):
+    table = TABLE.replace("2025-03-14T11:00:00+01:00", "2025-03-14T11:00:00")
+    with pytest.raises(SessionError) as caught:
+        load_session(write(tmp_path / "first", table))
+    assert caught.value.where.endswith("readings.csv:8")
+
+
+# ---- repeats
+
+
+def test_readings_with_another_approach_are_no_repeats(session, tmp_path):
+    o = build_observations(session)
+    assert o.place[0] != o.place[1]
+    assert o.place[3] == o.place[4]
+    assert o.posture[0] == o.posture[1]
+    scatter, dof = estimate_repeatability(o.values(session.values), o)
+    assert dof == 1
+    assert scatter == pytest.approx(0.01e-3 / np.sqrt(2.0))
+    with pytest.raises(SessionError, match="repeats"):
+        load_session(write(tmp_path / "other", TABLE.replace("npp", "ppp")))
+
+
+def test_slack_of_the_drives_is_no_scatter_of_the_gauge(tmp_path):
+    """Two approaches 60 µm apart, each read twice within 2 µm, by a dial of 5 µm."""
+    rows = ["setup,posture,cycle,reading_mm,approach"]
+    for cycle, off in enumerate((0.0, 0.002), start=1):
+        for posture in ("zero", "x_max", "x_min"):
+            for approach, step in (("ppp", 0.0), ("nnn", 0.06)):
+                rows.append(f"yx,{posture},{cycle},{0.1 + off + step},{approach}")
+    session = load_session(write(tmp_path / "first", "\n".join(rows) + "\n"))
+    assert not find_scattered(session)
+    blind = replace(session, readings=tuple(replace(r, conditions=None) for r in session.readings))
+    assert find_scattered(blind)
+
+
+# ---- joined sessions and those that are read again
+
+
+def test_joined_sessions_keep_them(session, tmp_path):
+    other = load_session(write(tmp_path / "second", TABLE.replace("+01:00", "")))
+    joined = join_sessions([session, other])
+    stated = [r.conditions for r in (*session.readings, *other.readings)]
+    assert [r.conditions for r in joined.readings] == stated
+    assert [len(s.readings) for s in split_sessions(joined)] == [7, 7]
+    o = build_observations(joined)  # times with and without zone, in different setups
+    assert np.array_equal(o.conditions["time"][:7], o.conditions["time"][7:])
+    assert session.with_values(session.values + 1e-6).readings[0].conditions == stated[0]
+    assert session.select(session.readings[2:4]).readings[0].conditions == stated[2]
+
+
+def test_a_session_read_again_has_its_approaches_planned(tmp_path, root, monkeypatch, capsys):
+    first = load_session(root / "examples/raw-cycles")
+    stated = Conditions("ppp", 21.0, datetime(2025, 3, 14, tzinfo=UTC))
+    readings = tuple(replace(r, conditions=stated) for r in first.readings)
+    write_session(replace(first, readings=readings), tmp_path / "first")
+    result = calibrate(load_session(tmp_path / "first"), "offsets", solver="eliminated")
+    write_calibration(result, tmp_path / "calibration.json")
+    words = ["again", tmp_path / "calibration.json", "--out", tmp_path / "second", "--anyway"]
+    monkeypatch.setattr(sys, "argv", ["orthocal", *map(str, words)])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 0, capsys.readouterr().err
+    lines = (tmp_path / "second/readings.csv").read_text().splitlines()
+    assert lines[0] == "setup,posture,cycle,reading_mm,approach,temperature_C,time"
+    assert all(line.endswith(",,ppp,,") for line in lines[1:])
+    assert {r.conditions for r in load_plan(tmp_path / "second").readings} == {Conditions("ppp")}
+
+
+# ---- recordings
+
+
+PLANNED = """setup,posture,reading_mm,approach,temperature_C
+yx,zero,,ppp,
+yx,zero,,nnn,
+yx,x_max,,,21.5
+"""
+
+
+def rows_of(folder):
+    return (folder / "readings.csv").read_text().splitlines()[1:]
+
+
+def test_a_recording_keeps_what_is_planned_and_takes_what_is_stated(tmp_path):
+    folder = write(tmp_path / "first", PLANNED)
+    time = datetime(2025, 3, 14, 9, 30)
+    with open_recording(folder) as recording:
+        assert [row.key[4:] for row in recording.rows] == [("ppp",), ("nnn",), ()]
+        recording.read(0, 0.01 * MM, Conditions(temperature=20.5, time=time))
+        recording.read(1, 0.02 * MM)
+        recording.read(2, 0.03 * MM, Conditions(approach="pnu"))
+        repeated = recording.repeat(1)
+        assert recording.rows[repeated].key == ("yx", "zero", None, 2, "nnn")
+        assert recording.rows[repeated].place == recording.rows[1].place
+    assert rows_of(folder) == [
+        "yx,zero,1,0.01,ppp,20.5,2025-03-14T09:30:00",
+        "yx,zero,1,0.02,nnn,,",
+        "yx,zero,2,,nnn,,",
+        "yx,x_max,1,0.03,pnu,21.5,",
+    ]
+    with open_recording(folder) as recording:
+        recording.empty(0)  # what was measured goes, what is planned stays
+    assert rows_of(folder) == [
+        *("yx,zero,1,,ppp", "yx,zero,1,,nnn", "yx,zero,2,,nnn", "yx,x_max,1,,pnu")
+    ]
+
+
+def test_a_killed_recording_is_done_again_with_its_conditions(tmp_path):
+    folder = write(tmp_path / "first", PLANNED)
+    with open_recording(folder) as recording:
+        before = (folder / "readings.csv").read_bytes()
+        recording.read(1, 0.02 * MM, Conditions(temperature=20.5))
+        after = (folder / "readings.csv").read_bytes()
+        journal = (folder / f"readings.csv{SUFFIX}").read_bytes()
+    (folder / "readings.csv").write_bytes(before)
+    (folder / f"readings.csv{SUFFIX}").write_bytes(journal)  # not closed
+    assert json.loads(journal.splitlines()[-1])["conditions"] == {"temperature_C": 20.5}
+    with open_recording(folder) as recording:
+        assert recording.restored == 1
+    assert (folder / "readings.csv").read_bytes() == after
+
+
+def test_a_recording_refuses_conditions_that_a_reading_cannot_have(tmp_path):
+    folder = write(tmp_path / "first", PLANNED)
+    with open_recording(folder) as recording:
+        for wrong in (Conditions("pp"), Conditions(temperature=300.0)):
+            with pytest.raises(SessionError, match="expected"):
+                recording.read(0, 0.0, wrong)
+        with pytest.raises(SessionError, match="exists already"):
+            recording.read(0, 0.0, Conditions("nnn"))
+        assert recording.missing == (0, 1, 2)
+    with pytest.raises(ValueError, match="approach"):
+        Change.model_validate(
+            {"done": "read", "rows": [["yx", "zero", None, 1]], "conditions": {"approach": "x"}}
+        )
+
+
+# ---- imports
+
+
+IMPORTED = """Setup;Posture;Reading [mm];Approach;temperature_C;Time;Note
+yx;zero;0,01;ppp;21,5;2025-03-14 09:26;a
+yx;zero;0,02;nnn;21,5;2025-03-14 09:27;b
+yx;x_max;0,03;;;;c
+"""
+
+
+def imported(folder, text=IMPORTED, *, overwrite=False, **options):
+    table = folder.parent / "table.csv"
+    table.write_text(text)
+    return import_readings(table, folder, TableOptions(**options), overwrite=overwrite)
+
+
+def test_an_import_fills_the_rows_of_the_same_approach(tmp_path):
+    folder = write(tmp_path / "first", PLANNED)
+    result = imported(folder)
+    assert (result.filled, result.added, result.replaced) == (3, 0, 0)
+    write_import(result)
+    assert rows_of(folder) == [
+        "yx,zero,0.01,ppp,21.5,2025-03-14 09:26",
+        "yx,zero,0.02,nnn,21.5,2025-03-14 09:27",
+        "yx,x_max,0.03,,21.5,",
+    ]
+    assert not imported(folder).changes
+    assert load_session(folder).readings[1].conditions.temperature == 21.5
+
+
+def test_an_import_matches_rows_whose_approach_one_side_does_not_state(tmp_path):
+    folder = write(tmp_path / "first", "setup,posture,reading_mm\nyx,zero,0.01\nyx,x_max,\n")
+    result = imported(folder, "setup,posture,reading_mm,approach\nyx,zero,0.01,ppp\n")
+    assert (result.filled, result.added) == (1, 0)
+    other = write(tmp_path / "other", "setup,posture,reading_mm,approach\nyx,zero,,ppp\n")
+    result = imported(other, "setup,posture,reading_mm,approach\nyx,zero,0.01,nnn\n")
+    assert (result.filled, result.added) == (0, 1)
+
+
+def test_an_import_refuses_to_change_conditions_unasked(tmp_path):
+    folder = write(tmp_path / "first", "setup,posture,reading_mm,temperature_C\nyx,zero,0.01,20\n")
+    table = "setup,posture,reading_mm,temperature_C\nyx,zero,0.01,21.0\n"
+    with pytest.raises(SessionError, match=r"20 °C, but 0\.01 mm, 21\.0 °C"):
+        imported(folder, table)
+    assert imported(folder, table, overwrite=True).replaced == 1
+    assert not imported(folder, table.replace("21.0", "20.0")).changes
+
+
+def test_the_times_of_a_clock_are_left_out_unless_they_are_asked_for(tmp_path):
+    folder = write(tmp_path / "first", PLANNED)
+    table = IMPORTED.replace("2025-03-14 09:26", "9:26")
+    result = imported(folder, table)
+    assert result.columns.time is None
+    assert len(result.columns.extra) == 2
+    with pytest.raises(SessionError, match="time is '9:26'"):
+        imported(folder, table, columns={"time": "Time"})
+
+
+# ---- records
+
+
+def test_a_calibration_keeps_them(session, tmp_path):
+    result = calibrate(session, Choice("offsets", prior=True), solver="eliminated")
+    write_calibration(result, tmp_path / "calibration.json")
+    again = load_calibration(tmp_path / "calibration.json")
+    stated = [r.conditions for r in session.readings]
+    assert [r.conditions for r in restore_session(again).readings] == stated
+    table = reading_table(again)
+    assert (table[0]["approach"], table[0]["temperature_C"]) == ("ppp", 21.5)
+    assert table[0]["time"] == "2025-03-14T09:26:53+01:00"
+    assert table[4]["approach"] is None
+    assert again.residuals[0].label == session.readings[0].label != session.readings[1].label
+    document = json.loads((tmp_path / "calibration.json").read_text())
+    assert document["residuals"][3]["conditions"]["temperature_C"] == 22.25
+    document["residuals"][0]["conditions"]["approach"] = "pp"
+    (tmp_path / "calibration.json").write_text(json.dumps(document))
+    with pytest.raises(CalibrationFileError) as caught:
+        load_calibration(tmp_path / "calibration.json")
+    assert caught.value.where.endswith("residuals[0].conditions")
