@@ -51,7 +51,8 @@ def run_lane(python: Path, *, resolution: str) -> None:
         inside = environment / "bin/python"
         subprocess.run([*uv, "venv", "--python", python, environment], check=True)
         install = [*uv, "pip", "install", "--python", inside, "--resolution", resolution]
-        subprocess.run([*install, "--editable", ROOT, "pytest>=8.0"], check=True)
+        tools = ["pytest>=8.0", "pytest-timeout>=2.3"]
+        subprocess.run([*install, "--editable", ROOT, *tools], check=True)
         cache = {**os.environ, "ORTHOCAL_CACHE": str(Path(directory) / "cache")}
         tests = [inside, "-m", "pytest", "-q", "-p", "no:cacheprovider", *TESTS]
         subprocess.run(tests, check=True, cwd=ROOT, env=cache)
