@@ -17,7 +17,7 @@ import orthocal
 from orthocal import Calibration, Choice, Session
 from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.assessment.tool_error import assess_tool
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import cube
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.mounting import EXACT
@@ -28,7 +28,7 @@ AGAIN = {"*.offset_mm": 0.5}  # once they were entered
 
 plan = orthocal.load_plan(Path(__file__).parent / "workshop/plan.yaml")
 robot, space = plan.robot, cube(plan.robot, points_a_side=5)  # ±60 mm around the mechanical zero
-drives = Assembly(robot).inverse(space.points)  # as a nominal controller commands them
+drives = LoopClosure(robot).inverse(space.points)  # as a nominal controller commands them
 
 
 def simplify(session: Session) -> Session:
@@ -43,7 +43,7 @@ def simplify(session: Session) -> Session:
 promised, kept = defaultdict(list), defaultdict(list)  # mean squares at the tool, by what was done
 
 
-def hold(label: str, session: Session, choice: Choice, real: Assembly) -> Calibration:
+def hold(label: str, session: Session, choice: Choice, real: LoopClosure) -> Calibration:
     """Calibrate, and hold the calibrated tool against the real one."""
     result = orthocal.calibrate(session, choice, solver="eliminated")
     at = drives - result.active_offsets
@@ -57,7 +57,7 @@ for seed in range(MACHINES):
     errors = orthocal.draw_errors(
         robot, robot.parameters.patterns("full"), seed=seed, tolerances=FIRST
     )
-    real = Assembly(robot, fixed=errors)
+    real = LoopClosure(robot, fixed=errors)
 
     first = orthocal.simulate_session(plan, errors, seed=seed).session
     hold("first round, offsets", first, Choice("offsets", tolerances=FIRST), real)

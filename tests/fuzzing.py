@@ -543,7 +543,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
         forward_rows,
         inverse_rows,
     )
-    from orthocal.kinematics.loop_closure import nominal_assembly
+    from orthocal.kinematics.loop_closure import nominal_closure
     from orthocal.measurement.files.coordinate_tables import read_points, stream_joints
     from orthocal.measurement.files.session_file import load_plan
     from orthocal.measurement.files.write_session import write_session
@@ -577,7 +577,7 @@ def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None
     elif kind in ("robot", "urdf"):
         robot = load_robot(folder / "machine")
         if deep:
-            nominal_assembly(robot).close(robot.drive_zero)
+            nominal_closure(robot).close(robot.drive_zero)
             draw_scene(robot).to_html()
     elif kind in ("table", "workbook"):
         found = import_readings(

@@ -18,7 +18,7 @@ from fuzzing import KINDS, lay_out, make_case, run
 from orthocal import calibrate, load_calibration, load_robot
 from orthocal.calibration.file import calibration_document
 from orthocal.errors import CalibrationFileError
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 
 COUNT = 2000
 
@@ -99,5 +99,5 @@ def test_a_machine_with_one_passive_joint(root, tmp_path):
     path.write_text(spoilt)
     robot = load_robot(folder)
     assert robot.passive_index.size == 1
-    passive = nominal_assembly(robot).close(robot.drive_zero)
+    passive = nominal_closure(robot).close(robot.drive_zero)
     assert passive == pytest.approx(np.zeros(1), abs=1e-9)

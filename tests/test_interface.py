@@ -28,7 +28,7 @@ from orthocal import (
 from orthocal.assessment.tool_error import Workspace
 from orthocal.calibration.file import write_calibration
 from orthocal.errors import OrthocalError, ParameterError
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import LoopClosure
 
 
 @pytest.fixture(scope="module")
@@ -137,14 +137,14 @@ SHAPES = [5, None, [1, 2], [[1, 2]], np.zeros((2, 2, 3)), [], "abc", {}, [1j, 0,
 
 @pytest.mark.parametrize("value", SHAPES, ids=lambda v: str(v)[:20])
 def test_coordinates_of_other_shapes(value, calibration, orthoglide):
-    assembly = Assembly(orthoglide)
+    closure = LoopClosure(orthoglide)
     for act in (
         calibration.machine.forward,
         calibration.machine.inverse,
-        assembly.close,
-        assembly.forward,
-        assembly.inverse,
-        lambda v: assembly.tcp(v, v),
+        closure.close,
+        closure.forward,
+        closure.inverse,
+        lambda v: closure.tcp(v, v),
     ):
         with pytest.raises(ValueError, match=r"expected 3 .* a row"):
             act(value)
@@ -160,13 +160,13 @@ def test_names_theta_and_start_of_other_lengths(calibration, orthoglide):
     with pytest.raises(ValueError, match="found 1 names for 2 rows"):
         calibration.machine.forward([zero, zero], names=["a"])
     with pytest.raises(ValueError, match="expected 1 values of the free parameters a row"):
-        Assembly(orthoglide, free=["x_slide.offset"]).close(zero, theta=[1.0, 2.0])
+        LoopClosure(orthoglide, free=["x_slide.offset"]).close(zero, theta=[1.0, 2.0])
     with pytest.raises(ValueError, match="expected 18 start values a row"):
-        Assembly(orthoglide).close(zero, start=[1.0, 2.0])
+        LoopClosure(orthoglide).close(zero, start=[1.0, 2.0])
     with pytest.raises(ValueError, match="expected 18 passive coordinates a row"):
-        Assembly(orthoglide).tcp(zero, [1.0])
+        LoopClosure(orthoglide).tcp(zero, [1.0])
     with pytest.raises(TypeError, match="expected a Robot"):
-        Assembly(5)
+        LoopClosure(5)
 
 
 def test_points_far_beyond_all_numbers(calibration):

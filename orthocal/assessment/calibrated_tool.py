@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, find_workspace
 from orthocal.robot.model import Robot
@@ -45,7 +45,7 @@ class CalibratedTool:
             names: What to call the points in messages.
         """
         commanded = self.drives - np.asarray(offsets, dtype=np.float64)
-        found = self.sensitivity.assembly.forward(commanded, start=self.passive, names=names)
+        found = self.sensitivity.closure.forward(commanded, start=self.passive, names=names)
         return np.asarray(found - self.targets)
 
 
@@ -65,10 +65,10 @@ def find_tool(calibration: Calibration) -> CalibratedTool | None:
     identified = calibration.offsets
 
     def reach(points: Array) -> None:
-        drives, passive = nominal_assembly(robot).reach(points)
+        drives, passive = nominal_closure(robot).reach(points)
         for offsets in (calibration.active_offsets, identified):
             _require_travel(robot, drives - offsets)
-            sensitivity.assembly.forward(drives - offsets, start=passive)
+            sensitivity.closure.forward(drives - offsets, start=passive)
 
     try:
         space = find_workspace(robot, reach)
@@ -111,10 +111,10 @@ def _place(
     sensitivity: ToolSensitivity,
     names: Sequence[str] | None,
 ) -> CalibratedTool:
-    nominal = nominal_assembly(calibration.robot)
+    nominal = nominal_closure(calibration.robot)
     drives, passive = nominal.reach(space.points, names=names)
     commanded = drives - calibration.active_offsets
-    closed = sensitivity.assembly.close(commanded, start=passive, names=names)
+    closed = sensitivity.closure.close(commanded, start=passive, names=names)
     return CalibratedTool(
         workspace=space,
         targets=read_only(nominal.tcp(drives, passive)),

@@ -16,11 +16,11 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.loop_closure import (
-    Assembly,
     Failures,
+    LoopClosure,
     as_rows,
     find_beyond_travel,
-    nominal_assembly,
+    nominal_closure,
 )
 from orthocal.kinematics.sensitivity import ToolSensitivity
 
@@ -74,11 +74,11 @@ def forward_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterato
         blocks: Names and drive coordinates of some rows, shape (n, n_drives), [m, rad].
     """
     robot = calibration.robot
-    assembly = Assembly(robot, fixed=calibration.errors)
+    closure = LoopClosure(robot, fixed=calibration.errors)
 
     def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
         failures.update(find_beyond_travel(robot, rows, names))
-        return assembly.forward(rows, names=names, failures=failures)
+        return closure.forward(rows, names=names, failures=failures)
 
     yield from _by_chunks(evaluate, blocks)
 
@@ -107,10 +107,10 @@ def inverse_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterato
         calibration: The calibration.
         blocks: Names and coordinates of some points, shape (n, n_drives), [m].
     """
-    assembly = Assembly(calibration.robot, fixed=calibration.errors)
+    closure = LoopClosure(calibration.robot, fixed=calibration.errors)
 
     def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
-        return assembly.inverse(rows, names=names, failures=failures)
+        return closure.inverse(rows, names=names, failures=failures)
 
     yield from _by_chunks(evaluate, blocks)
 
@@ -134,7 +134,7 @@ def accuracy_rows(
     robot, values = calibration.robot, calibration.errors
     free = [p.name for p in calibration.free]
     tool = ToolSensitivity(robot, free=[*free, *calibration.unmodelled.names], values=values)
-    nominal = nominal_assembly(robot)
+    nominal = nominal_closure(robot)
     rows, _ = as_rows(points, len(robot.drives), "coordinates")
     active = calibration.session.controller_offsets
     offsets = np.zeros(len(robot.drives)) if active is None else np.array(active)
@@ -145,13 +145,13 @@ def accuracy_rows(
         drives = nominal.inverse(rows, names=names, failures=failures)
         target = nominal.forward(drives, names=names, failures=failures)
         commanded = drives - offsets
-        passive = tool.assembly.close(commanded, names=names, failures=failures)
+        passive = tool.closure.close(commanded, names=names, failures=failures)
         result = np.full((len(rows), 9), np.nan)
         at = np.array([i for i in range(len(rows)) if i not in failures], dtype=np.int64)
         if not at.size:
             return result
         result[at, :3] = target[at]
-        result[at, 3:6] = tool.assembly.tcp(commanded[at], passive[at]) - target[at]
+        result[at, 3:6] = tool.closure.tcp(commanded[at], passive[at]) - target[at]
         if covariance is not None:
             jacobian = tool(commanded[at], passive=passive[at])
             variance = np.einsum("kin,nm,kim->ki", jacobian, covariance, jacobian, optimize=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.kinematics.loop_closure import Assembly, as_rows, find_beyond_travel
+from orthocal.kinematics.loop_closure import LoopClosure, as_rows, find_beyond_travel
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
@@ -40,7 +40,7 @@ class Machine:
         labels = names or [f"posture {i + 1}" for i in range(len(rows))]
         for error in find_beyond_travel(self.robot, rows, labels).values():
             raise error
-        points = Assembly(self.robot, fixed=self.errors).forward(rows, names=labels)
+        points = LoopClosure(self.robot, fixed=self.errors).forward(rows, names=labels)
         return points[0] if single else points
 
     def inverse(self, points: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
@@ -56,4 +56,4 @@ class Machine:
         Raises:
             ClosureError: If a point cannot be reached.
         """
-        return Assembly(self.robot, fixed=self.errors).inverse(points, names=names)
+        return LoopClosure(self.robot, fixed=self.errors).inverse(points, names=names)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from orthocal.calibration.calibration import Calibration
 from orthocal.export.polynomial import Polynomial, PolynomialFit, chebyshev_line
 from orthocal.export.tool_tip import ToolTip
-from orthocal.kinematics.loop_closure import Failures, nominal_assembly
+from orthocal.kinematics.loop_closure import Failures, nominal_closure
 from orthocal.kinematics.workspace import grid_points
 
 Array = NDArray[np.float64]
@@ -113,7 +113,7 @@ class CorrectionField:
         self.bound = ERROR_PART * within
         """Largest error of a point, [m]."""
         self._offsets = np.array(offsets, dtype=np.float64)
-        self._nominal = nominal_assembly(robot)
+        self._nominal = nominal_closure(robot)
         self._side = BOX * robot.characteristic_length
         self._boxes: dict[Key, _Box | Fallback] = {}
         self._largest_error = EXACT

@@ -15,7 +15,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ExportError, ParameterError
 from orthocal.export.linuxcnc.export import OPTIONS, ExportOptions, export_linuxcnc
 from orthocal.export.urdf import export_urdf
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import even_grid
 from orthocal.units import MM, format_fixed, tidy
 
@@ -63,7 +63,7 @@ def export_corrections(calibration: Calibration) -> dict[str, str]:
     coordinates = list(robot.tcp.coordinates)
     try:
         drives = calibration.machine.inverse(points) + entered_offsets(calibration)
-        commanded = nominal_assembly(robot).forward(drives)[:, coordinates]
+        commanded = nominal_closure(robot).forward(drives)[:, coordinates]
     except ClosureError as e:
         raise ExportError(f"the calibrated machine does not reach all of the grid: {e}") from None
     text = io.StringIO()

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError, ParameterError
-from orthocal.kinematics.loop_closure import Assembly, Failures
+from orthocal.kinematics.loop_closure import Failures, LoopClosure
 from orthocal.kinematics.robot_functions import reference_poses, robot_functions
 from orthocal.units import MM
 
@@ -65,7 +65,7 @@ class ToolTip:
         require_tip(self.tool.tolist())
         self.coordinates = list(robot.tcp.coordinates)
         """Indices of the coordinates that the drives control."""
-        self._assembly = Assembly(robot, fixed=calibration.errors)
+        self._closure = LoopClosure(robot, fixed=calibration.errors)
         self._pose = robot_functions(robot).pose(robot.tcp.frame)
         (zero,) = reference_poses(robot, [robot.tcp.frame])
         self.level = np.array(zero[:3, :3])
@@ -110,7 +110,7 @@ class ToolTip:
     def _reach(self, points: Array, failures: Failures | None) -> tuple[Array, Array]:
         shifted, targets, start = np.array(points), self.targets(points), None
         for _ in range(MOST_STEPS):
-            drives, passive = self._assembly.reach(shifted, start=start, failures=failures)
+            drives, passive = self._closure.reach(shifted, start=start, failures=failures)
             reached = np.isfinite(drives).all(axis=1)
             if not self.tool.any() or not reached.any():
                 return drives, passive
@@ -123,8 +123,8 @@ class ToolTip:
         raise ExportError("the platform turns too much for a tool this long; use a shorter one")
 
     def _poses(self, drives: Array, start: Array | None) -> Array:
-        machine = self._assembly.geometry()
-        passive = self._assembly.close(drives, start=start)
+        machine = self._closure.geometry()
+        passive = self._closure.close(drives, start=start)
         (poses,) = self._pose(machine.drives(drives), passive, machine.placements)
         return np.asarray(poses)
 

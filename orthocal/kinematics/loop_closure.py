@@ -20,6 +20,7 @@ from orthocal.errors import ClosureError, RobotError
 from orthocal.kinematics.error_map import MachineGeometry
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.robot_functions import robot_functions
+from orthocal.robot.closing import describe_opening
 from orthocal.robot.model import (
     Robot,
     Tcp,
@@ -28,7 +29,6 @@ from orthocal.robot.model import (
     coordinate_limits,
     coordinate_units,
 )
-from orthocal.robot.nominal_closure import describe_opening
 from orthocal.units import DRIVE_UNITS
 
 Array = NDArray[np.float64]
@@ -743,10 +743,6 @@ class LoopClosure:
 def nominal_closure(robot: Robot) -> LoopClosure:
     """The loop closure solver of a robot without errors, built once."""
     return LoopClosure(robot)
-
-
-Assembly = LoopClosure
-nominal_assembly = nominal_closure
 
 
 def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str]) -> Failures:

@@ -41,10 +41,10 @@ class ToolSensitivity:
         self.robot = robot
         self.free = tuple(free)
         self.theta = np.array([at.get(name, 0.0) for name in self.free])
-        self.assembly = LoopClosure(robot, fixed=at)
+        self.closure = LoopClosure(robot, fixed=at)
         self._functions = robot_functions(robot)
         errors = self._functions.errors
-        self._by_errors = errors.jacobian(self.assembly.errors(), errors.columns(self.free))
+        self._by_errors = errors.jacobian(self.closure.errors(), errors.columns(self.free))
 
     def __call__(
         self,
@@ -69,8 +69,8 @@ class ToolSensitivity:
         """
         d = np.atleast_2d(np.asarray(drives, dtype=np.float64))
         if passive is None:
-            passive = self.assembly.close(d, names=names)
-        geometry, by_errors = self.assembly.geometry(), self._by_errors
+            passive = self.closure.close(d, names=names)
+        geometry, by_errors = self.closure.geometry(), self._by_errors
         arguments = geometry.drives(d), passive, geometry.placements
         _, p_a, p_q, p_t = self._functions.tool_jacobian(*arguments)
         _, g_a, g_q, nonzeros = self._functions.closure_jacobian(*arguments)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.errors import ClosureError, RobotError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.function_cache import cached_per_robot
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.robot.model import Robot
 from orthocal.units import MM
@@ -307,7 +307,7 @@ def nominal_reach(robot: Robot) -> Callable[[Array], None]:
     sensitivity = ToolSensitivity(robot, free=[f"{d.name}.offset" for d in robot.drives])
 
     def reach(points: Array) -> None:
-        drives, passive = nominal_assembly(robot).reach(points)
+        drives, passive = nominal_closure(robot).reach(points)
         if (drives < lower).any() or (drives > upper).any():
             raise ClosureError("is beyond the travel of a drive", posture="a corner")
         if (np.linalg.cond(sensitivity(drives, passive=passive)[:, moved]) > NEARLY_SINGULAR).any():
@@ -341,7 +341,7 @@ def tool_at_zero(robot: Robot) -> Array:
         RobotError: If the robot has no tool centre point.
     """
     passive = robot.zero[robot.passive_index]
-    position = nominal_assembly(robot).tcp(robot.drive_zero, passive)
+    position = nominal_closure(robot).tcp(robot.drive_zero, passive)
     coordinates = () if robot.tcp is None else robot.tcp.coordinates
     return np.asarray(np.round(position[list(coordinates)], 12) + 0.0)  # the zero without rounding
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import nominal_sensitivity
@@ -287,7 +287,7 @@ def _add_postures(
     if len(points) < FEWEST:
         raise ParameterError("the machine reaches no posture in it", where="plan: box")
     names = [_name(p, robot, middle) for p in points]
-    drives = nominal_assembly(robot).inverse(points)
+    drives = nominal_closure(robot).inverse(points)
     for name, point, drive in zip(names, points, drives, strict=True):
         postures.setdefault(name, Posture(name, "tcp_mm", point, drive))
     return names

@@ -15,7 +15,7 @@ from orthocal.errors import ClosureError, SessionError
 from orthocal.io.documents import read_yaml, validate
 from orthocal.io.fields import read_only
 from orthocal.kinematics.function_cache import cached_per_robot
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import require_commanded_tool, tool_at_zero
 from orthocal.measurement.files.schema import GaugeKeys
 from orthocal.planning.expected_error import state_noise
@@ -155,9 +155,9 @@ def _reach(robot: Robot, middle: Array, coordinate: int, way: float) -> float:
 
 def reachable(robot: Robot, points: Array) -> NDArray[np.bool_]:
     """Mask of tool positions that the nominal machine reaches, shape (n,)."""
-    assembly = nominal_assembly(robot)
+    closure = nominal_closure(robot)
     try:
-        drives = assembly.inverse(points)
+        drives = closure.inverse(points)
     except ClosureError:
         if len(points) == 1:
             return np.array([False])

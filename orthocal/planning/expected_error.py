@@ -25,7 +25,7 @@ from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.weighting import split_by_gauge
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import (
     FEWEST_ALIGNED,
@@ -124,7 +124,7 @@ class ToolForecast:
         self.names = (*free, *self.others)
         own = {**(others or {}), **{p.name: p.tolerance for p in selection.parameters}}
         self.tolerances = np.array([own.get(n, parameters[n].tolerance) for n in self.names])
-        nominal = nominal_assembly(robot)
+        nominal = nominal_closure(robot)
         drives, passive = nominal.reach(self.workspace.points)
         self.positions = nominal.tcp(drives, passive)
         sensitivity = ToolSensitivity(robot, free=self.names)

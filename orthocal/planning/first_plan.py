@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import RobotError
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.planning.equipment import Equipment, choose_box
 from orthocal.robot.model import Leg, Robot
@@ -100,7 +100,7 @@ def paper_plan(robot: Robot, equipment: Equipment, *, reference: str = "") -> Se
             setups[setup] = Setup(setup, _sensor(leg, "xyz"[k], equipment))
             readings += [Reading(setup, p, None, 1, 0.0, None) for p in names]
             readings.append(Reading(setup, "zero", None, 2, 0.0, None))
-    drives = nominal_assembly(robot).inverse(np.array(list(points.values())), names=list(points))
+    drives = nominal_closure(robot).inverse(np.array(list(points.values())), names=list(points))
     return Session(
         robot=robot,
         robot_reference=reference or robot.name,

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError, ParameterError
 from orthocal.io.fields import read_only
+from orthocal.robot.closing import close_loops, describe_opening
 from orthocal.robot.frames import find_frame, place_frames
-from orthocal.robot.nominal_closure import close_loops, describe_opening
 from orthocal.robot.parameters import DeclaredErrors, ParameterSet
 from orthocal.units import InUnit, Unit
 
@@ -220,7 +220,7 @@ class Robot:
     ) -> Array:
         """Passive coordinates that close the loops, by damped least squares on Pinocchio's models.
 
-        One posture, from a near start; the independent check of `assembly`, which is the way to
+        One posture, from a near start; the independent check of `LoopClosure`, which is the way to
         close many postures from afar.
 
         Args:

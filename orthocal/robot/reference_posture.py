@@ -15,6 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import RobotError
 from orthocal.io.fields import read_only
+from orthocal.robot.closing import (
+    MAX_STEPS,
+    NOTHING,
+    Closing,
+    close_loops,
+    describe_opening,
+)
 from orthocal.robot.model import (
     Robot,
     closure_row_units,
@@ -22,13 +29,6 @@ from orthocal.robot.model import (
     coordinate_limits,
     coordinate_units,
     joint_turns,
-)
-from orthocal.robot.nominal_closure import (
-    MAX_STEPS,
-    NOTHING,
-    Closing,
-    close_loops,
-    describe_opening,
 )
 
 Array = NDArray[np.float64]

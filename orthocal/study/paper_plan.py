@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.errors import ParameterError
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.robot.model import Robot
 from orthocal.sensors.leg_indicator import LegIndicator, Section
 from orthocal.sensors.mounting import EXACT
@@ -48,7 +48,7 @@ def build_paper_plan(robot: Robot, displacements: Displacements, gauge: Gauge) -
     for i, axis in enumerate(axes):
         points[f"{axis}_max"] = displacements.maximum * np.eye(3)[i]
         points[f"{axis}_min"] = displacements.minimum * np.eye(3)[i]
-    drives = nominal_assembly(robot).inverse(np.array(list(points.values())), names=list(points))
+    drives = nominal_closure(robot).inverse(np.array(list(points.values())), names=list(points))
     postures = {
         name: Posture(name, "tcp_mm", point, coordinates)
         for (name, point), coordinates in zip(points.items(), drives, strict=True)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.estimation.problem import CalibrationProblem, build_problem
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.measurement.files.session_file import check_contacts
 from orthocal.observation.observations import drive_table
@@ -124,7 +124,7 @@ def build_sensitivity_study(
 def _at_points(session: Session, points: Array) -> Session:
     """The session with every setup read at every point of the tool."""
     names = [f"point_{i + 1}" for i in range(len(points))]
-    drives = nominal_assembly(session.robot).inverse(points, names=names)
+    drives = nominal_closure(session.robot).inverse(points, names=names)
     drives = drives - session.active_offsets
     postures = {
         n: Posture(n, "tcp_mm", p, d) for n, p, d in zip(names, points, drives, strict=True)

@@ -40,7 +40,7 @@ from orthocal.errors import RobotError
 from orthocal.estimation.problem import build_problem
 from orthocal.export.formats import export_corrections
 from orthocal.export.linuxcnc.approximation import approximate
-from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
+from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.kinematics.orthoglide import inverse
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, cube, find_workspace, tool_at_zero
@@ -81,7 +81,7 @@ def workspace(orthoglide):
 
 @pytest.fixture(scope="module")
 def jacobian(tool, workspace):
-    return tool(tool.assembly.inverse(workspace.points))
+    return tool(tool.closure.inverse(workspace.points))
 
 
 @pytest.fixture(scope="module")
@@ -101,10 +101,10 @@ def test_the_sensitivity_is_the_derivative_of_the_forward_kinematics(orthoglide,
     drives = np.array([0.33, 0.29, 0.27])
     values = dict(zip(names, at * scale, strict=True))
     found = ToolSensitivity(orthoglide, free=names, values=values)(drives)[0] * scale
-    assembly = Assembly(orthoglide, free=names)
+    closure = LoopClosure(orthoglide, free=names)
     assert_derivative(
         found * 1e3,
-        lambda t: assembly.forward(drives, theta=t * scale) * 1e3,
+        lambda t: closure.forward(drives, theta=t * scale) * 1e3,
         at,
         step=1e-3,
         tolerance=1e-6,  # steps of a thousandth of a tolerance, third order
@@ -202,16 +202,16 @@ def test_a_rigid_motion_is_taken_out_and_nothing_else(workspace):
 def test_the_cube_is_around_the_mechanical_zero_and_within_reach(tmp_path):
     """A machine whose drives end 20 mm beyond their zero, and one whose zero is not the origin."""
     robot = load_robot(write_orthoglide(tmp_path / "short", 0.25, travel=(0.1, 0.27)))
-    nominal = nominal_assembly(robot)
+    nominal = nominal_closure(robot)
     found = find_workspace(robot, nominal.inverse)
     assert found.half_side == pytest.approx(0.020)  # p + √(L² − …) ≤ 0.27 on the axis
     assert found.words == "the workspace ±20 mm"
     text = (tmp_path / "short/machine.yaml").read_text().replace("zero_mm: 250", "zero_mm: 240")
     (tmp_path / "short/machine.yaml").write_text(text)
     moved = load_robot(tmp_path / "short")
-    middle = nominal_assembly(moved).forward(np.full(3, 0.24))
+    middle = nominal_closure(moved).forward(np.full(3, 0.24))
     assert tool_at_zero(moved) == pytest.approx(middle, abs=1e-12)
-    found = find_workspace(moved, nominal_assembly(moved).inverse)
+    found = find_workspace(moved, nominal_closure(moved).inverse)
     assert found.weights @ found.points == pytest.approx(middle, abs=1e-12)
     assert 0.028 < found.half_side < 0.032
 
@@ -306,7 +306,7 @@ def test_where_the_tool_is_now_by_pinocchio(calibrated):
     found = assess_tool(calibrated, Workspace.even(points))
     drives = np.array([inverse(p, length=0.31025) for p in points])
     for i, d in enumerate(drives):
-        tool = place(machine, d, "tcp", start=nominal_assembly(machine).close(d))
+        tool = place(machine, d, "tcp", start=nominal_closure(machine).close(d))
         assert found.deviation[i] == pytest.approx(tool - points[i], abs=1e-9)
 
 
@@ -338,8 +338,8 @@ def test_the_truth_behind_the_examples_is_where_it_should_be(root):
     robot = load_robot("orthoglide")
     truth = load_errors(root / "tests/sessions/lines/truth.yaml", robot)
     space = cube(robot)
-    drives = Assembly(robot).inverse(space.points)
-    real = Assembly(robot, fixed=truth).forward(drives)
+    drives = LoopClosure(robot).inverse(space.points)
+    real = LoopClosure(robot, fixed=truth).forward(drives)
     for name, model, largest in (("sweep", "offsets", 2.0), ("lines", "full", 1.5)):
         result = calibrate(
             session_folder(root, name), Choice(model=model, tolerances={"*.offset_m": 2e-3})

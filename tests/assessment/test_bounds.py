@@ -17,7 +17,7 @@ from models import JOINTS
 from orthocal import load_plan
 from orthocal.assessment.tool_error import measure_uncertainty
 from orthocal.estimation.problem import build_problem
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import cube
 from orthocal.sensors.mounting import Standing
@@ -53,7 +53,7 @@ def bound(plan, space, *, sigma, free):
     names = robot.parameters.select(free)
     problem = build_problem(plan, free=names, prior=True, tolerances=OFFSETS)
     n = problem.n_machine
-    tool = ToolSensitivity(robot, free=problem.free[:n])(Assembly(robot).inverse(space.points))
+    tool = ToolSensitivity(robot, free=problem.free[:n])(LoopClosure(robot).inverse(space.points))
     _, slopes = problem.linearise(np.zeros(problem.n_free))
     posterior = decompose(slopes, problem.observations).covariance(
         sigma=sigma, precision=problem.prior_precision

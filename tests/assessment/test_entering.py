@@ -14,7 +14,7 @@ from machines import write_orthoglide
 from orthocal import Choice, calibrate, load_plan, simulate_session
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import choose_offsets, entered_offsets, find_entries
-from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
+from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 
 
 @pytest.fixture(scope="module")
@@ -30,9 +30,11 @@ def quarter(tmp_path_factory):
 
 def error_left(plan, errors, offsets, space):
     """R.m.s. error at the tool of a machine with offsets in its controller, aligned, [m]."""
-    nominal = nominal_assembly(plan.robot)
+    nominal = nominal_closure(plan.robot)
     drives = nominal.inverse(space.points)
-    moved = Assembly(plan.robot, fixed=errors).forward(drives - offsets) - nominal.forward(drives)
+    moved = LoopClosure(plan.robot, fixed=errors).forward(drives - offsets) - nominal.forward(
+        drives
+    )
     aligned = space.remove_motion(moved, space.points)
     return float(np.sqrt(space.weights @ (aligned**2).sum(axis=1)))
 

@@ -15,7 +15,7 @@ from orthocal.calibration.build_record import assemble_calibration
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import cube
 from orthocal.session.session import Gauge
@@ -42,9 +42,9 @@ class Machines:
         self.problem = build_problem(self.plan, free=JOINTS, prior=True, tolerances=IN_SI)
         self.batch = BatchProgram(self.problem)
         self.workspace = cube(self.plan.robot, points_a_side=5)
-        assembly = Assembly(self.plan.robot)
-        self.drives = assembly.inverse(self.workspace.points)
-        self.assembly = Assembly(self.plan.robot, free=self.problem.free)
+        closure = LoopClosure(self.plan.robot)
+        self.drives = closure.inverse(self.workspace.points)
+        self.closure = LoopClosure(self.plan.robot, free=self.problem.free)
 
     def draw(self, seed):
         errors = draw_errors(
@@ -62,7 +62,7 @@ class Machines:
         return self.batch.solve(values + SIGMA * rng.normal(size=values.shape), sigma=SIGMA).theta
 
     def tool(self, theta):
-        return self.assembly.forward(self.drives, theta=theta)
+        return self.closure.forward(self.drives, theta=theta)
 
 
 @pytest.fixture(scope="module", params=["sweep", "lines"])

@@ -16,7 +16,7 @@ from orthocal import draw_errors, load_plan
 from orthocal.assessment.tool_error import measure_uncertainty
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.variable_projection import VariableProjection
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import cube
 from orthocal.sensors.rod_indicator import RodByBall
@@ -74,8 +74,8 @@ def test_the_error_at_the_tool_is_what_is_predicted(root, name, offsets_mm, most
     problem = build_problem(plan, model="full", tolerances={"*.offset": 2e-3})
     n, scale, space = problem.n_machine, problem.theta_scale, cube(robot, points_a_side=5)
     names = problem.free[:n]
-    assembly = Assembly(robot, free=names)
-    drives = Assembly(robot).inverse(space.points)
+    closure = LoopClosure(robot, free=names)
+    drives = LoopClosure(robot).inverse(space.points)
     tool = ToolSensitivity(robot, free=names)(drives)
     program = VariableProjection(problem)
     drawn = {"*.offset_mm": offsets_mm}
@@ -90,7 +90,7 @@ def test_the_error_at_the_tool_is_what_is_predicted(root, name, offsets_mm, most
             sigma=SIGMA, precision=problem.prior_precision
         ) * np.outer(scale, scale)
         truth = np.array([errors[name] for name in names])
-        missed = assembly.forward(drives, theta=found.theta[:n]) - assembly.forward(
+        missed = closure.forward(drives, theta=found.theta[:n]) - closure.forward(
             drives, theta=truth
         )
         missed = space.remove_motion(missed, space.points)

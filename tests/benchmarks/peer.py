@@ -18,8 +18,8 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
+from orthocal.robot.closing import CLOSED
 from orthocal.robot.model import Robot
-from orthocal.robot.nominal_closure import CLOSED
 from orthocal.sensors.leg_indicator import DIRECTIONS
 from orthocal.session.session import Session
 

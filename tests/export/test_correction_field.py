@@ -16,7 +16,7 @@ from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.export.correction_field import CorrectionField, Fallback
 from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.program import ProgramCorrector
-from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
+from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 
 WITHIN = 1e-6
 
@@ -42,7 +42,7 @@ def test_error_of_the_field_is_within_its_estimate(real, field):
     points = np.random.default_rng(1).uniform(-0.06, 0.06, (300, 3))
     sent, refused = field(points)
     assert not refused
-    machine, nominal = Assembly(real.robot, fixed=real.errors), nominal_assembly(real.robot)
+    machine, nominal = LoopClosure(real.robot, fixed=real.errors), nominal_closure(real.robot)
     reached = machine.forward(nominal.inverse(sent) - OFFSETS)
     off = np.linalg.norm(reached - points, axis=1).max()
     assert off < 1.05 * field.error < 0.1 * WITHIN  # commanded and reached differ by a percent
@@ -114,7 +114,7 @@ def test_tip_of_a_tool_follows_the_program(real, field):
     pieces = read_polyline(lines)
     ends = [p for number in sorted(pieces) for p, _ in pieces[number]]
     dense = np.array([a + s * (b - a) for a, b in pairwise(ends) for s in (0.0, 0.3, 0.5, 0.8)])
-    sent = nominal_assembly(real.robot).inverse(dense * 1e-3) - OFFSETS
+    sent = nominal_closure(real.robot).inverse(dense * 1e-3) - OFFSETS
     reached = tips(real.robot, real.errors, sent, TOOL) - TOOL
     off = [distances(reached, np.array(line)) for line in ((begin, corner), (corner, end))]
     assert np.min(off, axis=0).max() < 1.02 * WITHIN
@@ -140,7 +140,7 @@ def test_real_tool_follows_lines_and_arcs(real, field):
     """Including points of a nominal controller between the commanded ones."""
     text = ["G21 G0 X-30 Y-20 Z5", "N1 G1 X30 Y10 Z-10 F500", "N2 G3 X10 Y30 I-20 J0"]
     pieces = read_polyline(correct(field, *text))
-    machine, nominal = Assembly(real.robot, fixed=real.errors), nominal_assembly(real.robot)
+    machine, nominal = LoopClosure(real.robot, fixed=real.errors), nominal_closure(real.robot)
     start = pieces[0][-1][0]
     for number in (1, 2):
         ends = np.array([start, *(p for p, _ in pieces[number])])
@@ -170,7 +170,7 @@ def test_planar_robots_and_robots_without_a_tool(biglide, orthoglide):
     drives = [d.name for d in biglide.drives]
     machine = SimpleNamespace(robot=biglide, errors={f"{drives[0]}.offset": 1e-3})
     field = CorrectionField(machine, np.zeros(2), within=WITHIN)
-    middle = nominal_assembly(biglide).forward(biglide.drive_zero)
+    middle = nominal_closure(biglide).forward(biglide.drive_zero)
     points = middle + np.random.default_rng(0).uniform(-5e-3, 5e-3, (50, 3))
     sent, refused = field(points)
     other = [k for k in range(3) if k not in field.axes]
@@ -216,7 +216,7 @@ def test_command_line(command, tmp_path):
     assert "active during the measurement: x_slide +0.0000 mm" in err
     wanted = np.array([11.0, 2.0, -2.0]) * 1e-3
     machine = command.calibration
-    expected = nominal_assembly(machine.robot).forward(machine.machine.inverse(wanted))
+    expected = nominal_closure(machine.robot).forward(machine.machine.inverse(wanted))
     got = read_polyline(out.splitlines())[0][0][0] + [10.0, 0.0, -5.0]
     assert np.abs(got - expected * 1e3).max() < 1e-4
     assert np.abs(entered_offsets(machine)).max() > 1e-4

@@ -26,7 +26,7 @@ from orthocal import (
 )
 from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.export.urdf import _correct, _find_twists
-from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
+from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.observation.simulate import load_errors
 from orthocal.robot.parameters import ElementaryError
 
@@ -59,7 +59,7 @@ def test_corrections_bring_the_tool_to_its_targets(full):
         np.array([[float(r[f"{d}{k}_mm"]) for k in "xyz"] for r in rows]) * 1e-3 for d in ("", "d")
     )
     assert len(rows) == 343
-    nominal, real = nominal_assembly(full.robot), Assembly(full.robot, fixed=full.errors)
+    nominal, real = nominal_closure(full.robot), LoopClosure(full.robot, fixed=full.errors)
     offsets = entered_offsets(full)
     reached = real.forward(nominal.inverse(point + change) - offsets)
     assert np.abs(reached - point).max() < ROUNDED
@@ -140,9 +140,9 @@ def test_urdf_is_the_calibrated_machine(full, tmp_path):
     scales = {r["drive"]: r["scale_ppm"] for r in csv.DictReader(io.StringIO(files["scales.csv"]))}
     gain = 1.0 + 1e-6 * np.array([float(scales[d.name]) for d in robot.drives])
     points = np.random.default_rng(0).uniform(-0.06, 0.06, (20, 3))
-    drives = nominal_assembly(full.robot).inverse(points)
+    drives = nominal_closure(full.robot).inverse(points)
     expected = full.machine.forward(drives)
-    assert np.abs(Assembly(robot).forward(drives * gain) - expected).max() < 1e-9
+    assert np.abs(LoopClosure(robot).forward(drives * gain) - expected).max() < 1e-9
     assert np.abs(expected - points).max() > 1e-3
 
 
@@ -227,7 +227,7 @@ def test_offset_displaces_the_origin_of_its_drive(root, tmp_path):
     files = export_calibration(calibration, "urdf")
     assert set(files) == {"orthoglide.urdf", "orthoglide.yaml"}
     robot = load_robot(written(files, tmp_path / "real"))
-    tool = Assembly(robot).forward(robot.drive_zero)
+    tool = LoopClosure(robot).forward(robot.drive_zero)
     assert np.abs(tool - calibration.machine.forward(robot.drive_zero)).max() < 1e-9
 
 

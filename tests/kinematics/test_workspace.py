@@ -9,7 +9,7 @@ from orthocal import load_robot
 from orthocal.builder.build import make_robot
 from orthocal.builder.machine_file import Dimensions
 from orthocal.errors import ClosureError, RobotError
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import box_workspace, even_grid, find_workspace, gauss_box
 
 BOX = ((-0.05, 0.06), (-0.06, 0.05), (-0.07, 0.04))
@@ -72,7 +72,7 @@ def test_a_machine_that_reaches_less_has_a_smaller_box_of_the_same_shape(tmp_pat
         "the workspace x −25…30, y −30…25, z −35…20 mm (the machine does not reach x −50…60, "
         "y −60…50, z −70…40 mm)"
     )
-    assert find_workspace(robot, nominal_assembly(robot).inverse).requested is None
+    assert find_workspace(robot, nominal_closure(robot).inverse).requested is None
 
 
 def test_a_machine_that_hardly_moves_has_no_workspace(tmp_path):

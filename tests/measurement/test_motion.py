@@ -22,7 +22,7 @@ from orthocal.builder.build import make_robot
 from orthocal.builder.machine_file import Counting, Dimensions
 from orthocal.errors import ParameterError, SessionError
 from orthocal.export.linuxcnc.export import ExportOptions
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.motion.motion import APPROACH, plan_motion, shown_joints
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
 from orthocal.units import MM
@@ -89,7 +89,7 @@ def test_program_pauses_in_the_alignment_posture_and_at_each_reading(small, moti
         if motion.setup == "xy":  # aligned in a posture that it does not read
             rows = ["zero", *rows]
         assert len(pauses) == text.splitlines().count("M0") == len(rows)
-        expected = nominal_assembly(small.robot).forward(
+        expected = nominal_closure(small.robot).forward(
             np.array([small.postures[p].drives for p in rows])
         )
         for (at, _), point in zip(pauses, expected, strict=True):
@@ -142,7 +142,7 @@ def test_every_drive_approaches_from_the_same_side(small, motions):
         assert motion.side == -1
         for before, after in zip(points[0::2], points[1::2], strict=True):
             shares = np.linspace(0.0, 1.0, 9)[:, None]
-            drives = nominal_assembly(robot).inverse((before + shares * (after - before)) * MM)
+            drives = nominal_closure(robot).inverse((before + shares * (after - before)) * MM)
             assert np.all(np.diff(drives, axis=0) > 0.0)
             assert drives[-1] - drives[0] == pytest.approx([APPROACH] * 3, abs=3e-7)
 
@@ -210,7 +210,7 @@ def test_path_that_leaves_the_travel_passes_through_the_mechanical_zero(small):
     """Between the postures, 10 mm above zero, the z leg is upright and its drive farthest."""
     robot = small.robot
     points = np.array([[60.0, 0.0, 10.0], [-60.0, 0.0, 10.0]]) * MM
-    drives = nominal_assembly(robot).inverse(points)
+    drives = nominal_closure(robot).inverse(points)
     assert drives[:, 2] == pytest.approx(0.25 * np.cos(np.arcsin(0.06 / 0.25)) + 0.01)
     z = replace(robot.drives[2], upper=0.256)  # 252.7 mm at the ends, 260 mm between, 250 at zero
     posture = small.postures["zero"]
@@ -228,7 +228,7 @@ def test_path_that_leaves_the_travel_passes_through_the_mechanical_zero(small):
     assert np.flatnonzero(np.abs(points).max(axis=1) == 0.0).tolist() == [2, 5]
     for start, end in pairwise(points * MM):
         path = start + np.linspace(0.0, 1.0, 50)[:, None] * (end - start)
-        assert nominal_assembly(robot).inverse(path)[:, 2].max() < z.upper
+        assert nominal_closure(robot).inverse(path)[:, 2].max() < z.upper
 
 
 def test_shift_moves_all_coordinates(small, motions):

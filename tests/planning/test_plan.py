@@ -24,7 +24,7 @@ from orthocal.builder.build import Dimensions, make_robot
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import cube, find_workspace
 from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
@@ -120,11 +120,11 @@ def simulate_tool_error(plan, workspace, *, machines):
     assert reached.all()
     values = values + sigma * rng.normal(size=values.shape)
     found = BatchProgram(problem).solve(values, sigma=sigma).theta
-    drives = Assembly(robot).inverse(workspace.points)
-    assembly, n = Assembly(robot, free=names), problem.n_machine
+    drives = LoopClosure(robot).inverse(workspace.points)
+    closure, n = LoopClosure(robot, free=names), problem.n_machine
     squares = []
     for truth, estimate in zip(theta, found, strict=True):
-        missed = assembly.forward(drives, theta=estimate[:n]) - assembly.forward(
+        missed = closure.forward(drives, theta=estimate[:n]) - closure.forward(
             drives, theta=truth[:n]
         )
         aligned = workspace.remove_motion(missed, workspace.points)
@@ -275,7 +275,7 @@ def test_the_default_workspace_keeps_clear_of_the_end_of_the_reach(tmp_path, leg
     robot = make_robot(sizes, tmp_path / "mine")
     space = find_workspace(robot)
     assert space.half_side == (0.06 if leg > 0.2 else pytest.approx(0.04, abs=0.02))
-    drives = Assembly(robot).inverse(1.07 * space.points)
+    drives = LoopClosure(robot).inverse(1.07 * space.points)
     assert (drives >= sizes.lower).all()
     assert (drives <= sizes.upper).all()
     forecast = ToolForecast(robot, Choice("full").select(robot.parameters))

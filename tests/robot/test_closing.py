@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tolerances import CLOSED
 
-from orthocal.robot.nominal_closure import close_loops, describe_opening
+from orthocal.robot.closing import close_loops, describe_opening
 
 
 def close(evaluate, start, **options):

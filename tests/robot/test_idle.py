@@ -7,7 +7,7 @@ import pytest
 from models import JOINTS
 
 from orthocal import load_robot
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import robot_functions
 
 STEP = 1e-6
@@ -16,8 +16,8 @@ STEP = 1e-6
 
 def seen_by(robot, errors, drives):
     """Tool and ends of all rods of a machine, loops closed anew, shape (K, n), [m]."""
-    assembly = Assembly(robot, fixed=errors)
-    passive, machine = assembly.close(drives), assembly.geometry()
+    closure = LoopClosure(robot, fixed=errors)
+    passive, machine = closure.close(drives), closure.geometry()
     frames = [robot.tcp.frame] + [
         frame
         for leg in robot.legs.values()
@@ -34,7 +34,7 @@ def effects(orthoglide):
     """Of every elementary error by central differences, loops closed anew, [m/m, m/rad]."""
     rng = np.random.default_rng(7)
     tool = rng.uniform(-0.08, 0.05, (4, 3))
-    drives = Assembly(orthoglide).inverse(tool)
+    drives = LoopClosure(orthoglide).inverse(tool)
     found = {}
     for name in orthoglide.parameters.elementary:
         plus, minus = (seen_by(orthoglide, {name: s}, drives) for s in (STEP, -STEP))

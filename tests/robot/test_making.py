@@ -13,7 +13,7 @@ from orthocal.builder.build import describe_machine, make_robot, remake_robot
 from orthocal.builder.machine_file import MACHINE, Counting, Dimensions, read_machine
 from orthocal.errors import RobotError
 from orthocal.kinematics import orthoglide as closed_forms
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.robot.loading import packaged_robots
 
 SMALL = Dimensions(
@@ -40,7 +40,7 @@ def test_a_machine_of_other_sizes_moves_as_the_papers_equations_say(tmp_path, si
     robot = make_robot(sizes, tmp_path / "mine")
     points = np.random.default_rng(0).uniform(-0.06, 0.06, (20, 3))
     drives = closed_forms.inverse(points, length=sizes.leg)
-    assert np.abs(Assembly(robot).forward(drives) - points).max() < CLOSED_FORM
+    assert np.abs(LoopClosure(robot).forward(drives) - points).max() < CLOSED_FORM
     assert robot.drive_zero == pytest.approx([sizes.leg] * 3)
     assert [(d.lower, d.upper) for d in robot.drives] == [(sizes.lower, sizes.upper)] * 3
     leg = robot.legs["y"]

@@ -18,7 +18,7 @@ from tolerances import CLOSED, KINEMATICS
 
 from orthocal import load_robot
 from orthocal.errors import ClosureError, RobotError
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.robot.reference_posture import count_free_motions
 
 
@@ -49,7 +49,7 @@ def test_loops_that_newton_does_not_close_are_closed(tmp_path):
     assert robot.drive_zero.tolist() == [0.0]
     assert not robot.drives[0].zero_found
     passive = robot.zero[robot.passive_index]
-    assert np.abs(Assembly(robot).close([[0.0]])[0] - passive).max() < CLOSED
+    assert np.abs(LoopClosure(robot).close([[0.0]])[0] - passive).max() < CLOSED
 
 
 def test_the_same_zero_is_found_every_time(tmp_path):
@@ -66,7 +66,7 @@ def test_drives_without_a_zero_are_moved_until_the_loops_close(tmp_path):
     # elbows at least 0.6 apart until both cranks are at 90 degrees
     assert np.pi / 2 < np.abs(robot.drive_zero).max() < 0.9 * np.pi
     assert count_free_motions(robot) == 0
-    Assembly(robot).close(robot.drive_zero + 0.01)
+    LoopClosure(robot).close(robot.drive_zero + 0.01)
 
 
 def test_a_given_zero_is_kept(tmp_path):
@@ -171,7 +171,7 @@ def test_free_motions_are_counted(tmp_path, orthoglide, fivebar):
 def test_loops_that_leave_motions_free_close_for_the_eye_only(tmp_path):
     """The 6d loop of a robot with two balls: more joints than rows."""
     robot = load_robot(write_ball_platform(tmp_path / "balls"))
-    assembly = Assembly(robot)
+    assembly = LoopClosure(robot)
     assert robot.passive_index.size > robot.closure_rows
     with pytest.raises(ClosureError, match="is singular: the drives leave"):
         assembly.close(robot.drive_zero)
@@ -186,11 +186,11 @@ def test_an_open_posture_says_mm_and_mrad(orthoglide):
         orthoglide.close_with_pinocchio([0.9, 0.3, 0.3], orthoglide.zero[orthoglide.passive_index])
     far = np.array([0.9, 0.3, 0.3])
     with pytest.raises(ClosureError, match=r"open by \S+ mm( and \S+ mrad)?, \d+% of the way"):
-        Assembly(orthoglide).close(far)
+        LoopClosure(orthoglide).close(far)
 
 
 def test_a_found_zero_is_where_pinocchio_says(tmp_path):
     """The assembly, which is CasADi's, starts from the zero that Pinocchio's models closed."""
     robot = load_robot(write_wide_linkage(tmp_path / "wide"))
-    passive = Assembly(robot).close(robot.drive_zero)
+    passive = LoopClosure(robot).close(robot.drive_zero)
     assert np.abs(passive - robot.zero[robot.passive_index]).max() < KINEMATICS

@@ -78,10 +78,10 @@ def plan(tmp_path):
 def test_its_readings_are_those_of_the_tool(plan):
     o = build_observations(plan)
     found = predict_readings(plan, TRUTH, observations=o, nuisance=np.array([1e-3, -2e-3]))
-    from orthocal.kinematics.loop_closure import Assembly
+    from orthocal.kinematics.loop_closure import LoopClosure
 
     drives = np.array([p.drives for p in plan.postures.values()])
-    tool = Assembly(plan.robot, fixed=TRUTH).forward(drives)
+    tool = LoopClosure(plan.robot, fixed=TRUTH).forward(drives)
     for setup, slope in enumerate((1e-3, 1e-3, -2e-3)):
         own = o.setup == setup
         expected = tool[o.posture[own], setup] * (1.0 + slope)

@@ -10,7 +10,7 @@ from tolerances import TRUTH_BACK
 
 from orthocal import Choice, load_plan, load_robot
 from orthocal.errors import ParameterError, SessionError
-from orthocal.kinematics.loop_closure import Assembly
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import cube, gauss_box
 from orthocal.session.session import Gauge
 from orthocal.study.accuracy import (
@@ -79,7 +79,7 @@ def test_tool_error_of_one_machine_agrees_with_pinocchio(workshop):
     rows = run_task(study, 0)
     robot, prepared = workshop.robot, study.prepare()
     space = gauss_box(robot, [[-0.05, 0.05]] * 3)
-    drives = Assembly(robot).inverse(space.points)
+    drives = LoopClosure(robot).inverse(space.points)
     drawn, _ = study.draw(prepared, 2)
     truth = dict(zip(study.drawn, drawn * prepared.truth.theta_scale, strict=False))
     found = {

@@ -18,7 +18,7 @@ from tolerances import CLOSED, KINEMATICS
 
 from orthocal import draw_scene, load_robot
 from orthocal.cli import main
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.output.scene import drawing
 from orthocal.robot.reference_posture import count_free_motions
 from orthocal.viewer.visuals import load_visuals
@@ -75,7 +75,7 @@ def test_every_drive_moves_within_the_size_of_the_machine(robot):
     assert len(stops) > 1
     drives = np.array([s.drives for s in stops])
     assert np.abs(drives - robot.drive_zero).max() <= 0.4 * max(1.0, robot.characteristic_length)
-    passive = nominal_assembly(robot).close(drives, allow_free=True)
+    passive = nominal_closure(robot).close(drives, allow_free=True)
     for d, p in zip(drives, passive, strict=True):
         residual, _ = robot.evaluate_constraints(d, p)
         assert np.abs(residual).max(initial=0.0) < CLOSED

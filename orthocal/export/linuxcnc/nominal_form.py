@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.robot.model import Robot
 
 Array = NDArray[np.float64]
@@ -94,7 +94,7 @@ def find_nominal_form(robot: Robot, middle: Array, half: Array) -> NominalForm:
     """
     n = middle.size
     points = middle + half * np.random.default_rng(0).uniform(-1.0, 1.0, (POINTS, n))
-    inverse = nominal_assembly(robot).inverse
+    inverse = nominal_closure(robot).inverse
     try:
         drives = inverse(points)
     except ClosureError:  # the nominal machine may not reach the region of the calibrated one

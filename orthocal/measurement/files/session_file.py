@@ -26,7 +26,7 @@ from orthocal.io.files import (
     read_file,
     require_plain_name,
 )
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.files.readings_checks import check_readings
 from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
@@ -375,7 +375,7 @@ def _build_postures(
     keys: SessionKeys, robot: Robot, offsets: Array | None, file: Path
 ) -> dict[str, Posture]:
     """Commanded drive coordinates of all postures, through the nominal inverse kinematics."""
-    assembly = nominal_assembly(robot)
+    closure = nominal_closure(robot)
     active = np.zeros(len(robot.drives)) if offsets is None else offsets
     stated = [] if keys.controller is None else keys.controller.stated
     nominal: dict[str, Array] = {}
@@ -411,7 +411,7 @@ def _build_postures(
         nominal[name] = si
     if targets:
         try:
-            joints = assembly.inverse(np.array(list(targets.values())), names=list(targets))
+            joints = closure.inverse(np.array(list(targets.values())), names=list(targets))
         except ClosureError as e:
             raise SessionError(e.reason, where=f"{file}: postures.{e.posture}") from None
         nominal.update(zip(targets, joints, strict=True))
@@ -420,7 +420,7 @@ def _build_postures(
         where = f"{file}: controller.{' and '.join(stated)}: in posture '{name}'"
         _check_travel(robot, nominal[name] - active, where=where, joiner=" ")
     try:
-        assembly.close(np.array([nominal[n] for n in keys.postures]), names=list(keys.postures))
+        closure.close(np.array([nominal[n] for n in keys.postures]), names=list(keys.postures))
     except ClosureError as e:
         raise SessionError(e.reason, where=f"{file}: postures.{e.posture}") from None
     return {

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError, SessionError
-from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_assembly
+from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
@@ -72,9 +72,9 @@ def guide(session: Session) -> Guidance:
     commanded = drive_table(session) + session.active_offsets
     tool: dict[str, Array] = {}
     if robot.tcp is not None:
-        assembly = nominal_assembly(robot)
-        passive = assembly.close(commanded, names=list(session.postures))
-        tool = dict(zip(session.postures, assembly.tcp(commanded, passive), strict=True))
+        closure = nominal_closure(robot)
+        passive = closure.close(commanded, names=list(session.postures))
+        tool = dict(zip(session.postures, closure.tcp(commanded, passive), strict=True))
     return Guidance(
         joints=dict(zip(session.postures, shown_joints(robot, commanded), strict=True)),
         tool=tool,
@@ -195,13 +195,13 @@ def _find_approaches(session: Session, alignment: set[str]) -> tuple[int, dict[s
     names = [n for n in session.postures if n in used]
     nominal = np.array([session.postures[n].drives + session.active_offsets for n in names])
     step = np.array([APPROACH if d.unit == "m" else APPROACH_TURN for d in robot.drives])
-    assembly = nominal_assembly(robot)
+    closure = nominal_closure(robot)
     refused: list[ClosureError] = []
     for side in (-1, 1):
         drives = nominal + side * step
         failures = find_beyond_travel(robot, drives, names)
         if not failures:
-            passive = assembly.close(drives, names=names, failures=failures)
+            passive = closure.close(drives, names=names, failures=failures)
         if failures:
             refused.append(next(iter(failures.values())))
             continue
@@ -209,8 +209,8 @@ def _find_approaches(session: Session, alignment: set[str]) -> tuple[int, dict[s
         starts = ends
         if _commands_tool(robot) and robot.tcp is not None:
             coordinates = list(robot.tcp.coordinates)
-            ends = list(assembly.forward(nominal, names=names)[:, coordinates])
-            starts = list(assembly.tcp(drives, passive)[:, coordinates])
+            ends = list(closure.forward(nominal, names=names)[:, coordinates])
+            starts = list(closure.tcp(drives, passive)[:, coordinates])
         columns = zip(names, nominal, drives, ends, starts, strict=True)
         return side, {name: Stop(name, "reading", None, 1, *parts) for name, *parts in columns}
     raise SessionError(
@@ -267,7 +267,7 @@ def _sample_path(robot: Robot, corners: Sequence[Array]) -> _Path | None:
         points.append(start + np.arange(1, count + 1)[:, None] / count * (end - start))
     sampled = np.concatenate(points)
     try:
-        drives, passive = nominal_assembly(robot).reach(sampled)
+        drives, passive = nominal_closure(robot).reach(sampled)
     except ClosureError:
         return None
     if find_beyond_travel(robot, drives, [""] * len(sampled)):
@@ -282,7 +282,7 @@ def _predict(
     points, drives, passive = (np.concatenate(part) for part in zip(*paths, strict=True))
     aligned = session.postures[session.alignment_postures[setup]]
     names = [f"{aligned.name} {i}" for i in range(len(points))]  # none is the posture's own
-    at_alignment = nominal_assembly(session.robot).close(aligned.drives + session.active_offsets)
+    at_alignment = nominal_closure(session.robot).close(aligned.drives + session.active_offsets)
     sampled = replace(
         session,
         postures={

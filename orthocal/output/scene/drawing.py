@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ParameterError
-from orthocal.kinematics.loop_closure import Assembly, nominal_assembly
+from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.output.scene.deviations import (
     Measurement,
     Stop,
@@ -138,7 +138,7 @@ def _draw_robot(robot: Robot, posture: str | None) -> Scene:
     drawing = MachineScene(robot, f"{robot.name}: the nominal machine")
     stops = _tour(robot)
     timeline = plan_motion([s.drives for s in stops], count=_longest_tour(robot))
-    poses = _follow(nominal_assembly(robot), robot, timeline, drawing.frames, allow_free=True)
+    poses = _follow(nominal_closure(robot), robot, timeline, drawing.frames, allow_free=True)
     drawing.draw_machine(MACHINE, "Machine", timeline, poses)
     drawing.draw_leg_lines(timeline, poses)
     drawing.look_at(poses)
@@ -197,7 +197,7 @@ def _find_reachable(robot: Robot, drive: int, move: float) -> Array | None:
         target = zero + part * move * np.eye(len(zero))[drive]
         timeline = plan_motion([zero, target, zero], count=_longest_tour(robot))
         try:
-            nominal_assembly(robot).close(timeline.drives, allow_free=True)
+            nominal_closure(robot).close(timeline.drives, allow_free=True)
         except ClosureError:
             continue
         return np.asarray(target)
@@ -209,7 +209,7 @@ def _draw_session(session: Session, posture: str | None) -> Scene:
     drawing = MachineScene(robot, session.title, sensor_frames=_sensor_frames(measured))
     stops, left_out = plan_stops(measured, posture)
     timeline = plan_motion([s.drives + measured.offsets for s in stops])
-    poses = _follow(nominal_assembly(robot), robot, timeline, drawing.all_frames)
+    poses = _follow(nominal_closure(robot), robot, timeline, drawing.all_frames)
     drawing.draw_machine(MACHINE, "Machine, nominal", timeline, poses)
     drawing.draw_leg_lines(timeline, poses)
     drawing.look_at(poses)
@@ -264,7 +264,7 @@ def _place_machines(
     robot, frames, size = measured.robot, drawing.all_frames, drawing.size
     rigid = {n: v for n, v in calibration.errors.items() if robot.parameters.are_rigid(n)}
     machine = robot.with_errors(rigid)
-    nominal_loops, real_loops = nominal_assembly(robot), Assembly(robot, fixed=calibration.errors)
+    nominal_loops, real_loops = nominal_closure(robot), LoopClosure(robot, fixed=calibration.errors)
     timeline = plan_motion([s.drives for s in stops])
     assumed = Timeline(timeline.drives + measured.offsets, timeline.times, timeline.stops)
     nominal = _follow(nominal_loops, robot, assumed, frames)
@@ -305,7 +305,7 @@ def _sensor_frames(measured: Measurement) -> list[str]:
 
 
 def _follow(
-    assembly: Assembly,
+    closure: LoopClosure,
     robot: Robot,
     timeline: Timeline,
     frames: Sequence[str],
@@ -313,7 +313,7 @@ def _follow(
     allow_free: bool = False,
 ) -> dict[str, Array]:
     """Poses of frames in all frames of a motion, with closed loops."""
-    passive = assembly.close(timeline.drives, allow_free=allow_free)
+    passive = closure.close(timeline.drives, allow_free=allow_free)
     return place_frames(robot, timeline.drives, passive, frames)
 
 

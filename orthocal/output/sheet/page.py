@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthocal.assessment.wording import name_direction
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
-from orthocal.kinematics.loop_closure import nominal_assembly
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.motion.motion import (
     SetupMotion,
     Stop,
@@ -76,7 +76,7 @@ def _close_loops(session: Session) -> dict[str, Array]:
     """Posture to passive coordinates of the nominal machine, [m, rad]."""
     names = list(session.postures)
     drives = np.array([session.postures[n].drives + session.active_offsets for n in names])
-    passive = nominal_assembly(session.robot).close(drives, names=names)
+    passive = nominal_closure(session.robot).close(drives, names=names)
     return dict(zip(names, passive, strict=True))
 
 
