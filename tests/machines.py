@@ -13,7 +13,7 @@ from orthocal.sensors.leg_indicator import DIRECTIONS
 
 def place(machine, drives, frame, *, start=None):
     """Position of a frame, loops closed by Pinocchio's constraint models, shape (3,), [m]."""
-    start = machine.zero[machine.passive_index] if start is None else start
+    start = machine.reference_passive if start is None else start
     data = _closed(machine, tuple(np.ravel(drives).tolist()), tuple(np.ravel(start).tolist()))
     return np.array(data.oMf[machine.frame_id(frame)].translation)
 

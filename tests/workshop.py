@@ -86,7 +86,7 @@ class Workshop:
         pitched = Rotation.from_rotvec(-crooked.pitch * side)
         plunger, edge = rolled.apply(pitched.apply(said)), rolled.apply(side)
         # in the rod as drawn, where the ruler says from this machine's root
-        drawn = rod.zero_root + 0.5 * (rod.zero_tip - rod.zero_root)
+        drawn = rod.reference_root + 0.5 * (rod.reference_tip - rod.reference_root)
         drawn = drawn - (drawn @ axis) * axis + sensor.beside
         assert sensor.section.form == "fraction"
         along = axis @ self.at_zero[leg.root] + sensor.section.value * leg.length
@@ -108,7 +108,7 @@ def _place(machine, drives):
 @lru_cache(maxsize=256)
 def _place_once(machine, coordinates):
     drives = np.array(coordinates)
-    passive = machine.close_with_pinocchio(drives, machine.zero[machine.passive_index])
+    passive = machine.close_with_pinocchio(drives, machine.reference_passive)
     data = machine.model.createData()
     q = machine.configuration(machine.joint_coordinates(drives, passive))
     pin.framesForwardKinematics(machine.model, data, q)

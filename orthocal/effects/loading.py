@@ -18,7 +18,7 @@ from orthocal.io.documents import PositiveNumber, validate
 from orthocal.robot.loading import LOADED, load_bare_robot
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import COMPLETE, ElementaryError, build_parameters
-from orthocal.robot.redundant import find_idle_errors
+from orthocal.robot.redundant import find_redundant_errors
 
 MODELS: Mapping[str, Sequence[str]] = {"offsets": ("*.offset",), "full": COMPLETE}
 """Models of each robot whose YAML does not define models of these names."""
@@ -66,7 +66,7 @@ def _add_parameters(robot: Robot) -> Robot:
             sums=declared.sums,
             overrides=_read_tolerances(robot).overrides,
             models=models,
-            find_idle=partial(find_idle_errors, robot, elementary),
+            find_redundant=partial(find_redundant_errors, robot, elementary),
         )
     except ParameterError as e:
         raise RobotError(e.problem, where=where) from None

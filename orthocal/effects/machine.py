@@ -76,7 +76,7 @@ def stretch_rod(robot: Robot, rod: Rod, change: ca.SX) -> dict[Placement, ca.SX]
     """
     model = robot.model
     data = model.createData()
-    pin.framesForwardKinematics(model, data, robot.configuration(robot.zero))
+    pin.framesForwardKinematics(model, data, robot.configuration(robot.reference_posture))
     root, tip = (data.oMf[robot.frame_id(f)].translation for f in (rod.root, rod.tip))
     axis = (tip - root) / rod.length
 

@@ -378,7 +378,7 @@ def _require_independent_rows(robot: Robot) -> None:
     Raises:
         RobotError: Naming the closures and the rows.
     """
-    passive = robot.zero[robot.passive_index]
+    passive = robot.reference_passive
     _, jacobian = robot.evaluate_constraints(robot.drive_zero, passive)
     by_passive = (jacobian * closure_row_units(robot)[:, None])[:, robot.passive_index]
     rows = [(c.name, AXES[row]) for c in robot.closures for row in c.rows]

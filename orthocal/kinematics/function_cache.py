@@ -143,7 +143,7 @@ def fingerprint(robot: Robot) -> str:
                 for leg in robot.legs.values()
             ]
         ),
-        repr([d.hex() for d in robot.zero.tolist()]),
+        repr([d.hex() for d in robot.reference_posture.tolist()]),
         repr(robot.drive_index.tolist()),
         repr(robot.passive_index.tolist()),
         repr([float(v).hex() for v in robot.drive_gain]),

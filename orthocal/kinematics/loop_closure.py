@@ -683,7 +683,7 @@ class LoopClosure:
             evaluate=evaluate,
             n_rows=robot.closure_rows,
             n_x=robot.passive_index.size,
-            start=robot.zero[robot.passive_index],
+            start=robot.reference_passive,
             origin=map_.command(robot.drive_zero),
             units=coordinate_units(robot)[robot.passive_index],
             lower=lower[robot.passive_index],
@@ -721,7 +721,7 @@ class LoopClosure:
 
         index = np.concatenate([robot.drive_index, robot.passive_index])
         lower, upper = coordinate_limits(robot)
-        zero_passive = robot.zero[robot.passive_index]
+        zero_passive = robot.reference_passive
         origin = nominal_closure(robot).tcp(robot.drive_zero, zero_passive)[chosen]
         return System(
             evaluate=evaluate,

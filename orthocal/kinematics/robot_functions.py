@@ -92,7 +92,7 @@ class RobotFunctions:
 
         Passive joints have their nominal values: they do not move frames that hang on drives alone.
         """
-        zero = ca.SX(self.robot.zero[self.robot.passive_index])
+        zero = ca.SX(self.robot.reference_passive)
         return RobotFunctions(self.robot, passive=zero, placements=self.placements)
 
     @property
@@ -330,5 +330,5 @@ def reference_poses(robot: Robot, frames: Sequence[str]) -> list[Array]:
     functions = robot_functions(robot)
     errors = functions.errors
     placements = errors.placements(np.zeros(len(errors.names)))
-    zero = robot.drive_zero[None], robot.zero[robot.passive_index][None]
+    zero = robot.drive_zero[None], robot.reference_passive[None]
     return [functions.pose(frame)(*zero, placements)[0][0] for frame in frames]

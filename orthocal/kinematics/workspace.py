@@ -340,7 +340,7 @@ def tool_at_zero(robot: Robot) -> Array:
     Raises:
         RobotError: If the robot has no tool centre point.
     """
-    passive = robot.zero[robot.passive_index]
+    passive = robot.reference_passive
     position = nominal_closure(robot).tcp(robot.drive_zero, passive)
     coordinates = () if robot.tcp is None else robot.tcp.coordinates
     return np.asarray(np.round(position[list(coordinates)], 12) + 0.0)  # the zero without rounding

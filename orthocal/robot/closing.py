@@ -1,8 +1,8 @@
-"""Levenberg and Marquardt's method for closing loops: damped least squares with a line search.
+"""Levenberg-Marquardt method with step control, for closing loops from a distant start.
 
-It finds a configuration near a start in which a residual vanishes, or the nearest to it that there
-is. Rows may depend on each other, and coordinates may be left free: of all steps that do the same
-the shortest is taken.
+It finds a configuration near a start in which a residual vanishes, or else a local minimum of the
+residual. Rows may depend on each other, and coordinates may be undetermined: steps have minimum
+norm.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Evaluate = Callable[[Array], tuple[Array, Array]]
-"""Coordinates to the residual, shape (m,), and its Jacobian, shape (m, n)."""
+"""Function of the coordinates: residual, shape (m,), and its Jacobian, shape (m, n)."""
 
 CLOSED = 1e-12
 """Largest closure residual of closed loops, [m or rad]."""
 
-NOTHING = 1e-9
-"""What is open by less is not worth a word, [m or rad]."""
+SMALLEST_SHOWN = 1e-9
+"""Openings below this are omitted from messages, [m or rad]."""
 
 MAX_STEPS = 150
 LARGEST_STEP = 0.5
-"""Change of a coordinate in one step, [m or rad]."""
+"""Largest change of a coordinate in one step, [m or rad]."""
 
 _MAX_TRIALS = 10
-"""Of a step, each more damped than the one before."""
+"""Trials of a step with increasing damping."""
 _FIRST_DAMPING = 1e-3
-"""Of the squared residual: the damping vanishes with it, so that the end is Newton's."""
-_PATIENCE = 12
+"""Damping relative to the squared residual, with which it vanishes: convergence is quadratic."""
+_WINDOW = 12
 _LEAST_GAIN = 0.1
-"""Share of the residual that these steps must remove while the loops are far from closed."""
-_RANK = 1e-10
-"""Singular values below this share of the largest are none."""
+"""Smallest relative reduction of the squared residual within _WINDOW steps."""
+_RANK_TOLERANCE = 1e-10
+"""Singular values below this fraction of the largest count as zero."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,44 +61,44 @@ def close_loops(
     units: ArrayLike,
     bounds: tuple[ArrayLike, ArrayLike] = (-np.inf, np.inf),
 ) -> Closing:
-    """Coordinates near a start in which a residual vanishes.
+    """Find coordinates near a start in which a residual vanishes.
 
         min ‖W r(x)‖²,  (Jᵀ W² J + μ U²) dx = −Jᵀ W² r,  x ← x + s dx
 
     Args:
-        evaluate: The residual and its Jacobian.
+        evaluate: Residual and Jacobian as a function of the coordinates.
         start: Shape (n,), [m, rad].
-        row_units: Metres that one unit of each row amounts to, the diagonal of W, shape (m,).
-        units: Metres that one unit of each coordinate amounts to, the diagonal of U, shape (n,).
-        bounds: Least and largest coordinates; steps end there.
+        row_units: Metres per unit of each row, the diagonal of W, shape (m,).
+        units: Metres per unit of each coordinate, the diagonal of U, shape (n,).
+        bounds: Lower and upper bounds of the coordinates; steps are clipped to them.
 
     Returns:
-        Where it ended, closed or not.
+        The last point, with closed loops or without.
     """
     lower, upper = (np.asarray(b, dtype=np.float64) for b in bounds)
     weights, scale = np.asarray(row_units), np.asarray(units)
     x = np.clip(np.asarray(start, dtype=np.float64), lower, upper)
     residual, jacobian = evaluate(x)
-    damping, past = _FIRST_DAMPING, []
+    damping, costs = _FIRST_DAMPING, []
     for _ in range(MAX_STEPS):
-        size = float(np.square(weights * residual).sum())
-        past.append(size)
-        if largest(residual) < CLOSED or not np.isfinite(size):
+        cost = float(np.square(weights * residual).sum())
+        costs.append(cost)
+        if largest(residual) < CLOSED or not np.isfinite(cost):
             break
         if not np.isfinite(jacobian).all():
             break
-        if len(past) > _PATIENCE and size > (1.0 - _LEAST_GAIN) * past[-1 - _PATIENCE]:
+        if len(costs) > _WINDOW and cost > (1.0 - _LEAST_GAIN) * costs[-1 - _WINDOW]:
             break
-        slopes = weights[:, None] * jacobian / scale
-        downhill = -(weights * residual) @ slopes
-        slopes[:, ((x <= lower) & (downhill < 0.0)) | ((x >= upper) & (downhill > 0.0))] = 0.0
-        direction = _Directions(weights * residual, slopes)
+        scaled = weights[:, None] * jacobian / scale
+        descent = -(weights * residual) @ scaled
+        scaled[:, ((x <= lower) & (descent < 0.0)) | ((x >= upper) & (descent > 0.0))] = 0.0
+        damped_step = _decompose(weights * residual, scaled)
         for _ in range(_MAX_TRIALS):
-            step = direction.step(damping * size) / scale
+            step = damped_step(damping * cost) / scale
             step *= min(1.0, LARGEST_STEP / max(largest(step), 1e-300))
             trial = np.clip(x + step, lower, upper)
             r, j = evaluate(trial)
-            if float(np.square(weights * r).sum()) < size:
+            if float(np.square(weights * r).sum()) < cost:
                 break
             damping *= 4.0
         else:
@@ -108,38 +108,34 @@ def close_loops(
     return Closing(x, residual)
 
 
-class _Directions:
-    """Steps of all dampings from one decomposition."""
+def _decompose(residual: Array, jacobian: Array) -> Callable[[float], Array]:
+    """Function of the damping that returns the damped step, from one decomposition."""
+    u, values, vt = np.linalg.svd(jacobian, full_matrices=False)
+    rank = values > _RANK_TOLERANCE * values.max(initial=0.0)
+    s, vt, projected = values[rank], vt[rank], (u.T @ residual)[rank]
 
-    def __init__(self, residual: Array, jacobian: Array) -> None:
-        left, self._values, self._right = np.linalg.svd(jacobian, full_matrices=False)
-        self._projected = left.T @ residual
-        first = self._values[0] if self._values.size else 0.0
-        self._kept = self._values > _RANK * first
+    def damped_step(damping: float) -> Array:
+        return np.asarray(-(vt.T @ (s / (s * s + damping) * projected)))
 
-    def step(self, damping: float) -> Array:
-        """The damped step, shape (n,)."""
-        s = self._values[self._kept]
-        share = s / (s * s + damping)
-        return np.asarray(-(self._right[self._kept].T @ (share * self._projected[self._kept])))
+    return damped_step
 
 
 def largest(values: Array) -> float:
-    """Largest magnitude, 0 of nothing."""
+    """Largest magnitude, 0 for an empty array."""
     return float(np.abs(values).max(initial=0.0))
 
 
 def describe_opening(residual: ArrayLike, rotations: ArrayLike) -> str:
-    """By how much loops are open, in words, metres and radians told apart.
+    """Opening of loops in words, separately in mm and mrad.
 
     Args:
         residual: Closure residual, shape (m,), [m, rad].
-        rotations: Which rows are rotations, shape (m,).
+        rotations: Mask of the rows that are rotations, shape (m,).
     """
-    r, turned = np.abs(np.asarray(residual)), np.asarray(rotations, dtype=bool)
-    parts = [(largest(r[~turned]), "mm"), (largest(r[turned]), "mrad")]
-    open_ones = [part for part in parts if part[0] > NOTHING] or parts[:1]
-    return " and ".join(f"{_three_digits(size * 1e3)} {unit}" for size, unit in open_ones)
+    r, mask = np.abs(np.asarray(residual)), np.asarray(rotations, dtype=bool)
+    parts = [(largest(r[~mask]), "mm"), (largest(r[mask]), "mrad")]
+    shown = [part for part in parts if part[0] > SMALLEST_SHOWN] or parts[:1]
+    return " and ".join(f"{_three_digits(size * 1e3)} {unit}" for size, unit in shown)
 
 
 def _three_digits(value: float) -> str:

@@ -1,4 +1,4 @@
-"""Frames of a Pinocchio model: by name, what they hang on, and errors written into them."""
+"""Frames of a Pinocchio model: search by name, parent frames, and placement errors."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ Array = NDArray[np.float64]
 
 
 def find_frame(model: pin.Model, name: str, *, where: str) -> int:
-    """Index of the frame of a link, or else of a fixed or moving joint, of this name.
+    """Index of the frame of a link, of a fixed joint, or of a moving joint, in this order.
 
     Raises:
-        RobotError: If there is none.
+        RobotError: If there is no such frame.
     """
     for kind in (pin.FrameType.BODY, pin.FrameType.FIXED_JOINT, pin.FrameType.JOINT):
         if model.existFrame(name, kind):
@@ -26,7 +26,7 @@ def find_frame(model: pin.Model, name: str, *, where: str) -> int:
 
 
 def hangs_on(model: pin.Model, frame: int) -> int | None:
-    """The frame of the same joint that a frame hangs on, whose errors move it; None if none."""
+    """Parent frame on the same joint, whose errors move this frame; None if there is none."""
     f = model.frames[frame]
     parent = int(f.parentFrame)
     if f.type == pin.FrameType.JOINT or frame == parent:
@@ -35,17 +35,23 @@ def hangs_on(model: pin.Model, frame: int) -> int | None:
 
 
 def place_frames(model: pin.Model, nominal: pin.Model, twists: Mapping[str, Array]) -> None:
-    """Write frame errors into a model; frames that hang on a frame move with it."""
+    """Write frame errors into a model: placement · exp6(δ); child frames move along.
+
+    Args:
+        model: The model to change.
+        nominal: The model without errors.
+        twists: Name of a frame to its error δ, shape (6,), [m, rad].
+    """
     moved: dict[int, pin.SE3] = {}
-    targets = {find_frame(nominal, name, where="frame"): t for name, t in twists.items()}
+    errors = {find_frame(nominal, name, where="frame"): t for name, t in twists.items()}
     for i, frame in enumerate(nominal.frames):
         parent = frame.parentFrame
-        shift = targets.get(i)
+        error = errors.get(i)
         hangs = nominal.frames[parent].parentJoint == frame.parentJoint and parent in moved
-        if frame.type == pin.FrameType.JOINT or (shift is None and not hangs):
+        if frame.type == pin.FrameType.JOINT or (error is None and not hangs):
             continue
         placement = frame.placement
         if hangs:
             placement = moved[parent] * nominal.frames[parent].placement.inverse() * placement
-        moved[i] = placement if shift is None else placement * pin.exp6(shift)
+        moved[i] = placement if error is None else placement * pin.exp6(error)
         model.frames[i].placement = moved[i]

@@ -1,10 +1,9 @@
-"""Joints that a robot's YAML declares to be of another type than its URDF says.
+"""Joint types that a robot's YAML declares in place of those in its URDF.
 
-A URDF has neither ball joints nor universal joints; Gepetto's keys `joint_name` and `joint_type`
-say which of its revolute joints stand for one. Such a joint is written into the URDF as revolute
-joints in series at the same place, with links without extent between them. A ball joint's turns
-about x, y and z reach every orientation; at a quarter turn about y two of them coincide, which a
-machine's ball joint does not come near.
+A URDF has neither ball joints nor universal joints. The keys `joint_name` and `joint_type` of the
+Gepetto "extended URDF" declare which revolute joints represent one. Such a joint becomes revolute
+joints in series at the same place, with links of zero length between them. A ball joint turns about
+x, y and z; it is singular at a quarter turn about y, far beyond the range of a ball joint.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ JOINT_TYPES: dict[str, str] = {
     "SPHERICAL": "XYZ",
     **{f"UJOINT_{a}{b}": a + b for a in "XYZ" for b in "XYZ" if a != b},
 }
-"""What a joint may be declared to be, and the axes of its own frame that it turns about."""
+"""Type to its rotation axes in the joint's frame, in their order."""
 
 _AXES = {"X": "1 0 0", "Y": "0 1 0", "Z": "0 0 1"}
 
@@ -35,19 +34,19 @@ def retype_joints(
     *,
     where: str,
 ) -> list[str]:
-    """Write declared types into a URDF that was checked.
+    """Write declared joint types into a checked URDF.
 
     Args:
-        root: Its outermost element, which is changed.
+        root: Root element of the URDF, which is changed.
         types: Name of a moving joint to one of `JOINT_TYPES`; joint j of `UJOINT_XY` becomes j_X
             and j_Y.
         where: File of the declarations, for messages.
 
     Returns:
-        The new joints, none of which is limited.
+        Names of the new joints, which have no limits.
 
     Raises:
-        RobotError: If there is no such moving joint, or one of its new names is taken.
+        RobotError: If there is no such moving joint, or a new name already exists.
     """
     joints = {j.get("name"): j for j in root.findall("joint")}
     moving = [name for name, joint in joints.items() if joint.get("type") != "fixed"]
@@ -67,21 +66,22 @@ def retype_joints(
 
 
 def _split(root: Any, joint: Any, axes: str, *, where: str) -> list[str]:  # noqa: ANN401
-    """Replace a joint by revolute joints in series, one an axis; returns their names."""
+    """Replace a joint by revolute joints in series, one per axis; returns their names."""
     name = joint.get("name")
-    links = [*(f"{name}_{axis}" for axis in axes[:-1]), joint.find("child").get("link")]
-    taken = {e.get("name") for tag in ("link", "joint") for e in root.findall(tag)}
-    parent = joint.find("parent").get("link")
-    for axis, child in zip(axes, links, strict=True):
-        own = f"{name}_{axis}"
-        if own in taken:
+    new_names = [f"{name}_{axis}" for axis in axes]
+    existing = {e.get("name") for tag in ("link", "joint") for e in root.findall(tag)}
+    for new in new_names:
+        if new in existing:
             raise RobotError(
-                f"'{name}' needs the name '{own}', which the URDF has already",
+                f"'{name}' needs the name '{new}', which the URDF has already",
                 where=f"{where}: joint_name",
             )
-        part = etree.SubElement(root, "joint", name=own, type="revolute")
-        if parent == joint.find("parent").get("link") and joint.find("origin") is not None:
-            part.append(joint.find("origin"))
+    parent, origin = joint.find("parent").get("link"), joint.find("origin")
+    links = [*new_names[:-1], joint.find("child").get("link")]
+    for new, axis, child in zip(new_names, axes, links, strict=True):
+        part = etree.SubElement(root, "joint", name=new, type="revolute")
+        if origin is not None and axis == axes[0]:
+            part.append(origin)
         etree.SubElement(part, "parent", link=parent)
         etree.SubElement(part, "child", link=child)
         etree.SubElement(part, "axis", xyz=_AXES[axis])
@@ -90,4 +90,4 @@ def _split(root: Any, joint: Any, axes: str, *, where: str) -> list[str]:  # noq
             etree.SubElement(root, "link", name=child)
         parent = child
     root.remove(joint)
-    return [f"{name}_{axis}" for axis in axes]
+    return new_names

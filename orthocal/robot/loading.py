@@ -35,7 +35,7 @@ from orthocal.robot.model import (
     joint_axis,
 )
 from orthocal.robot.parameters import AXES, DeclaredErrors, ParameterSet, split_unit
-from orthocal.robot.reference_posture import stand_at_zero
+from orthocal.robot.reference_posture import find_reference_posture
 from orthocal.robot.urdf import load_urdf
 from orthocal.units import DEG, DRIVE_UNITS, MM, Unit
 
@@ -127,11 +127,13 @@ def _build_robot(
         parameters=ParameterSet(),
         drive_index=np.array(drive_index, dtype=np.int64),
         passive_index=np.array(passive_index, dtype=np.int64),
-        zero=read_only(np.zeros(model.nv)),
+        reference_posture=read_only(np.zeros(model.nv)),
         drive_gain=read_only(np.ones(len(drives))),
     )
-    given = [_is_zero_given(keys, d.name) for d in drives]
-    robot = stand_at_zero(robot, _passive_start(robot, keys, where), given=given)
+    fixed_zeros = [_has_zero(keys, d.name) for d in drives]
+    robot = find_reference_posture(
+        robot, _passive_start(robot, keys, where), fixed_zeros=fixed_zeros
+    )
     return replace(robot, legs=_build_legs(robot, keys, where))
 
 
@@ -151,7 +153,7 @@ def _find_files(folder: Path) -> tuple[Path, Path]:
     return found[0], found[1]
 
 
-def _is_zero_given(keys: RobotKeys, motor: str) -> bool:
+def _has_zero(keys: RobotKeys, motor: str) -> bool:
     entry = keys.orthocal.drives.get(motor)
     return entry is not None and (entry.zero_mm is not None or entry.zero_deg is not None)
 
@@ -183,7 +185,7 @@ def _build_drives(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Drive,
         bounded = joint.nq == 1
         lower = float(model.lowerPositionLimit[joint.idx_q]) if bounded else -np.inf
         upper = float(model.upperPositionLimit[joint.idx_q]) if bounded else np.inf
-        if _is_zero_given(keys, motor) and not lower <= zero <= upper:
+        if _has_zero(keys, motor) and not lower <= zero <= upper:
             unit, size = DRIVE_UNITS["m" if prismatic else "rad"]
             raise RobotError(
                 f"the zero, {zero / size:g} {unit}, is outside the joint's limits "
@@ -290,7 +292,7 @@ def _without_rounding(unit_vector: Array) -> Array:
 def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
     model, legs = robot.model, {}
     data = model.createData()
-    q = robot.configuration(robot.zero)
+    q = robot.configuration(robot.reference_posture)
     pin.computeJointJacobians(model, data, q)
     pin.updateFramePlacements(model, data)
     for name, entry in keys.orthocal.legs.items():
@@ -310,7 +312,7 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
             tip=entry.tip,
             length=length,
             axis=read_only(_without_rounding((tip - root) / length)),
-            zero_root=read_only(root),
+            reference_root=read_only(root),
             root_driven=bool(moved < 1e-9),
             rods=_build_rods(model, data, entry, here),
         )
@@ -351,7 +353,7 @@ def _build_rods(model: pin.Model, data: pin.Data, entry: LegKeys, here: str) -> 
             tip=rod.tip,
             radius=rod.radius_mm * MM,
             length=float(np.linalg.norm(tip - root)),
-            zero_root=read_only(root),
-            zero_tip=read_only(tip),
+            reference_root=read_only(root),
+            reference_tip=read_only(tip),
         )
     return rods

@@ -33,7 +33,7 @@ class Drive(InUnit):
     """Least coordinate, [unit]; -inf where the URDF gives none."""
     upper: float
     """Largest coordinate, [unit]; inf where the URDF gives none."""
-    zero_found: bool = False
+    zero_computed: bool = False
     """Whether the zero was found by closing the loops, and is not the one that was given."""
     direction: int = 1
     """1 where the controller's joint grows with the coordinate, -1 where it falls."""
@@ -83,9 +83,9 @@ class Rod:
     """[m]."""
     length: float
     """Nominal distance from root to tip, [m]."""
-    zero_root: Array
+    reference_root: Array
     """Root in the mechanical zero of the nominal machine, shape (3,), [m]."""
-    zero_tip: Array
+    reference_tip: Array
     """Likewise."""
 
 
@@ -102,7 +102,7 @@ class Leg:
     """Nominal distance from root to tip, [m]."""
     axis: Array
     """Unit vector from root to tip in the mechanical zero of the nominal machine, shape (3,)."""
-    zero_root: Array
+    reference_root: Array
     """Root in the mechanical zero of the nominal machine, shape (3,), [m]."""
     root_driven: bool
     """Whether the root moves with drives alone, not with passive joints."""
@@ -151,8 +151,8 @@ class Robot:
     """Indices of the actuated coordinates, shape (n_drives,)."""
     passive_index: NDArray[np.int64]
     """Indices of the passive coordinates, shape (n_passive,)."""
-    zero: Array
-    """Coordinates of the mechanical zero with its loops closed, shape (nv,), [m, rad]."""
+    reference_posture: Array
+    """Joint coordinates with the drives at their mechanical zero, shape (nv,), [m, rad]."""
     drive_gain: Array
     """1 + scale error of each drive, shape (n_drives,); 1 for the nominal machine."""
 
@@ -165,6 +165,11 @@ class Robot:
     def drive_zero(self) -> Array:
         """Commanded drive coordinates of the mechanical zero, shape (n_drives,), [m, rad]."""
         return np.array([d.zero for d in self.drives])
+
+    @property
+    def reference_passive(self) -> Array:
+        """Passive coordinates of the reference posture, shape (n_passive,), [m, rad]."""
+        return np.asarray(self.reference_posture[self.passive_index])
 
     @property
     def characteristic_length(self) -> float:

@@ -95,7 +95,7 @@ class ParameterSet:
         elementary: All elementary errors.
         parameters: The errors and named sums of them.
         models: Model to patterns of names, or to COMPLETE.
-        find_idle: Finds the elementary errors that change nothing; called once, if needed.
+        find_redundant: Function that finds the redundant elementary errors; called at most once.
     """
 
     def __init__(
@@ -104,12 +104,12 @@ class ParameterSet:
         parameters: Iterable[Parameter] = (),
         models: Mapping[str, Sequence[str]] = MappingProxyType({}),
         *,
-        find_idle: Callable[[], frozenset[str]] = frozenset,
+        find_redundant: Callable[[], frozenset[str]] = frozenset,
     ) -> None:
         self.elementary = {e.name: e for e in elementary}
         self._parameters = {p.name: p for p in parameters}
         self._models = dict(models)
-        self._find_idle = find_idle
+        self._find_redundant = find_redundant
         self.own: ParameterSet = self
         """The same with the tolerances of the robot's YAML."""
         self.stated: Mapping[str, float] = {}
@@ -161,7 +161,7 @@ class ParameterSet:
 
         What changes something is found by rank, not by a list. Sums of errors are no further ones.
         """
-        return tuple(n for n in self.of_parts if n not in self.idle)
+        return tuple(n for n in self.of_parts if n not in self.redundant)
 
     @cached_property
     def of_parts(self) -> tuple[str, ...]:
@@ -169,9 +169,9 @@ class ParameterSet:
         return tuple(e.name for e in self.elementary.values() if e.complete)
 
     @cached_property
-    def idle(self) -> frozenset[str]:
-        """Elementary errors that change neither the tool nor what a gauge touches."""
-        return self._find_idle()
+    def redundant(self) -> frozenset[str]:
+        """Elementary errors that neither the tool nor a gauge can observe."""
+        return self._find_redundant()
 
     def coefficients(self, errors: Sequence[str], names: Sequence[str]) -> NDArray[np.float64]:
         """Contribution of one unit of each named parameter to each error, (n_errors, n_names).
@@ -255,7 +255,10 @@ class ParameterSet:
                 size = require_tolerance(value, self.own[name])
                 parameters[name] = replace(parameters[name], tolerance=size)
         found = ParameterSet(
-            self.elementary.values(), parameters.values(), self._models, find_idle=lambda: self.idle
+            self.elementary.values(),
+            parameters.values(),
+            self._models,
+            find_redundant=lambda: self.redundant,
         )
         found.own, found.stated = self.own, stated
         return found
@@ -367,7 +370,7 @@ def build_parameters(
     sums: Mapping[str, Sequence[str]],
     overrides: Mapping[str, float],
     models: Mapping[str, Sequence[str]],
-    find_idle: Callable[[], frozenset[str]],
+    find_redundant: Callable[[], frozenset[str]],
 ) -> ParameterSet:
     """The parameter set of a robot.
 
@@ -376,7 +379,7 @@ def build_parameters(
         sums: Name of a sum to names of elementary errors; a leading '-' subtracts.
         overrides: Parameter name or glob with its unit as suffix to a tolerance; later ones win.
         models: Model name to patterns, or to COMPLETE.
-        find_idle: As for `ParameterSet`.
+        find_redundant: As for `ParameterSet`.
 
     Raises:
         ParameterError: If a name is unknown, stated twice, or of another unit than its sum.
@@ -401,7 +404,7 @@ def build_parameters(
         for name in found:
             _check_unit(key, unit, parameters[name])
             parameters[name] = replace(parameters[name], tolerance=value * factor)
-    result = ParameterSet(elementary, parameters.values(), models, find_idle=find_idle)
+    result = ParameterSet(elementary, parameters.values(), models, find_redundant=find_redundant)
     for model, patterns in models.items():
         if patterns == COMPLETE:
             continue

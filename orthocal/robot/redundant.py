@@ -31,7 +31,7 @@ NOTHING = 1e-9
 """Of the largest effect of an error of its kind."""
 
 
-def find_idle_errors(robot: Robot, elementary: Sequence[ElementaryError]) -> frozenset[str]:
+def find_redundant_errors(robot: Robot, elementary: Sequence[ElementaryError]) -> frozenset[str]:
     """Names of the elementary errors of placements that change nothing.
 
     Errors of other kinds are never idle. A robot without tool and legs has no idle errors that
@@ -69,7 +69,7 @@ def _postures(robot: Robot) -> Iterator[Array]:
     for _ in range(TRIES):
         drives = robot.drive_zero + share * (rng.uniform(lower, upper) - robot.drive_zero)
         try:
-            passive = robot.close_with_pinocchio(drives, robot.zero[robot.passive_index])
+            passive = robot.close_with_pinocchio(drives, robot.reference_passive)
         except ClosureError:
             share *= 0.8
             continue

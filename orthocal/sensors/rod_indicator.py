@@ -289,10 +289,10 @@ class RodIndicator:
         axis = robot.legs[self.leg].axis
         plane, from_root = self._line.plane(robot)
         if from_root:
-            plane += float(axis @ robot.legs[self.leg].zero_root)
-        along = rod.zero_tip - rod.zero_root
-        share = (plane - axis @ rod.zero_root) / (axis @ along)
-        found = rod.zero_root + share * along
+            plane += float(axis @ robot.legs[self.leg].reference_root)
+        along = rod.reference_tip - rod.reference_root
+        share = (plane - axis @ rod.reference_root) / (axis @ along)
+        found = rod.reference_root + share * along
         return np.asarray(found - (axis @ found) * axis + self.beside)
 
 

@@ -66,7 +66,7 @@ class MachineScene:
         """Links, ends of the leg lines and tool centre point."""
         self.all_frames = tuple(dict.fromkeys([*self.frames, *sensor_frames]))
         """`frames` and the frames that sensors measure."""
-        passive = robot.zero[robot.passive_index]
+        passive = robot.reference_passive
         corners = self._corners(place_frames(robot, robot.drive_zero, passive, self.frames))
         points = corners.reshape(-1, 3)
         low, high = points.min(axis=0), points.max(axis=0)

@@ -130,7 +130,7 @@ class PeerProblem:
         ]
         self._drives = np.array([p.drives for p in session.postures.values()])
         self._legs_read = [np.unique(self._leg[self._posture == k]) for k in postures.values()]
-        self._passive = np.tile(robot.zero[robot.passive_index], (len(postures), 1))
+        self._passive = np.tile(robot.reference_passive, (len(postures), 1))
 
     def predict(self, errors: ArrayLike) -> Array:
         """Readings with gauge zeros at 0, shape (n_readings,), [m].
@@ -195,7 +195,7 @@ class PeerProblem:
 
         The root needs its drive alone, so no loops are closed.
         """
-        passive = self.robot.zero[self.robot.passive_index]
+        passive = self.robot.reference_passive
         pin.forwardKinematics(
             machine.model, data, machine.joint_coordinates(self._zero_drives, passive)
         )

@@ -232,7 +232,7 @@ def test_the_eliminated_solver_is_faster_than_ipopt(record):
 def test_the_fast_backend_is_faster_than_casadi(orthoglide, record):
     functions, count = robot_functions(orthoglide), 2000
     drives = np.tile(orthoglide.drive_zero, (count, 1))
-    passive = np.tile(orthoglide.zero[orthoglide.passive_index], (count, 1))
+    passive = np.tile(orthoglide.reference_passive, (count, 1))
     errors = functions.errors
     placements = errors.placements(np.zeros(len(errors.names)))
     seconds = {}

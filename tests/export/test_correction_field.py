@@ -90,7 +90,7 @@ TOOL = np.array([20.0, -5.0, -80.0]) * 1e-3
 def tips(robot, errors, drives, tool):
     """Tips by Pinocchio, with loops closed by Pinocchio."""
     real = robot.with_errors(errors)
-    data, passive, points = real.model.createData(), real.zero[real.passive_index], []
+    data, passive, points = real.model.createData(), real.reference_passive, []
     for row in drives:
         passive = real.close_with_pinocchio(row, passive)
         q = real.configuration(real.joint_coordinates(row, passive))

@@ -219,7 +219,7 @@ def test_tip_equals_pinocchio(full, core):
     """With placements of a robot with these errors, and loops closed by Pinocchio."""
     robot = full.robot.with_errors(full.errors)
     points = np.random.default_rng(9).uniform(-0.06, 0.06, (8, 3))
-    data, passive = robot.model.createData(), robot.zero[robot.passive_index]
+    data, passive = robot.model.createData(), robot.reference_passive
     for point, drives in zip(points, drives_of(full, core.inverse(points / MM)), strict=True):
         closed = robot.close_with_pinocchio(drives, passive)
         q = robot.configuration(robot.joint_coordinates(drives, closed))

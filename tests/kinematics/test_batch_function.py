@@ -20,7 +20,7 @@ def points(robot, count):
     rng = np.random.default_rng(0)
     errors = robot_functions(robot).errors
     drives = robot.drive_zero + 0.02 * rng.normal(size=(count, len(robot.drives)))
-    passive = robot.zero[robot.passive_index]
+    passive = robot.reference_passive
     passive = passive + 0.2 * rng.normal(size=(count, passive.size))
     return drives, passive, errors.placements(1e-2 * rng.normal(size=len(errors.names)))
 

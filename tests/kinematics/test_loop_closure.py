@@ -59,7 +59,7 @@ def test_batches_equal_pinocchios_own_newton(orthoglide):
     passive = LoopClosure(orthoglide, free=names).close(joints, theta=values)
     machine = orthoglide.with_errors(dict(zip(names, values, strict=True)))
     for d, ours in zip(joints, passive, strict=True):
-        theirs = machine.close_with_pinocchio(d, orthoglide.zero[orthoglide.passive_index])
+        theirs = machine.close_with_pinocchio(d, orthoglide.reference_passive)
         assert np.abs(ours - theirs).max() < CLOSED
 
 
@@ -74,7 +74,7 @@ def test_closures_hold_at_the_solution(orthoglide):
 def test_the_zero_posture_is_as_well_conditioned_as_designed(orthoglide):
     from orthocal.robot.model import closure_row_units
 
-    passive = orthoglide.zero[orthoglide.passive_index]
+    passive = orthoglide.reference_passive
     _, jacobian = orthoglide.evaluate_constraints(orthoglide.drive_zero, passive)
     scaled = jacobian[:, orthoglide.passive_index] * closure_row_units(orthoglide)[:, None]
     values = np.linalg.svd(scaled, compute_uv=False)
@@ -233,7 +233,7 @@ def test_a_batch_has_the_safeguards_of_one_machine(biglide):
 
 def test_a_solution_does_not_depend_on_earlier_calls(orthoglide):
     drives = orthoglide.drive_zero + np.array([[0.01, -0.02, 0.015]])
-    start = orthoglide.zero[orthoglide.passive_index] + 0.05
+    start = orthoglide.reference_passive + 0.05
     fresh = LoopClosure(orthoglide).close(drives, start=start)
     used = LoopClosure(orthoglide)
     used.close(drives)

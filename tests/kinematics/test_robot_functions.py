@@ -20,7 +20,7 @@ def _draw(robot, size, seed=1):
     rng = np.random.default_rng(seed)
     errors = size * rng.normal(size=len(robot_functions(robot).errors.names))
     drives = robot.drive_zero + 0.03 * rng.normal(size=len(robot.drives))
-    passive = robot.zero[robot.passive_index]
+    passive = robot.reference_passive
     return errors, drives, passive + 0.3 * rng.normal(size=passive.size)
 
 

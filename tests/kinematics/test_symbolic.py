@@ -166,7 +166,7 @@ def test_closure_residual_equals_pinocchios_constraint_error(request, robot):
         errors = size * rng.normal(size=len(names))
         with_errors = r.with_errors(dict(zip(names, errors, strict=True)))
         d = r.drive_zero + 0.05 * rng.normal(size=len(r.drives))
-        p = r.zero[r.passive_index] + 0.3 * rng.normal(size=r.passive_index.size)
+        p = r.reference_passive + 0.3 * rng.normal(size=r.passive_index.size)
         residual, jacobian = with_errors.evaluate_constraints(d, p)
         ours, slope = (np.asarray(v) for v in function(d, p, errors))
         assert np.abs(ours.ravel() - residual).max() < KINEMATICS

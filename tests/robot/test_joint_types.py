@@ -83,7 +83,7 @@ def test_a_closed_robot_with_them_is_pinocchios_in_casadi_too(tmp_path, kind):
     robot = load_robot(write_ball_platform(tmp_path / "balls", kind))
     rng = np.random.default_rng(5)
     drives = robot.drive_zero + 0.1 * rng.normal(size=2)
-    passive = robot.zero[robot.passive_index] + 0.3 * rng.normal(size=robot.passive_index.size)
+    passive = robot.reference_passive + 0.3 * rng.normal(size=robot.passive_index.size)
     residual, jacobian = robot.evaluate_constraints(drives, passive)
     assert_derivative(
         jacobian[:, robot.passive_index],

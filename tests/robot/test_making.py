@@ -45,7 +45,7 @@ def test_a_machine_of_other_sizes_moves_as_the_papers_equations_say(tmp_path, si
     assert [(d.lower, d.upper) for d in robot.drives] == [(sizes.lower, sizes.upper)] * 3
     leg = robot.legs["y"]
     assert (leg.length, leg.rods["b"].radius) == pytest.approx((sizes.leg, sizes.rod_radius))
-    apart = np.linalg.norm(leg.rods["a"].zero_root - leg.rods["b"].zero_root)
+    apart = np.linalg.norm(leg.rods["a"].reference_root - leg.rods["b"].reference_root)
     assert apart == pytest.approx(sizes.rods_apart)
 
 

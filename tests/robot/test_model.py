@@ -53,7 +53,7 @@ def test_joint_axes_and_origins_are_those_of_the_design(orthoglide):
 def test_closures_are_pinocchio_constraint_models(orthoglide):
     kinds = [type(c).__name__ for c in orthoglide.constraints]
     assert kinds == ["PointAnchorConstraintModel"] * 3 + ["FrameAnchorConstraintModel"] * 2
-    passive = orthoglide.zero[orthoglide.passive_index]
+    passive = orthoglide.reference_passive
     residual, _ = orthoglide.evaluate_constraints(orthoglide.drive_zero, passive)
     assert np.abs(residual).max() < KINEMATICS
 
@@ -63,7 +63,7 @@ def test_constraint_jacobians_are_derivatives(request, name):
     robot = request.getfixturevalue(name)
     rng = np.random.default_rng(0)
     drives = robot.drive_zero + 0.02 * rng.normal(size=len(robot.drives))
-    passive = robot.zero[robot.passive_index] + 0.2 * rng.normal(size=robot.passive_index.size)
+    passive = robot.reference_passive + 0.2 * rng.normal(size=robot.passive_index.size)
     _, jacobian = robot.evaluate_constraints(drives, passive)
     assert_derivative(
         jacobian[:, robot.passive_index],
@@ -108,7 +108,7 @@ def test_frame_errors_move_the_frames_that_hang_on_them(orthoglide):
 
 def test_an_offset_moves_the_slider_by_itself(orthoglide):
     moved = orthoglide.with_errors({"y_slide.offset": 0.002})
-    data, q = moved.model.createData(), moved.configuration(moved.zero)
+    data, q = moved.model.createData(), moved.configuration(moved.reference_posture)
     pin.framesForwardKinematics(moved.model, data, q)
     slider = data.oMf[moved.frame_id("y_slider")].translation
     assert np.abs(slider - [0.0, 0.31225, 0.0]).max() < KINEMATICS
@@ -116,7 +116,7 @@ def test_an_offset_moves_the_slider_by_itself(orthoglide):
 
 def test_read_only_arrays_cannot_be_written_to(orthoglide):
     with pytest.raises(ValueError, match="read-only"):
-        orthoglide.zero[0] = 1.0
+        orthoglide.reference_posture[0] = 1.0
 
 
 def test_the_same_files_give_the_same_robot_until_one_is_changed(root, tmp_path):

@@ -160,7 +160,7 @@ def test_a_folder_that_cannot_be_made_stops_nothing(tmp_path, monkeypatch):
 
 def test_functions_that_were_kept_are_those_that_are_built(folder):
     built = RobotFunctions(load_afresh("orthoglide"))
-    where = built.robot.drive_zero[None], built.robot.zero[built.robot.passive_index][None]
+    where = built.robot.drive_zero[None], built.robot.reference_passive[None]
     where = (*where, built.errors.placements(np.full(len(built.errors.names), 1e-3)))
     expected = built.closure_jacobian(*where)
     assert list(folder.glob("*.kept"))

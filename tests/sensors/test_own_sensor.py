@@ -253,7 +253,7 @@ value = compile_reading(robot, own.Own("x", 1e-3, None)).value
 from orthocal.kinematics.robot_functions import robot_functions
 errors = robot_functions(robot).errors
 zero = errors.placements(np.zeros(len(errors.names)))
-h, = value(robot.drive_zero[None] + 0.01, robot.zero[robot.passive_index][None], zero,
+h, = value(robot.drive_zero[None] + 0.01, robot.reference_passive[None], zero,
            robot.drive_zero[None], np.array([[1.0, 0.0, 0.0]]), np.zeros((1, 1)))
 print(float(h[0, 0]))
 """

@@ -92,7 +92,7 @@ def test_readings_are_those_of_solids_that_touch(tmp_path, tip, rod):
         )
         d = np.eye(3)[AXES.index(setup.sensor.direction)]
         side = np.cross(leg.axis, d)
-        zero = 0.5 * (leg.rods[rod].zero_root + leg.rods[rod].zero_tip)
+        zero = 0.5 * (leg.rods[rod].reference_root + leg.rods[rod].reference_tip)
         offset = TRUTH[f"{leg.name}_slide.offset"] * -leg.axis
         c = zero + (offset @ leg.axis) * leg.axis + beside[i] * side
         centre, unit = c + found[i] * d, (end - root) / np.linalg.norm(end - root)

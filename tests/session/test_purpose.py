@@ -132,4 +132,4 @@ def test_later_ones_come_on_top(orthoglide):
     parameters = parameters.with_tolerances({"*.offset_mm": 0.5})
     assert {parameters[f"{a}_slide.offset"].tolerance for a in "xyz"} == {0.5e-3}
     assert parameters.own is orthoglide.parameters
-    assert parameters.idle == orthoglide.parameters.idle
+    assert parameters.redundant == orthoglide.parameters.redundant

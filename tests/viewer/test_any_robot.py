@@ -61,7 +61,7 @@ def robot(request, tmp_path):
 def test_links_are_where_pinocchio_places_them(robot):
     scene = draw_scene(robot)
     data = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, data, robot.configuration(robot.zero))
+    pin.framesForwardKinematics(robot.model, data, robot.configuration(robot.reference_posture))
     drawn = {p.split("/")[1] for p in scene.nodes if p.startswith(f"{drawing.MACHINE}/")}
     assert drawn == {f.name for f in robot.model.frames if f.type == pin.FrameType.BODY}
     for link in drawn:
@@ -83,7 +83,7 @@ def test_every_drive_moves_within_the_size_of_the_machine(robot):
 
 def test_computed_zeros_and_free_motions_are_stated(robot):
     facts = " ".join(draw_scene(robot).facts)
-    found = [d.name for d in robot.drives if d.zero_found]
+    found = [d.name for d in robot.drives if d.zero_computed]
     assert ("Computed by closing the loops" in facts) == bool(found)
     assert all(name in facts for name in found)
     free = count_free_motions(robot)
@@ -91,7 +91,7 @@ def test_computed_zeros_and_free_motions_are_stated(robot):
 
 
 def test_only_the_wide_linkage_has_a_computed_zero(tmp_path):
-    found = {n: load_robot(w(tmp_path / n)).drives[0].zero_found for n, w in ROBOTS.items()}
+    found = {n: load_robot(w(tmp_path / n)).drives[0].zero_computed for n, w in ROBOTS.items()}
     assert [name for name, moved in found.items() if moved] == ["wide"]
 
 

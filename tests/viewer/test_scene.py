@@ -108,7 +108,7 @@ def animation(scene):
 
 def test_nominal_links_are_where_pinocchio_places_them(orthoglide):
     scene = draw_scene(orthoglide)
-    zero = placed(orthoglide, orthoglide.drive_zero, orthoglide.zero[orthoglide.passive_index])
+    zero = placed(orthoglide, orthoglide.drive_zero, orthoglide.reference_passive)
     drawn = links(scene, drawing.MACHINE)
     assert {"base", "x_slider", "y_rod_a", "z_rod_b", "platform"} <= drawn
     for link in drawn:
@@ -188,7 +188,7 @@ def test_active_offsets_move_the_ghost(root):
     scene = draw_scene(calibrate(active), posture="x_max")
     robot = session.robot
     drives = session.postures["x_max"].drives
-    passive = robot.close_with_pinocchio(drives, robot.zero[robot.passive_index])
+    passive = robot.close_with_pinocchio(drives, robot.reference_passive)
     target = placed(robot, drives, passive)["platform"]
     ghost = world(scene, f"{drawing.GHOST}/platform")
     assert np.abs(ghost - target).max() < 1e-11
@@ -241,7 +241,7 @@ def test_gauges_touch_the_leg_at_their_section(scene, calibration):
         off = tip - line[:3, 3]
         assert np.linalg.norm(off - (off @ along) * along) < KINEMATICS
         leg = calibration.robot.legs[setup.sensor.leg]
-        plane = leg.axis @ leg.zero_root + setup.sensor.section.value * leg.length
+        plane = leg.axis @ leg.reference_root + setup.sensor.section.value * leg.length
         assert leg.axis @ tip == pytest.approx(plane, abs=KINEMATICS)
         stem = scene.pose(f"{readings.GAUGES}/{setup.name}")[:3, 2]
         assert stem == pytest.approx(np.array(DIRECTIONS[setup.sensor.direction]))
@@ -449,7 +449,7 @@ def test_legend_names_existing_nodes(scene):
 def test_robots_without_visuals_are_drawn_as_sticks(root, name):
     robot = load_robot(root / "tests/robots" / name)
     scene = draw_scene(robot)
-    zero = placed(robot, robot.drive_zero, robot.zero[robot.passive_index])
+    zero = placed(robot, robot.drive_zero, robot.reference_passive)
     drawn = links(scene, drawing.MACHINE)
     assert drawn == {*zero}
     for link in drawn:

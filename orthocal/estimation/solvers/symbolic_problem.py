@@ -196,7 +196,7 @@ class SymbolicProblem:
             )
             for u, q in (
                 (command, passive * problem.passive_scale),
-                (reference, ca.SX(robot.zero[robot.passive_index])),
+                (reference, ca.SX(robot.reference_passive)),
             )
         )
         setups = list(problem.session.setups.values())

@@ -28,7 +28,7 @@ def require_given_zero(robot: Robot, where: str) -> None:
         f"{d.name}.zero_{unit} ({d.zero / size:.6g} was found)"
         for d in robot.drives
         for unit, size in [DRIVE_UNITS[d.unit]]
-        if d.zero_found
+        if d.zero_computed
     ]
     if found:
         raise SessionError(

@@ -158,7 +158,7 @@ def _state_zero(robot: Robot) -> list[str]:
         for d in robot.drives
     )
     facts = [f"Mechanical zero: {drives}."]
-    computed = [d.name for d in robot.drives if d.zero_found]
+    computed = [d.name for d in robot.drives if d.zero_computed]
     if computed:
         facts.append(f"Computed by closing the loops: the zero of {', '.join(computed)}.")
     free = count_free_motions(robot)

@@ -40,7 +40,7 @@ def point(program, problem, size, seed=0):
     functions = program.functions()
     n = functions["nlp"].size1_in(0)
     x = size * rng.normal(size=n)
-    passive = np.tile(problem.robot.zero[problem.robot.passive_index], problem.n_states)
+    passive = np.tile(problem.robot.reference_passive, problem.n_states)
     scale = np.tile(problem.passive_scale, problem.n_states)
     x[n - passive.size :] += passive / scale + 5.0 * rng.normal(size=passive.size)
     return x, program.pack(sigma=2e-4, left_out=[1, 4])

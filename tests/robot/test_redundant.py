@@ -43,7 +43,7 @@ def effects(orthoglide):
 
 
 def test_idle_errors_change_nothing_and_all_others_do(orthoglide, effects):
-    idle = orthoglide.parameters.idle
+    idle = orthoglide.parameters.redundant
     for name, size in effects.items():
         if name in idle:
             assert size < 1e-6, name
@@ -52,7 +52,7 @@ def test_idle_errors_change_nothing_and_all_others_do(orthoglide, effects):
 
 
 def test_hinges_take_up_errors_about_their_own_axes(orthoglide):
-    idle = orthoglide.parameters.idle
+    idle = orthoglide.parameters.redundant
     assert {f"{k}_{j}" for k in "xyz" for j in ("swivel.rz", "bar_a.ry", "wrist.rz")} <= idle
     assert {f"frame.{k}_crossbar_end.rx" for k in "xyz"} <= idle
     assert not any(n.endswith((".offset", ".scale")) for n in idle)
@@ -64,7 +64,7 @@ def test_the_complete_model_is_the_parts_errors_without_idle_ones(orthoglide):
     full = p.select_model("full")
     assert len(p.select(JOINTS)) == 126
     assert len(p.of_parts) == 126 + 8 * 6 + 3
-    assert set(full) == set(p.of_parts) - p.idle
+    assert set(full) == set(p.of_parts) - p.redundant
     assert len(full) == 129
     assert not any(
         n.endswith(".length") or n.startswith(("frame.tcp", "frame.x_leg")) for n in full
@@ -72,11 +72,11 @@ def test_the_complete_model_is_the_parts_errors_without_idle_ones(orthoglide):
 
 
 def test_a_robot_that_nothing_is_seen_of_has_no_idle_errors(fivebar, biglide):
-    assert fivebar.parameters.idle == frozenset()
+    assert fivebar.parameters.redundant == frozenset()
     # two drives on one rail each: only what leaves the plane is taken up by nothing
     assert biglide.parameters.complete
     assert set(biglide.parameters.complete) == set(biglide.parameters.of_parts) - set(
-        biglide.parameters.idle
+        biglide.parameters.redundant
     )
 
 

@@ -45,24 +45,26 @@ def closes_by_newton(robot, passive):
 def test_loops_that_newton_does_not_close_are_closed(tmp_path):
     robot = load_robot(write_crooked_loop(tmp_path / "crooked"))
     assert not closes_by_newton(robot, np.zeros(robot.passive_index.size))
-    assert gap(robot, robot.zero) < CLOSED
+    assert gap(robot, robot.reference_posture) < CLOSED
     assert robot.drive_zero.tolist() == [0.0]
-    assert not robot.drives[0].zero_found
-    passive = robot.zero[robot.passive_index]
+    assert not robot.drives[0].zero_computed
+    passive = robot.reference_passive
     assert np.abs(LoopClosure(robot).close([[0.0]])[0] - passive).max() < CLOSED
 
 
 def test_the_same_zero_is_found_every_time(tmp_path):
     folder = write_wide_linkage(tmp_path / "wide")
-    assert np.array_equal(load_robot(folder).zero, load_robot(folder).zero)
+    assert np.array_equal(
+        load_robot(folder).reference_posture, load_robot(folder).reference_posture
+    )
 
 
 def test_drives_without_a_zero_are_moved_until_the_loops_close(tmp_path):
     """Not much further than to where the rods first meet, and clear of that singular posture."""
     robot = load_robot(write_wide_linkage(tmp_path / "wide"))
-    assert gap(robot, robot.zero) < CLOSED
-    assert all(d.zero_found for d in robot.drives)
-    assert np.array_equal(robot.drive_zero, robot.zero[robot.drive_index])
+    assert gap(robot, robot.reference_posture) < CLOSED
+    assert all(d.zero_computed for d in robot.drives)
+    assert np.array_equal(robot.drive_zero, robot.reference_posture[robot.drive_index])
     # elbows at least 0.6 apart until both cranks are at 90 degrees
     assert np.pi / 2 < np.abs(robot.drive_zero).max() < 0.9 * np.pi
     assert count_free_motions(robot) == 0
@@ -74,8 +76,8 @@ def test_a_given_zero_is_kept(tmp_path):
     extra = "  drives: {motor_a: {zero_deg: 150}}\n"
     robot = load_robot(write_wide_linkage(tmp_path / "wide", extra))
     assert robot.drives[0].zero == np.deg2rad(150)
-    assert [d.zero_found for d in robot.drives] == [False, True]
-    assert gap(robot, robot.zero) < CLOSED
+    assert [d.zero_computed for d in robot.drives] == [False, True]
+    assert gap(robot, robot.reference_posture) < CLOSED
 
 
 def test_a_drive_that_cannot_be_at_0_stands_at_its_nearest_limit(tmp_path):
@@ -83,7 +85,7 @@ def test_a_drive_that_cannot_be_at_0_stands_at_its_nearest_limit(tmp_path):
     slide = joint("slide", "base", (0, 0, 0), "x", kind="prismatic", limit=limit)
     robot = make_robot(tmp_path / "s", slide, "closed_loop: []\ntype: []\nname_mot: [slide]\n")
     assert robot.drives[0].zero == 0.12
-    assert robot.drives[0].zero_found
+    assert robot.drives[0].zero_computed
 
 
 def test_given_zeros_at_which_loops_stay_open_are_refused_with_how_far(tmp_path):
@@ -120,7 +122,7 @@ def test_the_limits_of_joints_hold_in_a_zero_that_is_found(tmp_path):
     folder = write_wide_linkage(tmp_path / "wide", half=0.15)
     free = load_robot(folder)
     elbow = free.model.joints[free.model.getJointId("elbow_a")].idx_v
-    angle = float(free.zero[elbow])
+    angle = float(free.reference_posture[elbow])
     urdf = folder / "wide.urdf"
     text = urdf.read_text()
     start = text.index('<joint name="elbow_a"')
@@ -129,8 +131,8 @@ def test_the_limits_of_joints_hold_in_a_zero_that_is_found(tmp_path):
     head, tail = text[:start], text[start:]
     urdf.write_text(head + tail.replace(FREE, limit, 1))
     other = load_robot(folder)
-    assert float(wanted) <= other.zero[elbow] <= float(wanted) + 2.95
-    assert gap(other, other.zero) < CLOSED
+    assert float(wanted) <= other.reference_posture[elbow] <= float(wanted) + 2.95
+    assert gap(other, other.reference_posture) < CLOSED
 
 
 def test_a_posture_beyond_the_limits_of_a_joint_names_it(tmp_path):
@@ -141,13 +143,13 @@ def test_a_posture_beyond_the_limits_of_a_joint_names_it(tmp_path):
     limit = '<limit lower="2.9" upper="3" effort="1" velocity="1"/>'
     load_robot(folder)
     urdf.write_text(head + start + tail.replace(FREE, limit, 1))
-    with pytest.raises(RobotError, match=r"apart by \S+ mm \(one closes beyond the limits of elb"):
+    with pytest.raises(RobotError, match=r"apart by \S+ mm \(one closes outside the limits of elb"):
         load_robot(folder)
 
 
 def test_passive_joints_are_without_whole_turns(tmp_path):
     robot = load_robot(write_crooked_loop(tmp_path / "crooked"))
-    assert np.abs(robot.zero).max() <= np.pi
+    assert np.abs(robot.reference_posture).max() <= np.pi
 
 
 def test_free_motions_are_counted(tmp_path, orthoglide, fivebar):
@@ -171,26 +173,26 @@ def test_free_motions_are_counted(tmp_path, orthoglide, fivebar):
 def test_loops_that_leave_motions_free_close_for_the_eye_only(tmp_path):
     """The 6d loop of a robot with two balls: more joints than rows."""
     robot = load_robot(write_ball_platform(tmp_path / "balls"))
-    assembly = LoopClosure(robot)
+    solver = LoopClosure(robot)
     assert robot.passive_index.size > robot.closure_rows
     with pytest.raises(ClosureError, match="is singular: the drives leave"):
-        assembly.close(robot.drive_zero)
+        solver.close(robot.drive_zero)
     drives = robot.drive_zero + np.array([[0.1, -0.05], [-0.2, 0.1]])
-    for d, passive in zip(drives, assembly.close(drives, allow_free=True), strict=True):
+    for d, passive in zip(drives, solver.close(drives, allow_free=True), strict=True):
         residual, _ = robot.evaluate_constraints(d, passive)
         assert np.abs(residual).max() < CLOSED
 
 
 def test_an_open_posture_says_mm_and_mrad(orthoglide):
     with pytest.raises(ClosureError, match=r"does not close: open by \S+ mm( and \S+ mrad)?$"):
-        orthoglide.close_with_pinocchio([0.9, 0.3, 0.3], orthoglide.zero[orthoglide.passive_index])
+        orthoglide.close_with_pinocchio([0.9, 0.3, 0.3], orthoglide.reference_passive)
     far = np.array([0.9, 0.3, 0.3])
     with pytest.raises(ClosureError, match=r"open by \S+ mm( and \S+ mrad)?, \d+% of the way"):
         LoopClosure(orthoglide).close(far)
 
 
 def test_a_found_zero_is_where_pinocchio_says(tmp_path):
-    """The assembly, which is CasADi's, starts from the zero that Pinocchio's models closed."""
+    """The loop closure solver starts from the posture that Pinocchio's models closed."""
     robot = load_robot(write_wide_linkage(tmp_path / "wide"))
     passive = LoopClosure(robot).close(robot.drive_zero)
-    assert np.abs(passive - robot.zero[robot.passive_index]).max() < KINEMATICS
+    assert np.abs(passive - robot.reference_passive).max() < KINEMATICS
