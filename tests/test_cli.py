@@ -172,7 +172,7 @@ def test_what_is_to_be_reviewed_exits_3_with_all_that_was_asked_for(orthocal, ro
     assert document["findings"][0]["places"][0]["setup"] == "zx"
     code, out, _ = orthocal("calibrate", session, "--details")
     assert code == 3
-    assert "What was identified" in out
+    assert "Parameters" in out
 
 
 def test_the_printed_json_holds_what_the_file_holds_and_the_decision(
@@ -195,9 +195,8 @@ def test_details_and_all_print_the_rest(orthocal, experiment):
     _, details, _ = orthocal("calibrate", experiment, "--details")
     _, everything, _ = orthocal("calibrate", experiment, "--all")
     assert len(short.splitlines()) <= 40
-    assert "Readings before and after" not in short
-    assert "Readings before and after" in details
-    assert "studentised" in everything
+    assert "studentised" not in short
+    assert "studentised" in details
     assert len(everything) > len(details) > len(short)
 
 
@@ -302,7 +301,7 @@ def test_base_parameters_and_hubers_loss_by_option(orthocal, root):
     )  # fmt: skip
     assert code == 0
     assert "3 base parameters, no prior, Huber's loss" in out
-    assert "stands for" in out
+    assert "represents" in out
 
 
 def test_validate_holds_experiment_3_against_2(orthocal, calibrated, experiment):

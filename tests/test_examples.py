@@ -138,9 +138,9 @@ CALIBRATE = f"calibrate {EXPERIMENT}"
     [
         ("README.md", "Calibration of orthoglide", f"{CALIBRATE} --out out/experiment-2"),
         ("docs/results.md", "Calibration of orthoglide", f"{CALIBRATE} --out out/experiment-2"),
-        ("docs/results.md", "What was identified\n", f"{CALIBRATE} --details"),
-        ("docs/results.md", "At the tool\n", f"{CALIBRATE} --details"),
-        ("docs/results.md", "Recommendation\n", f"compare {EXPERIMENT}"),
+        ("docs/results.md", "Parameters\n", f"{CALIBRATE} --details"),
+        ("docs/results.md", "Tool error\n", f"{CALIBRATE} --details"),
+        ("docs/results.md", "Findings\n", f"compare {EXPERIMENT}"),
         (
             "docs/planning.md",
             "Expected tool error",

@@ -145,6 +145,11 @@ class Decision:
     """What to do next; empty if nothing."""
 
     @property
+    def words(self) -> str:
+        """Headline, reason and action in one paragraph."""
+        return " ".join(t for t in (self.headline, self.reason, self.action) if t)
+
+    @property
     def exit_code(self) -> int:
         """0 for enter, 3 for review and reject."""
         return EXIT_CODES[self.verdict]

@@ -39,7 +39,7 @@ def judgement_on_failure(session: Session, *, json: bool) -> Iterator[None]:
     except (SolverError, ClosureError) as failure:
         from orthocal.assessment.assess import check_session
         from orthocal.output.text.answer import print_decision
-        from orthocal.output.text.printed_json import printed_assessment
+        from orthocal.output.text.summary import result_json
 
         try:
             assessment = check_session(session)
@@ -49,7 +49,7 @@ def judgement_on_failure(session: Session, *, json: bool) -> Iterator[None]:
             raise
         put_note(f"orthocal: {failure}")
         deliver(
-            partial(printed_assessment, assessment),
+            partial(result_json, assessment),
             partial(print_decision, assessment),
             json=json,
             decision=assessment.decision,
@@ -129,12 +129,7 @@ def calibrate(
     from orthocal.estimation.selection import read_bounds, read_known, read_tolerances
     from orthocal.io.files import require_writable
     from orthocal.measurement.joining import join_sessions
-    from orthocal.output.text.summary import print_summary
-
-    def document() -> str:
-        from orthocal.output.text.printed_json import printed_calibration
-
-        return printed_calibration(result)
+    from orthocal.output.text.summary import print_summary, result_json
 
     def files() -> dict[str, str]:
         from orthocal.calibration.file import calibration_json
@@ -163,7 +158,7 @@ def calibrate(
             profile=split_globs(profile),
         )
     deliver(
-        document,
+        partial(result_json, result),
         partial(print_summary, result, details=details, all_rows=all_rows, saved=out),
         json=json,
         out=out,

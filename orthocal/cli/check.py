@@ -20,11 +20,11 @@ def check(sessions: SessionPaths, json: Json = False) -> None:
     from orthocal.assessment.assess import check_session
     from orthocal.measurement.joining import join_sessions
     from orthocal.output.text.answer import print_decision
-    from orthocal.output.text.printed_json import printed_assessment
+    from orthocal.output.text.summary import result_json
 
     assessment = check_session(join_sessions(load_each_once(sessions)))
     deliver(
-        partial(printed_assessment, assessment),
+        partial(result_json, assessment),
         partial(print_decision, assessment),
         json=json,
         decision=assessment.decision,

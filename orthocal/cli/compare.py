@@ -39,8 +39,7 @@ def compare(
     from orthocal.assessment.comparison import compare_models
     from orthocal.estimation.selection import read_tolerances
     from orthocal.measurement.joining import join_sessions
-    from orthocal.output.text.printed_json import printed_comparison
-    from orthocal.output.text.summary import print_summary
+    from orthocal.output.text.summary import print_summary, result_json
 
     loaded = load_each_once(sessions)
     parameters = loaded[0].robot.parameters
@@ -52,7 +51,7 @@ def compare(
             repeat=load_each_once(repeat) if repeat else None,
         )
     deliver(
-        partial(printed_comparison, comparison),
+        partial(result_json, comparison),
         partial(print_summary, comparison, all_rows=all_rows),
         json=json,
         decision=comparison.assessment.decision,

@@ -36,7 +36,8 @@ def record(
         Path,
         typer.Argument(
             metavar="SESSION",
-            help="session.yaml of a plan, with an empty readings.csv or none, or its folder.",
+            help="session.yaml of a plan, with an empty readings.csv or none, or the directory "
+            "that contains it.",
         ),
     ],
 ) -> None:

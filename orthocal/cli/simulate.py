@@ -33,7 +33,8 @@ def simulate(
         str | None,
         Option(
             metavar="MODEL|GLOBS",
-            help="Draw random errors within their tolerances: a model, or names and globs.",
+            help="Draw normally distributed errors by their tolerances: of a model, or of names "
+            "and globs.",
         ),
     ] = None,
     tolerance: Tolerances = None,

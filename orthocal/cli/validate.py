@@ -33,14 +33,13 @@ def validate(
     from orthocal.assessment.validation import validate_calibration
     from orthocal.calibration.file import load_calibration
     from orthocal.measurement.joining import join_sessions
-    from orthocal.output.text.printed_json import printed_validation
-    from orthocal.output.text.summary import print_summary
+    from orthocal.output.text.summary import print_summary, result_json
 
     before, loaded = load_calibration(calibration), load_each_once(sessions)
     with judgement_on_failure(join_sessions(loaded), json=json):
         validation = validate_calibration(before, loaded)
     deliver(
-        partial(printed_validation, validation),
+        partial(result_json, validation),
         partial(print_summary, validation, all_rows=all_rows),
         json=json,
         decision=validation.assessment.decision,

@@ -137,7 +137,7 @@ def require_entering(calibration: Calibration) -> None:
     """
     decision = assessment_of(calibration).decision
     if decision.verdict != "enter":
-        raise ExportError(f"{decision.headline} {decision.reason} {decision.action}".strip())
+        raise ExportError(decision.words)
 
 
 def warn_against_verdict(calibration: Calibration) -> str:

@@ -28,7 +28,7 @@ from orthocal import (
 )
 from orthocal.assessment.judgement import judge_session
 from orthocal.calibration.assessment_record import EXIT_CODES, Finding, FindingKind, Severity
-from orthocal.output.text.printed_json import printed_calibration, printed_validation
+from orthocal.output.text.summary import result_json
 
 UNITS = ("_mm", "_um", "_mrad", "_deg")
 
@@ -158,7 +158,7 @@ def test_the_judgement_does_not_depend_on_the_model(cases, case):
 def test_findings_have_known_kinds_units_and_load_again(cases, tmp_path):
     for case, (session, _) in cases.items():
         calibration = calibrate(session, solver="eliminated")
-        document = json.loads(printed_calibration(calibration))
+        document = json.loads(result_json(calibration))
         for finding in document["findings"]:
             assert finding["kind"] in get_args(FindingKind)
             assert finding["severity"] in get_args(Severity)
@@ -271,7 +271,7 @@ def test_a_validation_is_decided(table1, plan):
     (cause,) = found.of_kind("offsets not entered")
     assert {p.parameter for p in cause.places} == {"x_slide", "y_slide", "z_slide"}
     assert cause.numbers["x_slide_active_mm"] == 0.0
-    document = json.loads(printed_validation(refused))
+    document = json.loads(result_json(refused))
     assert document["decision"]["verdict"] == "review"
     assert document["mistake"]["kind"] == "offsets not entered"
     few = tuple(r for r in table1["2"].readings if r.setup in ("yx", "xy", "xz"))

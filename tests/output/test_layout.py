@@ -10,7 +10,7 @@ import pytest
 from orthocal import calibrate, validate_calibration
 from orthocal.assessment.comparison import compare_models
 from orthocal.output.text.layout import add_row, table_of, to_text
-from orthocal.output.text.summary import _render
+from orthocal.output.text.summary import render_result
 
 NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?")
 
@@ -31,7 +31,7 @@ def results(experiment_2):
 @pytest.mark.parametrize("details", [True, False], ids=["details", "answer"])
 @pytest.mark.parametrize("name", ["offsets", "full", "validation", "comparison"])
 def test_no_number_is_cut_however_narrow_it_gets(name, details, width, results):
-    content = _render(results[name], details, details)
+    content = render_result(results[name], details=details, all_rows=details)
     wide, narrow = to_text(content, width=400), to_text(content, width=width)
     assert max(len(line) for line in narrow.splitlines()) <= width
     assert not re.search(r"\d…|\.…", narrow)

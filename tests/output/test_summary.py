@@ -38,23 +38,22 @@ def test_every_reading_is_listed_before_and_after(table1):
         "-0.6",
         "0.6",
     ]
-    assert line(text, "r.m.s.").split()[-3:] == ["0.622", "0.195", "-69%"]
+    assert line(text, "RMS [mm]").split()[-3:] == ["0.622", "0.195", "-69%"]
     assert line(text, "largest").split()[-3:] == ["1.140", "0.278", "-76%"]
 
 
 def test_sigma_is_held_against_the_gauges_own(table1):
     text = " ".join(summarize(table1, details=True).split())
     assert "σ of a difference: 0.276 mm, from the residuals, 3 degrees of freedom" in text
-    assert "σ given for the gauge: 0.020 mm a reading, 0.028 mm a difference" in text
+    assert "σ stated for the gauge: 0.020 mm a reading, 0.028 mm a difference" in text
     (found,) = table1.assessment.of_kind("model error")
     assert found.numbers["ratio"] == pytest.approx(10.0, abs=0.3)
     assert found.text in text
 
 
-def test_it_says_what_to_type_and_what_to_believe(table1):
+def test_details_list_the_values_to_enter_and_significant_changes(table1):
     text = summarize(table1, details=True)
-    entered = text[text.index("What to enter into the controller") :]
-    assert line(entered, "z_slide").split() == [*("z_slide", "+0.000", "-1.761", "1.414", "mm")]
+    assert line(text, "z_slide").split() == [*("z_slide", "+0.000", "-1.761", "1.414", "mm")]
     (found,) = table1.assessment.of_kind("must change")
     assert [p.parameter for p in found.places] == ["z_slide"]
     assert found.text in text
@@ -124,7 +123,7 @@ def test_a_prior_marks_what_the_readings_leave_open(root):
     text = summarize(result, details=True)
     assert line(text, "x_leg.length").split()[4] == "0%"
     assert line(text, "x_slide.offset").split()[4] == "99%"
-    assert "resolved: part of the prior variance that the readings removed" in text
+    assert "resolved: share of the prior variance that the readings remove" in text
     assert "tolerances as prior" in text
 
 

@@ -136,7 +136,7 @@ def test_the_same_seed_gives_the_same_plan_in_python(orthoglide):
     again = plan_readings(orthoglide, "full", equipment=equipment, starts=1, seed=3)
     assert isinstance(plan, MeasuringPlan)
     assert "Expected tool error: " in summarize(plan)
-    assert "Largest remaining errors" in summarize(plan, details=True)
+    assert "Largest contributions" in summarize(plan, details=True)
     assert [r.posture for r in plan.session.readings] == [r.posture for r in again.session.readings]
 
 
@@ -201,7 +201,7 @@ def test_each_criterion_is_better_met_by_its_own_plan(orthoglide, for_the_headli
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["nowhere"], "nowhere: there is no such file or folder"),
+        (["nowhere"], "nowhere: there is no such file or directory"),
         (["orthoglide", "--add", 2], "--add: needs a session; found a robot"),
         (["orthoglide", "--criterion", "F"], "--criterion: found 'F'; expected one of aligned,"),
         (["orthoglide", "--box", "-10"], "--box: found '-10'; expected half the side of a cube"),

@@ -1,7 +1,6 @@
-"""The report of a calibration: a page with the values to enter, their accuracy, and the reasons.
+"""Report of a calibration: a page with the values to enter, their accuracy, and the reasons.
 
-The order is that of mrcal's tour: accuracy of the tool, fit of the model, residuals, and then
-everything else. The page is self-contained and needs no network.
+The page is self-contained and needs no network.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from pathlib import Path
 from rich.console import Group
 
 from orthocal.arguments import require_kind
-from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, OrthocalError, RobotError
@@ -30,15 +28,16 @@ from orthocal.output.report.tool_map import Field, plot_tool_map
 from orthocal.output.scene.drawing import draw_scene
 from orthocal.output.text.accuracy import render_tool
 from orthocal.output.text.answer import render_answer
-from orthocal.output.text.entries import entry_table, render_meaning
-from orthocal.output.text.heading import render_heading
-from orthocal.output.text.layout import bullets, mm, plain, signed, to_markup
-from orthocal.output.text.sensors import render_parts
+from orthocal.output.text.entries import render_values
+from orthocal.output.text.heading import render_method, render_subject
+from orthocal.output.text.layout import mm, plain, signed, to_markup
 from orthocal.output.text.tables import (
+    render_findings,
     render_fit,
     render_identifiability,
     render_parameters,
-    render_residuals,
+    render_readings,
+    render_sensors,
 )
 from orthocal.units import MM
 from orthocal.viewer.scene import frame_of
@@ -54,26 +53,25 @@ MOST_NAMED = 9
 
 GLOSSARY = (
     "σ: standard deviation of one reading. It comes from repeated cycles, else from the residuals, "
-    "else from the gauge as stated. by noise: the part of ± that is due to the noise of the "
-    "readings.",
-    "tolerance: prior standard deviation of an error, from the robot's YAML or --tolerance. told: "
-    "share of the prior uncertainty that the readings removed.",
+    "else from the gauge as stated.",
+    "tolerance: prior standard deviation of an error, from the robot's YAML or --tolerance.",
+    "resolved: share of the prior variance that the readings remove.",
     "before: measured less nominal with the active offsets. after: measured less calibrated. Both "
     "use the best gauge zeros.",
     "predicted: readings of a setup, predicted from all other setups.",
     "studentised: deviation of a reading from its prediction by all other readings, divided by its "
-    "own standard deviation. moves by: largest change of a parameter without this reading, in its "
-    "standard deviation.",
-    "shift and rotation taken out: the error after the best alignment of the workpiece on the "
-    "machine, which removes one shift and one rotation of the workspace.",
-    "not known before: uncertainty of the tool position with every error at its tolerance. after: "
-    "the uncertainty with the readings. worst point: the largest standard deviation in the "
+    "standard deviation. influence: largest change of a parameter without this reading, in the "
+    "standard deviation of the parameter.",
+    "workpiece aligned on the machine: tool error after the best alignment, which removes one "
+    "translation and one rotation of the workspace.",
+    "uncertainty before calibration: standard deviation of the tool position with every error at "
+    "its tolerance. After calibration: with the readings. worst point: the largest value in the "
     "workspace.",
     "combination: a direction in parameter space. It is identifiable if a change by its prior "
-    "standard deviation moves the readings by more than their noise. Condition number and "
-    "observability O1 to O5 are the usual indices of identifiability.",
+    "standard deviation changes the readings by more than their noise. Condition number and "
+    "observability indices O1 to O5 are measures of identifiability.",
 )
-"""Terms of the report that a machine builder may not know."""
+"""Terms of the report."""
 
 
 def build_report(calibration: Calibration) -> str:
@@ -84,26 +82,26 @@ def build_report(calibration: Calibration) -> str:
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     title = f"Calibration of {calibration.robot_record.name}: {calibration.session.title}"
-    sensors = "".join(to_markup(part) for part in render_parts(calibration))
+    sensors = render_sensors(calibration)
     sections = [
-        ("verdict", "Values to enter", _verdict(calibration)),
+        ("verdict", "Verdict", _verdict(calibration)),
         ("tool", "Tool error", _tool(calibration)),
-        ("fit", "Fit of the model", _fit(calibration)),
-        ("residuals", "Readings before and after, the worst first", _residuals(calibration)),
+        ("fit", "Residuals", _fit(calibration)),
+        ("residuals", "Readings", _readings(calibration)),
         ("parameters", "Parameters", _parameters(calibration)),
-        *([("sensors", "Gauges and sensors", sensors)] if sensors else []),
+        *([("sensors", "Gauges and sensors", to_markup(sensors))] if sensors else []),
         ("correlations", "Correlations", _correlations(calibration)),
         ("identifiability", "Identifiability", _identifiability(calibration)),
         ("words", "Glossary", items(GLOSSARY)),
         ("provenance", "Provenance", _provenance(calibration)),
-        ("scene", "The machine", _scene(calibration)),
+        ("scene", "Scene", _scene(calibration)),
     ]
     links = "".join(f'<a href="#{name}">{escape(words)}</a>' for name, words, _ in sections)
     body = "".join(
         f'<section id="{name}">{heading(words)}{content}</section>'
         for name, words, content in sections
     )
-    head = to_markup(render_heading(calibration, effort=False))
+    head = to_markup(Group(render_subject(calibration), render_method(calibration, effort=False)))
     style = (resources.files("orthocal.output.report") / "report.css").read_text(encoding="utf-8")
     header = f"<header>{heading('Calibration report', level=1)}{head}<nav>{links}</nav></header>"
     return page(title, style, f"{header}\n<main>{body}</main>", scripts=True)
@@ -122,24 +120,18 @@ def write_report(calibration: Calibration, path: str | Path) -> Path:
 def _verdict(calibration: Calibration) -> str:
     before, after = calibration.rms_before, calibration.rms_after
     change = f" ({after / before - 1.0:+.0%})" if before > 1e-8 else ""
-    told = (
-        f"Deviations of {mm(before)} mm (r.m.s.) become residuals of {mm(after)} mm{change}: the "
-        f"largest was {mm(calibration.largest_before)} mm and is {mm(calibration.largest_after)} "
-        "mm."
+    fit = (
+        f"Deviations of the readings: {mm(before)} mm RMS before, {mm(after)} mm after "
+        f"calibration{change}; largest {mm(calibration.largest_before)} mm before, "
+        f"{mm(calibration.largest_after)} mm after."
     )
-    found = assessment_of(calibration)
-    answer = to_markup(render_answer(calibration, heading=False))
-    # what the answer leaves out: where the sliders are, and what is not to be entered
-    told_all = found.decision.verdict != "reject" and calibration.only_offsets
-    listed = [entry_table(calibration)] if found.entries and not told_all else []
-    meaning = Group(*listed, *render_meaning(calibration))
     return (
-        answer
-        + heading("Meaning of the values", level=3)
-        + to_markup(meaning)
-        + paragraph(told)
+        to_markup(render_answer(calibration, heading=False))
+        + heading("Values to enter", level=3)
+        + to_markup(render_values(calibration))
+        + paragraph(fit)
         + heading("Findings", level=3)
-        + to_markup(bullets([f.words for f in found.findings]))
+        + to_markup(render_findings(calibration))
     )
 
 
@@ -152,14 +144,15 @@ def _tool(calibration: Calibration) -> str:
 
 
 def _maps(calibration: Calibration, accuracy: ToolAccuracy) -> str:
-    excess = calibration.tolerance_scale
-    times = f"{excess:.1f} times " if excess > 1.0 else ""
+    scale = calibration.tolerance_scale
+    times = f"{scale:.1f} times " if scale > 1.0 else ""
     captions: dict[Field, str] = {
         "now": "Actual less commanded position of the tool, with the offsets that were active "
         "during the measurement. All maps are for a workpiece that is aligned on the machine: one "
-        "shift and one rotation are removed.",
-        "left": "The same once the offsets above are entered, without any other correction.",
-        "unknown": "Uncertainty of the tool position after this calibration: one standard "
+        "translation and one rotation are removed.",
+        "entered": "Actual less commanded position of the tool with the offsets above, without any "
+        "other correction.",
+        "uncertainty": "Uncertainty of the tool position after calibration: one standard "
         f"deviation in space, with unidentified errors at {times}their tolerances.",
     }
     return "".join(
@@ -194,9 +187,9 @@ def _fit(calibration: Calibration) -> str:
     return "".join(parts)
 
 
-def _residuals(calibration: Calibration) -> str:
+def _readings(calibration: Calibration) -> str:
     every = len(calibration.residuals) <= ALL_ROWS
-    listed = to_markup(render_residuals(calibration, all_rows=every, worst_first=True))
+    listed = to_markup(render_readings(calibration, all_rows=every, worst_first=True))
     words = "All readings" if every else "The largest"
     few = len(calibration.residuals) <= FEW_ROWS
     return _figure(plot_residuals(calibration), "") + _details(words, listed, shown=few)

@@ -1,4 +1,4 @@
-"""Plots of the parameters: estimates, correlations, singular values, error of linearising."""
+"""Plots of the parameters: estimates, correlations, singular values, linearisation error."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ FEW_PARAMETERS = 12
 """Number of parameters up to which units and correlations are printed as numbers."""
 
 NEGLIGIBLE = 0.1
-"""Error of the linearised solution that does not matter, [σ]."""
+"""Negligible error of the linearised solution, [σ]."""
 
 MOST_SHIFTS = 20
 """Largest number of parameters whose linearised solution is shown."""
@@ -69,7 +69,7 @@ def plot_linearised(calibration: Calibration) -> Figure | None:
     axes.hlines(y, 0.0, sizes, color="#888888", linewidth=0.8)
     axes.plot(sizes, y, label="exact − linearised", **AFTER_LOOK)
     axes.axvline(0.0, color="black", linewidth=0.8)
-    for sign, label in ((-1.0, "±0.1 σ: smaller errors do not matter"), (1.0, "")):
+    for sign, label in ((-1.0, "±0.1 σ: negligible"), (1.0, "")):
         axes.axvline(sign * NEGLIGIBLE, color="black", linestyle=":", label=label)
     axes.set_xlabel("exact − linearised estimate, in σ of the parameter")
     draw_legend(figure, axes)
@@ -90,12 +90,12 @@ def plot_parameters(calibration: Calibration, *, most: int = 30) -> Figure:
     if len(rows) < len(free):
         title += f": {len(rows)} of {len(free)}, offsets, then the best determined"
     names = [f"{short_name(p.name)}{f' at {p.at_bound} bound' if p.at_bound else ''}" for p in rows]
-    own_unit = len(rows) <= FEW_PARAMETERS and len({p.unit for p in rows}) == 1
+    in_unit = len(rows) <= FEW_PARAMETERS and len({p.unit for p in rows}) == 1
     figure, axes = open_list(title, names, share=calibration.prior)
-    scale = np.array([p.edge_factor if own_unit else 1.0 / p.tolerance for p in rows])
+    scale = np.array([p.edge_factor if in_unit else 1.0 / p.tolerance for p in rows])
     y, values = np.arange(len(rows)), np.array([p.value for p in rows]) * scale
     prior = np.array([i for i, p in enumerate(rows) if p.prior], dtype=int)
-    if prior.size and not own_unit:
+    if prior.size and not in_unit:
         means = np.array([rows[i].mean for i in prior]) * scale[prior]
         shade(axes, prior, means - 1.0, means + 1.0, "prior: ±1 standard deviation")
     axes.axvline(0.0, color="black", linewidth=0.8)
@@ -113,7 +113,7 @@ def plot_parameters(calibration: Calibration, *, most: int = 30) -> Figure:
     if not known.any() and not bound.all():
         axes.plot([], [], linestyle="none", label="no intervals: the noise is unknown")
     axes.set_xlabel(
-        f"estimate [{rows[0].edge_unit}]" if own_unit else "estimate [prior standard deviations]"
+        f"estimate [{rows[0].edge_unit}]" if in_unit else "estimate [prior standard deviations]"
     )
     draw_legend(figure, axes)
     if calibration.prior:
@@ -129,7 +129,7 @@ def _draw_shares(axes: Axes, rows: Sequence[ParameterEstimate]) -> None:
     axes.set_xticks([0, 50, 100])
     axes.grid(True, axis="x")
     axes.tick_params(axis="y", length=0, labelleft=False)
-    axes.set_xlabel("from readings [%]")
+    axes.set_xlabel("resolved [%]")
 
 
 @plot("correlations")

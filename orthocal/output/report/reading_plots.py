@@ -105,7 +105,7 @@ def plot_setups(calibration: Calibration, *, most: int = 40) -> Figure:
         axes.axvline(sigma, color="black", linestyle=":", label=f"σ of a {_row_word(calibration)}")
         shown.append(np.array([sigma]))
     scale_log(axes, "x", np.concatenate(shown))
-    axes.set_xlabel("r.m.s. of measured − model [mm], logarithmic")
+    axes.set_xlabel("RMS of measured − model [mm], logarithmic")
     draw_legend(figure, axes)
     return figure
 

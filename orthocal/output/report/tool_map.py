@@ -23,12 +23,12 @@ from orthocal.units import MM, UM
 
 Array = NDArray[np.float64]
 
-Field = Literal["now", "left", "unknown"]
+Field = Literal["now", "entered", "uncertainty"]
 
 TITLES: dict[Field, str] = {
     "now": "Tool error now, workpiece aligned on the machine",
-    "left": "Tool error with the offsets entered, workpiece aligned on the machine",
-    "unknown": "Uncertainty of the tool error, one standard deviation, workpiece aligned",
+    "entered": "Tool error with the offsets entered, workpiece aligned on the machine",
+    "uncertainty": "Uncertainty of the tool error, one standard deviation, workpiece aligned",
 }
 
 FINEST = 1e-3
@@ -72,7 +72,7 @@ def _error_parts(calibration: Calibration, accuracy: ToolAccuracy, which: Field)
     if which == "now":
         return accuracy.align(accuracy.deviation) / UM
     remaining = assess_remaining(calibration, accuracy)
-    if which == "left" or remaining is None:
+    if which == "entered" or remaining is None:
         return accuracy.align(accuracy.error_after_offsets) / UM
     variance = np.trace(remaining.aligned_covariance, axis1=1, axis2=2)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0))[:, None] / UM)
@@ -97,8 +97,8 @@ def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Fiel
     lines = _find_grid(accuracy.workspace.points)
     shown = {
         "now": True,
-        "left": not calibration.only_offsets and bool(find_entries(calibration)),
-        "unknown": accuracy.after is not None,
+        "entered": not calibration.only_offsets and bool(find_entries(calibration)),
+        "uncertainty": accuracy.after is not None,
     }
     if lines is None or not shown[which]:
         return None
@@ -122,16 +122,16 @@ def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Fiel
         axes.set_xlabel(f"{'xyz'[world[plane[0]]]} [mm]")
         axes.set_ylabel(f"{'xyz'[world[plane[1]]]} [mm]", labelpad=0.0)
         taken = np.zeros((0, 2))
-        if which != "unknown":
+        if which != "uncertainty":
             sides = [lines[k] for k in plane]
             taken = _draw_arrows(axes, sides, at, [world[k] for k in plane], levels)
         _draw_size(axes, x, y, size, levels, taken)
     label = "size of the tool error [µm]; arrows: its part in the plane"
-    if which == "unknown":
+    if which == "uncertainty":
         label = "standard deviation in space [µm]"
-        excess = calibration.tolerance_scale
-        if excess > 1.0:
-            label += f", errors at {excess:.1f} × their tolerances"
+        scale = calibration.tolerance_scale
+        if scale > 1.0:
+            label += f", tolerances × {scale:.1f}"
     figure.colorbar(
         ScalarMappable(BoundaryNorm(levels, 256), COLOURS),
         ax=list(panels),

@@ -1,8 +1,9 @@
-"""Where the tool is and how well that is known, as tables."""
+"""Tool errors over a region, as tables, CSV and JSON."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from rich.text import Text
 
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import find_entries
-from orthocal.assessment.remaining_errors import find_remaining_errors
+from orthocal.assessment.remaining_errors import RemainingError, find_remaining_errors
 from orthocal.assessment.tool_error import (
     ErrorSize,
     ErrorSizes,
@@ -27,87 +28,88 @@ from orthocal.errors import ClosureError, RobotError
 from orthocal.output.text.layout import add_row, print_rich, table_of, um
 from orthocal.units import MM, UM
 
-THREE_WAYS = (
-    "With shift and rotation taken out, as a workpiece sees it that is aligned on the machine; "
-    "shift out: with the common shift alone taken out (r.m.s.); absolute (r.m.s.)."
-)
-"""What the three forms of an error at the tool are."""
-
 Array = NDArray[np.float64]
 
 POINT_COLUMNS = (
-    "x_mm",
-    "y_mm",
-    "z_mm",
-    "deviation_x_um",
-    "deviation_y_um",
-    "deviation_z_um",
-    "sigma_x_um",
-    "sigma_y_um",
-    "sigma_z_um",
+    *("x_mm", "y_mm", "z_mm"),
+    *("deviation_x_um", "deviation_y_um", "deviation_z_um"),
+    *("sigma_x_um", "sigma_y_um", "sigma_z_um"),
 )
-"""Commanded tool position; where the tool really is, less that; standard deviation of that."""
+"""Commanded tool position; actual less commanded position; standard deviation of the actual one."""
+
+COLUMNS_NOTE = (
+    "RMS, 95 % and worst point: workpiece aligned on the machine (translation and rotation "
+    "removed). The last two columns are RMS without this alignment."
+)
+
+UNCERTAINTY_NOTE = (
+    "Uncertainty: one standard deviation in space. Errors that were not identified are included "
+    "with their tolerances."
+)
+
+MOST_PARTS = 5
+"""Largest number of parameters that are listed of a combination."""
 
 
 def render_tool(calibration: Calibration) -> RenderableType:
-    """The tool's errors over the cube around the mechanical zero."""
+    """Tool errors over the workspace."""
     try:
         return render_accuracy(calibration, assess_tool(calibration))
     except (ClosureError, RobotError) as e:
-        return Text(f"Nothing can be said of the tool: {e}.")
+        return Text(f"The tool error cannot be computed: {e}.")
 
 
 def print_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> None:
-    """Print the tool's errors over a region."""
+    """Print the tool errors over a region."""
     print_rich(render_accuracy(calibration, accuracy))
 
 
 def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> RenderableType:
-    """The tool's errors over a region.
+    """Tool errors over a region.
 
     Args:
         calibration: The calibration.
-        accuracy: Its errors at the tool.
+        accuracy: Its tool errors.
     """
-    table = table_of("[µm]", "r.m.s.", "95 %", "worst point", "shift out", "absolute")
-    rows = [("known to be off now", accuracy.measure(accuracy.deviation))]
+    rows = [("identified error, now", accuracy.measure(accuracy.deviation))]
     if not calibration.only_offsets and find_entries(calibration):
-        rows.append(("with the offsets entered", accuracy.measure(accuracy.error_after_offsets)))
-    rows.append(("not known before", accuracy.before.sizes))
-    remaining, excess = assess_remaining(calibration, accuracy), calibration.tolerance_scale
+        entered = accuracy.measure(accuracy.error_after_offsets)
+        rows.append(("identified error, offsets entered", entered))
+    rows.append(("uncertainty before calibration", accuracy.before.sizes))
+    remaining, scale = assess_remaining(calibration, accuracy), calibration.tolerance_scale
     if accuracy.after is not None:
-        rows.append(("not known after", accuracy.after.sizes))
-    if remaining is not None and excess > 1.0:
-        rows.append((f"  at {excess:.1f} × tolerances", remaining.sizes))
+        rows.append(("uncertainty after calibration", accuracy.after.sizes))
+    if remaining is not None and scale > 1.0:
+        rows.append((f"  with tolerances × {scale:.1f}", remaining.sizes))
+    table = table_of("[µm]", "RMS", "95 %", "worst point", "translation removed", "absolute")
     for name, sizes in rows:
-        aligned = ("", "", "") if sizes.aligned is None else tuple(map(um, _parts(sizes.aligned)))
-        add_row(table, name, *aligned, um(sizes.relative.rms), um(sizes.absolute.rms))
-    lines: list[RenderableType] = [table, Text(f"Over {accuracy.workspace.words}. {THREE_WAYS}")]
+        a = sizes.aligned
+        aligned = (None,) * 3 if a is None else (a.rms, a.percentile_95, a.largest)
+        values = (*aligned, sizes.relative.rms, sizes.absolute.rms)
+        add_row(table, name, *("" if v is None else um(v) for v in values))
+    notes = [f"Over {accuracy.workspace.words}. {COLUMNS_NOTE}"]
     if accuracy.after is None:
-        lines.append(Text("What is not known after cannot be told: nothing tells the noise."))
-        return Group(*lines)
-    lines.append(
-        Text(
-            "Not known: one standard deviation in space (95 %: 95 of 100 errors are smaller; "
-            "worst point: one standard deviation there), with all errors of the machine that "
-            "were not identified at their tolerances."
+        notes.append(
+            "The uncertainty after calibration is unknown, because the noise of the readings is."
         )
-    )
-    summary = summarise_tool(calibration, accuracy)
-    if summary is not None:
-        keep = assessment_of(calibration).keeps_offsets
-        lines.append(Text(describe_tool_error(summary, keep=keep)))
-    lines += [Text(line) for line in describe_remaining(calibration, accuracy)]
-    return Group(*lines)
+    else:
+        notes.append(UNCERTAINTY_NOTE)
+        summary = summarise_tool(calibration, accuracy)
+        if summary is not None:
+            keep = assessment_of(calibration).keeps_offsets
+            notes.append(describe_tool_error(summary, keep=keep))
+        notes += describe_remaining(find_remaining_errors(calibration, accuracy, count=2))
+    return Group(table, *map(Text, notes))
 
 
-def describe_remaining(calibration: Calibration, accuracy: ToolAccuracy) -> list[str]:
-    """What matters most of what is not known after, in a line each."""
+def describe_remaining(errors: Iterable[RemainingError]) -> list[str]:
+    """Combinations of errors with the largest remaining tool errors, one per line."""
     lines = []
-    for found in find_remaining_errors(calibration, accuracy, count=2):
-        parts = ", ".join(f"{name} {share:+.1f}" for name, share in found.parts[:5])
-        if parts and found.rms > 1e-6:
-            lines.append(f"Largest part: {um(found.rms)} µm, from {parts} tolerances together.")
+    for error in errors:
+        parts = ", ".join(f"{name} {size:+.1f}" for name, size in error.parts[:MOST_PARTS])
+        if error.rms > UM:
+            combination = f"{parts} tolerances" if parts else "small errors"
+            lines.append(f"Contribution of {um(error.rms)} µm RMS: {combination}.")
     return lines
 
 
@@ -116,7 +118,7 @@ def format_points(rows: Array) -> str:
 
     Args:
         rows: Commanded position, deviation and its standard deviation, shape (K, 9), [m]; NaN for
-            what is not known.
+            unknown values.
     """
     lines = []
     for row in rows:
@@ -127,7 +129,7 @@ def format_points(rows: Array) -> str:
 
 
 def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
-    """Sizes over the region as JSON, SI units."""
+    """Tool errors over a region as JSON, SI units."""
 
     def size(s: ErrorSize | None) -> dict[str, float] | None:
         if s is None:
@@ -154,7 +156,3 @@ def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
         "uncertainty_after": None if after is None else all_sizes(after.sizes),
     }
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
-
-
-def _parts(size: ErrorSize) -> tuple[float, float, float]:
-    return size.rms, size.percentile_95, size.largest

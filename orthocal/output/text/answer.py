@@ -40,7 +40,7 @@ LISTED: tuple[FindingKind, ...] = (
 
 STYLES: dict[Verdict, str] = {"enter": "bold green", "review": "bold yellow", "reject": "bold red"}
 
-MORE = "--details shows every reading, the fit, the tool and what was identified."
+MORE = "--details prints all readings, residuals, parameters and tool errors."
 
 
 def render_answer(
@@ -50,14 +50,18 @@ def render_answer(
 
     Args:
         calibration: The calibration.
-        heading: Whether to begin with what was measured, and of which machine.
+        heading: Whether to begin with the machine and its readings.
         saved: Directory in which the calibration was written, for the next step.
     """
     found = assessment_of(calibration)
     parts: list[RenderableType] = [render_subject(calibration), Text()] if heading else []
     parts += [_decision(found.decision), Text()]
     if found.entries and found.decision.verdict != "reject":
-        parts += [_indented(short_entry_table(calibration)), *_how(calibration, found), Text()]
+        parts += [
+            _indented(short_entry_table(calibration)),
+            *_entry_notes(calibration, found),
+            Text(),
+        ]
     parts += _tool(calibration, found)
     parts.append(bullets([f.words for f in _listed(calibration, found)]))
     parts.append(Text.assemble(("Next: ", "bold"), _next_step(found, saved)))
@@ -65,7 +69,7 @@ def render_answer(
 
 
 def render_decision(found: Assessment) -> RenderableType:
-    """A decision about readings, all findings, and what to do first."""
+    """A decision about readings, all findings, and the next step."""
     decision = found.decision
     parts: list[RenderableType] = [_decision(decision)]
     further = [f.words for f in found.findings if f.text != decision.reason]
@@ -77,7 +81,7 @@ def render_decision(found: Assessment) -> RenderableType:
 
 
 def print_decision(found: Assessment) -> None:
-    """Print a decision about readings: in colour where there is a terminal."""
+    """Print a decision about readings: in colour on a terminal."""
     print_rich(render_decision(found))
 
 
@@ -86,8 +90,8 @@ def _decision(decision: Decision) -> Text:
     return Text.assemble(headline, f" {decision.reason}".rstrip())
 
 
-def _how(calibration: Calibration, found: Assessment) -> list[RenderableType]:
-    """What is special about entering these values."""
+def _entry_notes(calibration: Calibration, found: Assessment) -> list[RenderableType]:
+    """Notes on entering the values."""
     unstated = found.of_kind("controller not stated")
     if unstated:
         return [_indented(Text(unstated[0].words))]
@@ -99,7 +103,7 @@ def _how(calibration: Calibration, found: Assessment) -> list[RenderableType]:
         _indented(
             Text(
                 f"{joined(down)} {verb} down in the controller: subtract the value there "
-                "(`orthocal export --to linuxcnc --offsets` writes the lines)."
+                "instead of adding it (`orthocal export --to linuxcnc --offsets` writes the lines)."
             )
         )
     ]
@@ -117,7 +121,7 @@ def _tool(calibration: Calibration, found: Assessment) -> list[RenderableType]:
 
 
 def _listed(calibration: Calibration, found: Assessment) -> Sequence[Finding]:
-    """Further findings to know before anything is entered, the gravest first."""
+    """Further findings that matter before anything is entered, the gravest first."""
     listed = [
         f
         for f in found.findings
@@ -131,10 +135,10 @@ def _listed(calibration: Calibration, found: Assessment) -> Sequence[Finding]:
 
 
 def _next_step(found: Assessment, saved: Path | None) -> str:
-    """What to do next."""
+    """The next command or action."""
     decision = found.decision
     if decision.verdict != "enter" or found.keeps_offsets:
-        return decision.action or "nothing to do."
+        return decision.action or "none."
     if saved is None:
         return "keep the result with --out DIRECTORY; then `orthocal again DIRECTORY`."
     return f"orthocal again {saved} --out SESSION; measure; orthocal validate {saved} SESSION"

@@ -12,9 +12,11 @@ from orthocal.assessment.comparison import Comparison
 from orthocal.output.text.layout import (
     EXPANDED,
     MANY_ROWS,
+    NOISE_SOURCES,
     WORST_ROWS,
     add_row,
     bullets,
+    counted,
     mm,
     plain,
     section,
@@ -28,40 +30,36 @@ from orthocal.units import MM
 def render_comparison(comparison: Comparison, *, all_rows: bool = False) -> RenderableType:
     """A comparison as rich renderables."""
     c = comparison
-    source = {
-        "cycles": "as repeated cycles scatter",
-        "gauge": "as given for the gauge",
-        "unknown": "nothing tells it",
-    }[c.noise.source]
     parts = [
-        Text("Which model do the readings support?", style="bold"),
+        Text("Comparison of models", style="bold"),
         Text(c.title),
         Text(
-            f"{c.independent} independent readings; noise of one {mm(c.noise.sigma)} mm, {source}"
+            f"{counted(c.independent, 'independent reading')}; σ of a reading: "
+            f"{mm(c.noise.sigma)} mm, {NOISE_SOURCES[c.noise.source]}"
         ),
-        section("Recommendation", bullets([f.words for f in c.assessment.findings])),
-        section("Models side by side", _scores(c)),
+        section("Findings", bullets([f.words for f in c.assessment.findings])),
+        section("Models", _scores(c)),
         section("Estimates", _estimates(c, all_rows)),
-        section("What each leaves of the readings", _residuals(c, all_rows)),
+        section("Residuals by model", _residuals(c, all_rows)),
     ]
     return Group(*parts)
 
 
 def _scores(comparison: Comparison) -> RenderableType:
     sizes = ("free", "effective", "RMS [mm]", "χ²", "dof", "AICc", "BIC", "ln evidence")
-    table = table_of("model", "", *sizes, "unseen [mm]", "tool [µm]", left=2)
+    table = table_of("model", "", *sizes, "CV [mm]", "tool [µm]", left=2)
     for result in comparison.results:
         after = None if result.tool is None else result.tool.after
         checked = result.spare > 0
         evidence = comparison.recommendation.of(result.model)
         for score in (result.linearised, result.exact):
             first = score.method == "linearised"
-            # residuals say nothing of a model that can take up every reading
+            # without redundancy the residuals do not check the model
             fits = (
                 plain(score.rms / MM, 4),
                 _short(score.chi_square),
                 f"{score.dof:.1f}",
-                _short(score.aicc if score.dof >= FEWEST_LEFT else math.inf),
+                _short(score.aicc if score.dof >= FEWEST_DOF else math.inf),
                 _short(score.bic),
             )
             add_row(
@@ -76,21 +74,21 @@ def _scores(comparison: Comparison) -> RenderableType:
                 "" if after is None or first else um(after.sizes.headline.rms),
             )
     for u in comparison.undetermined:
-        add_row(table, u.model, "", str(u.n_free), "", "not determined", *([""] * 8))
+        add_row(table, u.model, "", str(u.n_free), "", "not identifiable", *([""] * 8))
     return Group(
         table,
-        Text("–: no redundant reading checks that model"),
-        Text("effective: number of parameters that the readings determine beside the priors"),
-        Text("AICc, BIC: lower is better; ln evidence, of the complete model 0: higher is better"),
-        Text("unseen: RMS error of predicting each setup from all others"),
-        Text("tool: RMS uncertainty over the workspace, workpiece aligned on the machine"),
+        Text("–: no redundant reading checks this model"),
+        Text("effective: number of parameters that the readings determine"),
+        Text("AICc, BIC: lower is better; ln evidence (0: complete model): higher is better"),
+        Text("CV: cross-validation, RMS error of predicting each setup from all others"),
+        Text("tool: RMS uncertainty after calibration, workpiece aligned on the machine"),
     )
 
 
 def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
     results = comparison.results
     if not results:
-        return Text("None: no model is determined.")
+        return Text("No model is identifiable.")
     names = list(dict.fromkeys(n for r in results for n in r.exact.estimates))
     small = [r for r in results if r.n_free <= 12]
     named = {n for r in small for n in r.exact.estimates}
@@ -126,7 +124,7 @@ def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
 def _residuals(comparison: Comparison, all_rows: bool) -> RenderableType:
     results = comparison.results
     if not results:
-        return Text("Nothing was fitted.")
+        return Text("No model is identifiable.")
     table = table_of("reading", *(f"{r.model} [mm]" for r in results))
     order: Sequence[int] = range(len(comparison.labels))
     note = ""
@@ -139,7 +137,7 @@ def _residuals(comparison: Comparison, all_rows: bool) -> RenderableType:
     return Group(table, Text(note)) if note else table
 
 
-FEWEST_LEFT = 3.0
+FEWEST_DOF = 3.0
 """Degrees of freedom below which AICc is decided by its correction, and hundredths of a parameter
 move it by more than the readings do."""
 

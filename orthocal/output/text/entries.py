@@ -12,27 +12,31 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.output.text.layout import EXPANDED, add_row, plain, signed, table_of
 
 
-def render_controller(calibration: Calibration) -> RenderableType:
-    """What to enter into the controller, and what is to be known of it."""
+def render_values(calibration: Calibration) -> RenderableType:
+    """Meaning of the values to enter, and those that the short answer does not list."""
     found = assessment_of(calibration)
     if not found.entries:
-        return Group(Text("Nothing: no offset was identified."), *render_meaning(calibration))
-    decision = found.decision
-    advice = f"{decision.headline} {decision.reason} {decision.action}".strip()
-    return Group(Text(advice), entry_table(calibration), *render_meaning(calibration))
-
-
-def entry_table(calibration: Calibration) -> Table:
-    """Values to enter, drive by drive, and the identified offsets."""
-    return _table(calibration, identified=not calibration.only_offsets)
+        return Group(Text("None: no offset was identified."), Text(EXPANDED))
+    complete = found.decision.verdict != "reject" and calibration.only_offsets
+    table = _entry_table(calibration, identified=not calibration.only_offsets)
+    notes = [_example(calibration, found.entries[0])]
+    notes += [f.text for f in found.of_kind("controller not stated")]
+    notes.append(EXPANDED)
+    if not calibration.only_offsets:
+        notes.append(
+            "The values to enter minimise the tool error in a controller that corrects nothing "
+            "else: they compensate a part of the other errors. The identified offsets belong to a "
+            "controller that corrects all errors (`orthocal inverse`)."
+        )
+    return Group(*([] if complete else [table]), *map(Text, notes))
 
 
 def short_entry_table(calibration: Calibration) -> Table:
     """Values to enter, drive by drive."""
-    return _table(calibration, identified=False)
+    return _entry_table(calibration, identified=False)
 
 
-def _table(calibration: Calibration, *, identified: bool) -> Table:
+def _entry_table(calibration: Calibration, *, identified: bool) -> Table:
     found = assessment_of(calibration)
     enter = "estimate" if found.of_kind("no change needed") else "enter"
     stated = any(e.active is not None for e in found.entries)
@@ -41,43 +45,25 @@ def _table(calibration: Calibration, *, identified: bool) -> Table:
     for e in found.entries:
         factor = e.edge_factor
         now = [] if e.active is None else [signed(e.active * factor)]
-        own = [signed(e.identified * factor)] if identified else []
+        estimate = [signed(e.identified * factor)] if identified else []
         half = e.held or plain(expanded_uncertainty(calibration, e) * factor)
-        add_row(table, e.drive, *now, signed(e.enter * factor), half, *own, e.edge_unit)
+        add_row(table, e.drive, *now, signed(e.enter * factor), half, *estimate, e.edge_unit)
     return table
-
-
-def render_meaning(calibration: Calibration) -> list[RenderableType]:
-    """What an offset is, and what ± means."""
-    found = assessment_of(calibration)
-    if not found.entries:
-        return [Text(EXPANDED)]
-    notes = [_example(calibration, found.entries[0])]
-    notes += [f.text for f in found.of_kind("controller not stated")]
-    notes.append(EXPANDED)
-    if not calibration.only_offsets:
-        notes.append(
-            "These offsets leave the least tool error in a controller that corrects nothing else: "
-            "they compensate a part of the other errors. The identified offsets belong to a "
-            "controller that corrects all errors (`orthocal inverse`)."
-        )
-    notes += [f.text for f in found.of_kind("tool error")]
-    return [Text(note) for note in notes]
 
 
 def _example(calibration: Calibration, entry: ControllerEntry) -> str:
     """Meaning of an offset, by the first drive at its mechanical zero."""
     drive = next(d for d in calibration.robot.drives if d.name == entry.drive)
     factor, unit = drive.edge_factor, drive.edge_unit
-    meaning = "An offset is added to the encoder's coordinate to give the slider's true one"
+    meaning = "Slider coordinate = encoder coordinate + offset"
     if entry.active is None:
-        return f"{meaning}; these are to be added to the present offsets."
+        return f"{meaning}. Add these values to the present offsets."
     at, actual = drive.zero * factor, (drive.zero + entry.identified) * factor
     shown = ""
     if drive.direction < 0 or drive.joint_zero is not None:
         joint = float(drive.to_joint(drive.zero)) * factor
         shown = f" (the controller's joint shows {joint:.3f} {unit})"
     return (
-        f"{meaning}: with {drive.name}'s encoder at {at:.3f} {unit}{shown} its slider is at "
+        f"{meaning}. With {drive.name}'s encoder at {at:.3f} {unit}{shown}, its slider is at "
         f"{actual:.3f} {unit}. Enter the complete offset in place of the present one."
     )

@@ -1,4 +1,4 @@
-"""What was calibrated, from what and how, in lines."""
+"""Subject and method of a calibration, in lines."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from orthocal.output.text.layout import counted, list_places, short_name
 from orthocal.units import DRIVE_UNITS
 
 LONGEST_LINE = 150
-"""Characters of a line whose length others decide, where there is little room."""
+"""Characters of a line with names from files, in the short answer."""
 
 
 def render_subject(calibration: Calibration) -> RenderableType:
-    """What was measured, and of which machine, in four lines."""
+    """Machine and readings of a calibration, in four lines."""
     title = short_name(calibration.session.title, LONGEST_LINE)
     return Group(
         Text(_name(calibration), style="bold"),
@@ -25,23 +25,16 @@ def render_subject(calibration: Calibration) -> RenderableType:
     )
 
 
-def render_heading(calibration: Calibration, *, effort: bool = True) -> RenderableType:
-    """What was calibrated, from what and how, with what it took."""
-    session = calibration.session
-    return Group(
-        Text(_name(calibration), style="bold"),
-        Text(session.title),
-        *([Text(f"Source: {session.source}")] if session.source else []),
-        Text(f"Machine: {describe_machine(calibration)}"),
-        Text(_measured(calibration)),
-        Text(_solved(calibration, effort)),
-    )
+def render_method(calibration: Calibration, *, effort: bool = True) -> RenderableType:
+    """Source of the readings, model and solver.
 
-
-def render_origin(calibration: Calibration) -> RenderableType:
-    """Where the session is from, and how it was solved."""
+    Args:
+        calibration: The calibration.
+        effort: Whether to state iterations and time of the solver.
+    """
     source = calibration.session.source
-    return Group(*([Text(f"Source: {source}")] if source else []), Text(_solved(calibration, True)))
+    lines = [f"Source: {source}"] if source else []
+    return Group(*map(Text, [*lines, *_describe_method(calibration, effort)]))
 
 
 def _name(calibration: Calibration) -> str:
@@ -52,7 +45,7 @@ def _measured(calibration: Calibration) -> str:
     kind = "difference" if calibration.rows_are_differences else "reading"
     read = {r.setup for r in calibration.residuals}
     setups = [s for s in calibration.setups if s.name in read]
-    idle = [s.name for s in calibration.setups if s.name not in read]
+    unread = [s.name for s in calibration.setups if s.name not in read]
     places = list_places(s.sensor.place for s in setups)
     used = {r.posture for r in calibration.residuals} | {
         r.minus for r in calibration.residuals if r.minus
@@ -60,11 +53,11 @@ def _measured(calibration: Calibration) -> str:
     return (
         f"Measured: {counted(len(calibration.residuals), kind)} in "
         f"{counted(len(used), 'posture')}, {counted(len(setups), 'setup')} on {places}"
-        + (f"; no reading of {', '.join(idle)}" if idle else "")
+        + (f"; no reading of {', '.join(unread)}" if unread else "")
     )
 
 
-def _solved(calibration: Calibration, effort: bool) -> str:
+def _describe_method(calibration: Calibration, effort: bool) -> list[str]:
     solver = calibration.solver
     with_prior = sum(p.prior for p in calibration.free)
     prior = "tolerances as prior" if with_prior else "no prior"
@@ -72,12 +65,13 @@ def _solved(calibration: Calibration, effort: bool) -> str:
         prior = f"{with_prior} with a prior"
     kind = "base parameter" if calibration.base else "parameter"
     loss = ", Huber's loss" if solver.loss == "huber" else ""
-    took = (
-        f"; {solver.name}: {solver.status}, {counted(solver.iterations, 'iteration')}, "
-        f"{solver.seconds_build:.2f} + {solver.seconds_solve:.2f} s"
-    )
-    solved = f"Solved: {counted(len(calibration.free), kind)}, {prior}{loss}"
-    return f"{solved}{took if effort else ''}"
+    lines = [f"Estimated: {counted(len(calibration.free), kind)}, {prior}{loss}"]
+    if effort:
+        lines.append(
+            f"Solver: {solver.name}, {solver.status}, {counted(solver.iterations, 'iteration')}, "
+            f"{solver.seconds_build + solver.seconds_solve:.2f} s"
+        )
+    return lines
 
 
 def describe_machine(calibration: Calibration) -> str:

@@ -1,10 +1,10 @@
-"""Tables, sections and numbers as all printed results have them."""
+"""Tables, sections and numbers of all printed results."""
 
 from __future__ import annotations
 
 import io
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from itertools import groupby
 
 from rich import box
@@ -16,7 +16,7 @@ from rich.segment import Segment, Segments
 from rich.table import Table
 from rich.text import Text
 
-# numbers stand in tables as they stand in sentences
+# the same number formats in tables and in sentences
 from orthocal.assessment.wording import counted as counted
 from orthocal.assessment.wording import mm as mm
 from orthocal.assessment.wording import plain as plain
@@ -32,17 +32,25 @@ MANY_ROWS = 60
 WORST_ROWS = 20
 
 LONGEST_NAME = 44
-"""Characters of a name that are shown where there is little room."""
+"""Longest name in a plot or a label, [characters]."""
 
 
 WIDTH = 100
 """Columns of plain text."""
 
 EXPANDED = (
-    "±: expanded uncertainty (k = 2; Student's factor for 95 % where the noise was estimated from "
-    "few readings), with everything that is not known."
+    "±: expanded uncertainty (k = 2; Student's factor for 95 % if the noise was estimated from few "
+    "readings), including all errors that were not identified."
 )
 """Meaning of ± in tables of values."""
+
+NOISE_SOURCES = {
+    "cycles": "from repeated cycles",
+    "residuals": "from the residuals",
+    "gauge": "as stated for the gauge",
+    "unknown": "unknown",
+}
+"""Source of the noise of a reading, in words."""
 
 BULLET = "• "
 """Start of an item of a list."""
@@ -55,7 +63,7 @@ GAP = 3
 """Columns between those of a table."""
 
 TIGHT_GAP = 1
-"""The same where there is little room."""
+"""Columns between those of a table that is too wide with GAP."""
 
 NEW_LINE = Segment("\n")
 
@@ -64,7 +72,7 @@ class NumberTable(Table):
     """A table whose numbers are never cut: where it is too wide each row becomes a paragraph."""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """As rich asks for it."""
+        """Render the table, or each row as a paragraph (rich's protocol)."""
         for gap, padding in ((GAP, (0, 1)), (TIGHT_GAP, (0, 0))):
             if self._least_width(gap) <= options.max_width:
                 self.padding = padding
@@ -81,7 +89,7 @@ class NumberTable(Table):
                     yield Padding(Text(words), (0, 0, 0, 2))
 
     def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
-        """As rich asks for it; as narrow as its paragraphs are."""
+        """Measure the table; it may be as narrow as its paragraphs (rich's protocol)."""
         return super().__rich_measure__(console, options).with_maximum(options.max_width)
 
     def _least_width(self, gap: int) -> int:
@@ -101,7 +109,7 @@ def to_text(content: RenderableType, *, width: int = WIDTH) -> str:
     """Rich renderables as plain text.
 
     Args:
-        content: What rich can print.
+        content: The renderables.
         width: Columns.
     """
     stream = io.StringIO()
@@ -199,7 +207,7 @@ def typeset(value: float, decimals: int = 3) -> str:
 
     Args:
         value: The number.
-        decimals: Of them.
+        decimals: Number of decimals.
     """
     rounded = round(value, decimals)
     text = signed(rounded, decimals) if rounded else plain(0.0, decimals)
@@ -212,11 +220,31 @@ def choose_rows(
     *,
     key: Callable[[ResidualRow], float] = lambda r: abs(r.residual),
 ) -> tuple[Iterable[ResidualRow], str]:
-    """All rows, or the worst of many, and a note that says so."""
+    """All rows, or the worst of many with a note."""
     if all_rows or len(rows) <= MANY_ROWS:
         return rows, ""
     worst = sorted(rows, key=key, reverse=True)[:WORST_ROWS]
     return worst, f"The {WORST_ROWS} largest of {len(rows)}; --all lists every reading."
+
+
+def residual_table(
+    rows: Iterable[ResidualRow],
+    columns: Mapping[str, Callable[[ResidualRow], str]],
+    *,
+    cycles: bool,
+) -> Table:
+    """A table of readings.
+
+    Args:
+        rows: The readings.
+        columns: Headers of the columns with numbers, and their cells.
+        cycles: Whether to list the cycle of each reading.
+    """
+    table = table_of("setup", "posture", *(["cycle"] if cycles else []), *columns, left=2)
+    for r in rows:
+        names = (r.setup, r.postures, *([str(r.cycle)] if cycles else []))
+        add_row(table, *names, *(cell(r) for cell in columns.values()))
+    return table
 
 
 def short_name(text: str, longest: int = LONGEST_NAME) -> str:
@@ -227,7 +255,7 @@ def short_name(text: str, longest: int = LONGEST_NAME) -> str:
 
 
 def list_places(places: Iterable[tuple[str, str]]) -> str:
-    """Where sensors stand, such as "legs x, y, z" or "leg x and tool"."""
+    """Places of sensors, such as "legs x, y, z" or "leg x and tool"."""
     named: dict[str, list[str]] = {}
     for kind, name in sorted(set(places)):
         named.setdefault(kind, []).append(name)

@@ -1,4 +1,4 @@
-"""Measuring plan as text, as plain data, and as a picture of the error over measuring time."""
+"""Measuring plan as text, as plain data, and as a plot of the error over measuring time."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from orthocal.kinematics.workspace import find_workspace
+from orthocal.output.text.accuracy import describe_remaining
 from orthocal.output.text.layout import add_row, bullets, counted, plain, section, table_of
 from orthocal.planning.cost_curve import ENOUGH, HOUR, Stage
 from orthocal.planning.expected_error import Criterion, Expected
@@ -66,6 +67,7 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
         f" (now {show_um(plan.known)} µm), {plan.forecast.workspace.words.removeprefix('the ')}, "
         "workpiece aligned on the machine.",
     )
+    remaining = describe_remaining(plan.find_remaining()) if details else []
     parts: list[RenderableType] = [
         Text(
             f"Plan for {robot.name}, model {plan.forecast.selection.label}: "
@@ -79,7 +81,7 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
         Text(_when_enough(plan)),
         section("At equal cost", _alternatives(plan, closing)),
         section("Other gauges", bullets(_helps(plan))),
-        *([section("Largest remaining errors", bullets(_remaining(plan)))] if details else []),
+        *([section("Largest contributions", bullets(remaining))] if remaining else []),
         section("Setups", _setups(plan)),
         section("How to measure", bullets(list(HOW))),
     ]
@@ -175,7 +177,7 @@ def plan_json(plan: MeasuringPlan) -> str:
 
 
 def draw_plan(plan: MeasuringPlan) -> str:
-    """Expected error over measuring time, as an SVG picture."""
+    """Expected error over measuring time, as an SVG plot."""
     from matplotlib.figure import Figure
 
     from orthocal.output.report.figure import (
@@ -198,9 +200,9 @@ def draw_plan(plan: MeasuringPlan) -> str:
         errors = [s.error / unit for s in stages]
         axes.plot(hours, errors, "-", color=AFTER, label="setups added one by one")
         axes.plot(hours, errors, ".", color=AFTER)
-        own = plan.stage.error / unit
-        axes.plot(plan.minutes / HOUR, own, "s", color=AFTER, label="this plan")
-        values = [*errors, own]
+        chosen = plan.stage.error / unit
+        axes.plot(plan.minutes / HOUR, chosen, "s", color=AFTER, label="this plan")
+        values = [*errors, chosen]
         if plan.criterion == "aligned":
             for marker, colour, other in zip("o^", (BEFORE, UNSEEN), plan.compared, strict=False):
                 if other.expected is None:
@@ -302,14 +304,6 @@ def _helps(plan: MeasuringPlan) -> list[str]:
         )
         texts.append(f"{none}. Less needs another sensor, such as an indicator at the tool.")
     return texts
-
-
-def _remaining(plan: MeasuringPlan) -> list[str]:
-    found = []
-    for r in plan.find_remaining():
-        parts = ", ".join(f"{n} {t:+.1f}" for n, t in r.parts[:5]) or "many small errors"
-        found.append(f"{plain(r.rms / UM, 1)} µm from this combination, in tolerances: {parts}.")
-    return found
 
 
 def _setups(plan: MeasuringPlan) -> RenderableType:

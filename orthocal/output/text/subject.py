@@ -1,4 +1,4 @@
-"""What a user means by a path: a calibration, a session or a robot."""
+"""Calibration, session or robot that a path names."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ Subject = Calibration | Session | Robot
 
 
 def load_subject(path: str | Path) -> Subject:
-    """A calibration, a session (or a plan of one) or a robot, whichever a path or name is.
+    """A calibration, a session (or a plan of one) or a robot, by its path or name.
 
-    A folder with both a calibration and a session is the calibration.
+    A directory with both a calibration and a session is the calibration.
 
     Args:
-        path: calibration.json, session.yaml, a folder that holds one, or a robot's folder or name.
+        path: calibration.json, session.yaml, a directory that contains one, or a robot's directory
+            or name.
 
     Raises:
         OrthocalError: If it is none of these, or does not load.
@@ -33,8 +34,9 @@ def load_subject(path: str | Path) -> Subject:
         if str(path) in packaged_robots():
             return load_robot(str(path))
         raise OrthocalError(
-            "there is no such file or folder; expected a calibration.json, a session.yaml, a "
-            f"folder that holds one, or a robot ({', '.join(packaged_robots())}, or its folder)",
+            "there is no such file or directory; expected a calibration.json, a session.yaml, a "
+            "directory that contains one, or a robot "
+            f"({', '.join(packaged_robots())}, or its directory)",
             where=str(path),
         )
     if not is_folder(file):
@@ -45,8 +47,8 @@ def load_subject(path: str | Path) -> Subject:
         return load_plan(file)
     if not any(file.glob("*.urdf")):
         raise OrthocalError(
-            "holds neither a calibration.json nor a session.yaml, nor is it a robot's folder (no "
-            "*.urdf)",
+            "contains no calibration.json and no session.yaml, and is no robot directory: it "
+            "contains no *.urdf",
             where=str(path),
         )
     return load_robot(file.resolve())

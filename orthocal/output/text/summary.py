@@ -1,7 +1,8 @@
-"""Calibrations and validations as text that people read: tables, then what they mean."""
+"""Results as text and as JSON: calibrations, validations, comparisons, plans and studies."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,9 +11,10 @@ from rich.text import Text
 
 from orthocal.arguments import require_kind
 from orthocal.assessment.assess import assessment_of
+from orthocal.calibration.assessment_record import Assessment
 from orthocal.calibration.calibration import Calibration
 from orthocal.output.text.answer import MORE, render_answer
-from orthocal.output.text.layout import bullets, print_rich, section, to_text
+from orthocal.output.text.layout import print_rich, section, to_markup, to_text
 
 if TYPE_CHECKING:
     from orthocal.assessment.comparison import Comparison
@@ -29,36 +31,33 @@ def summarize(
     """A calibration, validation, comparison, plan or study as plain text.
 
     Args:
-        result: What to summarise.
-        details: Of a calibration all that is known; else the short answer.
-        all_rows: List every reading and parameter, however many there are: details, too.
-        html: As HTML, as a notebook shows it.
+        result: The result.
+        details: Whether to describe a calibration completely; else the short answer.
+        all_rows: Whether to list every reading and parameter; includes the details.
+        html: Whether to return HTML, as a notebook shows it.
     """
-    content = _render(result, details, all_rows)
-    if not html:
-        return to_text(content)
-    from orthocal.output.text.layout import to_markup
-
-    return to_markup(content)
+    content = render_result(result, details=details, all_rows=all_rows)
+    return to_markup(content) if html else to_text(content)
 
 
 def print_summary(
     result: Result, *, details: bool = False, all_rows: bool = False, saved: Path | None = None
 ) -> None:
-    """Print a calibration, validation, comparison or plan: in colour where there is a terminal.
+    """Print a result: in colour on a terminal. For arguments see `render_result`."""
+    print_rich(render_result(result, details=details, all_rows=all_rows, saved=saved))
+
+
+def render_result(
+    result: Result, *, details: bool = False, all_rows: bool = False, saved: Path | None = None
+) -> RenderableType:
+    """A result as rich renderables.
 
     Args:
-        result: What to print.
-        details: Of a calibration everything; otherwise the short answer.
-        all_rows: List every reading and parameter.
+        result: The result.
+        details: Whether to describe a calibration or a plan completely.
+        all_rows: Whether to list every reading and parameter.
         saved: Directory in which a calibration was written.
     """
-    print_rich(_render(result, details, all_rows, saved))
-
-
-def _render(
-    result: Result, details: bool, all_rows: bool, saved: Path | None = None
-) -> RenderableType:
     if isinstance(result, Calibration):
         return render_calibration(result, details=details, all_rows=all_rows, saved=saved)
     from orthocal.assessment.comparison import Comparison
@@ -94,30 +93,40 @@ def render_calibration(
     all_rows: bool = False,
     saved: Path | None = None,
 ) -> RenderableType:
-    """A calibration as rich renderables: the short answer, and on demand everything else."""
+    """A calibration as rich renderables: the short answer, and on demand the details."""
     answer = render_answer(calibration, saved=saved)
     if not (details or all_rows):
         return Group(answer, Text(MORE))
+    from orthocal.output.text import tables
     from orthocal.output.text.accuracy import render_tool
-    from orthocal.output.text.entries import render_controller
-    from orthocal.output.text.heading import render_origin
-    from orthocal.output.text.sensors import render_parts
-    from orthocal.output.text.tables import (
-        render_fit,
-        render_identifiability,
-        render_parameters,
-        render_residuals,
-    )
+    from orthocal.output.text.entries import render_values
+    from orthocal.output.text.heading import render_method
 
-    return Group(
-        answer,
-        section("How it was done", render_origin(calibration)),
-        section("What was identified", render_parameters(calibration, all_rows=all_rows)),
-        section("Identifiability", render_identifiability(calibration, all_rows=all_rows)),
-        section("Readings before and after", render_residuals(calibration, all_rows=all_rows)),
-        section("How well it fits", render_fit(calibration)),
-        *(section("Gauges and sensors", part) for part in render_parts(calibration)),
-        section("At the tool", render_tool(calibration)),
-        section("Findings", bullets([f.words for f in assessment_of(calibration).findings])),
-        section("What to enter into the controller", render_controller(calibration)),
-    )
+    sections: dict[str, RenderableType | None] = {
+        "Method": render_method(calibration),
+        "Parameters": tables.render_parameters(calibration, all_rows=all_rows),
+        "Identifiability": tables.render_identifiability(calibration, all_rows=all_rows),
+        "Readings": tables.render_readings(calibration, all_rows=all_rows),
+        "Residuals": tables.render_fit(calibration),
+        "Gauges and sensors": tables.render_sensors(calibration),
+        "Tool error": render_tool(calibration),
+        "Findings": tables.render_findings(calibration),
+        "Values to enter": render_values(calibration),
+    }
+    return Group(answer, *(section(name, part) for name, part in sections.items() if part))
+
+
+def result_json(result: Calibration | Validation | Comparison | Assessment) -> str:
+    """A result as JSON, with `decision` and `findings` at the top level.
+
+    The JSON of a calibration loads like calibration.json.
+    """
+    if isinstance(result, Calibration):
+        from orthocal.calibration.file import calibration_document
+
+        document, assessment = calibration_document(result), assessment_of(result)
+    elif isinstance(result, Assessment):
+        document, assessment = {}, result
+    else:
+        document, assessment = json.loads(result.to_json()), result.assessment
+    return json.dumps(document | assessment.to_document(), indent=1, allow_nan=False) + "\n"

@@ -154,7 +154,7 @@ def test_scene_is_embedded_whole(read):
 def test_full_model_shows_the_error_with_offsets_entered(root):
     found = calibrate(load_session(root / "examples/sweep"), "full")
     page = build_report(found)
-    assert "once the offsets above are entered" in page
+    assert "without any other correction" in page
     read = Reader(page)
     assert ["drive", "now", "enter", "±", "identified", "unit"] in read.rows
     assert (
@@ -227,7 +227,7 @@ def test_robot_without_a_tool_has_a_report(experiment_2):
     bare = replace(experiment_2.robot, tcp=None)
     found = calibrate(replace(experiment_2, robot=bare))
     page = build_report(found)
-    assert "Nothing can be said of the tool" in page
+    assert "The tool error cannot be computed" in page
     assert "no tool centre point" in page
 
 

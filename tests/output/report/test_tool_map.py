@@ -29,7 +29,7 @@ BETWEEN = 1e-3
 CONTOUR = 0.2
 """[mm] Contours of a length between points of the drawn grid, 3 mm apart."""
 
-WHICH = ("now", "left", "unknown")
+WHICH = ("now", "entered", "uncertainty")
 
 
 @pytest.fixture(scope="module")
@@ -125,14 +125,14 @@ def test_sizes_are_those_of_the_error_in_question(table1, accuracy):
     found = (accuracy.deviation, accuracy.error_after_offsets)
     deviation, left = (np.linalg.norm(accuracy.align(v), axis=1) for v in found)
     np.testing.assert_allclose(sizes("now"), deviation * 1e6, rtol=GRID)
-    np.testing.assert_allclose(sizes("left"), left * 1e6, rtol=GRID)
+    np.testing.assert_allclose(sizes("entered"), left * 1e6, rtol=GRID)
 
 
 def test_uncertainty_within_tolerances_is_that_of_the_assessment(planar):
     accuracy = assess_tool(planar)
     assert planar.tolerance_scale == 1.0
     variance = np.trace(accuracy.after.aligned_covariance, axis1=1, axis2=2)
-    sizes = tool_map._error_parts(planar, accuracy, "unknown")[:, 0]
+    sizes = tool_map._error_parts(planar, accuracy, "uncertainty")[:, 0]
     np.testing.assert_allclose(sizes, np.sqrt(variance) * 1e6, rtol=GRID)
 
 
@@ -144,10 +144,10 @@ def test_a_machine_worse_than_its_tolerances_is_known_less_well(experiment_2):
     covariance = error_covariance(calibration, excess=excess)
     worse = measure_uncertainty(accuracy.jacobian, covariance, accuracy.workspace, accuracy.targets)
     variance = np.trace(worse.aligned_covariance, axis1=1, axis2=2)
-    sizes = tool_map._error_parts(calibration, accuracy, "unknown")[:, 0]
+    sizes = tool_map._error_parts(calibration, accuracy, "uncertainty")[:, 0]
     np.testing.assert_allclose(sizes, np.sqrt(variance) * 1e6, rtol=GRID)
-    shown = texts(tool_map.plot_tool_map(calibration, accuracy, which="unknown"))
-    label = f"standard deviation in space [µm], errors at {excess:.1f} × their tolerances"
+    shown = texts(tool_map.plot_tool_map(calibration, accuracy, which="uncertainty"))
+    label = f"standard deviation in space [µm], tolerances × {excess:.1f}"
     assert label in shown
 
 
@@ -211,7 +211,7 @@ def test_arrows_point_where_the_tool_is_off_to(table1, accuracy):
 
 
 def test_uncertainty_has_no_arrows(table1, accuracy):
-    for axes in draw(table1, accuracy, "unknown").axes[:3]:
+    for axes in draw(table1, accuracy, "uncertainty").axes[:3]:
         assert not [c for c in axes.collections if hasattr(c, "U")]
 
 
@@ -279,9 +279,9 @@ def test_axes_are_the_coordinates_that_the_drives_control(planar):
 
 
 def test_no_map_without_uncertainty_or_further_errors(table1, accuracy):
-    assert tool_map.plot_tool_map(table1, replace(accuracy, after=None), which="unknown") == ""
+    assert tool_map.plot_tool_map(table1, replace(accuracy, after=None), which="uncertainty") == ""
     offsets = replace(table1, parameters=table1.parameters[:3])
-    assert tool_map.plot_tool_map(offsets, accuracy, which="left") == ""
+    assert tool_map.plot_tool_map(offsets, accuracy, which="entered") == ""
     assert tool_map.plot_tool_map(offsets, accuracy, which="now")
 
 
