@@ -15,7 +15,7 @@ from orthocal.effects.protocol import Effect
 from orthocal.effects.registry import find_effect
 from orthocal.errors import OrthocalError, ParameterError, RobotError
 from orthocal.io.documents import PositiveNumber, validate
-from orthocal.robot.loading import LOADED, load_bare_robot
+from orthocal.robot.loading import MAX_LOADED, load_bare_robot
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import COMPLETE, ElementaryError, build_parameters
 from orthocal.robot.redundant import find_redundant_errors
@@ -46,7 +46,7 @@ def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
     return _add_parameters(load_bare_robot(robot, beside=beside))
 
 
-@lru_cache(maxsize=LOADED)
+@lru_cache(maxsize=MAX_LOADED)
 def _add_parameters(robot: Robot) -> Robot:
     where, declared = f"{robot.yaml}: orthocal", robot.declared
     errors: dict[str, ElementaryError] = {}
@@ -73,7 +73,7 @@ def _add_parameters(robot: Robot) -> Robot:
     return replace(robot, parameters=parameters)
 
 
-@lru_cache(maxsize=2 * LOADED)
+@lru_cache(maxsize=2 * MAX_LOADED)
 def robot_effects(robot: Robot) -> tuple[Effect, ...]:
     """Effects of a robot: drive, geometry, and those that its YAML names, in this order.
 

@@ -1,6 +1,6 @@
-"""The YAML beside a robot's URDF, validated.
+"""Keys of a robot's YAML, and their validation.
 
-The keys at the top are those of the Gepetto "extended URDF"; all else stands under `orthocal`.
+The top-level keys are those of the Gepetto "extended URDF"; all others are below `orthocal`.
 """
 
 from __future__ import annotations
@@ -20,21 +20,19 @@ Coordinate = Literal["x", "y", "z"]
 Name = Annotated[str, Field(min_length=1, max_length=200), AfterValidator(composed)]
 
 
-def _in_small_letters(value: object) -> object:
-    return value.lower() if isinstance(value, str) else value
+ClosureKind = Annotated[
+    Literal["3d", "6d"],
+    BeforeValidator(lambda value: value.lower() if isinstance(value, str) else value),
+]
+"""Kind of a closure; Gepetto's robots have upper case, too."""
 
-
-ClosureKind = Annotated[Literal["3d", "6d"], BeforeValidator(_in_small_letters)]
-"""Gepetto's robots write it in capitals, too."""
-
-
-THICKEST_ROD_MM = 500.0
-"""No rod that a gauge touches is thicker: it is a wrong unit."""
+LARGEST_ROD_RADIUS_MM = 500.0
+"""Largest radius of a rod; a larger one is in another unit."""
 
 LARGEST_WORKSPACE_MM = 1e4
 
 MOST_PARTS = 100
-"""Legs, closures and named sums of a robot, of each."""
+"""Largest number of legs, of closures and of named sums."""
 
 
 class _Keys(BaseModel):
@@ -45,61 +43,59 @@ class ClosureKeys(_Keys):
     """Keys that orthocal adds to one pair of `closed_loop`."""
 
     rows: list[Row] | None = None
-    """Rows that count, in the axes of the pair's first frame; all by default."""
+    """Rows that are constrained, in the axes of the pair's first frame; all by default."""
 
 
 class JointKeys(_Keys):
-    """A controller's joint, where it counts otherwise than the drive."""
+    """Joint coordinate of the controller, if it differs from the drive coordinate."""
 
     counts: Literal["up", "down"] = "up"
-    """Whether the joint grows with the drive's coordinate, or against it."""
+    """Sign: up if the joint coordinate grows with the drive coordinate."""
     at_zero_mm: Number | None = None
-    """What the joint shows in the mechanical zero, of a prismatic drive; the drive's own
-    coordinate where it is not said."""
+    """Joint coordinate at the mechanical zero, for a prismatic drive; the drive coordinate by
+    default."""
     at_zero_deg: Number | None = None
-    """The same for a revolute drive."""
+    """Joint coordinate at the mechanical zero, for a revolute drive."""
 
 
 class DriveKeys(_Keys):
     """Keys that orthocal adds to one motor."""
 
     zero_mm: Number | None = None
-    """Commanded coordinate of the mechanical zero, for a prismatic drive."""
+    """Commanded coordinate at the mechanical zero, for a prismatic drive."""
     zero_deg: Number | None = None
-    """The same for a revolute drive."""
+    """Commanded coordinate at the mechanical zero, for a revolute drive."""
     joint: JointKeys | None = None
-    """How the controller counts; as the drive where it is not said."""
+    """Joint coordinate of the controller; the drive coordinate by default."""
 
 
 class RodKeys(_Keys):
     """A round rod of a leg."""
 
     root: Name
-    """Frame on its axis, at the drive's end."""
+    """Frame on the rod's axis, at the drive's end."""
     tip: Name
-    """Frame on its axis, at the platform's end."""
-    radius_mm: Annotated[PositiveNumber, Field(le=THICKEST_ROD_MM)]
+    """Frame on the rod's axis, at the platform's end."""
+    radius_mm: Annotated[PositiveNumber, Field(le=LARGEST_ROD_RADIUS_MM)]
 
 
 class LegKeys(_Keys):
-    """The line that a gauge touches."""
+    """Leg: the line that a gauge measures, and its rods."""
 
     root: Name
     """Frame at the drive's end of the leg."""
     tip: Name
     """Frame at the platform's end of the leg."""
     rods: dict[Name, RodKeys] = {}
-    """Round rods of the leg that a gauge may touch, by name."""
+    """Round rods that a gauge can touch, by name."""
 
 
 class TcpKeys(_Keys):
     """The tool centre point."""
 
     frame: Name
-    """Its frame."""
     coordinates: Annotated[list[Coordinate], Field(min_length=1, max_length=3)] = ["x", "y", "z"]
-    """World coordinates that the drives control; as many as drives where postures are
-    commanded by the tool."""
+    """World coordinates that the drives control; one per drive if postures are tool positions."""
 
 
 def _require_ascending(limits: list[float]) -> list[float]:
@@ -130,13 +126,13 @@ class WorkspaceKeys(_Keys):
 
 
 class OrthocalKeys(_Keys):
-    """Everything that is not in Gepetto's keys."""
+    """Keys below `orthocal`."""
 
     closures: dict[Name, ClosureKeys] | None = None
     drives: dict[Name, DriveKeys] = {}
     passive_start: dict[Name, Number] = {}
-    """Passive joint with `_mm` or `_deg` suffix to the value from which the loops are first
-    closed; 0 where absent."""
+    """Passive joint with suffix `_mm` or `_deg` to its start value for closing the loops; 0 by
+    default."""
     legs: Annotated[dict[Name, LegKeys], Field(max_length=MOST_PARTS)] = {}
     tcp: TcpKeys | None = None
     workspace: WorkspaceKeys | None = None
@@ -145,29 +141,29 @@ class OrthocalKeys(_Keys):
     ] = {}
     """Named sums of elementary errors; a leading '-' subtracts."""
     tolerances: dict[str, Any] = {}
-    """Tolerances of the errors that every machine has, read by `orthocal.effects`."""
+    """Tolerances of the rigid-body errors, read by `orthocal.effects`."""
     effects: Annotated[dict[Name, dict[str, Any]], Field(max_length=MOST_PARTS)] = {}
-    """Further effects by name, with keys that each reads itself."""
+    """Further effects by name; each reads its own keys."""
     models: dict[Name, Annotated[list[Name], Field(min_length=1)] | Literal["complete"]] = {}
-    """Patterns of names; or every error that changes something."""
+    """Patterns of parameter names, or all observable errors."""
 
 
 class RobotKeys(_Keys):
-    """A whole robot YAML."""
+    """Keys of a robot's YAML."""
 
     closed_loop: Annotated[
         list[Annotated[list[Name], Field(min_length=2, max_length=2)]],
         Field(max_length=MOST_PARTS),
     ]
-    """Pairs of frames that coincide."""
+    """Pairs of frames that coincide when the loops are closed."""
     type: list[ClosureKind]
-    """Whether a pair shares its origin only, or its axes too."""
+    """Kind of each pair: 3d for the same origin, 6d for the same pose."""
     name_mot: Annotated[list[Name], Field(min_length=1)]
-    """The actuated joints."""
+    """Actuated joints (motors)."""
     joint_name: list[Name] = []
-    """Joints that are of another type than the URDF says."""
+    """Joints whose type differs from the URDF."""
     joint_type: list[str] = []
-    """Of each of them: SPHERICAL, UJOINT_XY (about x, then y; other axes alike) or FIXED."""
+    """Type of each such joint: FIXED, SPHERICAL, UJOINT_XY (about x, then y) or other axes."""
     orthocal: OrthocalKeys = OrthocalKeys()
 
     @model_validator(mode="after")
@@ -178,8 +174,8 @@ class RobotKeys(_Keys):
         closures = self.orthocal.closures
         if closures is not None and len(closures) != pairs:
             raise ValueError(
-                f"orthocal.closures has {len(closures)} entries; closed_loop has {pairs}, "
-                "and each needs one, in the same order"
+                f"orthocal.closures has {len(closures)} entries; expected one for each of the "
+                f"{pairs} pairs of closed_loop, in the same order"
             )
         if len(set(self.name_mot)) != len(self.name_mot):
             raise ValueError("name_mot names a motor twice")
@@ -216,11 +212,11 @@ class RobotKeys(_Keys):
                     f"joint_type of '{name}': found '{declared}'; expected {', '.join(JOINT_TYPES)}"
                 )
             if name in self.name_mot:
-                raise ValueError(f"joint_name: '{name}' is a motor, which stays what the URDF says")
+                raise ValueError(f"joint_name: '{name}' is a motor; its type cannot be changed")
 
     @property
     def joint_types(self) -> dict[str, str]:
-        """Joint to the type that it is declared to be of."""
+        """Joint to its declared type."""
         return dict(zip(self.joint_name, self.joint_type, strict=True))
 
 
@@ -229,7 +225,7 @@ def load_description(path: Path, *, content: bytes | None = None) -> RobotKeys:
 
     Args:
         path: The file.
-        content: What it holds, where it was read already.
+        content: Content of the file, if it was read before.
 
     Raises:
         RobotError: Naming file and key.

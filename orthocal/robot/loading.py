@@ -16,6 +16,7 @@ from orthocal.errors import ParameterError, RobotError
 from orthocal.io.fields import read_only
 from orthocal.io.files import content_withheld_outside, is_folder, read_file, require_plain_name
 from orthocal.robot.description import (
+    ClosureKeys,
     DriveKeys,
     JointKeys,
     LegKeys,
@@ -37,19 +38,19 @@ from orthocal.robot.model import (
 from orthocal.robot.parameters import AXES, DeclaredErrors, ParameterSet, split_unit
 from orthocal.robot.reference_posture import find_reference_posture
 from orthocal.robot.urdf import load_urdf
-from orthocal.units import DEG, DRIVE_UNITS, MM, Unit
+from orthocal.units import DRIVE_UNITS, MM, Unit
 
 Array = NDArray[np.float64]
 
 LONGEST_LEG = 20.0
-"""A leg beyond this has its length in mm, [m]."""
+"""Largest length of a leg; a longer one is in mm, [m]."""
 
-LOADED = 8
-"""Robots that a process keeps: sessions and calibrations load the same ones again and again."""
+MAX_LOADED = 8
+"""Robots held in memory: sessions and calibrations load the same ones repeatedly."""
 
 
 def packaged_robots() -> dict[str, Path]:
-    """Name to folder of the robots that come with orthocal."""
+    """Packaged robots: name to directory."""
     package = Path(str(resources.files("orthocal")))
     for folder in (package / "_robots", package.parent / "robots"):
         if folder.is_dir():
@@ -60,15 +61,15 @@ def packaged_robots() -> dict[str, Path]:
 def load_bare_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
     """Load a robot without its error parameters, which `orthocal.effects.loading` adds.
 
-    URDF and YAML are checked against each other, and the loops are closed. A robot is never
-    changed: the same files give the same one again.
+    URDF and YAML are checked against each other, and the loops are closed. Robots are immutable:
+    the same files return the same object.
 
     Args:
-        robot: Name of a robot that comes with orthocal, or path to a robot folder.
-        beside: Folder that a relative path counts from; the working directory by default.
+        robot: Name of a packaged robot, or path to a robot directory.
+        beside: Directory to which a relative path refers; the working directory by default.
 
     Raises:
-        RobotError: Naming file and line or key, what was found and what was expected.
+        RobotError: If the files are missing or invalid; names file and line or key.
     """
     packaged = packaged_robots()
     if str(robot) in packaged:
@@ -77,7 +78,7 @@ def load_bare_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
     if not str(robot) or not is_folder(folder):
         raise RobotError(
             f"'{robot}' is neither a robot of orthocal ({', '.join(packaged)}) "
-            f"nor a folder ({folder})"
+            f"nor a directory ({folder})"
         )
     return _load_folder(folder)
 
@@ -86,22 +87,22 @@ def _load_folder(folder: Path) -> Robot:
     require_plain_name(folder.resolve(), error=RobotError)
     yaml_path, urdf_path = _find_files(folder)
     urdf, description = (read_file(p, error=RobotError) for p in (urdf_path, yaml_path))
-    name = folder.resolve().name  # of a relative one it depends on where we are
+    name = folder.resolve().name
     with content_withheld_outside(folder, yaml_path, urdf_path):
         return _build_robot(name, folder, yaml_path, urdf_path, urdf, description)
 
 
-@lru_cache(maxsize=LOADED)
+@lru_cache(maxsize=MAX_LOADED)
 def _build_robot(
     name: str, folder: Path, yaml_path: Path, urdf_path: Path, urdf: bytes, description: bytes
 ) -> Robot:
-    """The robot of these files, with this content."""
+    """Build a robot from the content of its files."""
     keys = load_description(yaml_path, content=description)
     where = str(yaml_path)
     model = load_urdf(urdf_path, content=urdf, joint_types=keys.joint_types, declared_in=where)
     digest = hashlib.sha256(urdf + b"\0" + description).hexdigest()
 
-    drives = _build_drives(model, keys, where)
+    drives = tuple(_build_drive(model, motor, keys, where) for motor in keys.name_mot)
     drive_index = [model.joints[model.getJointId(d.name)].idx_v for d in drives]
     passive_index = [i for i in range(model.nv) if i not in drive_index]
     closures = _build_closures(model, keys, where)
@@ -138,105 +139,92 @@ def _build_robot(
 
 
 def _find_files(folder: Path) -> tuple[Path, Path]:
-    """YAML and URDF of a robot folder: those named as the folder, or the only ones."""
-    found = []
+    """YAML and URDF of a robot directory: those with its name, or the only ones."""
+    paths = []
     for suffix in (".yaml", ".urdf"):
-        own = folder / f"{folder.resolve().name}{suffix}"
-        files = [own] if own.is_file() else sorted(folder.glob(f"*{suffix}"))
+        preferred = folder / f"{folder.resolve().name}{suffix}"
+        files = [preferred] if preferred.is_file() else sorted(folder.glob(f"*{suffix}"))
         if len(files) != 1:
             names = ", ".join(f.name for f in files) or "none"
             raise RobotError(
-                f"expected one {suffix[1:].upper()} file, or one named {own.name}; found {names}",
+                f"expected one {suffix[1:].upper()} file, or one named {preferred.name}; found "
+                f"{names}",
                 where=str(folder),
             )
-        found.append(files[0])
-    return found[0], found[1]
+        paths.append(files[0])
+    return paths[0], paths[1]
 
 
 def _has_zero(keys: RobotKeys, motor: str) -> bool:
+    """True if the YAML states the mechanical zero of a motor."""
     entry = keys.orthocal.drives.get(motor)
     return entry is not None and (entry.zero_mm is not None or entry.zero_deg is not None)
 
 
-def _build_drives(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Drive, ...]:
-    drives = []
-    for motor in keys.name_mot:
-        if not model.existJointName(motor):
-            moving = ", ".join(list(model.names)[1:]) or "none"
-            raise RobotError(
-                f"the URDF has no moving joint '{motor}'; joints: {moving}",
-                where=f"{where}: name_mot",
-            )
-        joint = model.joints[model.getJointId(motor)]
-        if joint.nv != 1:
-            raise RobotError(
-                f"'{motor}' has {joint.nv} degrees of freedom; a motor has one",
-                where=f"{where}: name_mot",
-            )
-        prismatic = not np.any(joint_axis(model, joint.id)[3:])
-        entry = keys.orthocal.drives.get(motor)
-        entry_where = f"{where}: orthocal.drives.{motor}"
-        zero, direction, shown = 0.0, 1, None
-        if entry is not None:
-            zero = _in_drive_unit(entry, "zero", prismatic, entry_where) or 0.0
-            if entry.joint is not None:
-                direction = 1 if entry.joint.counts == "up" else -1
-                shown = _in_drive_unit(entry.joint, "at_zero", prismatic, f"{entry_where}.joint")
-        bounded = joint.nq == 1
-        lower = float(model.lowerPositionLimit[joint.idx_q]) if bounded else -np.inf
-        upper = float(model.upperPositionLimit[joint.idx_q]) if bounded else np.inf
-        if _has_zero(keys, motor) and not lower <= zero <= upper:
-            unit, size = DRIVE_UNITS["m" if prismatic else "rad"]
-            raise RobotError(
-                f"the zero, {zero / size:g} {unit}, is outside the joint's limits "
-                f"{lower / size:g} ... {upper / size:g} {unit}",
-                where=entry_where,
-            )
-        drives.append(
-            Drive(
-                motor,
-                "m" if prismatic else "rad",
-                zero,
-                lower,
-                upper,
-                direction=direction,
-                joint_zero=shown,
-            )
-        )
-    return tuple(drives)
-
-
-def _in_drive_unit(
-    keys: DriveKeys | JointKeys, key: str, prismatic: bool, where: str
-) -> float | None:
-    """A length or an angle, whichever the drive has, [m, rad]; None where it is not said."""
-    wrong, right = (f"{key}_deg", f"{key}_mm") if prismatic else (f"{key}_mm", f"{key}_deg")
-    if getattr(keys, wrong) is not None:
+def _build_drive(model: pin.Model, motor: str, keys: RobotKeys, where: str) -> Drive:
+    """Drive of a motor: unit, mechanical zero, limits and the controller's joint."""
+    if not model.existJointName(motor):
+        joints = ", ".join(list(model.names)[1:]) or "none"
         raise RobotError(
-            f"the drive is {'prismatic' if prismatic else 'revolute'}; expected {right}",
-            where=f"{where}.{wrong}",
+            f"the URDF has no moving joint '{motor}'; joints: {joints}", where=f"{where}: name_mot"
         )
-    value = getattr(keys, right)
-    return None if value is None else float(value * (MM if prismatic else DEG))
+    joint = model.joints[model.getJointId(motor)]
+    if joint.nv != 1:
+        raise RobotError(
+            f"'{motor}' has {joint.nv} degrees of freedom; a motor has one",
+            where=f"{where}: name_mot",
+        )
+    unit: Unit = "rad" if np.any(joint_axis(model, joint.id)[3:]) else "m"
+    here = f"{where}: orthocal.drives.{motor}"
+    entry = keys.orthocal.drives.get(motor, DriveKeys())
+    counting = entry.joint or JointKeys()
+    zero = _in_drive_unit(entry, "zero", unit, here) or 0.0
+    lower, upper = -np.inf, np.inf
+    if joint.nq == 1:
+        limits = model.lowerPositionLimit, model.upperPositionLimit
+        lower, upper = (float(v[joint.idx_q]) for v in limits)
+    if _has_zero(keys, motor) and not lower <= zero <= upper:
+        name, size = DRIVE_UNITS[unit]
+        raise RobotError(
+            f"the zero, {zero / size:g} {name}, is outside the joint's limits "
+            f"{lower / size:g} ... {upper / size:g} {name}",
+            where=here,
+        )
+    return Drive(
+        motor,
+        unit,
+        zero,
+        lower,
+        upper,
+        direction=1 if counting.counts == "up" else -1,
+        joint_zero=_in_drive_unit(counting, "at_zero", unit, f"{here}.joint"),
+    )
+
+
+def _in_drive_unit(keys: DriveKeys | JointKeys, key: str, unit: Unit, where: str) -> float | None:
+    """Value of a key in the unit of a drive, [m, rad]; None if it is absent."""
+    expected, other = (f"{key}_mm", f"{key}_deg") if unit == "m" else (f"{key}_deg", f"{key}_mm")
+    if getattr(keys, other) is not None:
+        kind = "prismatic" if unit == "m" else "revolute"
+        raise RobotError(f"the drive is {kind}; expected {expected}", where=f"{where}.{other}")
+    value = getattr(keys, expected)
+    return None if value is None else float(value * DRIVE_UNITS[unit][1])
 
 
 def _build_closures(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Closure, ...]:
-    named = keys.orthocal.closures
-    names = (
-        list(named) if named is not None else [f"closure_{i + 1}" for i in range(len(keys.type))]
-    )
-    rows_of = {r: i for i, r in enumerate(AXES)}
+    entries = keys.orthocal.closures or {
+        f"closure_{i + 1}": ClosureKeys() for i in range(len(keys.type))
+    }
     closures = []
-    for i, (name, pair, kind) in enumerate(zip(names, keys.closed_loop, keys.type, strict=True)):
+    for i, (name, pair, kind) in enumerate(zip(entries, keys.closed_loop, keys.type, strict=True)):
         for frame in pair:
             find_frame(model, frame, where=f"{where}: closed_loop[{i}]")
         if pair[0] == pair[1]:
             raise RobotError(
                 f"closes the frame '{pair[0]}' on itself", where=f"{where}: closed_loop[{i}]"
             )
-        rows = named[name].rows if named is not None else None
-        count = 3 if kind == "3d" else 6
-        indices = tuple(range(count)) if rows is None else tuple(sorted(rows_of[r] for r in rows))
+        rows = entries[name].rows or AXES[: 3 if kind == "3d" else 6]
+        indices = tuple(sorted(AXES.index(row) for row in rows))
         closures.append(Closure(name, pair[0], pair[1], kind, indices))
     return tuple(closures)
 
@@ -265,6 +253,7 @@ def _read_workspace(keys: RobotKeys, where: str) -> NDArray[np.float64] | None:
 
 
 def _passive_start(robot: Robot, keys: RobotKeys, where: str) -> Array:
+    """Passive coordinates from which the loops are first closed, shape (n_passive,)."""
     start = np.zeros(robot.model.nv)
     for key, value in keys.orthocal.passive_start.items():
         here = f"{where}: orthocal.passive_start.{key}"
@@ -283,8 +272,8 @@ def _passive_start(robot: Robot, keys: RobotKeys, where: str) -> Array:
     return np.asarray(start[robot.passive_index])
 
 
-def _without_rounding(unit_vector: Array) -> Array:
-    """A unit vector whose components within rounding of 0 or ±1 are exactly that."""
+def _snap_to_axes(unit_vector: Array) -> Array:
+    """Unit vector with components within rounding of 0 or ±1 replaced by 0 or ±1."""
     nearest = np.round(unit_vector)
     return np.where(np.abs(unit_vector - nearest) < 1e-12, nearest, unit_vector)
 
@@ -311,7 +300,7 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
             root=entry.root,
             tip=entry.tip,
             length=length,
-            axis=read_only(_without_rounding((tip - root) / length)),
+            axis=read_only(_snap_to_axes((tip - root) / length)),
             reference_root=read_only(root),
             root_driven=bool(moved < 1e-9),
             rods=_build_rods(model, data, entry, here),
@@ -322,10 +311,10 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
 def _ends(
     model: pin.Model, data: pin.Data, entry: LegKeys | RodKeys, here: str
 ) -> tuple[Array, Array]:
-    """Root and tip of a line in the mechanical zero, shape (3,) each, [m].
+    """Root and tip of a line in the reference posture, shape (3,) each, [m].
 
     Raises:
-        RobotError: If a frame does not exist, or the line is too long or none.
+        RobotError: If a frame does not exist, or the line is too long or has no length.
     """
     ids = [find_frame(model, f, where=here) for f in (entry.root, entry.tip)]
     root, tip = (np.array(data.oMf[i].translation) for i in ids)

@@ -1,4 +1,4 @@
-"""A robot: its URDF in Pinocchio, its loops as Pinocchio constraint models, its drives and legs."""
+"""Robot: Pinocchio model, loop closures as constraint models, drives, legs and tool."""
 
 from __future__ import annotations
 
@@ -28,38 +28,38 @@ class Drive(InUnit):
     unit: Unit
     """m for a prismatic, rad for a revolute drive."""
     zero: float
-    """Commanded coordinate of the mechanical zero, [unit]."""
+    """Commanded coordinate at the mechanical zero, [unit]."""
     lower: float
-    """Least coordinate, [unit]; -inf where the URDF gives none."""
+    """Lower limit, [unit]; -inf without a limit in the URDF."""
     upper: float
-    """Largest coordinate, [unit]; inf where the URDF gives none."""
+    """Upper limit, [unit]; inf without a limit in the URDF."""
     zero_computed: bool = False
-    """Whether the zero was found by closing the loops, and is not the one that was given."""
+    """True if the zero was computed by closing the loops; False if it is that of the YAML."""
     direction: int = 1
-    """1 where the controller's joint grows with the coordinate, -1 where it falls."""
+    """1 if the controller's joint coordinate grows with the drive coordinate, else -1."""
     joint_zero: float | None = None
-    """What the controller's joint shows in the mechanical zero, [unit]; None: the coordinate."""
+    """Joint coordinate of the controller at the mechanical zero, [unit]; None for `zero`."""
 
     def to_joint(self, coordinate: ArrayLike) -> Array:
-        """Coordinates of the controller's joint for drive coordinates of any shape, [unit]."""
+        """Joint coordinates of the controller from drive coordinates, any shape, [unit]."""
         shown = self.zero if self.joint_zero is None else self.joint_zero
         return shown + self.direction * (np.asarray(coordinate, dtype=np.float64) - self.zero)
 
     def from_joint(self, joint: ArrayLike) -> Array:
-        """Coordinates at which the controller's joint shows this, of any shape, [unit]."""
+        """Drive coordinates from joint coordinates of the controller, any shape, [unit]."""
         shown = self.zero if self.joint_zero is None else self.joint_zero
         return self.zero + self.direction * (np.asarray(joint, dtype=np.float64) - shown)
 
     @property
     def joint_limits(self) -> tuple[float, float]:
-        """Least and largest that the joint may show, [unit]."""
+        """Lower and upper limit of the controller's joint coordinate, [unit]."""
         ends = (float(self.to_joint(self.lower)), float(self.to_joint(self.upper)))
         return min(ends), max(ends)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Closure:
-    """Two frames that coincide, and the rows of their pose error that count."""
+    """Pair of frames that coincide, and the constrained rows of their pose error."""
 
     name: str
     frame_a: str
@@ -67,7 +67,7 @@ class Closure:
     kind: str
     """'3d': position of b in a, 3 rows; '6d': log6 of the pose of b in a, 6 rows."""
     rows: tuple[int, ...]
-    """Rows that count, 0 to 5: x, y, z, rx, ry, rz."""
+    """Constrained rows, 0 to 5 for x, y, z, rx, ry, rz."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,22 +76,22 @@ class Rod:
 
     name: str
     root: str
-    """Frame on its axis, at the drive's end."""
+    """Frame on the rod's axis, at the drive's end."""
     tip: str
-    """Frame on its axis, at the platform's end."""
+    """Frame on the rod's axis, at the platform's end."""
     radius: float
     """[m]."""
     length: float
     """Nominal distance from root to tip, [m]."""
     reference_root: Array
-    """Root in the mechanical zero of the nominal machine, shape (3,), [m]."""
+    """Root in the nominal reference posture, shape (3,), [m]."""
     reference_tip: Array
-    """Likewise."""
+    """Tip in the nominal reference posture, shape (3,), [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Leg:
-    """A leg: the line that stands for it, and its rods."""
+    """Leg: the line from root to tip, and its rods."""
 
     name: str
     root: str
@@ -101,13 +101,13 @@ class Leg:
     length: float
     """Nominal distance from root to tip, [m]."""
     axis: Array
-    """Unit vector from root to tip in the mechanical zero of the nominal machine, shape (3,)."""
+    """Unit vector from root to tip in the nominal reference posture, shape (3,)."""
     reference_root: Array
-    """Root in the mechanical zero of the nominal machine, shape (3,), [m]."""
+    """Root in the nominal reference posture, shape (3,), [m]."""
     root_driven: bool
-    """Whether the root moves with drives alone, not with passive joints."""
+    """True if no passive joint moves the root."""
     rods: Mapping[str, Rod]
-    """Round rods that a gauge may touch."""
+    """Round rods that a gauge can touch, by name."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,9 +121,9 @@ class Tcp:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Robot:
-    """A robot with closed loops.
+    """Robot with closed loops.
 
-    Joint coordinates are one number a degree of freedom (an angle also for unbounded revolute
+    Joint coordinates hold one number per degree of freedom (an angle also for unbounded revolute
     joints), in the order of Pinocchio's velocities.
     """
 
@@ -132,7 +132,7 @@ class Robot:
     urdf: Path
     yaml: Path
     sha256: str
-    """Of the URDF and the YAML."""
+    """Digest of the URDF and the YAML."""
     model: pin.Model
     constraints: tuple[pin.PointAnchorConstraintModel | pin.FrameAnchorConstraintModel, ...]
     """The closures as Pinocchio's constraint models, all rows."""
@@ -141,10 +141,10 @@ class Robot:
     legs: Mapping[str, Leg]
     tcp: Tcp | None
     workspace: Array | None
-    """Box over which errors at the tool are reported, relative to the mechanical zero, shape
-    (n_coordinates, 2), [m]; None where the YAML states none."""
+    """Box in the YAML over which tool errors are reported, relative to the mechanical zero, shape
+    (n_coordinates, 2), [m]; None without one."""
     declared: DeclaredErrors
-    """What the YAML says of the machine's errors, for `orthocal.effects`."""
+    """Errors declared in the YAML, for `orthocal.effects`."""
     parameters: ParameterSet
     """Error parameters, from `orthocal.effects.loading`."""
     drive_index: NDArray[np.int64]
@@ -158,12 +158,12 @@ class Robot:
 
     @property
     def closure_rows(self) -> int:
-        """Number of closure rows that count."""
+        """Number of constrained closure rows."""
         return sum(len(c.rows) for c in self.closures)
 
     @property
     def drive_zero(self) -> Array:
-        """Commanded drive coordinates of the mechanical zero, shape (n_drives,), [m, rad]."""
+        """Mechanical zero: commanded drive coordinates, shape (n_drives,), [m, rad]."""
         return np.array([d.zero for d in self.drives])
 
     @property
@@ -173,9 +173,9 @@ class Robot:
 
     @property
     def characteristic_length(self) -> float:
-        """Length that turns rotations into displacements when rows are scaled, [m].
+        """Length that scales rotations to displacements, [m].
 
-        The mean nominal leg length, or the mean distance between joints where there are no legs.
+        The mean nominal leg length, or without legs the mean distance between joints.
         """
         if self.legs:
             return float(np.mean([leg.length for leg in self.legs.values()]))
@@ -184,7 +184,7 @@ class Robot:
         return float(np.mean(spans)) if spans else 1.0
 
     def frame_id(self, name: str) -> int:
-        """Pinocchio's index of a link's or fixed joint's frame.
+        """Pinocchio's index of a frame by its name.
 
         Raises:
             RobotError: If there is no such frame.
@@ -204,7 +204,7 @@ class Robot:
         return np.asarray(pin.integrate(self.model, pin.neutral(self.model), v))
 
     def joint_coordinates(self, drives: ArrayLike, passive: ArrayLike) -> Array:
-        """Joint coordinates from commanded drive and passive coordinates, offsets not added.
+        """Joint coordinates from commanded drive and passive coordinates, without drive offsets.
 
         Args:
             drives: Shape (..., n_drives), [m, rad].
@@ -223,10 +223,10 @@ class Robot:
     def close_with_pinocchio(
         self, drives: ArrayLike, start: ArrayLike, *, posture: str = "posture"
     ) -> Array:
-        """Passive coordinates that close the loops, by damped least squares on Pinocchio's models.
+        """Solve the loop closures of one posture by damped least squares on Pinocchio's models.
 
-        One posture, from a near start; the independent check of `LoopClosure`, which is the way to
-        close many postures from afar.
+        It needs a near start. Reference for `LoopClosure`, which closes batches of postures from
+        the reference posture.
 
         Args:
             drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
@@ -247,22 +247,23 @@ class Robot:
             return residual, jacobian[:, self.passive_index]
 
         row_units = closure_row_units(self)
-        found = close_loops(
+        closing = close_loops(
             evaluate,
             start,
             row_units=row_units,
             units=coordinate_units(self)[self.passive_index],
         )
-        if not found.closed:
+        if not closing.closed:
+            opening = describe_opening(closing.residual, closure_turns(self))
             raise ClosureError(
-                f"does not close: open by {describe_opening(found.residual, closure_turns(self))}",
+                f"does not close: open by {opening}",
                 posture=posture,
-                residual=float(np.abs(row_units * found.residual).max()),
+                residual=float(np.abs(row_units * closing.residual).max()),
             )
-        return found.coordinates
+        return closing.coordinates
 
     def evaluate_constraints(self, drives: ArrayLike, passive: ArrayLike) -> tuple[Array, Array]:
-        """Closure residual and its Jacobian by Pinocchio, rows that count.
+        """Closure residual and its Jacobian by Pinocchio, constrained rows.
 
         Args:
             drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
@@ -277,7 +278,12 @@ class Robot:
     def evaluate_constraints_at(
         self, coordinates: ArrayLike, *, data: pin.Data | None = None
     ) -> tuple[Array, Array]:
-        """Closure residual and derivative at joint coordinates, shape (nv,); `data` is reused."""
+        """Closure residual and its Jacobian at joint coordinates, as `evaluate_constraints`.
+
+        Args:
+            coordinates: Shape (nv,), [m, rad].
+            data: Workspace of Pinocchio, to reuse in repeated calls.
+        """
         data = self.model.createData() if data is None else data
         pin.computeJointJacobians(self.model, data, self.configuration(coordinates))
         residuals, jacobians = [np.zeros(0)], [np.zeros((0, self.model.nv))]
@@ -286,7 +292,7 @@ class Robot:
             constraint.calc(self.model, data, cdata)
             error = np.array(cdata.constraint_position_error)
             jacobian = constraint.jacobian(self.model, data, cdata)
-            if closure.kind == "6d":  # of the relative velocity; the error is its logarithm
+            if closure.kind == "6d":  # Pinocchio differentiates the pose, not its logarithm
                 c1mc2 = cdata.c1Mc2
                 jacobian = pin.Jlog6(c1mc2) @ c1mc2.toActionMatrixInverse() @ jacobian
             rows = list(closure.rows)
@@ -295,20 +301,20 @@ class Robot:
         return np.concatenate(residuals), np.vstack(jacobians)
 
     def with_tolerances(self, given: Mapping[str, float]) -> Robot:
-        """The robot whose errors have other tolerances; see `ParameterSet.with_tolerances`.
+        """Robot with other tolerances of its errors; see `ParameterSet.with_tolerances`.
 
         Raises:
-            ParameterError: If a name or unit is unknown, or a number makes no sense.
+            ParameterError: If a name or unit is unknown, or a number is implausible.
         """
         if not given:
             return self
         return replace(self, parameters=self.parameters.with_tolerances(given))
 
     def with_errors(self, values: Mapping[str, float]) -> Robot:
-        """The robot with errors written into its Pinocchio placements.
+        """Robot with errors written into its Pinocchio placements.
 
-        Joint and frame placements become placement · exp6(δ); an offset moves the placement of its
-        drive along or about its own axis; a scale error stays with the drive.
+        Joint and frame placements become placement · exp6(δ). An offset moves the placement of a
+        drive along or about the drive's axis. A scale error becomes part of `drive_gain`.
 
         Args:
             values: Parameter name to value, [unit of the parameter].
@@ -363,15 +369,15 @@ def closure_turns(robot: Robot) -> NDArray[np.bool_]:
 
 
 def closure_row_units(robot: Robot) -> Array:
-    """Displacement that one unit of each closure row amounts to, shape (closure_rows,).
+    """Metres per unit of each closure row, shape (closure_rows,), [1 or m/rad].
 
-    1 for translations, the characteristic length for rotations: residual × this is in [m].
+    1 for translations, the characteristic length for rotations.
     """
     return np.where(closure_turns(robot), robot.characteristic_length, 1.0)
 
 
 def coordinate_units(robot: Robot) -> Array:
-    """Displacement that one unit of each joint coordinate amounts to, shape (nv,), [m or m/rad]."""
+    """Metres per unit of each joint coordinate, shape (nv,), [1 or m/rad]."""
     model, length = robot.model, robot.characteristic_length
     units = np.ones(model.nv)
     for i in range(1, model.njoints):
@@ -387,10 +393,10 @@ def coordinate_limits(robot: Robot) -> tuple[Array, Array]:
     lower, upper = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
     for joint in list(model.joints)[1:]:
         if joint.nq == joint.nv:
-            own = slice(joint.idx_v, joint.idx_v + joint.nv)
-            place = slice(joint.idx_q, joint.idx_q + joint.nq)
-            lower[own] = model.lowerPositionLimit[place]
-            upper[own] = model.upperPositionLimit[place]
+            v = slice(joint.idx_v, joint.idx_v + joint.nv)
+            q = slice(joint.idx_q, joint.idx_q + joint.nq)
+            lower[v] = model.lowerPositionLimit[q]
+            upper[v] = model.upperPositionLimit[q]
     return lower, upper
 
 
@@ -403,7 +409,7 @@ def joint_turns(model: pin.Model, joint: int) -> bool:
 def build_constraints(
     model: pin.Model, closures: Sequence[Closure]
 ) -> tuple[pin.PointAnchorConstraintModel | pin.FrameAnchorConstraintModel, ...]:
-    """Pinocchio's constraint models of closures, in the present placements of the model."""
+    """Pinocchio's constraint models of closures, with the placements of a model."""
     result = []
     for closure in closures:
         a, b = (

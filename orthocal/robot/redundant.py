@@ -1,13 +1,13 @@
-"""Errors that change nothing: neither the tool nor what a gauge touches, in any posture.
+"""Redundant errors: those that neither the tool nor a gauge can observe in any posture.
 
-Loops closed by Pinocchio, in postures drawn from the travel of the drives; an error of a placement
-is a small motion of all that it carries. What passive joints take up changes nothing, such as an
-error about a hinge's own axis.
+An error of a placement is a small motion of everything that it carries. Passive joints follow it
+until the loops are closed again. An error that they compensate entirely is redundant, such as a
+rotation about a hinge's axis.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -15,148 +15,150 @@ from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError
 from orthocal.robot.frames import hangs_on
-from orthocal.robot.model import Robot, joint_axis
+from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError
 
 Array = NDArray[np.float64]
+Owner = tuple[int, bool]
+"""Index of a joint or of a frame, and True for a frame."""
 
 POSTURES = 4
 
-TRIES = 200
+MAX_ATTEMPTS = 200
+"""Random drive coordinates at most, of which some cannot be reached."""
 
-UNBOUNDED = 0.2
-"""How far a drive without limits is moved, [m, rad]."""
+UNLIMITED_TRAVEL = 0.2
+"""Travel of a drive without limits to both sides of its zero, [m, rad]."""
 
-NOTHING = 1e-9
-"""Of the largest effect of an error of its kind."""
+SMALLEST_EFFECT = 1e-9
+"""Effect below which an error is redundant, relative to the largest effect of its kind."""
 
 
 def find_redundant_errors(robot: Robot, elementary: Sequence[ElementaryError]) -> frozenset[str]:
-    """Names of the elementary errors of placements that change nothing.
+    """Names of the placement errors that the tool and the gauges cannot observe.
 
-    Errors of other kinds are never idle. A robot without tool and legs has no idle errors that
-    anyone could tell.
+    Errors of other kinds are never redundant. Without a tool and legs nothing is observed, and no
+    error counts as redundant.
     """
     errors = [e for e in elementary if e.axis >= 0]
     if robot.tcp is None and not robot.legs:
         return frozenset()
-    owners = list(dict.fromkeys((e.owner, e.of_frame) for e in errors))
-    place = np.array([owners.index((e.owner, e.of_frame)) for e in errors])
-    axes = np.array([e.axis for e in errors])
-    parts = _Parts(robot, owners)
-    largest = np.zeros(len(errors))
-    for coordinates in _postures(robot):
-        effect = np.abs(parts.effects(coordinates)).max(axis=0)
-        largest = np.maximum(largest, effect[place, axes])
-    turns = np.array([e.axis >= 3 for e in errors])
-    idle = np.zeros(len(errors), dtype=np.bool_)
-    for kind in (turns, ~turns):
-        idle |= kind & (largest <= NOTHING * largest[kind].max(initial=0.0))
-    return frozenset(e.name for e, out in zip(errors, idle, strict=True) if out)
+    owners = list(dict.fromkeys(_owner(robot, e) for e in errors))
+    columns = [6 * owners.index(_owner(robot, e)) + e.axis for e in errors]
+    observed = [] if robot.tcp is None else [robot.tcp.frame]
+    for leg in robot.legs.values():
+        for rod in leg.rods.values() or (leg,):
+            observed += [rod.root, rod.tip]
+    frames = [robot.frame_id(name) for name in dict.fromkeys(observed)]
+    masks = _carried_masks(robot, owners, frames)
+    effects = np.zeros(len(errors))
+    for coordinates in _random_postures(robot):
+        sensitivity = _sensitivity(robot, owners, frames, masks, coordinates)
+        effects = np.maximum(effects, np.abs(sensitivity).max(axis=0)[columns])
+    rotations = np.array([e.axis >= 3 for e in errors], dtype=np.bool_)
+    redundant = np.zeros(len(errors), dtype=np.bool_)
+    for kind in (rotations, ~rotations):
+        redundant |= kind & (effects <= SMALLEST_EFFECT * effects[kind].max(initial=0.0))
+    return frozenset(e.name for e, r in zip(errors, redundant, strict=True) if r)
 
 
-def _postures(robot: Robot) -> Iterator[Array]:
-    """Joint coordinates of machines in postures all over the travel, loops closed."""
-    rng = np.random.default_rng(0)
+def _owner(robot: Robot, error: ElementaryError) -> Owner:
     model = robot.model
-    lower, upper = robot.drive_zero - UNBOUNDED, robot.drive_zero + UNBOUNDED
-    for i, v in enumerate(robot.drive_index.tolist()):
-        joint = next(j for j in model.joints if j.idx_v == v and j.nv == 1)
-        if joint.nq == 1 and np.isfinite(model.upperPositionLimit[joint.idx_q]):
-            lower[i] = model.lowerPositionLimit[joint.idx_q]
-            upper[i] = model.upperPositionLimit[joint.idx_q]
-    found, share = 0, 0.5
-    for _ in range(TRIES):
-        drives = robot.drive_zero + share * (rng.uniform(lower, upper) - robot.drive_zero)
+    index = robot.frame_id(error.owner) if error.of_frame else model.getJointId(error.owner)
+    return int(index), error.of_frame
+
+
+def _random_postures(robot: Robot) -> Iterator[Array]:
+    """Joint coordinates of postures within the travel of the drives, loops closed."""
+    rng = np.random.default_rng(0)
+    zero = robot.drive_zero
+    lower, upper = np.array([(d.lower, d.upper) for d in robot.drives]).T
+    unlimited = ~np.isfinite(upper)
+    lower = np.where(unlimited, zero - UNLIMITED_TRAVEL, lower)
+    upper = np.where(unlimited, zero + UNLIMITED_TRAVEL, upper)
+    count, fraction = 0, 0.5
+    for _ in range(MAX_ATTEMPTS):
+        drives = zero + fraction * (rng.uniform(lower, upper) - zero)
         try:
             passive = robot.close_with_pinocchio(drives, robot.reference_passive)
         except ClosureError:
-            share *= 0.8
+            fraction *= 0.8
             continue
         yield robot.joint_coordinates(drives, passive)
-        found += 1
-        if found == POSTURES:
+        count += 1
+        if count == POSTURES:
             return
 
 
-class _Parts:
-    """Parts of a machine, and how it moves with a small motion of each.
+def _carried_masks(
+    robot: Robot, owners: Sequence[Owner], observed: Sequence[int]
+) -> dict[int, Array]:
+    """Frames of closures and observed frames, with a 0-1 mask of the motions that carry them.
+
+    The motions are the six of each owner, then those of the passive coordinates.
+    """
+    model = robot.model
+    joint_of = {j.idx_v + k: i for i, j in enumerate(model.joints) if i for k in range(j.nv)}
+    joints = [joint_of[k] for k in robot.passive_index.tolist()]
+    ends = [robot.frame_id(n) for c in robot.closures for n in (c.frame_a, c.frame_b)]
+    masks = {}
+    for frame in {*observed, *ends}:
+        supports = model.supports[model.frames[frame].parentJoint]
+        carriers = {(int(joint), False) for joint in supports}
+        current: int | None = frame
+        while current is not None:
+            carriers.add((current, True))
+            current = hangs_on(model, current)
+        mask = np.repeat([owner in carriers for owner in owners], 6)
+        passive = [(joint, False) in carriers for joint in joints]
+        masks[frame] = np.concatenate([mask, passive]).astype(np.float64)
+    return masks
+
+
+def _sensitivity(
+    robot: Robot,
+    owners: Sequence[Owner],
+    observed: Sequence[int],
+    masks: Mapping[int, Array],
+    coordinates: Array,
+) -> Array:
+    """Sensitivity of observed points to placement errors, with the loops closed.
+
+        dp/dξ = p_ξ − p_q g_q⁺ g_ξ
 
     Args:
         robot: The robot.
-        owners: Joints and frames that are moved, and whether it is a frame.
+        owners: Joints and frames with an error ξ, a twist in their own frame.
+        observed: Frames whose origins p are observed.
+        masks: Motions that carry each frame, as `_carried_masks` returns them.
+        coordinates: Joint coordinates with closed loops, shape (nv,), [m, rad].
+
+    Returns:
+        Shape (3 n_observed, 6 n_owners), [m/m, m/rad].
     """
+    model = robot.model
+    data = model.createData()
+    pin.computeJointJacobians(model, data, robot.configuration(coordinates))
+    pin.updateFramePlacements(model, data)
+    frames = [
+        data.oMf[i] if of_frame else data.oMi[model.parents[i]] * model.jointPlacements[i]
+        for i, of_frame in owners
+    ]
+    twists = np.hstack(
+        [*(f.toActionMatrix() for f in frames), data.J[:, robot.passive_index.tolist()]]
+    )
 
-    def __init__(self, robot: Robot, owners: list[tuple[str, bool]]) -> None:
-        self._robot, model = robot, robot.model
-        passive = set(robot.passive_index.tolist())
-        self._joints = [j for j in range(1, model.njoints) if model.joints[j].idx_v in passive]
-        self._axes = np.array([joint_axis(model, j) for j in self._joints]).reshape(-1, 6)
-        self._owners = [
-            (robot.frame_id(n) if of_frame else model.getJointId(n), of_frame)
-            for n, of_frame in owners
-        ]
-        looked_at = [] if robot.tcp is None else [robot.tcp.frame]
-        for leg in robot.legs.values():
-            for rod in leg.rods.values() or (leg,):
-                looked_at += [rod.root, rod.tip]
-        self._seen = [robot.frame_id(name) for name in looked_at]
-        self._ends = [
-            (robot.frame_id(c.frame_a), robot.frame_id(c.frame_b)) for c in robot.closures
-        ]
-        moved = [*self._owners, *((j, False) for j in self._joints)]
-        self._carried = {}
-        for frame in {*self._seen, *(f for pair in self._ends for f in pair)}:
-            carriers = self._carriers(frame)
-            self._carried[frame] = np.array([m in carriers for m in moved], dtype=np.float64)
+    def motion(point: Array) -> Array:
+        """Velocity and angular velocity at a point by all motions, in the world, shape (6, n)."""
+        return np.vstack([twists[:3] - pin.skew(point) @ twists[3:], twists[3:]])
 
-    def effects(self, coordinates: Array) -> Array:
-        """Sensitivity of observed points along the closed loops, (n, n_owners, 6), [m/m, m/rad]."""
-        robot, model = self._robot, self._robot.model
-        data = model.createData()
-        pin.framesForwardKinematics(model, data, robot.configuration(coordinates))
-        places = [
-            data.oMf[i] if of_frame else data.oMi[model.parents[i]] * model.jointPlacements[i]
-            for i, of_frame in self._owners
-        ]
-        errors = np.array([p.toActionMatrix() for p in places])
-        joints = np.array([data.oMi[j].toActionMatrix() for j in self._joints]).reshape(-1, 6, 6)
-        turns = joints @ self._axes[:, :, None]
-        n, count = len(places), len(self._joints)
-        rows, by_error, by_joint = [], [], []
-
-        def move(frame: int, point: Array, twists: Array, carried: Array) -> Array:
-            velocity = np.hstack([np.eye(3), -pin.skew(point)])
-            turning = np.hstack([np.zeros((3, 3)), np.eye(3)])
-            return np.asarray(carried[:, None, None] * (np.vstack([velocity, turning]) @ twists))
-
-        for closure, (a, b) in zip(robot.closures, self._ends, strict=True):
-            point, turned = data.oMf[b].translation, np.kron(np.eye(2), data.oMf[a].rotation.T)
-            apart = self._carried[b] - self._carried[a]
-            own = list(closure.rows)
-            rows.append(
-                (
-                    (turned @ move(b, point, errors, apart[:n]))[:, own],
-                    (turned @ move(b, point, turns, apart[n:]))[:, own],
-                )
-            )
-        for frame in self._seen:
-            point, carried = data.oMf[frame].translation, self._carried[frame]
-            by_error.append(move(frame, point, errors, carried[:n])[:, :3])
-            by_joint.append(move(frame, point, turns, carried[n:])[:, :3])
-        closing = np.concatenate([np.zeros((n, 0, 6)), *(r for r, _ in rows)], axis=1)
-        following = np.concatenate([np.zeros((count, 0, 1)), *(r for _, r in rows)], axis=1)
-        seen, carried = np.concatenate(by_error, axis=1), np.concatenate(by_joint, axis=1)
-        closing, seen = (np.moveaxis(v, 1, 0).reshape(v.shape[1], -1) for v in (closing, seen))
-        followed = np.linalg.lstsq(following[:, :, 0].T, -closing, rcond=1e-10)[0]
-        return np.asarray(seen + carried[:, :, 0].T @ followed).reshape(-1, n, 6)
-
-    def _carriers(self, frame: int) -> set[tuple[int, bool]]:
-        """The joints and frames that carry a frame, and whether each is a frame."""
-        model = self._robot.model
-        found = {(joint, False) for joint in model.supports[model.frames[frame].parentJoint]}
-        current: int | None = frame
-        while current is not None:
-            found.add((current, True))
-            current = hangs_on(model, current)
-        return found
+    rows = [np.zeros((0, twists.shape[1]))]
+    for closure in robot.closures:
+        a, b = robot.frame_id(closure.frame_a), robot.frame_id(closure.frame_b)
+        axes = np.kron(np.eye(2), data.oMf[a].rotation.T)
+        relative = axes @ motion(data.oMf[b].translation) * (masks[b] - masks[a])
+        rows.append(relative[list(closure.rows)])
+    points = [motion(data.oMf[f].translation)[:3] * masks[f] for f in observed]
+    g, p, n = np.vstack(rows), np.vstack(points), 6 * len(owners)
+    following = np.linalg.lstsq(g[:, n:], -g[:, :n], rcond=1e-10)[0]
+    return np.asarray(p[:, :n] + p[:, n:] @ following)
