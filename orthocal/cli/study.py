@@ -297,15 +297,14 @@ def _run(
 ) -> None:
     """Run a study, print its report and write its files."""
     from orthocal.io.files import Content, require_writable
-    from orthocal.output.study.contents import report_study, study_json
-    from orthocal.output.study.report import draw_figure, render_report
     from orthocal.output.text.layout import print_rich
+    from orthocal.output.text.study import render_report, report_study, study_json
     from orthocal.runtime.interrupts import message_at_interrupt
     from orthocal.runtime.worker_pool import available_cores, call_in_parallel, worker_budget
     from orthocal.study.runner import JOURNAL, run_study, to_parquet
 
     def files() -> dict[str, Content]:
-        calls = [lambda: to_parquet(table), lambda: draw_figure(report.figure)]
+        calls = [lambda: to_parquet(table), report.draw]
         return dict(zip(FILES, (document, *call_in_parallel(calls)), strict=True))
 
     if dask is not None and workers is not None:

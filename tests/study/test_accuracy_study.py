@@ -134,8 +134,7 @@ def test_readings_out_of_range_are_counted(workshop):
 
 
 def test_report_without_a_calibrated_machine(workshop):
-    from orthocal.output.study.contents import report_study
-    from orthocal.output.study.report import draw_figure
+    from orthocal.output.text.study import report_study
 
     study = build_accuracy_study(workshop, "offsets", machines=2)
     rows = run_task(study, 0)
@@ -145,7 +144,7 @@ def test_report_without_a_calibrated_machine(workshop):
     report = report_study(table)
     assert report.document["machines"] == 0
     assert not report.tables
-    assert draw_figure(report.figure).startswith("<?xml")
+    assert report.draw().startswith("<?xml")
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from processes import children_of, is_running, until
 
 from orthocal import load_session
 from orthocal.errors import OrthocalError
-from orthocal.output.study.contents import report_study, study_json
+from orthocal.output.text.study import report_study, study_json
 from orthocal.runtime import worker_pool as cores
 from orthocal.study import runner as running
 from orthocal.study.bootstrap import build_bootstrap_study

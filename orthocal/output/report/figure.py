@@ -147,6 +147,10 @@ class Plot(Generic[P]):
             return ""
         return render_figure(self.name, str(figure.get_label()), lambda: figure)
 
+    def document(self, *args: P.args, **kwargs: P.kwargs) -> str:
+        """The plot as an SVG file."""
+        return f'<?xml version="1.0" encoding="utf-8"?>\n{self(*args, **kwargs)}\n'
+
 
 def plot(name: str) -> Callable[[Callable[P, Figure | None]], Plot[P]]:
     """Decorator that makes a plot of a function that draws a figure.

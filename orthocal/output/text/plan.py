@@ -177,52 +177,10 @@ def plan_json(plan: MeasuringPlan) -> str:
 
 
 def draw_plan(plan: MeasuringPlan) -> str:
-    """Expected error over measuring time, as an SVG plot."""
-    from matplotlib.figure import Figure
+    """Expected error over measuring time, as an SVG file."""
+    from orthocal.output.report.study_plots import plot_plan
 
-    from orthocal.output.report.figure import (
-        AFTER,
-        BEFORE,
-        UNSEEN,
-        draw_legend,
-        open_figure,
-        render_figure,
-        scale_log,
-    )
-
-    stages = [s for s in plan.curve if s.setups]
-    unit = _unit(plan)
-
-    def draw() -> Figure:
-        figure = open_figure(3.2, "Expected error over measuring time")
-        axes = figure.subplots()
-        hours = [s.minutes / HOUR for s in stages]
-        errors = [s.error / unit for s in stages]
-        axes.plot(hours, errors, "-", color=AFTER, label="setups added one by one")
-        axes.plot(hours, errors, ".", color=AFTER)
-        chosen = plan.stage.error / unit
-        axes.plot(plan.minutes / HOUR, chosen, "s", color=AFTER, label="this plan")
-        values = [*errors, chosen]
-        if plan.criterion == "aligned":
-            for marker, colour, other in zip("o^", (BEFORE, UNSEEN), plan.compared, strict=False):
-                if other.expected is None:
-                    continue
-                size = other.expected.headline.rms / unit
-                values.append(size)
-                axes.plot(other.minutes / HOUR, size, marker, color=colour, label=other.name)
-        if plan.enough is not None:
-            label = f"another hour gains < {ENOUGH:.0%}"
-            axes.axvline(plan.enough.minutes / HOUR, color="#999999", linestyle=":", label=label)
-        scale_log(axes, "y", np.array(values))
-        axes.set_xlim(left=0.0)
-        axes.grid(True)
-        axes.set_xlabel("time [h]")
-        axes.set_ylabel("expected tool error [µm]" if unit == UM else "criterion")
-        draw_legend(figure, axes)
-        return figure
-
-    label = "Expected error over measuring time"
-    return f'<?xml version="1.0" encoding="utf-8"?>\n{render_figure("plan", label, draw)}\n'
+    return plot_plan.document(plan, _unit(plan))
 
 
 def show_um(expected: Expected) -> str:
@@ -237,7 +195,8 @@ def show_duration(minutes: float) -> str:
 
 
 def _unit(plan: MeasuringPlan) -> float:
-    return UM if plan.criterion in ("aligned", "relative", "absolute", "worst") else 1.0
+    """Unit of the criterion of a plan: a micrometre, or 1."""
+    return 1.0 if plan.criterion in ("A", "D", "E") else UM
 
 
 def _counts(plan: MeasuringPlan) -> tuple[int, int]:
@@ -248,7 +207,7 @@ def _counts(plan: MeasuringPlan) -> tuple[int, int]:
 
 def _when_enough(plan: MeasuringPlan) -> str:
     """Number of setups beyond which another hour gains little, in a sentence."""
-    if plan.criterion not in ("aligned", "relative", "absolute", "worst"):
+    if _unit(plan) != UM:
         return f"Criterion: {FORMS[plan.criterion]}."
     enough = plan.enough
     if enough is None:

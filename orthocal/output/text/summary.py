@@ -69,8 +69,7 @@ def render_result(
     expected = "a Calibration, a Comparison, a Validation, a MeasuringPlan or a StudyTable"
     require_kind(result, kinds, expected=expected)
     if isinstance(result, StudyTable):
-        from orthocal.output.study.contents import report_study
-        from orthocal.output.study.report import render_report
+        from orthocal.output.text.study import render_report, report_study
 
         return render_report(report_study(result, all_rows=all_rows or details))
     if isinstance(result, MeasuringPlan):

@@ -1,26 +1,19 @@
-"""Contents of the reports of studies: answer, tables, figure and plain data of each kind."""
+"""Reports of studies: answer, tables, plot and plain data of each kind, as text and as JSON."""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from rich.console import Group, RenderableType
+from rich.text import Text
 
 from orthocal.kinematics.workspace import describe_box
-from orthocal.output.study.report import (
-    Curve,
-    CurveFigure,
-    Figure,
-    IntervalFigure,
-    MatrixFigure,
-    ReportTable,
-    StudyReport,
-    to_json,
-)
-from orthocal.output.text.layout import counted, plain
+from orthocal.output.text.layout import add_row, counted, plain, section, table_of
 from orthocal.study.accuracy import (
     AccuracyStudy,
     AccuracySummary,
@@ -37,28 +30,17 @@ from orthocal.study.runner import StudyTable
 from orthocal.study.sensitivity import SensitivitySummary, summarise_sensitivity
 from orthocal.units import UM
 
-Array = NDArray[np.float64]
-
 MOST_ROWS = 12
 """Parameters in a table unless all are asked for."""
 
 MOST_COLUMNS = 6
 """Parameters in the table of derivatives unless all are asked for."""
 
-MOST_INTERVALS = 40
-MOST_MATRIX_COLUMNS = 40
-"""Parameters in a figure."""
-
 SIGNIFICANT = 3.0
 """Standard errors by which a result differs significantly from its prediction."""
 
 LINEAR_PREDICTION_ERROR = 0.1
 """Relative error that a first-order prediction may have."""
-
-SMALLEST_DRAWN_MM = 1e-4
-
-BEFORE, AFTER, NOISE, RESOLUTION = "#E69F00", "#0072B2", "#009E73", "#777777"
-"""Colours of curves and lines, as in the report of a calibration."""
 
 METHOD_NAMES = {
     "six": "paper, six equations",
@@ -69,6 +51,32 @@ METHOD_NAMES = {
     "steps_3": "three Gauss-Newton steps",
     "exact": "exact solution",
 }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReportTable:
+    """A table of a report."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: Sequence[Sequence[str]]
+    left: int = 1
+    """Number of left-aligned columns."""
+    omitted: str = ""
+    """Sentence about rows or columns that are not listed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StudyReport:
+    """Answer, tables, plot and plain data of a study."""
+
+    answer: str
+    tables: tuple[ReportTable, ...]
+    draw: Callable[[], str]
+    """Function that draws the plot as an SVG file."""
+    document: dict[str, Any]
+    """Summary as plain data."""
+    notes: tuple[str, ...] = ()
 
 
 def report_study(table: StudyTable, *, all_rows: bool = False) -> StudyReport:
@@ -96,7 +104,20 @@ def study_json(table: StudyTable, report: StudyReport) -> str:
         "answer": report.answer,
         "summary": report.document,
     }
-    return to_json(document)
+    return json.dumps(_finite(document), indent=1, allow_nan=False) + "\n"
+
+
+def render_report(report: StudyReport) -> RenderableType:
+    """A report as text, the answer first."""
+    parts: list[RenderableType] = [Text(report.answer, style="bold")]
+    for table in report.tables:
+        body = table_of(*table.header, left=table.left)
+        for row in table.rows:
+            add_row(body, *row)
+        parts.append(section(table.title, body))
+        if table.omitted:
+            parts.append(Text(table.omitted))
+    return Group(*parts, *map(Text, report.notes))
 
 
 def _accuracy(table: StudyTable, all_rows: bool) -> StudyReport:
@@ -133,7 +154,13 @@ def _accuracy(table: StudyTable, all_rows: bool) -> StudyReport:
         f"Not calibrated: {counted(n, 'machine')} ({reason})." for reason, n in s.failed.items()
     ]
     answer = _accuracy_answer(study, s, predicted["aligned_um"] * UM)
-    return StudyReport(answer, tables, _accuracy_figure(table, predicted), document, tuple(notes))
+
+    def draw() -> str:
+        from orthocal.output.report.study_plots import plot_machines
+
+        return plot_machines.document(table, predicted["aligned_um"])
+
+    return StudyReport(answer, tables, draw, document, tuple(notes))
 
 
 def _accuracy_answer(study: AccuracyStudy, s: AccuracySummary, predicted: float) -> str:
@@ -184,29 +211,6 @@ def _estimate_table(errors: tuple[EstimationError, ...], all_rows: bool) -> Repo
     return ReportTable("Errors of the estimates, RMS", header, rows, omitted=omitted)
 
 
-def _accuracy_figure(table: StudyTable, predicted: dict[str, float]) -> Figure:
-    curves = []
-    for name, color, label in (
-        ("before_um", BEFORE, "before calibration"),
-        ("tool_um", AFTER, "after calibration"),
-    ):
-        values = np.array(table.columns.get(name, []), dtype=np.float64)
-        values = np.sort(values[np.isfinite(values)])
-        if values.size:
-            share = 100.0 * (np.arange(values.size) + 1) / values.size
-            curves.append(Curve(label, values, share, color))
-    rms = predicted["aligned_um"]
-    return CurveFigure(
-        title="Share of machines below a tool error",
-        label="Tool error before and after calibration",
-        x_label="tool error, workpiece aligned [µm]",
-        y_label="machines [%]",
-        curves=tuple(curves),
-        height=3.2,
-        vertical=(("predicted RMS", rms),) if math.isfinite(rms) else (),
-    )
-
-
 def _bootstrap(table: StudyTable, all_rows: bool) -> StudyReport:
     s = summarise_bootstrap(table.study, table)  # type: ignore[arg-type] # by its kind
     shown = s.parameters if all_rows else s.parameters[:MOST_ROWS]
@@ -235,7 +239,13 @@ def _bootstrap(table: StudyTable, all_rows: bool) -> StudyReport:
         "parameters": parameters,
     }
     tables = (ReportTable("Estimates", header, rows[: len(shown)], omitted=omitted),)
-    return StudyReport(_bootstrap_answer(s), tables, _bootstrap_figure(s), document, notes)
+
+    def draw() -> str:
+        from orthocal.output.report.study_plots import plot_bootstrap
+
+        return plot_bootstrap.document(s)
+
+    return StudyReport(_bootstrap_answer(s), tables, draw, document, notes)
 
 
 def _bootstrap_answer(s: BootstrapSummary) -> str:
@@ -255,17 +265,6 @@ def _bootstrap_answer(s: BootstrapSummary) -> str:
             f"{100.0 * uncertainty:.0f} %."
         )
     return text
-
-
-def _bootstrap_figure(s: BootstrapSummary) -> Figure:
-    shown = s.parameters[:MOST_INTERVALS]
-    unit = np.array([p.predicted or math.nan for p in shown])
-    low, high = (
-        np.array([getattr(p, end) - p.estimate for p in shown]) / unit for end in ("low", "high")
-    )
-    names = tuple(p.parameter.name for p in shown)
-    title = "Intervals of 95 % of the draws, in predicted standard deviations"
-    return IntervalFigure(title, "Intervals of the draws", names, low, high, band=1.96)
 
 
 def _linearisation(table: StudyTable, all_rows: bool) -> StudyReport:
@@ -306,7 +305,13 @@ def _linearisation(table: StudyTable, all_rows: bool) -> StudyReport:
             for m in s.methods
         ],
     }
-    return StudyReport(_linearisation_answer(s), tables, _linearisation_figure(s), document)
+
+    def draw() -> str:
+        from orthocal.output.report.study_plots import plot_linearisation
+
+        return plot_linearisation.document(s, METHOD_NAMES)
+
+    return StudyReport(_linearisation_answer(s), tables, draw, document)
 
 
 def _limits(m: MethodErrors) -> tuple[float | None, ...]:
@@ -350,35 +355,6 @@ def _limit_sentence(subject: str, m: MethodErrors, resolution: float) -> str:
     return f"{first}, {noise}"
 
 
-def _linearisation_figure(s: LinearisationSummary) -> Figure:
-    looks = {
-        "six": (BEFORE, "-", 3.0),
-        "first_order": (AFTER, "-", 1.5),
-        "steps_2": (AFTER, "--", 1.5),
-        "steps_3": (AFTER, ":", 1.5),
-    }
-    curves = [
-        Curve(METHOD_NAMES[m.name], s.sizes, m.errors, *looks[m.name])
-        for m in s.methods
-        if m.name in looks
-    ]
-    noise = next(m for m in s.methods if m.name == "first_order").standard_error
-    lines = [("standard error", noise, NOISE)]
-    if s.resolution > 0.0:
-        lines.append(("resolution", s.resolution, RESOLUTION))
-    finite = [m.errors[np.isfinite(m.errors)].max(initial=0.0) for m in s.methods]
-    return CurveFigure(
-        title="Error of linearised identification",
-        label="Error of linearised identification by the size of the machine's errors",
-        x_label="largest error of the machine [mm]",
-        y_label="error of the estimates [mm]",
-        curves=tuple(curves),
-        height=3.6,
-        y_range=(SMALLEST_DRAWN_MM, max(*finite, 10.0 * SMALLEST_DRAWN_MM)),
-        horizontal=tuple(lines),
-    )
-
-
 def _sensitivity(table: StudyTable, all_rows: bool) -> StudyReport:
     s = summarise_sensitivity(table.study, table)  # type: ignore[arg-type] # by its kind
     count = len(s.parameters)
@@ -412,16 +388,13 @@ def _sensitivity(table: StudyTable, all_rows: bool) -> StudyReport:
             )
         ],
     }
-    drawn = np.sort(largest_first[:MOST_MATRIX_COLUMNS])
-    number = f"{len(drawn)} of {count}" if len(drawn) < count else f"{count}"
-    figure = MatrixFigure(
-        title=f"Change by one prior standard deviation of each error [µm], {number} errors",
-        label="Sensitivity of each reading to each error",
-        rows=tuple(f"{posture}  {output}" for posture, output in s.rows),
-        columns=tuple(s.parameters[i] for i in drawn),
-        values=s.per_prior_std[:, drawn] / UM,
-    )
-    return StudyReport(_sensitivity_answer(s), (derivatives,), figure, document)
+
+    def draw() -> str:
+        from orthocal.output.report.study_plots import plot_sensitivity
+
+        return plot_sensitivity.document(s)
+
+    return StudyReport(_sensitivity_answer(s), (derivatives,), draw, document)
 
 
 def _sensitivity_answer(s: SensitivitySummary) -> str:
@@ -450,3 +423,13 @@ def _number(value: float) -> str:
     if abs(value) < 5e-7:
         return "0"
     return f"{value:.3g}" if abs(value) >= 1e-4 else f"{value:.6f}"
+
+
+def _finite(value: Any) -> Any:  # noqa: ANN401 - plain data
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,193 @@
+"""Plots of studies, and of the expected tool error over measuring time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import SymLogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter
+from numpy.typing import NDArray
+
+from orthocal.output.report.figure import (
+    AFTER,
+    AFTER_LOOK,
+    BAND,
+    BEFORE,
+    UNSEEN,
+    Look,
+    draw_legend,
+    open_figure,
+    open_list,
+    plot,
+    scale_log,
+)
+from orthocal.planning.cost_curve import ENOUGH, HOUR
+from orthocal.planning.plan import MeasuringPlan
+from orthocal.study.bootstrap import BootstrapSummary
+from orthocal.study.linearisation import LinearisationSummary
+from orthocal.study.runner import StudyTable
+from orthocal.study.sensitivity import SensitivitySummary
+from orthocal.units import UM
+
+Array = NDArray[np.float64]
+
+GREY = "#777777"
+
+SMALLEST_DRAWN_MM = 1e-4
+"""Smallest error on a logarithmic axis, [mm]."""
+
+MOST_ERRORS = 40
+"""Largest number of errors in a plot."""
+
+NORMAL_95 = 1.96
+"""Half width of the 95 % interval of a normal distribution, in standard deviations."""
+
+
+@plot("study")
+def plot_machines(table: StudyTable, predicted: float) -> Figure:
+    """Share of machines below a tool error, before and after calibration.
+
+    Args:
+        table: Result of an accuracy study.
+        predicted: Predicted tool error, [µm]; NaN if it is unknown.
+    """
+    figure = open_figure(3.2, "Share of machines below a tool error")
+    axes = figure.subplots()
+    drawn = [np.ones(1)]
+    for name, colour, label in (
+        ("before_um", BEFORE, "before calibration"),
+        ("tool_um", AFTER, "after calibration"),
+    ):
+        values = np.array(table.columns.get(name, []), dtype=np.float64)
+        values = np.sort(values[np.isfinite(values)])
+        if values.size:
+            share = 100.0 * (np.arange(values.size) + 1) / values.size
+            axes.plot(values, share, color=colour, label=label)
+            drawn.append(values)
+    if math.isfinite(predicted):
+        axes.axvline(predicted, color="black", linestyle=":", label="predicted RMS")
+    scale_log(axes, "x", np.concatenate(drawn[1:] or drawn))
+    _finish(figure, axes, "tool error, workpiece aligned [µm]", "machines [%]")
+    return figure
+
+
+@plot("study")
+def plot_linearisation(s: LinearisationSummary, names: Mapping[str, str]) -> Figure:
+    """Error of linearised identification by the size of the machine's errors.
+
+    Args:
+        s: Summary of a linearisation study.
+        names: Names of the methods on the plot.
+    """
+    looks: dict[str, Look] = {
+        "six": {"color": BEFORE, "linewidth": 3.0},
+        "first_order": {"color": AFTER},
+        "steps_2": {"color": AFTER, "linestyle": "--"},
+        "steps_3": {"color": AFTER, "linestyle": ":"},
+    }
+    figure = open_figure(3.6, "Error of linearised identification")
+    axes = figure.subplots()
+    for m in s.methods:
+        if m.name in looks:
+            axes.plot(s.sizes, m.errors, label=names[m.name], **looks[m.name])
+    (noise,) = (m.standard_error for m in s.methods if m.name == "first_order")
+    for label, size, colour in (
+        ("standard error", noise, UNSEEN),
+        ("resolution", s.resolution, GREY),
+    ):
+        if size > 0.0 or label != "resolution":
+            axes.axhline(size, color=colour, linewidth=1.0)
+            axes.annotate(label, (s.sizes.min(), size), va="bottom")
+    largest = max(m.errors[np.isfinite(m.errors)].max(initial=0.0) for m in s.methods)
+    scale_log(axes, "x", s.sizes)
+    limits = (SMALLEST_DRAWN_MM, max(largest, 10.0 * SMALLEST_DRAWN_MM))
+    scale_log(axes, "y", np.array(limits))
+    _finish(figure, axes, "largest error of the machine [mm]", "error of the estimates [mm]")
+    return figure
+
+
+@plot("study")
+def plot_bootstrap(s: BootstrapSummary) -> Figure:
+    """Intervals of 95 % of the draws around the estimates, in predicted standard deviations."""
+    shown = s.parameters[:MOST_ERRORS]
+    unit = np.array([p.predicted or math.nan for p in shown])
+    low, high = (
+        np.array([getattr(p, end) - p.estimate for p in shown]) / unit for end in ("low", "high")
+    )
+    title = "Intervals of 95 % of the draws, in predicted standard deviations"
+    figure, axes = open_list(title, [p.parameter.name for p in shown])
+    y = np.arange(len(shown))
+    axes.axvspan(-NORMAL_95, NORMAL_95, color=BAND, label="predicted")
+    axes.hlines(y, low, high, color=AFTER)
+    axes.plot(0.0 * y, y, label="estimate", **AFTER_LOOK)
+    draw_legend(figure, axes)
+    return figure
+
+
+@plot("study")
+def plot_sensitivity(s: SensitivitySummary) -> Figure:
+    """Change of each reading and tool coordinate by each error, as a heat map."""
+    influence = np.argsort(-np.abs(s.per_prior_std).max(axis=0), kind="stable")
+    chosen = np.sort(influence[:MOST_ERRORS])
+    count = len(s.parameters)
+    number = f"{count}" if len(chosen) == count else f"{len(chosen)} of {count}"
+    values = s.per_prior_std[:, chosen] / UM
+    largest = max(float(np.abs(values).max()), 1e-9)
+    decades = 10.0 ** np.arange(math.floor(math.log10(largest)) - 1, math.ceil(math.log10(largest)))
+    title = f"Change by one prior standard deviation of each error [µm], {number} errors"
+    figure = open_figure(1.6 + 0.16 * len(s.rows), title, legend=False)
+    axes = figure.subplots()
+    norm = SymLogNorm(linthresh=decades[0], vmin=-largest, vmax=largest)
+    look: dict[str, Any] = {"aspect": "auto", "cmap": "RdBu_r", "interpolation": "nearest"}
+    image = axes.imshow(values, norm=norm, **look)
+    rows = [f"{posture}  {output}" for posture, output in s.rows]
+    axes.set_yticks(range(len(rows)), rows, fontsize=6.5)
+    columns = [s.parameters[i] for i in chosen]
+    axes.set_xticks(range(len(columns)), columns, fontsize=6.5, rotation=90)
+    ticks = FixedLocator([*-decades[::-1], 0.0, *decades])
+    text = FuncFormatter(lambda v, _: f"{v:+g}" if v else "0")
+    bar = figure.colorbar(image, ax=axes, fraction=0.04, ticks=ticks, format=text)
+    bar.minorticks_off()
+    return figure
+
+
+@plot("plan")
+def plot_plan(plan: MeasuringPlan, unit: float) -> Figure:
+    """Expected tool error over measuring time.
+
+    Args:
+        plan: The plan.
+        unit: Unit of its criterion: a micrometre or 1.
+    """
+    figure = open_figure(3.2, "Expected error over measuring time")
+    axes = figure.subplots()
+    stages = [s for s in plan.curve if s.setups]
+    hours, errors = [s.minutes / HOUR for s in stages], [s.error / unit for s in stages]
+    axes.plot(hours, errors, ".-", color=AFTER, label="setups added one by one")
+    errors.append(plan.stage.error / unit)
+    axes.plot(plan.minutes / HOUR, errors[-1], "s", color=AFTER, label="this plan")
+    if plan.criterion == "aligned":
+        for marker, colour, other in zip("o^", (BEFORE, UNSEEN), plan.compared, strict=False):
+            if other.expected is not None:
+                errors.append(other.expected.headline.rms / unit)
+                look: Look = {"color": colour, "label": other.name}
+                axes.plot(other.minutes / HOUR, errors[-1], marker, **look)
+    if plan.enough is not None:
+        label = f"another hour gains < {ENOUGH:.0%}"
+        axes.axvline(plan.enough.minutes / HOUR, color="#999999", linestyle=":", label=label)
+    scale_log(axes, "y", np.array(errors))
+    axes.set_xlim(left=0.0)
+    _finish(figure, axes, "time [h]", "expected tool error [µm]" if unit == UM else "criterion")
+    return figure
+
+
+def _finish(figure: Figure, axes: Axes, x_label: str, y_label: str) -> None:
+    axes.grid(True)
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    draw_legend(figure, axes)

@@ -1,1 +1,0 @@
-"""Reports of studies as text, JSON and figures."""
