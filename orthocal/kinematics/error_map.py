@@ -129,21 +129,21 @@ class ErrorMap:
         self._index = {name: i for i, name in enumerate(self.names)}
         errors = ca.SX.sym("errors", len(self.names))
         commanded = ca.SX.sym("commanded", len(robot.drives))
-        known = {c: ca.SX.sym(c, condition_size(robot, c)) for c in NEUTRAL}
+        symbols = {c: ca.SX.sym(c, condition_size(robot, c)) for c in NEUTRAL}
         machine = express_machine(
-            robot, commanded, {n: errors[i] for i, n in enumerate(self.names)}, known
+            robot, commanded, {n: errors[i] for i, n in enumerate(self.names)}, symbols
         )
         moving = {p: ca.sparsify(t) for p, t in machine.twists.items()}
         self.moved = tuple(p for p, t in moving.items() if t.nnz())
         twists = ca.vertcat(ca.SX(0, 1), *(moving[p] for p in self.moved))
-        self.conditions = _conditions_in(ca.vertcat(twists, machine.actuated), known)
-        self.placement_conditions = _conditions_in(twists, known)
+        self.conditions = _conditions_in(ca.vertcat(twists, machine.actuated), symbols)
+        self.placement_conditions = _conditions_in(twists, symbols)
         sizes = [condition_size(robot, c) for c in self.conditions]
         of_placements = np.repeat([c in self.placement_conditions for c in self.conditions], sizes)
         drives = np.zeros(len(robot.drives), dtype=np.bool_)
         self.of_placements = np.concatenate([drives, of_placements.astype(np.bool_)])
         self._neutral = np.repeat([NEUTRAL[c] for c in self.conditions], sizes).astype(np.float64)
-        conditions = ca.vertcat(ca.SX(0, 1), *(known[c] for c in self.conditions))
+        conditions = ca.vertcat(ca.SX(0, 1), *(symbols[c] for c in self.conditions))
         by_errors = ca.jacobian(machine.actuated, errors)
         self.drive_errors = np.unique(np.array(by_errors.sparsity().get_triplet()[1], np.int64))
         chosen = self.drive_errors.tolist()
@@ -183,11 +183,7 @@ class ErrorMap:
 
     def columns(self, names: Sequence[str]) -> Array:
         """Elementary errors of one unit of each named parameter, shape (n_errors, n)."""
-        result = np.zeros((len(self.names), len(names)))
-        for column, name in enumerate(names):
-            for term, coefficient in self.robot.parameters[name].terms:
-                result[self._index[term], column] += coefficient
-        return result
+        return self.robot.parameters.coefficients(self.names, names)
 
     def command(self, coordinates: Array) -> Array:
         """Commands of drive coordinates, shape (..., n_command); commands stay what they are."""
@@ -333,9 +329,10 @@ class ErrorMap:
 
 
 class _Twists:
-    """Numbers of a function of conditions and errors: twists and their derivative by the errors.
+    """Twists as a function of conditions and errors, and their derivative by the errors.
 
-    Errors that alone move a twist, and linearly, are placed by index: those of the geometry.
+    Errors of the geometry are single linear terms of a twist and are assigned by index. The other
+    terms are evaluated by CasADi.
     """
 
     def __init__(self, function: ca.Function) -> None:
@@ -352,14 +349,16 @@ class _Twists:
         self._linear = rows[linear], columns[linear]
         self._slopes = np.array([float(v) for v, ok in zip(nonzeros, linear, strict=True) if ok])
         others = np.unique(self._linear[1]).tolist()
-        rest = ca.SX(twists)
+        remainder = ca.SX(twists)
         if others:
-            rest = ca.substitute(rest, errors[others], ca.SX.zeros(len(others)))
+            remainder = ca.substitute(remainder, errors[others], ca.SX.zeros(len(others)))
         self._varying = varying
         chosen = errors[varying.tolist()]
-        self._is_linear = not ca.sparsify(rest).nnz()
-        self._rest = BatchFunction(
-            ca.Function("rest", [conditions, chosen], [rest, ca.jacobian(rest, chosen)]),
+        self._is_linear = not ca.sparsify(remainder).nnz()
+        self._nonlinear = BatchFunction(
+            ca.Function(
+                "nonlinear", [conditions, chosen], [remainder, ca.jacobian(remainder, chosen)]
+            ),
             matrices=["o1"],
         )
 
@@ -388,9 +387,9 @@ class _Twists:
 
     def _evaluate(self, errors: Array, conditions: Array) -> tuple[Array, Array]:
         at = errors.reshape(-1, errors.shape[-1])[:, self._varying]
-        given = np.broadcast_to(conditions, (*errors.shape[:-1], conditions.shape[-1]))
-        twists, jacobian = self._rest(given.reshape(len(at), -1), at)
         shape = errors.shape[:-1]
+        rows = np.broadcast_to(conditions, (*shape, conditions.shape[-1])).reshape(len(at), -1)
+        twists, jacobian = self._nonlinear(rows, at)
         return twists.reshape(*shape, -1), jacobian.reshape(*shape, *jacobian.shape[1:])
 
 
@@ -400,9 +399,9 @@ def error_map(robot: Robot) -> ErrorMap:
     return ErrorMap(robot)
 
 
-def _conditions_in(expression: ca.SX, known: Mapping[Condition, ca.SX]) -> tuple[Condition, ...]:
+def _conditions_in(expression: ca.SX, symbols: Mapping[Condition, ca.SX]) -> tuple[Condition, ...]:
     """Conditions on which an expression depends."""
-    return tuple(c for c, symbol in known.items() if ca.jacobian(expression, symbol).nnz())
+    return tuple(c for c, symbol in symbols.items() if ca.jacobian(expression, symbol).nnz())
 
 
 class SymbolicErrorMap:

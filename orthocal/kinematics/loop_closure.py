@@ -64,12 +64,6 @@ LIMIT_TOLERANCE = 1e-9
 MAX_POINTS = 4096
 """Postures of a batch of machines that are solved together, for the memory of their Jacobians."""
 
-MAX_SOLUTIONS = 4
-"""Solutions that a solver holds for repeated calls with the same arguments."""
-
-MAX_SOLUTION_POSTURES = 1000
-"""Postures of a solution that is held."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class System:
@@ -137,7 +131,7 @@ class _Batch:
     """The geometry of machines in K postures each, point by point."""
 
     geometry: MachineGeometry
-    """Of each machine, or of each machine in each posture."""
+    """Geometry of each machine, or of each machine in each posture."""
     machines: int
     postures: int
 
@@ -169,19 +163,17 @@ def solve_closures(
         machines: S.
         start: x to start from, shape (n_x,), (K, n_x) or (S, K, n_x); by default the system's.
         names: Names of the postures, for messages.
-        failures: Filled with the postures that cannot be reached, which are NaN then; by default
-            the first of them raises.
+        failures: As for `LoopClosure.close`.
         allow_singular: Accept targets that leave motions free.
 
     Returns:
         x, shape (S, K, n_x).
 
     Raises:
-        ClosureError: If a posture cannot be reached, is outside the limits of a joint or, unless
-            that is allowed, singular.
+        ClosureError: As `LoopClosure.close`.
     """
     count = len(targets)
-    labels = names if names is not None else [f"posture {i + 1}" for i in range(count)]
+    labels = [f"posture {i + 1}" for i in range(count)] if names is None else names
     if len(labels) != count:
         raise ValueError(f"found {len(labels)} names for {count} rows")
     shape = (machines, count, system.n_x)
@@ -201,15 +193,39 @@ def solve_closures(
             np.tile(targets, (n, 1)),
             _Batch(block, n, max(count, 1)),
             begin[part].reshape(n * count, system.n_x),
-            list(labels) * n,
-            refused,
+            _Refusals(list(labels) * n, refused),
             restart=start is not None,
             allow_singular=allow_singular,
         ).reshape(n, count, system.n_x)
-        if failures is not None and refused:
-            for point, error in refused.items():
+        for point, error in (refused or {}).items():
+            if failures is not None:
                 failures.setdefault(i * count + point, error)
     return result
+
+
+class _Refusals:
+    """Points that cannot be reached.
+
+    Args:
+        labels: Names of the points, for messages.
+        failures: Filled with the refused points; without it the first refusal raises.
+    """
+
+    def __init__(self, labels: Sequence[str], failures: Failures | None) -> None:
+        self._labels, self._failures = labels, failures
+        self.mask = np.zeros(len(labels), dtype=np.bool_)
+
+    def add(self, point: int, reason: str, residual: float | None) -> None:
+        """Refuse a point.
+
+        Raises:
+            ClosureError: If refusals are not collected.
+        """
+        error = ClosureError(reason, posture=self._labels[point], residual=residual)
+        if self._failures is None:
+            raise error
+        self._failures.setdefault(point, error)
+        self.mask[point] = True
 
 
 def _follow(
@@ -217,8 +233,7 @@ def _follow(
     targets: Array,
     batch: _Batch,
     start: Array,
-    labels: Sequence[str],
-    failures: Failures | None,
+    refusals: _Refusals,
     *,
     restart: bool,
     allow_singular: bool,
@@ -226,22 +241,13 @@ def _follow(
     """Continuation of the points of a batch; arguments as for `solve_closures`."""
     tolerance = CLOSED * max(1.0, system.length)
     count = len(targets)
-    refused = np.zeros(count, dtype=bool)
     regular = np.full(count, allow_singular)
-
-    def refuse(i: int, reason: str, residual: float | None) -> None:
-        error = ClosureError(reason, posture=labels[i], residual=residual)
-        if failures is None:
-            raise error
-        failures.setdefault(i, error)
-        refused[i] = True
-
     for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)).tolist():
-        refuse(i, "has coordinates that are not numbers", None)
+        refusals.add(i, "has coordinates that are not numbers", None)
     x = np.array(start)
     moves = np.where(system.units == 1.0, system.length, 1.0)
     done, step = np.zeros(count), np.ones(count)
-    pending = np.flatnonzero(~refused)
+    pending = np.flatnonzero(~refusals.mask)
     fresh = np.full(count, restart)
     while pending.size:
         reach = np.minimum(1.0, done[pending] + step[pending])
@@ -271,24 +277,27 @@ def _follow(
                 f"{system.describe(last[0], targets[i], at)}, {done[i]:.0%} of the way "
                 "from the mechanical zero"
             )
-            refuse(i, reason, float(final[0]))
-        pending = pending[(done[pending] < 1.0) & ~refused[pending]]
-    for i in np.flatnonzero(~system.within_limits(x) & ~refused).tolist():
-        over = np.maximum(x[i] - system.upper, system.lower - x[i])
-        j = int(over.argmax())
+            refusals.add(i, reason, float(final[0]))
+        pending = pending[(done[pending] < 1.0) & ~refusals.mask[pending]]
+    _refuse_outside_limits(system, x, refusals)
+    uncertain = np.flatnonzero(~regular & ~refusals.mask)
+    if uncertain.size and system.n_x:
+        _refuse_singular(system, targets, x, batch, uncertain, refusals)
+    x[refusals.mask] = np.nan
+    return x
+
+
+def _refuse_outside_limits(system: System, x: Array, refusals: _Refusals) -> None:
+    """Refuse solutions with a joint outside its limits."""
+    for i in np.flatnonzero(~system.within_limits(x) & ~refusals.mask).tolist():
+        j = int(np.maximum(x[i] - system.upper, system.lower - x[i]).argmax())
         unit, size = DRIVE_UNITS["m" if system.units[j] == 1.0 else "rad"]
         reason = (
             f"cannot be reached: joint '{system.names[j]}' would be at "
             f"{x[i][j] / size:.4g} {unit}, outside its limits "
             f"{system.lower[j] / size:g} ... {system.upper[j] / size:g} {unit}"
         )
-        refuse(i, reason, 0.0)
-    x[refused] = np.nan
-    doubtful = np.flatnonzero(~regular & ~refused)
-    if doubtful.size and system.n_x:
-        _refuse_singular(system, targets, x, batch, doubtful, refuse)
-        x[refused] = np.nan
-    return x
+        refusals.add(i, reason, 0.0)
 
 
 def _refuse_singular(
@@ -296,22 +305,22 @@ def _refuse_singular(
     targets: Array,
     x: Array,
     batch: _Batch,
-    doubtful: NDArray[np.intp],
-    refuse: Callable[[int, str, float | None], None],
+    points: NDArray[np.intp],
+    refusals: _Refusals,
 ) -> None:
-    """Refuse solutions that leave motions free, the most singular one first."""
-    _, jacobians = system.evaluate(x[doubtful], targets[doubtful], batch.at(doubtful))
+    """Refuse solutions at some points that leave motions free, the most singular one first."""
+    _, jacobians = system.evaluate(x[points], targets[points], batch.at(points))
     values = np.linalg.svd(jacobians / system.units, compute_uv=False)
     smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
     largest = values.max(axis=1, initial=0.0)  # without closures there are no values
-    ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), doubtful.shape)
+    ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), points.shape)
     for k in np.argsort(ratio)[: int((ratio < SINGULAR_BELOW).sum())].tolist():
-        free = int((values[k] > SINGULAR_BELOW * largest[k]).sum())
+        rank = int((values[k] > SINGULAR_BELOW * largest[k]).sum())
         reason = (
-            f"is singular: the drives leave {system.n_x - free} of {system.n_x} passive motions "
+            f"is singular: the drives leave {system.n_x - rank} of {system.n_x} passive motions "
             "free"
         )
-        refuse(int(doubtful[k]), reason, None)
+        refusals.add(int(points[k]), reason, None)
 
 
 def _newton(
@@ -414,7 +423,6 @@ class LoopClosure:
         self._columns = self._functions.errors.columns(self.free)
         others = {k: v for k, v in (fixed or {}).items() if k not in self.free}
         self._fixed = self._functions.errors.expand(others)
-        self._solutions: dict[tuple[object, ...], Array] = {}
 
     def close(
         self,
@@ -453,22 +461,16 @@ class LoopClosure:
         geometry, batch = self._batch(theta, errors, d)
         system = replace(self._closing, shortest=allow_free)
 
-        def solve() -> Array:
-            return solve_closures(
-                system,
-                d,
-                geometry,
-                machines=len(geometry.drive_errors),
-                start=start,
-                names=names,
-                failures=failures,
-                allow_singular=allow_free,
-            )
-
-        if failures is None:
-            passive = self._remember(("close", allow_free), d, geometry, start, solve)
-        else:
-            passive = solve()
+        passive = solve_closures(
+            system,
+            d,
+            geometry,
+            machines=len(geometry.drive_errors),
+            start=start,
+            names=names,
+            failures=failures,
+            allow_singular=allow_free,
+        )
         passive = passive if batch else passive[0]
         return passive[..., 0, :] if single else passive
 
@@ -556,22 +558,15 @@ class LoopClosure:
             ClosureError, RobotError: As `inverse`.
         """
         geometry, _ = self._batch(theta, None)
-
-        def solve() -> Array:
-            return solve_closures(
-                self._inverting,
-                points,
-                geometry,
-                machines=1,
-                start=start,
-                names=names,
-                failures=failures,
-            )
-
-        if failures is None:
-            x = self._remember(("inverse",), points, geometry, start, solve)[0]
-        else:
-            x = solve()[0]
+        x = solve_closures(
+            self._inverting,
+            points,
+            geometry,
+            machines=1,
+            start=start,
+            names=names,
+            failures=failures,
+        )[0]
         return x[:, : len(self.robot.drives)], x[:, len(self.robot.drives) :]
 
     def tcp(
@@ -639,27 +634,6 @@ class LoopClosure:
             n += map_.n_conditions
         rows, single = as_rows(drives, n, "drive coordinates")
         return map_.command(rows), single
-
-    def _remember(
-        self,
-        name: tuple[object, ...],
-        targets: Array,
-        geometry: MachineGeometry,
-        start: ArrayLike | None,
-        solve: Callable[[], Array],
-    ) -> Array:
-        """The solution for the same arguments, held from a recent call or computed now."""
-        arguments = [targets, geometry.placements, geometry.drive_errors]
-        if start is not None:
-            arguments.append(np.asarray(start, dtype=np.float64))
-        key = (*name, *(a.tobytes() for a in arguments))
-        if key in self._solutions:
-            return np.array(self._solutions[key])
-        solution = solve()
-        if solution.shape[0] * solution.shape[1] <= MAX_SOLUTION_POSTURES:
-            recent = [*self._solutions.items(), (key, np.array(solution))]
-            self._solutions = dict(recent[-MAX_SOLUTIONS:])
-        return solution
 
     def _require_tcp(self) -> Tcp:
         if self.robot.tcp is None:

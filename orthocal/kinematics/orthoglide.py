@@ -2,7 +2,7 @@
 
 A check on the closed-loop model and a fast special case; nothing in the identification uses them.
 R = ρ + Δρ is where the sliders really are. Equation numbers are the paper's (Pashkevich, Chablat,
-Wenger 2006); three of its formulas are corrected here, each where it stands.
+Wenger 2006); three of its formulas are corrected here, as noted in the docstrings.
 """
 
 from __future__ import annotations

@@ -112,13 +112,15 @@ class Workspace:
             return field, self.weights
         n, count = self.line.size, self.points.shape[1]
         cells = (2.0 * np.arange(CELLS_A_SIDE) + 1.0) / CELLS_A_SIDE - 1.0
-        known, wanted = (np.polynomial.legendre.legvander(x, n - 1) for x in (self.line, cells))
-        between = wanted @ np.linalg.inv(known)
-        found = field.reshape(*[n] * count, -1)
+        at_nodes, at_cells = (
+            np.polynomial.legendre.legvander(x, n - 1) for x in (self.line, cells)
+        )
+        interpolation = at_cells @ np.linalg.inv(at_nodes)
+        values = field.reshape(*[n] * count, -1)
         for _ in range(count):  # interpolate along the first axis, then make it the last one
-            found = np.moveaxis(np.tensordot(between, found, axes=1), 0, count - 1)
+            values = np.moveaxis(np.tensordot(interpolation, values, axes=1), 0, count - 1)
         size = CELLS_A_SIDE**count
-        return found.reshape(size, *field.shape[1:]), np.full(size, 1.0 / size)
+        return values.reshape(size, *field.shape[1:]), np.full(size, 1.0 / size)
 
     def remove_shift(self, field: Array) -> Array:
         """Position errors with the mean translation removed, shape (K, 3, ...)."""
@@ -158,8 +160,9 @@ def box_workspace(robot: Robot, box: ArrayLike, *, points_a_side: int = POINTS_A
     """
     limits, line = _limits(box), _lobatto_points(points_a_side)
     legendre = np.polynomial.legendre.Legendre.basis(points_a_side - 1)
-    own = 1.0 / (points_a_side * (points_a_side - 1) * legendre(line) ** 2)
-    points, weights = grid_points(line, len(limits)), grid_points(own, len(limits)).prod(axis=1)
+    node_weights = 1.0 / (points_a_side * (points_a_side - 1) * legendre(line) ** 2)
+    points = grid_points(line, len(limits))
+    weights = grid_points(node_weights, len(limits)).prod(axis=1)
     return Workspace(
         read_only(_scale_to(limits, points, tool_at_zero(robot))),
         read_only(weights),
@@ -218,8 +221,8 @@ def gauss_box(robot: Robot, box: ArrayLike) -> Workspace:
     """
     limits = _limits(box)
     count = len(limits)
-    nodes, own = np.polynomial.legendre.leggauss(3)
-    weights = grid_points(own, count).prod(axis=1)
+    nodes, node_weights = np.polynomial.legendre.leggauss(3)
+    weights = grid_points(node_weights, count).prod(axis=1)
     points = np.vstack([grid_points(nodes, count), grid_points(np.array([-1.0, 1.0]), count)])
     weighted = np.append(weights / weights.sum(), np.zeros(2**count))
     return Workspace(
@@ -252,9 +255,9 @@ def find_workspace(robot: Robot, reach: Callable[[Array], object] | None = None)
     require_commanded_tool(robot)
     if reach is not None:
         requested = cube_limits(robot) if robot.workspace is None else robot.workspace
-        found = _largest_box(robot, requested, reach)
-        whole = robot.workspace is None or found.box is robot.workspace
-        return found if whole else replace(found, requested=robot.workspace)
+        reached = _largest_box(robot, requested, reach)
+        complete = robot.workspace is None or reached.box is robot.workspace
+        return reached if complete else replace(reached, requested=robot.workspace)
     if robot.workspace is None:
         return _default_workspace(robot)
     problem = find_unreached(robot, robot.workspace)

@@ -179,11 +179,12 @@ class ParameterSet:
         Raises:
             ParameterError: If a name is unknown.
         """
+        rows = {error: i for i, error in enumerate(errors)}
         result = np.zeros((len(errors), len(names)))
         for j, name in enumerate(names):
             for term, coefficient in self[name].terms:
-                if term in errors:
-                    result[list(errors).index(term), j] = coefficient
+                if term in rows:
+                    result[rows[term], j] = coefficient
         return result
 
     def are_offsets(self, name: str) -> bool:

@@ -76,32 +76,6 @@ def test_every_operation_is_casadis(count):
     assert_same(*(batch.evaluate(*values, backend=b) for b in BACKENDS))
 
 
-@pytest.mark.parametrize("count", [0, 1, 12])
-def test_numpy_executes_short_functions_to_the_same_numbers(count):
-    x, y = ca.SX.sym("x", 2), ca.SX.sym("y", 2)
-    values = [x + y, x - y, x * y, x / y, -x, x**2, 2.0 * x, 1.0 / x, ca.sqrt(ca.fabs(x)), 3.0 * x]
-    outputs = [ca.vertcat(*values, 3.5), ca.diag(x)]
-    batch = BatchFunction(ca.Function("short", [x, y], outputs), matrices=["o1"])
-    rng = np.random.default_rng(4)
-    for rows in {1, max(count // 3, 1), max(count, 1)}:
-        where = rng.normal(size=(count, 2)), rng.normal(size=(rows, 2))
-        expected = batch.evaluate(*where, backend="casadi")
-        assert_same(batch.evaluate(*where, backend="numpy"), expected)
-        assert_same(batch(*where), expected)
-
-
-def test_numpy_leaves_other_functions_to_casadi(monkeypatch):
-    """Long ones, and those whose operations it may round otherwise."""
-    monkeypatch.setattr(batch_function, "_run_numpy", None)
-    x = ca.SX.sym("x")
-    long = x
-    for _ in range(batch_function.MAX_SHORT):
-        long = long * x + 1.0
-    for expression in (ca.sin(x), long):
-        batch = BatchFunction(ca.Function("other", [x], [expression]))
-        assert_same(batch(np.ones((3, 1))), batch.evaluate(np.ones((3, 1)), backend="casadi"))
-
-
 @pytest.mark.parametrize("example", ["raw-cycles", "workshop"])
 def test_the_instructions_of_all_readings_are_known(root, example):
     """Line between rods, and ball on a rod: others would be evaluated ten times slower."""

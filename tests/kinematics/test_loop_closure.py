@@ -229,12 +229,3 @@ def test_a_batch_has_the_safeguards_of_one_machine(biglide):
     assert list(failures) == [0]
     assert np.isnan(passive[0]).all()
     assert np.isfinite(passive[1]).all()
-
-
-def test_a_solution_does_not_depend_on_earlier_calls(orthoglide):
-    drives = orthoglide.drive_zero + np.array([[0.01, -0.02, 0.015]])
-    start = orthoglide.reference_passive + 0.05
-    fresh = LoopClosure(orthoglide).close(drives, start=start)
-    used = LoopClosure(orthoglide)
-    used.close(drives)
-    assert np.array_equal(used.close(drives, start=start), fresh)

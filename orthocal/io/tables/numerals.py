@@ -38,10 +38,10 @@ def _pattern(decimal: str, group: str) -> re.Pattern[str]:
     grouped = (
         rf"[1-9][0-9]{{0,2}}(?P<group>[{group}{_BLANKS}'’])[0-9]{{3}}(?:(?P=group)[0-9]{{3}})*"
     )
-    whole = rf"(?P<whole>{grouped}|[0-9]+)"
+    integer = rf"(?P<integer>{grouped}|[0-9]+)"
     fraction = rf"{decimal}(?P<fraction>[0-9]*)"
     return re.compile(
-        rf"(?P<sign>[-+]?)[{_BLANKS}]*(?:{whole}(?:{fraction})?|{decimal}(?P<only>[0-9]+))"
+        rf"(?P<sign>[-+]?)[{_BLANKS}]*(?:{integer}(?:{fraction})?|{decimal}(?P<only>[0-9]+))"
         r"(?:[eE](?P<power>[-+]?[0-9]{1,3}))?"
     )
 
@@ -83,10 +83,10 @@ def parse_numeral(text: str, sign: Sign) -> Decimal | None:
     match = _PATTERNS[sign].fullmatch(text)
     if not match:
         return None
-    whole = re.sub("[^0-9]", "", match["whole"] or "")
+    integer = re.sub("[^0-9]", "", match["integer"] or "")
     fraction = match["fraction"] or match["only"] or ""
     try:
-        return Decimal(f"{match['sign']}{whole or '0'}.{fraction or '0'}e{match['power'] or '0'}")
+        return Decimal(f"{match['sign']}{integer or '0'}.{fraction or '0'}e{match['power'] or '0'}")
     except InvalidOperation:
         return None
 

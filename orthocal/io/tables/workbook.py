@@ -233,9 +233,9 @@ class _Workbook:
                         raise SessionError(f"has more than {limit}", where=where)
             else:
                 first, _, last = element.get("ref", "").partition(":")
-                (top, left), (bottom, right) = _parse_address(first), _parse_address(last or first)
-                if top < bottom and left == right:
-                    merged.append((left, top, bottom))
+                (top, column_a), (bottom, column_b) = map(_parse_address, (first, last or first))
+                if top < bottom and column_a == column_b:
+                    merged.append((column_a, top, bottom))
         return Sheet(title, tuple(rows), tuple(sorted(merged)), formulas, hidden)
 
     def _read_cell(self, element: Any, children: dict[str, Any], where: str) -> Cell:  # noqa: ANN401 - lxml has no types

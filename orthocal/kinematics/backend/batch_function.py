@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import casadi as ca
 import numpy as np
@@ -16,7 +15,7 @@ from orthocal.kinematics.backend import llvm
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-Backend = Literal["casadi", "llvm", "numpy"]
+Backend = Literal["casadi", "llvm"]
 
 BLOCK_SIZES = (32, 8, 1)
 """Points of one call of a mapped CasADi function, largest first."""
@@ -25,31 +24,12 @@ MIN_POINTS, MIN_OPERATIONS = 16, 2e4
 """Points of a call, and instructions times points, from which the LLVM backend is used. It takes a
 tenth of CasADi's time, but 0.1 s once to start: sessions of a few postures do not start it."""
 
-MAX_SHORT = 100
-"""Instructions of a function that NumPy executes, one after another for all points at once: calls
-of CasADi would take longer than its 20 instructions."""
-
-_UFUNCS: dict[str, Callable[..., Any]] = {
-    "ASSIGN": np.positive,
-    "ADD": np.add,
-    "SUB": np.subtract,
-    "MUL": np.multiply,
-    "DIV": np.divide,
-    "NEG": np.negative,
-    "SQ": np.square,
-    "TWICE": lambda a: a + a,
-    "INV": np.reciprocal,
-    "SQRT": np.sqrt,
-    "FABS": np.abs,
-}
-"""Operations that NumPy rounds as CasADi does, with their functions."""
-
 
 class BatchFunction:
     """A CasADi function of column vectors, evaluated at many points.
 
-    All backends execute the same instructions in the same order and give the same numbers, bit by
-    bit. The choice among them depends only on the function, the number of points and whether
+    Both backends execute the same instructions in the same order and give the same numbers, bit by
+    bit. The choice between them depends only on the function, the number of points and whether
     llvmlite is installed.
 
     Args:
@@ -97,8 +77,6 @@ class BatchFunction:
             Each output with shape (K, rows, columns), or (K, rows) for a column vector; `matrices`
             keep their one column; sparse outputs have shape (K, nnz).
         """
-        if self._short:
-            return self.evaluate(*inputs, backend="numpy")
         count = self._count(inputs)
         large = count >= MIN_POINTS and self._n_instructions * count >= MIN_OPERATIONS
         fast = large and llvm.is_installed()
@@ -107,15 +85,13 @@ class BatchFunction:
     def evaluate(self, *inputs: ArrayLike, backend: Backend) -> tuple[Array, ...]:
         """Evaluate with one backend; arguments and result as for a call.
 
-        CasADi evaluates a function with an instruction that another backend lacks.
+        CasADi evaluates functions with an instruction that the LLVM backend lacks.
         """
         arrays = [np.atleast_2d(np.asarray(a, dtype=np.float64)) for a in inputs]
         count = self._count(inputs)
         nonzeros = None
         if backend == "llvm" and self._program is not None:
             nonzeros = llvm.run(self._program, arrays, count)
-        elif backend == "numpy" and self._short and self._program is not None:
-            nonzeros = _run_numpy(self._program, arrays, count)
         if nonzeros is None:
             nonzeros = self._run_casadi(arrays, count)
         results = []
@@ -134,14 +110,6 @@ class BatchFunction:
     @cached_property
     def _n_instructions(self) -> int:
         return int(self.function.n_instructions())
-
-    @cached_property
-    def _short(self) -> bool:
-        """True for a short function whose operations NumPy has."""
-        if self._n_instructions > MAX_SHORT or self._program is None:
-            return False
-        names = {llvm.OPERATIONS[code] for code in self._program.table[:, 0].tolist()}
-        return names <= {"CONST", "INPUT", "OUTPUT", *_UFUNCS}
 
     @cached_property
     def _program(self) -> llvm.Program | None:
@@ -172,29 +140,6 @@ class BatchFunction:
         if size not in blocks:
             blocks[size] = _MappedBlock(self.function, size)
         return blocks[size]
-
-
-def _run_numpy(program: llvm.Program, arrays: Sequence[Array], count: int) -> list[Array]:
-    """Nonzeros of each output, shape (count, nnz)."""
-    inputs = [a if len(a) in (1, count) else np.repeat(a, count // len(a), axis=0) for a in arrays]
-    work: dict[int, Any] = {}
-    result = np.empty((count, int(program.output_starts[-1])))
-    for (code, to, a, b), constant in zip(
-        program.table.tolist(), program.constants.tolist(), strict=True
-    ):
-        name = llvm.OPERATIONS[code]
-        if name == "CONST":
-            work[to] = constant
-        elif name == "INPUT":
-            work[to] = inputs[a][:, b]
-        elif name == "OUTPUT":
-            result[:, to] = work[a]
-        else:
-            ufunc = _UFUNCS[name]
-            binary = name in ("ADD", "SUB", "MUL", "DIV")
-            work[to] = ufunc(work[a], work[b]) if binary else ufunc(work[a])
-    starts = program.output_starts.tolist()
-    return [result[:, first:end] for first, end in itertools.pairwise(starts)]
 
 
 class _MappedBlock:

@@ -111,8 +111,8 @@ def _decode(content: bytes | None, function: ca.Function) -> Program | None:
     n, outputs = function.n_instructions(), function.n_out()
     if content is None or len(content) != 24 * n + 8 * (outputs + 2):
         return None
-    table, constants, rest = np.split(np.frombuffer(content, np.uint8), [16 * n, 24 * n])
-    n_work, *starts = rest.view(np.int64)
+    table, constants, numbers = np.split(np.frombuffer(content, np.uint8), [16 * n, 24 * n])
+    n_work, *starts = numbers.view(np.int64)
     return Program(
         table.view(np.int32).reshape(n, 4),
         constants.view(np.float64),
@@ -382,9 +382,9 @@ class _Source:
         align = ", align 8" if kind == self._row else ""
         self._put(f"store {kind} {value}, ptr {place}{align}")
 
-    def _new(self, what: str) -> str:
+    def _new(self, instruction: str) -> str:
         name = self._name()
-        self._put(f"{name} = {what}")
+        self._put(f"{name} = {instruction}")
         return name
 
     def _name(self) -> str:
