@@ -205,15 +205,16 @@ class CalibrationProblem:
         if self._near_reference is None:
             return None
         try:
-            linear = self._reference_linearisation
+            linear = self.reference_linearisation
         except np.linalg.LinAlgError:
             return None
         change = (theta - self.reference) / self.theta_scale
         return np.asarray(self._near_reference + linear.follow(change))
 
     @cached_property
-    def _reference_linearisation(self) -> Linearisation:
-        return self.linearisation(self.reference, self.reference_passive, dense=False)
+    def reference_linearisation(self) -> Linearisation:
+        """Readings to first order about the reference."""
+        return self.linearisation(self.reference, self.reference_passive)
 
     @cached_property
     def _near_reference(self) -> Array | None:
@@ -293,15 +294,12 @@ class CalibrationProblem:
         jacobian = linear.jacobian
         return linear.reading, jacobian if units == "tolerance" else jacobian / self.theta_scale
 
-    def linearisation(
-        self, theta: ArrayLike, passive: Array, *, dense: bool = True
-    ) -> Linearisation:
+    def linearisation(self, theta: ArrayLike, passive: Array) -> Linearisation:
         """Readings to first order about parameters and passive coordinates near closed loops.
 
         Args:
             theta: Shape (n_free,), or (S, n_free) for a batch, [SI].
             passive: Shape (n_states, n_passive), with S in front for a batch, [m, rad].
-            dense: Compute the Jacobian; without it only products with its transpose.
 
         Raises:
             LinAlgError: If a posture is singular.
@@ -312,7 +310,6 @@ class CalibrationProblem:
             self._nuisance(theta),
             free=self._free_parameters,
             noise=self.noise,
-            dense=dense,
         )
 
     def split_errors(self, theta: ArrayLike) -> dict[str, float]:

@@ -140,18 +140,6 @@ class _ClosurePattern:
             result[..., row] = (nonzeros[..., part] @ twists[:, self.columns[part], None])[..., 0]
         return result
 
-    def subtract(self, twists: Array, nonzeros: Array, forces: Array) -> None:
-        """Subtract λ · ∂g, summed over postures, from (S, n_twists), in place.
-
-        Args:
-            twists: Shape (S, n_twists).
-            nonzeros: Shape (S, k, nnz).
-            forces: λ, shape (S, k, n_rows).
-        """
-        for row, part in self._row_parts(forces.shape[2]):
-            product = forces[:, None, :, row] @ nonzeros[:, :, part]
-            twists[:, self.columns[part]] -= product[:, 0]  # no column twice in a row
-
     def _row_parts(self, n_rows: int) -> Iterator[tuple[int, slice]]:
         """Rows that have nonzeros, and the slice of each."""
         starts = np.searchsorted(self.rows, np.arange(n_rows + 1)).tolist()
@@ -258,7 +246,6 @@ class ObservationModel:
         *,
         free: FreeParameters,
         noise: Array | None = None,
-        dense: bool = True,
         aligned: bool = True,
     ) -> Linearisation:
         """Readings to first order about machines and passive coordinates near closed loops.
@@ -269,8 +256,6 @@ class ObservationModel:
             nuisance: As for `predict`.
             free: The free parameters.
             noise: Divisor of each entry's reading, shape (n_entries,); 1 by default.
-            dense: Compute the Jacobian. Without it, products with its transpose are available:
-                they take one small product a posture, however many parameters there are.
             aligned: As for `predict`.
 
         Raises:
@@ -280,9 +265,15 @@ class ObservationModel:
         alignment = self.alignment.slopes if aligned else np.zeros((nu.shape[1], at.shape[1]))
         divisor = np.ones(self.observations.size) if noise is None else noise
         return Linearisation(
-            self, at, q, nu, free=free, alignment=alignment, noise=divisor, dense=dense,
+            self,
+            at,
+            q,
+            nu,
+            free=free,
+            alignment=alignment,
+            noise=divisor,
             batch=errors.ndim > 1,
-        )  # fmt: skip
+        )
 
     def _batch(
         self, errors: Array, passive: Array, nuisance: Array | None, *, aligned: bool
@@ -371,7 +362,6 @@ class Linearisation:
         free: The free parameters.
         alignment: Derivative of the nuisance parameters by errors, shape (n_nuisance, n_errors).
         noise: Divisor of each entry's reading, shape (n_entries,).
-        dense: Compute the Jacobian.
         batch: Keep the leading dimension of results.
 
     Attributes:
@@ -379,8 +369,7 @@ class Linearisation:
         opening: Change of h when the loops are closed, to first order, shape (S, n_entries), [m].
         correction: Change of the passive coordinates that closes the loops, shape (S, n_states,
             n_passive), [m, rad].
-        jacobian: dh/dθ̂ with the loops closed, shape (S, n_entries, n_free), [m per unit of θ̂]; only
-            if dense.
+        jacobian: dh/dθ̂ with the loops closed, shape (S, n_entries, n_free), [m per unit of θ̂].
     """
 
     def __init__(
@@ -393,11 +382,10 @@ class Linearisation:
         free: FreeParameters,
         alignment: Array,
         noise: Array,
-        dense: bool,
         batch: bool,
     ) -> None:
-        self._model, self._free, self._noise, self._batch = model, free, noise, batch
-        self._by_errors = alignment @ free.columns
+        self._model, self._free, self._batch = model, free, batch
+        by_errors = alignment @ free.columns
         self._geometries = model.geometries(errors)
         geometry, references = self._geometries[0], model.reference_commands
         self._actuated = geometry.drives(model.states.commands)
@@ -414,8 +402,8 @@ class Linearisation:
         n_machine, n_nuisance = free.columns.shape[1], free.nuisance_scale.size
         reading, opening = np.empty((n_sets, n)), np.empty((n_sets, n))
         correction = np.zeros_like(passive, dtype=np.float64)
-        jacobian = np.empty((n_sets, n, n_machine + n_nuisance)) if dense else np.empty((0, 0, 0))
-        self._blocks: list[tuple[_Block, _Closures, _Readings | None]] = []
+        jacobian = np.empty((n_sets, n, n_machine + n_nuisance))
+        self._blocks: list[tuple[_Block, _Closures]] = []
         for block in model._single_blocks if n_sets == 1 else model.blocks(n_sets):
             closures = self._evaluate_closures(block, passive)
             readings = self._evaluate_readings(block, passive, nuisance)
@@ -426,30 +414,19 @@ class Linearisation:
             by_passive = readings.by_passive.reshape(n_sets, k, m, -1)
             reading[:, entries] = readings.value
             opening[:, entries] = (by_passive @ dq[..., None]).reshape(n_sets, k * m)
-            if dense:
-                rows = self._machine_rows(block, closures, readings)
-                jacobian[:, entries, :n_machine] = rows
-                jacobian[:, entries, n_machine:] = readings.by_nuisance
-            self._blocks.append((block, closures, None if dense else readings))
-        if dense:
-            aligned = np.flatnonzero(self._by_errors.any(axis=1))
-            by_nuisance = jacobian[:, :, n_machine:]
-            if aligned.size:
-                jacobian[:, :, :n_machine] += by_nuisance[:, :, aligned] @ self._by_errors[aligned]
-            by_nuisance *= free.nuisance_scale
+            jacobian[:, entries, :n_machine] = self._machine_rows(block, closures, readings)
+            jacobian[:, entries, n_machine:] = readings.by_nuisance
+            self._blocks.append((block, closures))
+        aligned = np.flatnonzero(by_errors.any(axis=1))
+        by_nuisance = jacobian[:, :, n_machine:]
+        if aligned.size:
+            jacobian[:, :, :n_machine] += by_nuisance[:, :, aligned] @ by_errors[aligned]
+        by_nuisance *= free.nuisance_scale
         if (noise != 1.0).any():
             reading, opening = reading / noise, opening / noise
-            jacobian = jacobian / noise[:, None] if dense else jacobian
+            jacobian /= noise[:, None]
         self.reading, self.opening = self._squeeze(reading), self._squeeze(opening)
-        self.correction = self._squeeze(correction)
-        self._jacobian = self._squeeze(jacobian) if dense else None
-
-    @property
-    def jacobian(self) -> Array:
-        """dh/dθ̂ with the loops closed, shape (S, n_entries, n_free), [m per unit of θ̂]."""
-        if self._jacobian is None:
-            raise ValueError("linearised without a Jacobian; expected dense=True")
-        return self._jacobian
+        self.correction, self.jacobian = self._squeeze(correction), self._squeeze(jacobian)
 
     def follow(self, change: Array) -> Array:
         """Change of the passive coordinates that closes the loops after a change of θ̂.
@@ -466,50 +443,12 @@ class Linearisation:
         drive_errors = (self._by_machine @ machine)[:, None]
         correction = self.correction if self._batch else self.correction[None]
         result = np.array(np.broadcast_to(correction, (len(d), *correction.shape[1:])))
-        for block, closures, _ in self._blocks:
+        for block, closures in self._blocks:
             opened = (closures.by_drive_errors @ drive_errors)[..., 0]
             moved = twists[block.variant]
             opened += self._pattern.times(closures.by_twists, moved, opened.shape[2])
             result[:, block.states] -= (closures.inverse @ opened[..., None])[..., 0]
         return result if change.ndim > 1 else result[0]
-
-    def transposed_product(self, forces: Array) -> Array:
-        """Jᵀ f without the Jacobian (the adjoint method).
-
-            Σ f dh = (f h_θ − λ g_θ) dθ,  g_qᵀ λ = h_qᵀ f
-
-        Args:
-            forces: f, shape (S, n_entries).
-
-        Returns:
-            Shape (S, n_free).
-        """
-        f_all = np.atleast_2d(forces) / self._noise
-        n_sets, n_twists = len(f_all), self._model.functions.n_twists
-        of_variant = np.zeros((len(self._twists), n_sets, n_twists))
-        drive_errors = np.zeros((n_sets, len(self._by_machine)))
-        nuisance = np.zeros((n_sets, self._free.nuisance_scale.size))
-        for block, closures, readings in self._blocks:
-            if readings is None:
-                raise ValueError("linearised with a Jacobian; expected dense=False")
-            k, m = block.entries.shape
-            entries = block.entries.reshape(-1)
-            f = f_all[:, entries]
-            rows = f.reshape(n_sets, k, 1, m)
-            on_passive = rows @ readings.by_passive.reshape(n_sets, k, m, -1)
-            multiplier = (on_passive @ closures.inverse)[:, :, 0]
-            drive_errors += (f[:, None] @ readings.by_drive_errors)[:, 0]
-            drive_errors -= (multiplier[:, :, None] @ closures.by_drive_errors)[:, :, 0].sum(axis=1)
-            twists = of_variant[block.variant]
-            for where, columns, nonzeros in readings.by_twists:
-                twists[:, columns] += (f[:, None, where] @ nonzeros)[:, 0]
-            self._pattern.subtract(twists, closures.by_twists, multiplier)
-            nuisance += (f[:, None] @ readings.by_nuisance)[:, 0]
-        machine = drive_errors @ self._by_machine
-        for chain, twists in zip(self._twists, of_variant, strict=True):
-            machine += chain.transposed_product(twists)
-        machine += nuisance @ self._by_errors
-        return self._squeeze(np.hstack([machine, nuisance * self._free.nuisance_scale]))
 
     def _evaluate_closures(self, block: _Block, passive: Array) -> _Closures:
         n_sets, k = len(passive), block.states.size
@@ -625,11 +564,6 @@ class _TwistChain:
         """Twists ∂ξ of changes of machine parameters, shape (D, n_twists) of (D, n_machine, 1)."""
         inner = (self._inner @ change).reshape(len(change), -1, 6, 1)
         return np.asarray((self._right @ inner).reshape(len(change), -1))
-
-    def transposed_product(self, twists: Array) -> Array:
-        """Forces on machine parameters, (S, n_machine), of forces on twists, (S, n_twists)."""
-        local = (twists.reshape(len(twists), -1, 1, 6) @ self._right).reshape(len(twists), 1, -1)
-        return np.asarray((local @ self._inner)[:, 0])
 
 
 def predict_readings(

@@ -305,15 +305,12 @@ def test_the_jacobian_is_that_of_the_readings(problem):
     assert (np.abs(jacobian).max(axis=0) > 0.0).all()
 
 
-def test_batches_adjoint_and_first_order_agree_with_the_jacobian(problem):
+def test_batches_and_first_order_agree_with_the_jacobian(problem):
     thetas = np.array([point(problem, size) for size in (0.2, 0.6)])
     passive = problem.close(thetas)
     readings, jacobians = problem.linearise(thetas, passive)
-    batch = problem.linearisation(thetas, passive, dense=False)
+    batch = problem.linearisation(thetas, passive)
     rng = np.random.default_rng(5)
-    forces = rng.normal(size=readings.shape)
-    expected = np.einsum("sn,snp->sp", forces, jacobians)
-    assert np.abs(batch.transposed_product(forces) - expected).max() < KINEMATICS
     change = 1e-4 * rng.normal(size=thetas.shape)
     for i, theta in enumerate(thetas):
         alone, jacobian = problem.linearise(theta, passive[i])

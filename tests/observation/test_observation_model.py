@@ -101,23 +101,6 @@ def test_the_jacobian_is_that_of_central_differences(problem):
     assert np.allclose(si * problem.theta_scale, jacobian, rtol=1e-14, atol=0.0)
 
 
-def test_the_adjoint_is_the_transposed_jacobian(problem):
-    theta, readings, passive, rng = draw(problem)
-    near = passive + 1e-5 * rng.normal(size=passive.shape)
-    forces = rng.normal(size=readings.shape)
-    dense = problem.linearisation(theta, near)
-    adjoint = problem.linearisation(theta, near, dense=False)
-    assert np.array_equal(adjoint.reading, dense.reading)
-    assert np.array_equal(adjoint.correction, dense.correction)
-    expected = (forces[:, None] @ dense.jacobian)[:, 0]
-    scale = np.abs(expected).max()
-    assert np.abs(adjoint.transposed_product(forces) - expected).max() < 1e-12 * scale
-    with pytest.raises(ValueError, match="dense=True"):
-        _ = adjoint.jacobian
-    with pytest.raises(ValueError, match="dense=False"):
-        dense.transposed_product(forces)
-
-
 def test_opening_and_follow_close_the_loops_to_first_order(problem):
     theta, _, passive, rng = draw(problem, count=1)
     for size in (1e-4, 1e-5):

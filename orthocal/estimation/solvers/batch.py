@@ -1,9 +1,8 @@
-"""Solver for many sets of readings of one plan: the optimum of each set, as if solved alone.
+"""Batch solver: the optimum of each of many sets of readings of one plan.
 
-Gauss-Newton runs on all sets at once. It starts at the linearised solutions, with the Jacobian of
-each set there. Further steps use the exact gradient, which takes one small product a posture
-whatever the number of parameters, and inverse normal equations improved by BFGS updates. Sets that
-do not converge or that reach a bound are solved one by one.
+Gauss-Newton runs on all sets at once, from the linearised solutions, with the Jacobian of each set.
+Sets that do not converge or that reach a bound are solved one by one by variable projection, so
+that every set has the optimum that it has alone.
 """
 
 from __future__ import annotations
@@ -27,9 +26,6 @@ MAX_STEPS = 30
 
 MAX_STEP_SIZE = 100.0
 """Longer steps mark a set that is solved alone, [tolerances]."""
-
-LARGEST_INVERSE = 1e12
-"""Entry of inverse normal equations from which they count as singular, [tolerances²]."""
 
 MAX_NUMBERS = 2**21
 """Numbers in the Jacobians of the sets that are solved together."""
@@ -114,52 +110,30 @@ class BatchProgram:
         raise ValueError(f"found the shape {rows.shape}; expected (n_sets, {o.size})")
 
     def _solve_part(self, shared: _Shared, y: Array, solution: BatchSolution, part: slice) -> None:
-        """Gauss-Newton of some sets; fills their part of the solution."""
+        """Gauss-Newton steps for some sets; fills their part of the solution."""
         problem, sigma = self.problem, shared.sigma
         theta = shared.linearised_solutions(y)
         passive = problem.reference_passive + shared.reference.follow(theta - shared.start)
         active, converged = np.arange(len(y)), np.zeros(len(y), dtype=np.bool_)
-        sizes, last = np.full((3, len(y)), np.inf), np.zeros_like(theta)
-        reading, previous = np.empty_like(y), None
-        jacobian: Array = np.empty(0)
-        inverses: Array = np.empty(0)
-        for iteration in range(MAX_STEPS):
-            first = iteration == 0
+        sizes, reading = np.full((3, len(y)), np.inf), np.empty_like(y)
+        for _ in range(MAX_STEPS):
             try:
-                linear = problem.linearisation(
-                    theta[active] * problem.theta_scale, passive[active], dense=first
-                )
-            except np.linalg.LinAlgError:  # a singular posture: all of them alone
+                linear = problem.linearisation(theta[active] * problem.theta_scale, passive[active])
+            except np.linalg.LinAlgError:  # a singular posture: solve all of them one by one
                 break
-            reading[active] = linear.reading + linear.opening
-            residual, _, _ = shared.residual((y[active] - reading[active]) / sigma)
-            influence = shared.loss.influence(residual)
-            if first:
-                jacobian = linear.jacobian / sigma
-                gradient = (influence[:, None] @ jacobian)[:, 0]
-            else:
-                gradient = linear.transposed_product(influence / sigma)
-            gradient = shared.with_prior(theta[active], gradient)
-            if first or shared.loss.robust:
-                normal = shared.normal_matrices(residual, jacobian[active])
-                inverses = _inverse(normal)
-            if previous is not None:
-                _update_inverses(inverses, previous[0], previous[1] - gradient)
-            step = (inverses @ gradient[..., None])[..., 0]
+            closed = linear.reading + linear.opening
+            residual, _, _ = shared.residual((y[active] - closed) / sigma)
+            step = shared.step(theta[active], residual, linear.jacobian)
+            reading[active] = closed + (linear.jacobian @ step[..., None])[..., 0]
             theta[active] += step
             passive[active] += linear.follow(step)
-            last[active] = step
             sizes = np.roll(sizes, 1, axis=0)
             sizes[0, active] = np.abs(step).max(axis=1)
             settled = _settled(sizes[:, active])
             converged[active] = settled
-            on = ~settled & (sizes[0, active] < MAX_STEP_SIZE)
-            previous = None if first else (step[on], gradient[on])
-            active, inverses = active[on], inverses[on]
+            active = active[~settled & (sizes[0, active] < MAX_STEP_SIZE)]
             if not active.size:
                 break
-        if jacobian.size:
-            reading += sigma * (jacobian @ last[..., None])[..., 0]
         theta, zeros, objective, good = shared.evaluate(y, theta, reading)
         solution.theta[part], solution.zeros[part] = theta * problem.theta_scale, zeros
         solution.objective[part], solution.alone[part] = objective, ~(good & converged)
@@ -178,7 +152,7 @@ class _Shared:
         self._counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
         self._incidence = problem.zero_incidence
         self._free_zeros = problem.zero_incidence * ~o.zero_known
-        self.reference = problem.linearisation(problem.reference, problem.reference_passive)
+        self.reference = problem.reference_linearisation
         self._jacobian = self._centre(self.reference.jacobian / sigma)
         normal = self._jacobian.T @ self._jacobian + np.diag(self._precision)
         self._inverse = np.linalg.pinv(normal, rcond=1e-13, hermitian=True)
@@ -203,22 +177,32 @@ class _Shared:
         residual = deviation - zeros[:, o.zero]
         return residual, zeros, self.loss.value(residual).sum(axis=1)
 
-    def normal_matrices(self, residual: Array, jacobian: Array) -> Array:
-        """Normal equations of each set, gauge zeros eliminated, shape (S, n_free, n_free)."""
-        if not self.loss.robust:
-            weighted, sums = jacobian, self._counts[None, :, None]
-        else:
-            weights = self.loss.weight(residual)[..., None]
-            weighted, sums = weights * jacobian, self._incidence.T @ weights
-        by_zero = self._free_zeros.T @ weighted
-        result = np.swapaxes(jacobian, 1, 2) @ weighted
-        result -= np.swapaxes(by_zero, 1, 2) @ (by_zero / sums)
-        result += np.diag(self._precision)
-        return np.asarray(result)
+    def step(self, theta: Array, residual: Array, jacobian: Array) -> Array:
+        """Gauss-Newton steps s = (JᵀWJ + P)⁻¹ (Jᵀρ' − P (θ̂ − mean)), shape (S, n_free).
 
-    def with_prior(self, theta: Array, gradient: Array) -> Array:
-        """Descent direction of the objective: that of the readings and that of the prior."""
-        return np.asarray(gradient - self._precision * (theta - self._mean))
+        W holds the weights ρ'(r)/r, J the rows minus the weighted mean of those with the same
+        free zero.
+
+        Args:
+            theta: θ̂, shape (S, n_free).
+            residual: Shape (S, n_entries), [σ].
+            jacobian: Shape (S, n_entries, n_free), [m per tolerance].
+        """
+        rows = jacobian / self.sigma
+        gradient = (self.loss.influence(residual)[:, None] @ rows)[:, 0]
+        gradient -= self._precision * (theta - self._mean)
+        weighted, sums = rows, self._counts[None, :, None]
+        if self.loss.robust:
+            weights = self.loss.weight(residual)[..., None]
+            weighted, sums = weights * rows, self._incidence.T @ weights
+        by_zero = self._free_zeros.T @ weighted
+        normal = np.swapaxes(rows, 1, 2) @ weighted + np.diag(self._precision)
+        normal -= np.swapaxes(by_zero, 1, 2) @ (by_zero / sums)
+        try:
+            steps = np.linalg.solve(normal, gradient[..., None])
+        except np.linalg.LinAlgError:
+            steps = np.linalg.pinv(normal, rcond=1e-13, hermitian=True) @ gradient[..., None]
+        return np.asarray(steps[..., 0])
 
     def evaluate(
         self, y: Array, theta: Array, reading: Array
@@ -246,26 +230,3 @@ def _settled(sizes: Array) -> NDArray[np.bool_]:
 def _parts(count: int, size: int) -> Iterator[slice]:
     for first in range(0, count, size):
         yield slice(first, first + size)
-
-
-def _inverse(matrices: Array) -> Array:
-    """Inverses of symmetric matrices; pseudo-inverses if one of them is singular."""
-    try:
-        inverses = np.asarray(np.linalg.inv(matrices))
-    except np.linalg.LinAlgError:
-        inverses = np.full_like(matrices, np.inf)
-    if np.abs(inverses).max(initial=0.0) < LARGEST_INVERSE:
-        return inverses
-    return np.asarray(np.linalg.pinv(matrices, rcond=1e-13, hermitian=True))
-
-
-def _update_inverses(inverses: Array, step: Array, change: Array) -> None:
-    """Inverse BFGS update of normal equations by a step and its change of gradient, in place."""
-    curvature = (step * change).sum(axis=1)
-    with np.errstate(divide="ignore"):
-        rho = np.where(curvature > 0.0, 1.0 / curvature, 0.0)[:, None]
-    mapped = (inverses @ change[..., None])[..., 0]
-    along = rho * (1.0 + rho * (change * mapped).sum(axis=1, keepdims=True)) * step
-    half = 0.5 * along - rho * mapped
-    inverses += half[:, :, None] * step[:, None, :]
-    inverses += step[:, :, None] * half[:, None, :]
