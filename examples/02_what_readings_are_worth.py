@@ -45,7 +45,7 @@ promised, kept = defaultdict(list), defaultdict(list)  # mean squares at the too
 
 def hold(label: str, session: Session, choice: Choice, real: LoopClosure) -> Calibration:
     """Calibrate, and hold the calibrated tool against the real one."""
-    result = orthocal.calibrate(session, choice, solver="eliminated")
+    result = orthocal.calibrate(session, choice, solver="variable-projection")
     at = drives - result.active_offsets
     left = space.remove_motion(result.machine.forward(at) - real.forward(at), space.points)
     kept[label].append(space.weights @ (left**2).sum(axis=1))

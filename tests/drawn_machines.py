@@ -25,7 +25,7 @@ class DrawnMachines:
         self.tolerances = np.array([p.tolerance for p in self.machine.parameters])
         problem = build_problem(plan, model=model)
         # the same optimum as Ipopt's (`test_solvers`), in less time
-        self.nominal = fit_problem(problem, options=SolverOptions(solver="eliminated"))
+        self.nominal = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
         self.problem, self.others = problem, find_other_errors(self.nominal)
 
     def draw(self, rng, *, level=1.0):

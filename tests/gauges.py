@@ -10,8 +10,8 @@ from orthocal.sensors.mounting import EXACT
 def exact(session):
     """The same session, or plan, with nothing unknown of its gauges but their zeros."""
     setups = {
-        name: replace(s, sensor=replace(s.sensor, standing=EXACT))
-        if hasattr(s.sensor, "standing")
+        name: replace(s, sensor=replace(s.sensor, mounting=EXACT))
+        if hasattr(s.sensor, "mounting")
         else s
         for name, s in session.setups.items()
     }

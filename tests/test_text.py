@@ -79,8 +79,8 @@ def test_names_of_files_are_escaped_in_messages(file, old, new, session):
 def test_strings_in_lists_of_a_json_are_looked_at_too(session):
     path = write_calibration(calibrate(load_session(session)), session / "calibration.json")
     text = path.read_text(encoding="utf-8")
-    assert '"told": [\n   "x_slide.offset"' in text
-    path.write_text(text.replace('"told": [\n   "x_', '"told": [\n   "\\u001b[31mx_'))
+    assert '"resolvable": [\n   "x_slide.offset"' in text
+    path.write_text(text.replace('"resolvable": [\n   "x_', '"resolvable": [\n   "\\u001b[31mx_'))
     with pytest.raises(OrthocalError, match="a text contains a control character"):
         load_calibration(session)
 

@@ -1,7 +1,6 @@
 """A sensor of the tests' own: an indicator that follows a coordinate of the tool.
 
-How much it shows of a millimetre is not known exactly; an error of the slope that is shared by all
-setups that name the same `dial`.
+Its scale has an error, a nuisance parameter that all setups with the same `dial` share.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import numpy as np
 
 from orthocal.errors import SessionError
 from orthocal.io.documents import Name, PositiveNumber
-from orthocal.sensors.protocol import Contact, Frames, SetupKeys, Unknown
+from orthocal.sensors.protocol import Contact, Frames, NuisanceParameter, SetupKeys
 
 
 class ToolKeys(SetupKeys):
@@ -59,15 +58,15 @@ class ToolCoordinate:
         return self._axis
 
     @property
-    def unknowns(self):
+    def nuisance_parameters(self):
         shared = None if self.dial is None else f"dial.{self.dial}"
-        return (Unknown("slope", "1", self.slope_tolerance, shared),)
+        return (NuisanceParameter("slope", "1", self.slope_tolerance, shared),)
 
-    def set_by(self, robot):
+    def aligned_to(self, robot):
         return {}
 
     def expression(self, view, robot):
-        return ca.dot(view.constants, view.frames[0].position) * (1.0 + view.unknowns[0])
+        return ca.dot(view.constants, view.frames[0].position) * (1.0 + view.nuisance[0])
 
     def contact(self, frames, at_zero, robot):
         points = frames[0][:, :3, 3]

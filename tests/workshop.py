@@ -35,7 +35,7 @@ class Crooked:
 
 
 def draw_crooked(rng, *, direction=10e-3, place=0.5e-3):
-    """One standing, as a hand and an eye make it; what belongs to the dial is not its."""
+    """A mounting aligned by eye; the scale belongs to the dial."""
     roll, pitch = direction * rng.normal(size=2)
     section, lateral = place * rng.normal(size=2)
     return Crooked(roll, pitch, section, lateral)

@@ -71,8 +71,8 @@ def calibrate(
         choice: Which errors are free and what is known of them; or the name of a model. By default
             what the session states, otherwise the complete model with priors.
         loss: Cost of a residual: `squares` (the default), `huber`, or one with its own width.
-        solver: `ipopt` on the complete program, the reference; `eliminated`, variable projection,
-            the same optimum in less time; `linearised`, as the paper; or one with its own settings.
+        solver: `ipopt` on the complete program, the reference; `variable-projection`, the
+            same optimum in less time; `linearised`, as the paper; or one with its own settings.
         profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
         start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
             solution.

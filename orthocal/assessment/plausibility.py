@@ -115,7 +115,7 @@ def _by_fit(session: Session, problem: CalibrationProblem) -> Iterator[Finding |
     """Findings from residuals: before any fit, and of a fit of offsets."""
     try:
         yield _dimensions(session, problem)
-        fit = fit_problem(problem, options=SolverOptions(solver="eliminated"))
+        fit = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
     except (OrthocalError, np.linalg.LinAlgError):
         return  # readings that are no machine's are found otherwise
     yield _too_small(session, fit)

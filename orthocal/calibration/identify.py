@@ -50,8 +50,8 @@ def identify(
         choice: Which errors are free, and what is known of them; or the name of a model. By default
             what the session is for, or offsets.
         loss: What a residual costs: `squares` (the default), `huber`, or one with its own width.
-        solver: `ipopt` on the whole program, the reference; `eliminated`, the same optimum sooner;
-            `linearised`, as the paper; or one with its own settings.
+        solver: `ipopt` on the whole program, the reference; `variable-projection`, the
+            same optimum sooner; `linearised`, as the paper; or one with its own settings.
         profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
         start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
             solution.

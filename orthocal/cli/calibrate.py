@@ -101,7 +101,7 @@ def calibrate(
     solver: Annotated[
         str,
         Option(
-            metavar="ipopt|eliminated|linearised",
+            metavar="ipopt|variable-projection|linearised",
             help="Reference, variable projection (faster), or first order as in the paper.",
         ),
     ] = "ipopt",

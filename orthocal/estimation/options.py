@@ -2,7 +2,7 @@
 
 - `ipopt`: the complete nonlinear program, with passive coordinates and gauge zeros as variables;
   the reference.
-- `eliminated`: the same optimum by variable projection, for repetition and large sessions.
+- `variable-projection`: the same optimum by variable projection, for repetition and large sessions.
 - `linearised`: one step with readings to first order about the active offsets, as in the paper.
 """
 
@@ -17,7 +17,7 @@ from orthocal.arguments import require_kind
 from orthocal.errors import OrthocalError
 from orthocal.estimation.loss import SQUARES, Loss
 
-SolverKind = Literal["ipopt", "eliminated", "linearised"]
+SolverKind = Literal["ipopt", "variable-projection", "linearised"]
 Hessian = Literal["gauss-newton", "exact"]
 
 OptionValue = float | int | str | bool

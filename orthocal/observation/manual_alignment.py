@@ -66,9 +66,11 @@ def list_alignments(session: Session, nuisance: NuisanceParameters) -> list[Alig
     for i, setup in enumerate(session.setups.values()):
         if not nuisance.of_setup[i]:  # it has no readings
             continue
-        virtual = setup.sensor.set_by(session.robot)
+        virtual = setup.sensor.aligned_to(session.robot)
         # those of effects follow, and are not aligned
-        for index, parameter in zip(nuisance.of_setup[i], setup.sensor.unknowns, strict=False):
+        for index, parameter in zip(
+            nuisance.of_setup[i], setup.sensor.nuisance_parameters, strict=False
+        ):
             if parameter.name in virtual:
                 posture = session.postures[aligned_at[setup.name]]
                 result.append(

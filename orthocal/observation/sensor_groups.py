@@ -12,7 +12,7 @@ from orthocal.effects.loading import reading_effects
 from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
 from orthocal.sensors.compiled import CompiledReading, compile_reading
-from orthocal.sensors.protocol import Unknown
+from orthocal.sensors.protocol import NuisanceParameter
 from orthocal.session.session import Session, Setup
 
 Array = NDArray[np.float64]
@@ -59,7 +59,7 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
             continue
         own = [
             Parameter(f"{_owner(u, setup, session)}.{u.name}", u.unit, u.tolerance, ())
-            for u in setup.sensor.unknowns
+            for u in setup.sensor.nuisance_parameters
         ]
         own += [
             Parameter(f"setup.{setup.name}.{e.name}", e.unit, e.tolerance, (), e.positive)
@@ -73,7 +73,7 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
     return NuisanceParameters(tuple(parameters.values()), tuple(of_setup))
 
 
-def _owner(unknown: Unknown, setup: Setup, session: Session) -> str:
+def _owner(unknown: NuisanceParameter, setup: Setup, session: Session) -> str:
     """Owner of a nuisance parameter: a gauge, a session's shared object, or the setup itself."""
     label, joined, _ = setup.name.partition("/") if session.joined else ("", "", "")
     if unknown.of_gauge:

@@ -38,7 +38,7 @@ class SimulatedSession:
     """Parameter name to true value, [SI]."""
     zeros: Mapping[str, float]
     """Setup to the true zero of its gauge, [m]."""
-    unknowns: Mapping[str, float] = field(default_factory=dict)
+    nuisance: Mapping[str, float] = field(default_factory=dict)
     """Nuisance parameter to its true value, [SI]."""
 
 
@@ -316,13 +316,13 @@ def truth_document(simulated: SimulatedSession) -> str:
         "errors": errors,
         "zeros_mm": {name: to_mm(value) for name, value in simulated.zeros.items()},
     }
-    if simulated.unknowns:
+    if simulated.nuisance:
         of_sensors = {p.name: p for p in nuisance_parameters(simulated.session).parameters}
         document["sensors"] = {
             f"{name}_{of_sensors[name].edge_unit}": float(
                 f"{value * of_sensors[name].edge_factor:.9g}"
             )
-            for name, value in simulated.unknowns.items()
+            for name, value in simulated.nuisance.items()
         }
     head = "# The truth behind the simulated readings beside this file. No calibration reads it.\n"
     return head + str(yaml.safe_dump(document, sort_keys=False, default_flow_style=False))

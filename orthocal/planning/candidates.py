@@ -233,8 +233,8 @@ def _list_aligned(
     """
     aligned: dict[str, dict[str, Setup]] = {}
     for name, setup in session.setups.items():
-        for unknown, sensor in setup.sensor.set_by(session.robot).items():
-            if unknown in {u.name for u in setup.sensor.unknowns}:
+        for unknown, sensor in setup.sensor.aligned_to(session.robot).items():
+            if unknown in {u.name for u in setup.sensor.nuisance_parameters}:
                 aligned.setdefault(unknown, {})[name] = replace(setup, sensor=sensor)
     listed: dict[str, list[tuple[int, Array]]] = {}
     for unknown, setups in aligned.items():

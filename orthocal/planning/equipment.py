@@ -21,7 +21,7 @@ from orthocal.measurement.files.schema import GaugeKeys
 from orthocal.planning.expected_error import state_noise
 from orthocal.robot.model import Robot
 from orthocal.sensors.leg_indicator import LegIndicator
-from orthocal.sensors.mounting import USUAL, Standing, StandingKeys
+from orthocal.sensors.mounting import USUAL, Mounting, MountingKeys
 from orthocal.sensors.rod_indicator import RodIndicator
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Gauge, Session
@@ -65,7 +65,7 @@ class Equipment:
     gauge: Gauge = USUAL_DIAL
     tip: Tip | None = USUAL_BALL
     """Tip of the gauge; None for readings of the line between a leg's rods, as in the paper."""
-    mounting: Standing = USUAL
+    mounting: Mounting = USUAL
     """Mounting uncertainty of the gauge."""
     rods: tuple[str, ...] = ()
     """Rods of each leg that the gauge can touch; by default the first one."""
@@ -189,7 +189,7 @@ def load_dial(path: str | Path, equipment: Equipment) -> Equipment:
     gauge = validate(GaugeKeys, data, where=str(file), error=SessionError)
     if gauge.scale_tolerance is not None:
         own["scale_tolerance"] = gauge.scale_tolerance
-    mounting = Standing.from_keys(validate(StandingKeys, own, where=str(file), error=SessionError))
+    mounting = Mounting.from_keys(validate(MountingKeys, own, where=str(file), error=SessionError))
     if gauge.sigma_mm is None and gauge.resolution_mm is None:
         raise SessionError(
             "is missing; a plan needs the repeatability of the readings",
@@ -223,9 +223,9 @@ def equipment_of(session: Session, equipment: Equipment) -> Equipment:
     on_lines = [s for s in sensors if isinstance(s, LegIndicator)]
     if on_rods:
         rods = equipment.rods or tuple(dict.fromkeys(s.rod for s in on_rods))
-        mounting = replace(on_rods[0].standing, stand=None)
+        mounting = replace(on_rods[0].mounting, stand=None)
         return replace(
             equipment, gauge=session.gauge, tip=on_rods[0].tip, mounting=mounting, rods=rods
         )
-    mounting = replace(on_lines[0].standing, stand=None) if on_lines else equipment.mounting
+    mounting = replace(on_lines[0].mounting, stand=None) if on_lines else equipment.mounting
     return replace(equipment, gauge=session.gauge, tip=None, mounting=mounting)

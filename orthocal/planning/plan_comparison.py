@@ -180,8 +180,8 @@ def _with_blocks(session: Session) -> Session:
         sensor = setup.sensor
         if not isinstance(sensor, LegIndicator | RodIndicator):
             return setup
-        standing = replace(sensor.standing, stand=f"block_{sensor.leg}")
-        return replace(setup, sensor=replace(sensor, standing=standing))
+        mounting = replace(sensor.mounting, stand=f"block_{sensor.leg}")
+        return replace(setup, sensor=replace(sensor, mounting=mounting))
 
     return replace(session, setups={n: change(s) for n, s in session.setups.items()})
 
@@ -191,7 +191,7 @@ def _with_blade(session: Session) -> Session:
         s = setup.sensor
         if not isinstance(s, RodByBall):
             return setup
-        sensor = RodByBlade(s.leg, s.rod, s.direction, s.section, BLADE, s.standing, s.beside)
+        sensor = RodByBlade(s.leg, s.rod, s.direction, s.section, BLADE, s.mounting, s.beside)
         return replace(setup, sensor=sensor)
 
     return replace(session, setups={n: change(s) for n, s in session.setups.items()})

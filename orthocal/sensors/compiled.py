@@ -31,7 +31,7 @@ from orthocal.sensors.protocol import Frames, Sensor, View, sensor_conditions
 
 Array = NDArray[np.float64]
 
-INPUTS = ["actuated", "passive", "placements", "zero", "constants", "unknowns"]
+INPUTS = ["actuated", "passive", "placements", "zero", "constants", "nuisance"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +54,7 @@ class CompiledReading:
     conditions: tuple[Condition, ...]
     """Conditions that follow the constants of the sensor among its inputs."""
     probe: float | None
-    """Value of the expression of a sensor from outside orthocal, at some arguments."""
+    """Value of the expression of a sensor from outside orthocal, at fixed arguments."""
 
 
 def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
@@ -68,7 +68,7 @@ def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
     if reading.probe is not None and _probe(pattern) != reading.probe:
         raise OrthocalError(
             f"the expression of a sensor '{sensor.kind}' depends on more than its frames, "
-            "constants and unknowns: what differs between setups belongs into `constants`"
+            "constants and nuisance parameters: what differs between setups belongs into `constants`"
         )
     return reading
 
@@ -82,14 +82,14 @@ class _Pattern:
         sizes = (condition_size(robot, c) for c in self.conditions)
         self.n_constants = sensor.constants(robot).size + sum(sizes)
         of_effects = (e.name for effect in reading_effects(robot) for e in effect.setup_errors)
-        self.unknowns = (*(u.name for u in sensor.unknowns), *of_effects)
+        self.nuisance_parameters = (*(u.name for u in sensor.nuisance_parameters), *of_effects)
         self._key = (
             identify(robot),
             type(sensor),
             (sensor.kind, type(sensor).__qualname__),
             frames,
             self.n_constants,
-            self.unknowns,
+            self.nuisance_parameters,
             self.conditions,
             source_digest(type(sensor)),
         )
@@ -141,7 +141,7 @@ def _build_value(pattern: _Pattern) -> ca.Function:
 
 def _build_jacobian(pattern: _Pattern) -> ca.Function:
     inputs, outputs = pattern.expressions
-    labels = ["h", *(f"by_{n}" for n in ("actuated", "passive", "twists", "zero", "unknowns"))]
+    labels = ["h", *(f"by_{n}" for n in ("actuated", "passive", "twists", "zero", "nuisance"))]
     return ca.Function("jacobian", inputs, outputs, INPUTS, labels)
 
 
@@ -151,20 +151,20 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
     here: RobotFunctions = robot_functions(robot)
     there = here.reference
     constants = ca.SX.sym("constants", pattern.n_constants)
-    unknowns = ca.SX.sym("unknowns", len(pattern.unknowns))
+    nuisance = ca.SX.sym("nuisance", len(pattern.nuisance_parameters))
     trees = [
         *((here, robot.frame_id(f)) for f in pattern.frames.in_posture),
         *((there, robot.frame_id(f)) for f in pattern.frames.at_zero),
     ]
-    poses, h = _sensor_expression(pattern, constants, unknowns)
+    poses, h = _sensor_expression(pattern, constants, nuisance)
     wrenches = [_wrench(h, pose) for pose in poses]
     local = ca.Function(
         "sensor",
-        [*(s for pose in poses for s in (pose.rotation, pose.position)), constants, unknowns],
-        [h, *(v for wrench in wrenches for v in wrench), ca.jacobian(h, unknowns)],
+        [*(s for pose in poses for s in (pose.rotation, pose.position)), constants, nuisance],
+        [h, *(v for wrench in wrenches for v in wrench), ca.jacobian(h, nuisance)],
     )
     at = [machine.tree.frame_pose(frame) for machine, frame in trees]
-    values = local(*(s for pose in at for s in (pose.rotation, pose.position)), constants, unknowns)
+    values = local(*(s for pose in at for s in (pose.rotation, pose.position)), constants, nuisance)
     value, by_unknowns = values[0], values[-1]
     n_d, n_p = here.actuated.numel(), here.passive.numel()
     by_actuated, by_passive = ca.SX(1, n_d), ca.SX(1, n_p)
@@ -178,12 +178,12 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
             by_zero += actuated
         else:
             by_actuated, by_passive = by_actuated + actuated, by_passive + passive
-    inputs = [*here.symbols, there.actuated, constants, unknowns]
+    inputs = [*here.symbols, there.actuated, constants, nuisance]
     return inputs, [value, by_actuated, by_passive, by_twists, by_zero, by_unknowns]
 
 
 def _sensor_expression(
-    pattern: _Pattern, constants: ca.SX, unknowns: ca.SX
+    pattern: _Pattern, constants: ca.SX, nuisance: ca.SX
 ) -> tuple[list[Pose], ca.SX]:
     """Symbols of a sensor's frames, and its reading as an expression of them."""
     count = len(pattern.frames.in_posture)
@@ -192,7 +192,7 @@ def _sensor_expression(
         for _ in range(count + len(pattern.frames.at_zero))
     ]
     frames = poses[:count], poses[count:]
-    return poses, express_reading(pattern.robot, pattern.sensor, *frames, constants, unknowns)
+    return poses, express_reading(pattern.robot, pattern.sensor, *frames, constants, nuisance)
 
 
 def express_reading(
@@ -201,9 +201,9 @@ def express_reading(
     frames: Sequence[Pose],
     at_zero: Sequence[Pose],
     constants: ca.SX,
-    unknowns: ca.SX,
+    nuisance: ca.SX,
 ) -> ca.SX:
-    """What a gauge shows, its zero at 0: the sensor's expression under the effects on readings.
+    """Reading with the gauge zero at 0: the sensor's expression under the effects on readings.
 
     Args:
         robot: The robot.
@@ -211,19 +211,19 @@ def express_reading(
         frames: Poses of its frames in the posture.
         at_zero: Poses of its frames in the zero posture.
         constants: Constants of the sensor, then the conditions of the reading.
-        unknowns: Nuisance parameters of the sensor, then those of the effects.
+        nuisance: Nuisance parameters of the sensor, then those of the effects.
     """
     names = reading_conditions(robot, sensor)
     sizes = [condition_size(robot, c) for c in names]
     n = constants.numel() - sum(sizes)
     values = ca.vertsplit(constants, np.cumsum([0, n, *sizes]).tolist())
     known = dict(zip(names, values[1:], strict=True))
-    first = len(sensor.unknowns)
+    first = len(sensor.nuisance_parameters)
     seen: dict[str, ca.SX] = {c: known[c] for c in sensor_conditions(sensor)}
-    view = View(frames, at_zero, values[0], unknowns[:first], seen)
+    view = View(frames, at_zero, values[0], nuisance[:first], seen)
     reading = sensor.expression(view, robot)
     for effect in reading_effects(robot):
-        errors = {e.name: unknowns[first + i] for i, e in enumerate(effect.setup_errors)}
+        errors = {e.name: nuisance[first + i] for i, e in enumerate(effect.setup_errors)}
         reading = effect.reading(reading, errors, {c: known[c] for c in effect.conditions})
         first += len(errors)
     return reading
@@ -239,9 +239,9 @@ def reading_conditions(robot: Robot, sensor: Sensor) -> tuple[Condition, ...]:
 def _probe(pattern: _Pattern) -> float:
     """Reading of a sensor at fixed arguments: equal for equal expressions."""
     constants = ca.SX.sym("constants", pattern.n_constants)
-    unknowns = ca.SX.sym("unknowns", len(pattern.unknowns))
-    poses, h = _sensor_expression(pattern, constants, unknowns)
-    symbols = [*(s for pose in poses for s in (pose.rotation, pose.position)), constants, unknowns]
+    nuisance = ca.SX.sym("nuisance", len(pattern.nuisance_parameters))
+    poses, h = _sensor_expression(pattern, constants, nuisance)
+    symbols = [*(s for pose in poses for s in (pose.rotation, pose.position)), constants, nuisance]
     rng = np.random.default_rng(0)
     values = [ca.DM(rng.uniform(0.1, 1.0, s.shape)) for s in symbols]
     return float(ca.Function("probe", symbols, [h])(*values))

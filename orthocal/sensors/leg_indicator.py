@@ -1,13 +1,13 @@
-"""The paper's sensor: an indicator on the base reads a leg that is not parallel to its motion.
+"""Line model of the paper: an indicator on the base measures the line of a leg.
 
-It touches the leg where the leg's line, from root to tip, crosses the plane of the section, as an
-edge across leg and plunger does. Where the plunger is square to the leg its reading is the
-coordinate of that point along its direction:
+The gauge touches the leg where its line, from root to tip, crosses the plane of the section, like
+an edge across leg and plunger. If the plunger is square to the leg, the reading is the coordinate of
+that point along the direction of the plunger:
 
     h = d · (root + t (tip − root)),  t = (c − a · root)/(a · (tip − root))
 
 with a the leg's nominal axis and c the plane: a world coordinate, or counted from the root in the
-zero posture (the paper's X-leg midpoint, section 3.2).
+reference posture (the paper's X-leg midpoint, section 3.2).
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from orthocal.errors import SessionError
 from orthocal.io.documents import Name, Number
 from orthocal.robot.model import Leg, Robot
-from orthocal.sensors.mounting import USUAL, Standing, StandingKeys, stand
-from orthocal.sensors.protocol import Contact, Frames, Sensor, SetupKeys, Unknown, View
+from orthocal.sensors.mounting import USUAL, Mounting, MountingKeys, mount
+from orthocal.sensors.protocol import Contact, Frames, NuisanceParameter, Sensor, SetupKeys, View
 from orthocal.sensors.tips import touch_by_blade
 from orthocal.units import MM, to_mm
 
@@ -46,16 +46,16 @@ Direction = str | tuple[float, float, float]
 """A name of `DIRECTIONS`, or a vector in the world, of any length."""
 
 SectionForm = Literal["coordinate_mm", "from_root_mm", "fraction"]
-"""How a section is given."""
+"""Key that states a section."""
 
 
 LARGEST_OBLIQUITY_DEG = 1.0
-"""How far a measured direction may be from square to the leg; the nominal leg, in the mechanical
-zero. What touches a line has no side that an oblique plunger could slide on."""
+"""Largest deviation of a measured direction from square to the nominal leg at the mechanical zero.
+A line has no surface for an oblique plunger."""
 
 
 class SectionKeys(BaseModel):
-    """Where along the leg's nominal axis the gauge touches."""
+    """Section: position along the leg's nominal axis at which the gauge touches."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
@@ -66,15 +66,15 @@ class SectionKeys(BaseModel):
     @model_validator(mode="after")
     def _one_form(self) -> SectionKeys:
         forms = ("coordinate_mm", "from_root_mm", "fraction")
-        given = [k for k in forms if getattr(self, k) is not None]
-        if len(given) != 1:
-            found = " and ".join(given) if given else "none"
+        stated = [k for k in forms if getattr(self, k) is not None]
+        if len(stated) != 1:
+            found = " and ".join(stated) if stated else "none"
             raise ValueError(f"found {found}; expected one of {', '.join(forms)}")
         return self
 
 
-class LegKeys(StandingKeys, SetupKeys):
-    """A setup of an indicator on a leg, as in a session.yaml."""
+class LegKeys(MountingKeys, SetupKeys):
+    """Keys of a setup with an indicator on a leg."""
 
     leg: Name
     direction: str | Annotated[list[Number], Field(min_length=3, max_length=3)]
@@ -94,15 +94,15 @@ class LegKeys(StandingKeys, SetupKeys):
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """Where along the leg's nominal axis the gauge touches."""
+    """Section: position along the leg's nominal axis at which the gauge touches."""
 
     form: SectionForm
     value: float
-    """World coordinate [m], distance from the root in the zero posture [m], or fraction [1]."""
+    """World coordinate [m], distance from the root at the mechanical zero [m], or fraction [1]."""
 
     @staticmethod
     def from_keys(keys: SectionKeys) -> Section:
-        """As in a session.yaml."""
+        """Build from the keys of a session.yaml."""
         if keys.coordinate_mm is not None:
             return Section("coordinate_mm", keys.coordinate_mm * MM)
         if keys.from_root_mm is not None:
@@ -110,7 +110,7 @@ class Section:
         return Section("fraction", keys.fraction or 0.0)
 
     def to_keys(self) -> dict[str, float]:
-        """As in a session.yaml."""
+        """Keys for a session.yaml."""
         return {self.form: self.value if self.form == "fraction" else to_mm(self.value)}
 
 
@@ -120,9 +120,9 @@ class LegIndicator:
 
     leg: str
     direction: Direction
-    """Of a growing reading: x, y, z, -x, -y or -z of the world, or a vector."""
+    """Direction of a growing reading: x, y, z, -x, -y or -z of the world, or a vector."""
     section: Section
-    standing: Standing = USUAL
+    mounting: Mounting = USUAL
 
     kind: ClassVar[str] = "leg"
     keys: ClassVar[type[SetupKeys]] = LegKeys
@@ -130,15 +130,15 @@ class LegIndicator:
 
     @classmethod
     def from_keys(cls, keys: LegKeys) -> LegIndicator:
-        """As in a session.yaml."""
+        """Build from the keys of a session.yaml."""
         section = Section.from_keys(keys.section)
-        return cls(keys.leg, read_direction(keys), section, Standing.from_keys(keys))
+        return cls(keys.leg, read_direction(keys), section, Mounting.from_keys(keys))
 
     def to_keys(self) -> dict[str, Any]:
-        """As in a session.yaml."""
-        section, standing = self.section.to_keys(), self.standing.to_keys()
+        """Keys for a session.yaml."""
+        section, mounting = self.section.to_keys(), self.mounting.to_keys()
         direction = self.direction if isinstance(self.direction, str) else list(self.direction)
-        return {"leg": self.leg, "direction": direction, "section": section, **standing}
+        return {"leg": self.leg, "direction": direction, "section": section, **mounting}
 
     def require_fit(self, robot: Robot, *, where: str) -> None:
         """Refuse a leg, direction or section that the robot does not have.
@@ -149,7 +149,7 @@ class LegIndicator:
         self.require_fit_within(LARGEST_OBLIQUITY_DEG, robot, where=where)
 
     def require_fit_within(self, largest_deg: float, robot: Robot, *, where: str) -> None:
-        """The same where a plunger may be further from square to the leg."""
+        """Refuse as `require_fit`, with another limit of the deviation from square, [°]."""
         if not robot.legs:
             raise SessionError(
                 f"'{robot.name}' has no legs for a gauge to touch; add orthocal.legs to "
@@ -187,50 +187,50 @@ class LegIndicator:
         return "leg", self.leg
 
     def frames(self, robot: Robot) -> Frames:
-        """Root and tip of the leg; its root at zero, where a section may count from it."""
+        """Root and tip of the leg; its root in the reference posture for sections from the root."""
         leg = robot.legs[self.leg]
         return Frames((leg.root, leg.tip), (leg.root,) if leg.root_driven else ())
 
     def constants(self, robot: Robot) -> Array:
-        """Direction (3), plane, whether that counts from the root; and the leg's axis (3)."""
+        """Direction (3), plane (1), 1 if it counts from the root else 0, axis of the leg (3)."""
         plane, from_root = self.plane(robot)
         axis = robot.legs[self.leg].axis
         return np.array([*direction_vector(self.direction), plane, float(from_root), *axis])
 
     @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        """How it stands."""
-        return self.standing.unknowns(ball=False)
+    def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
+        """Nuisance parameters of the mounting."""
+        return self.mounting.nuisance_parameters(ball=False)
 
-    def set_by(self, robot: Robot) -> Mapping[str, Sensor]:
-        """Nothing: how it stands is measured along the leg."""
+    def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
+        """No parameter is aligned by eye."""
         del robot
         return {}
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
-        """What it shows, [m]."""
+        """Reading with the gauge zero at 0, [m]."""
         del robot
         root, tip = (pose.position for pose in view.frames)
         c = view.constants
         direction, plane, axis = c[:3], c[3], c[5:8]
         if view.at_zero:
             plane += c[4] * ca.dot(axis, view.at_zero[0].position)
-        stood = stand(
-            self.unknowns,
-            view.unknowns,
+        gauge = mount(
+            self.nuisance_parameters,
+            view.nuisance,
             direction=direction,
             side=ca.cross(axis, direction),
             axis=axis,
         )
-        found = touch_by_blade(
+        reading = touch_by_blade(
             at=root,
             along=tip - root,
             radius=ca.SX(0.0),
-            edge=stood.edge,
-            tip=plane * axis + stood.moved,
-            direction=stood.direction,
+            edge=gauge.edge,
+            tip=plane * axis + gauge.displacement,
+            direction=gauge.direction,
         )
-        return stood.scale * found
+        return gauge.scale * reading
 
     def describe(self) -> str:
         """Leg, direction and section."""
@@ -240,7 +240,7 @@ class LegIndicator:
         return f"leg {self.leg}, {direction_name(self.direction)}, {where}"
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
-        """Where the leg's line crosses the plane of the section."""
+        """Points in which the leg's line crosses the plane of the section."""
         leg = robot.legs[self.leg]
         plane, from_root = self.plane(robot)
         if from_root:
@@ -263,7 +263,7 @@ class LegIndicator:
         )
 
     def plane(self, robot: Robot, *, where: str = "") -> tuple[float, bool]:
-        """Plane across the leg that the gauge touches in: a · p = plane (+ a · root).
+        """Plane of the section across the leg, a · p = plane (+ a · root).
 
         Args:
             robot: The robot.
@@ -271,7 +271,7 @@ class LegIndicator:
 
         Returns:
             Coordinate of the plane along the leg's axis a (from root to tip), [m], and whether it
-            counts from the root in the zero posture.
+            counts from the root in the reference posture.
 
         Raises:
             SessionError: If the section's form does not fit the leg.
@@ -299,7 +299,7 @@ def _coordinate_plane(leg: Leg, value: float, where: str) -> float:
 
 
 def _crooked(leg: Leg) -> str:
-    """That a leg lies along no axis, which may not be meant."""
+    """Hint for a leg that lies along no axis of the world."""
     along = ", ".join(f"{v:.3f}" for v in leg.axis)
     return (
         f". In the mechanical zero the leg lies along ({along}): where it should lie along an axis "
@@ -312,13 +312,13 @@ def _is_number(value: object) -> bool:
 
 
 def read_direction(keys: LegKeys) -> Direction:
-    """A direction as a session.yaml has it."""
-    given = keys.direction
-    return given if isinstance(given, str) else (given[0], given[1], given[2])
+    """Direction of the keys of a session.yaml."""
+    d = keys.direction
+    return d if isinstance(d, str) else (d[0], d[1], d[2])
 
 
 def direction_vector(direction: Direction) -> Array:
-    """Of a growing reading in the world, a unit vector, shape (3,); 0 where a vector is 0."""
+    """Unit vector of a growing reading in the world, shape (3,); 0 for the vector 0."""
     vector = np.array(DIRECTIONS[direction] if isinstance(direction, str) else direction)
     if isinstance(direction, str) or not vector.any():
         return vector
@@ -327,7 +327,7 @@ def direction_vector(direction: Direction) -> Array:
 
 
 def direction_name(direction: Direction) -> str:
-    """A direction in words: its name, or its vector in brackets."""
+    """Name of a direction, or its vector in brackets."""
     if isinstance(direction, str):
         return direction
     return f"({', '.join(f'{v:g}' for v in direction)})"
@@ -336,14 +336,14 @@ def direction_name(direction: Direction) -> str:
 def check_direction(
     direction: Direction, leg: Leg, largest_deg: float = LARGEST_OBLIQUITY_DEG, *, where: str
 ) -> None:
-    """Refuse a gauge that does not measure square to the leg, as far as what touches it needs that.
+    """Refuse a gauge that does not measure square to the leg.
 
-    An oblique plunger also sees how far the leg moves along itself.
+    The reading of an oblique plunger also changes when the leg moves along itself.
 
     Args:
-        direction: Of the plunger.
-        leg: The leg it touches.
-        largest_deg: How far from square it may be, [°].
+        direction: Direction of the plunger.
+        leg: The leg that it touches.
+        largest_deg: Largest deviation from square, [°].
         where: File and key, for messages.
 
     Raises:
@@ -353,17 +353,17 @@ def check_direction(
     def angle(axis: ArrayLike) -> float:
         return float(np.degrees(np.arccos(np.clip(np.dot(axis, leg.axis), -1.0, 1.0))))
 
-    own = angle(direction_vector(direction))
-    if abs(own - 90.0) <= largest_deg:
+    to_leg = angle(direction_vector(direction))
+    if abs(to_leg - 90.0) <= largest_deg:
         return
     square = [n for n, a in DIRECTIONS.items() if abs(angle(a) - 90.0) <= largest_deg]
     choice = f"; square to it: {', '.join(square)}" if square else ""
-    found, named = min(own, 180.0 - own), f"'{direction_name(direction)}'"
-    if found < LARGEST_OBLIQUITY_DEG:
+    acute, named = min(to_leg, 180.0 - to_leg), f"'{direction_name(direction)}'"
+    if acute < LARGEST_OBLIQUITY_DEG:
         problem = f"{named} is along leg {leg.name}; a gauge measures across it{choice}"
     else:
         problem = (
-            f"{named} is at {found:.1f}° to leg {leg.name} in the mechanical zero; expected "
+            f"{named} is at {acute:.1f}° to leg {leg.name} in the mechanical zero; expected "
             f"a direction square to the leg, to within {largest_deg:g}°{choice}"
             + ("" if square else _crooked(leg))
         )

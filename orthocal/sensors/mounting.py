@@ -1,9 +1,9 @@
-"""How a gauge really stands: a little turned and moved from where it is said to be.
+"""Mounting uncertainty of a gauge: direction, section, lateral position and dial scale.
 
-Each setup has small unknowns with a tolerance each: roll about the leg and pitch towards it, place
-of the section, lateral place of a ball; and the dial, how much it shows of a millimetre. On the
-axes of a parallel machine the first order of roll, pitch and section vanishes. Setups on one square
-block share its roll, but for how square the block is.
+Each setup has nuisance parameters with Gaussian priors: roll about the leg and pitch towards it,
+position of the section along the leg, lateral position of a ball. The scale belongs to the dial. On
+the axes of a parallel machine, readings depend on roll, pitch and section only to second order.
+Setups on one square block share its roll, up to the squareness of the block.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import casadi as ca
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from orthocal.io.documents import Name, Number
-from orthocal.sensors.protocol import Unknown
+from orthocal.sensors.protocol import NuisanceParameter
 from orthocal.units import MM, MRAD, tidy
 
 DIRECTION = 10 * MRAD
-"""How well a plunger is turned by hand and eye, [rad]."""
+"""Direction of a plunger aligned by eye, [rad]."""
 
 SECTION = 0.5 * MM
-"""How well its place is measured with a ruler, along the leg and across it, [m]."""
+"""Position measured with a ruler, along the leg and across it, [m]."""
 
 SCALE = 0.002
-"""How well a dial shows a millimetre: the lead of its rack, [1]."""
+"""Scale of a dial: the lead of its rack, [1]."""
 
 SQUARE = 0.1 * MRAD
-"""How square a block is, [rad]."""
+"""Squareness of a block, [rad]."""
 
 LARGEST_TOLERANCE_MM = 20.0
 LARGEST_TOLERANCE_MRAD = 200.0
@@ -39,50 +39,50 @@ Millimetres = Annotated[Number, Field(ge=0.0, le=LARGEST_TOLERANCE_MM)]
 Milliradians = Annotated[Number, Field(ge=0.0, le=LARGEST_TOLERANCE_MRAD)]
 
 
-class StandingKeys(BaseModel):
-    """What a setup may say of how well its gauge stands; 0 where it is known exactly."""
+class MountingKeys(BaseModel):
+    """Mounting uncertainty in a session.yaml; 0 for a parameter that is known exactly."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     direction_tolerance_mrad: Milliradians = DIRECTION / MRAD
     section_tolerance_mm: Millimetres = SECTION / MM
     lateral_tolerance_mm: Millimetres = SECTION / MM
-    """Of a ball; nothing else is moved by it."""
+    """Lateral position of a ball; other tips have none."""
     scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] = SCALE
-    """Of the dial: one for all setups with the same gauge."""
+    """Scale of the dial: one for all setups with the same gauge."""
     stand: Name | None = None
-    """A square block that other setups at this leg stand on too: they share its roll."""
+    """Square block that several setups of this leg share, with its roll."""
     square_tolerance_mrad: Milliradians | None = None
 
     @model_validator(mode="after")
-    def _square_of_a_stand(self) -> StandingKeys:
+    def _square_of_a_stand(self) -> MountingKeys:
         if self.square_tolerance_mrad is not None and self.stand is None:
             raise ValueError("square_tolerance_mrad|found without `stand`, a square block")
         return self
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
-    """How well it is known how a gauge stands, one standard deviation each."""
+class Mounting:
+    """Mounting uncertainty of a gauge: one standard deviation of each parameter."""
 
     direction: float = DIRECTION
-    """Of roll and of pitch, [rad]."""
+    """Roll and pitch, [rad]."""
     section: float = SECTION
-    """Along the leg, [m]."""
+    """Position along the leg, [m]."""
     lateral: float = SECTION
-    """Across leg and plunger, [m]."""
+    """Position across leg and plunger, [m]."""
     scale: float = SCALE
-    """Of the dial, [1]."""
+    """Scale of the dial, [1]."""
     stand: str | None = None
-    """The square block that it stands on."""
+    """Name of the square block."""
     square: float = SQUARE
-    """Of that block, [rad]."""
+    """Squareness of that block, [rad]."""
 
     @staticmethod
-    def from_keys(keys: Any) -> Standing:  # noqa: ANN401 - of any setup with StandingKeys
-        """As in a session.yaml."""
+    def from_keys(keys: Any) -> Mounting:  # noqa: ANN401 - of any setup with MountingKeys
+        """Build from the keys of a session.yaml."""
         square = keys.square_tolerance_mrad
-        return Standing(
+        return Mounting(
             direction=tidy(keys.direction_tolerance_mrad * MRAD),
             section=tidy(keys.section_tolerance_mm * MM),
             lateral=tidy(keys.lateral_tolerance_mm * MM),
@@ -92,79 +92,83 @@ class Standing:
         )
 
     def to_keys(self) -> dict[str, Any]:
-        """As in a session.yaml: what is not as by default."""
-        usual = USUAL
-        found: dict[str, Any] = {
-            "direction_tolerance_mrad": (self.direction, usual.direction, MRAD),
-            "section_tolerance_mm": (self.section, usual.section, MM),
-            "lateral_tolerance_mm": (self.lateral, usual.lateral, MM),
-            "scale_tolerance": (self.scale, usual.scale, 1.0),
-            "square_tolerance_mrad": (self.square, usual.square, MRAD),
+        """Keys for a session.yaml that differ from the defaults."""
+        values: dict[str, Any] = {
+            "direction_tolerance_mrad": (self.direction, USUAL.direction, MRAD),
+            "section_tolerance_mm": (self.section, USUAL.section, MM),
+            "lateral_tolerance_mm": (self.lateral, USUAL.lateral, MM),
+            "scale_tolerance": (self.scale, USUAL.scale, 1.0),
+            "square_tolerance_mrad": (self.square, USUAL.square, MRAD),
         }
-        other = {k: tidy(v / unit) for k, (v, of_all, unit) in found.items() if v != of_all}
-        return other if self.stand is None else {**other, "stand": self.stand}
+        keys = {k: tidy(v / unit) for k, (v, usual, unit) in values.items() if v != usual}
+        return keys if self.stand is None else {**keys, "stand": self.stand}
 
-    def unknowns(self, *, ball: bool) -> tuple[Unknown, ...]:
-        """What is not known exactly of it; a tolerance of 0 leaves nothing unknown."""
+    def nuisance_parameters(self, *, ball: bool) -> tuple[NuisanceParameter, ...]:
+        """Nuisance parameters with a standard deviation above 0."""
         block = None if self.stand is None else f"stand.{self.stand}"
-        found = [
-            Unknown("roll", "rad", self.direction, shared_by=block),
-            Unknown("pitch", "rad", self.direction),
-            Unknown("section", "m", self.section),
-            Unknown("scale", "1", self.scale, of_gauge=True),
+        parameters = [
+            NuisanceParameter("roll", "rad", self.direction, shared_by=block),
+            NuisanceParameter("pitch", "rad", self.direction),
+            NuisanceParameter("section", "m", self.section),
+            NuisanceParameter("scale", "1", self.scale, of_gauge=True),
         ]
         if block is not None:
-            found.append(Unknown("square", "rad", self.square))
+            parameters.append(NuisanceParameter("square", "rad", self.square))
         if ball:
-            found.append(Unknown("lateral", "m", self.lateral))
-        return tuple(u for u in found if u.tolerance > 0.0)
+            parameters.append(NuisanceParameter("lateral", "m", self.lateral))
+        return tuple(p for p in parameters if p.tolerance > 0.0)
 
 
-USUAL = Standing()
-"""By eye and ruler."""
+USUAL = Mounting()
+"""Mounting aligned by eye and ruler."""
 
-EXACT = Standing(0.0, 0.0, 0.0, 0.0)
-"""As it is said to be: the gauge of the paper."""
+EXACT = Mounting(0.0, 0.0, 0.0, 0.0)
+"""Mounting without errors: the gauge of the paper."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stood:
-    """A gauge as it stands with given unknowns, as expressions."""
+class MountedGauge:
+    """A gauge with mounting errors, as expressions."""
 
     direction: ca.SX
-    """Of the plunger, a unit vector, shape (3,)."""
+    """Unit vector of the plunger, shape (3,)."""
     edge: ca.SX
-    """Of a blade across leg and plunger, a unit vector, shape (3,)."""
-    moved: ca.SX
-    """What the tip is moved by from where it is said to be, shape (3,), [m]."""
+    """Unit vector of a blade across leg and plunger, shape (3,)."""
+    displacement: ca.SX
+    """Displacement of the tip from its nominal position, shape (3,), [m]."""
     scale: ca.SX
-    """What the dial shows of a metre, [1]."""
+    """Indicated over actual displacement, [1]."""
 
 
-def stand(
-    unknowns: Sequence[Unknown], values: ca.SX, *, direction: ca.SX, side: ca.SX, axis: ca.SX
-) -> Stood:
-    """How a gauge stands.
+def mount(
+    parameters: Sequence[NuisanceParameter],
+    values: ca.SX,
+    *,
+    direction: ca.SX,
+    side: ca.SX,
+    axis: ca.SX,
+) -> MountedGauge:
+    """Gauge with mounting errors.
 
     Args:
-        unknowns: Which there are.
-        values: Of them, shape (n_unknowns,), [SI].
-        direction: Of the plunger as it is said to be, a unit vector, shape (3,).
-        side: Across leg and plunger, a unit vector, shape (3,).
-        axis: Of the leg, from root to tip, a unit vector, shape (3,).
+        parameters: Nuisance parameters of the mounting.
+        values: Their values, shape (n_nuisance,), [SI].
+        direction: Nominal unit vector of the plunger, shape (3,).
+        side: Unit vector across leg and plunger, shape (3,).
+        axis: Unit vector of the leg, from root to tip, shape (3,).
     """
-    of = {u.name: values[i] for i, u in enumerate(unknowns)}
-    roll = of.get("roll", 0.0) + of.get("square", 0.0)
-    pitched = _turn(direction, side, -of.get("pitch", ca.SX(0.0)))
-    return Stood(
-        direction=_turn(pitched, axis, ca.SX(roll)),
-        edge=_turn(side, axis, ca.SX(roll)),
-        moved=of.get("section", 0.0) * axis + of.get("lateral", 0.0) * side,
-        scale=1.0 + of.get("scale", ca.SX(0.0)),
+    error = {p.name: values[i] for i, p in enumerate(parameters)}
+    roll = ca.SX(error.get("roll", 0.0) + error.get("square", 0.0))
+    pitched = _rotate(direction, side, -error.get("pitch", ca.SX(0.0)))
+    return MountedGauge(
+        direction=_rotate(pitched, axis, roll),
+        edge=_rotate(side, axis, roll),
+        displacement=error.get("section", 0.0) * axis + error.get("lateral", 0.0) * side,
+        scale=1.0 + error.get("scale", ca.SX(0.0)),
     )
 
 
-def _turn(vector: ca.SX, axis: ca.SX, angle: ca.SX) -> ca.SX:
-    """A vector turned about a unit vector."""
+def _rotate(vector: ca.SX, axis: ca.SX, angle: ca.SX) -> ca.SX:
+    """Rotation of a vector about a unit vector (Rodrigues)."""
     along = ca.dot(axis, vector) * axis
     return along + ca.cos(angle) * (vector - along) + ca.sin(angle) * ca.cross(axis, vector)

@@ -1,8 +1,8 @@
-"""What every kind of sensor says of itself, and nothing else is known of any.
+"""Protocol of sensors: all that other modules know of a kind of sensor.
 
-A sensor looks at frames of the machine, in the posture and (where they move with drives alone) in
-the zero posture, and shows a number: an expression of their poses, of constants of its setup and of
-unknowns of its own. The zero of its setup comes on top, unless it is known to be 0.
+A reading is an expression of the poses of some frames, in the posture and (for frames that move
+with drives alone) in the reference posture, of constants of the setup and of nuisance parameters.
+The gauge zero of the setup is added, unless it is known to be 0.
 """
 
 from __future__ import annotations
@@ -31,40 +31,40 @@ absolute."""
 
 
 @dataclass(frozen=True, slots=True)
-class Unknown:
-    """Something of a sensor that is not known exactly, and is identified with the machine."""
+class NuisanceParameter:
+    """Error of a sensor or its mounting that is estimated together with the machine."""
 
     name: str
-    """Within its setup; with `shared_by`, within those who share it."""
+    """Unique within its setup, or within the setups that share it."""
     unit: Unit
     tolerance: float
     """One standard deviation, [unit]; its mean is 0."""
     shared_by: str | None = None
-    """Name of what setups of a session share that have the same of it, at one place, such as a
-    block they stand on; None for its own."""
+    """Name of the object at one place that setups of a session share, such as a square block; None
+    for a parameter of one setup."""
     of_gauge: bool = False
-    """Whether all setups share it whose readings are shown by the same gauge."""
+    """True if all setups with the same gauge share it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What a sensor sees of a machine, as expressions."""
+    """Arguments of a sensor's expression."""
 
     frames: Sequence[Pose]
-    """Frames that it looks at, in the posture."""
+    """Poses of its frames in the posture."""
     at_zero: Sequence[Pose]
-    """Frames that it looks at in the zero posture."""
+    """Poses of its frames in the reference posture."""
     constants: ca.SX
     """Of its setup, shape (n_constants,)."""
-    unknowns: ca.SX
-    """Its own, shape (n_unknowns,), [unit]."""
+    nuisance: ca.SX
+    """Values of its nuisance parameters, shape (n_nuisance,), [unit]."""
     conditions: Mapping[str, ca.SX] = field(default_factory=dict)
     """Conditions of the reading that it names under `conditions`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Names of the frames that a sensor looks at."""
+    """Names of the frames on which a reading depends."""
 
     in_posture: tuple[str, ...]
     at_zero: tuple[str, ...] = ()
@@ -72,61 +72,61 @@ class Frames:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TouchingTip:
-    """What touches, as it is: a ball, or a blade or pin along an edge."""
+    """Tip for checks and drawings: a ball, or a blade or pin along an edge."""
 
     radius: float
     """Of the ball or the pin, [m]; 0 for a blade's edge."""
     edge: Array | None = None
-    """Way of the edge, a unit vector, shape (3,); None for a ball."""
+    """Direction of the edge, a unit vector, shape (3,); None for a ball."""
     width: float = 0.0
     """Of the edge, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """Where and how a sensor touches, in K postures: for scenes and checks."""
+    """Points of contact of a sensor in K postures, for scenes and checks."""
 
     points: Array
     """In the world, shape (K, 3), [m]."""
     direction: Array
     """Of a growing reading, shape (3,)."""
     along: Array
-    """Way on what it touches on which there is room beside it, shape (3,)."""
+    """Direction along the touched surface with free space beside the sensor, shape (3,)."""
     problems: Sequence[str]
-    """Why it cannot touch there, in words; empty where it can. K of them."""
+    """Reason why it cannot touch, or an empty string; one for each posture."""
     key: str
     """Key of the setup that says where it touches, for messages."""
     tip: TouchingTip | None = None
-    """What touches there, where that is said."""
+    """The tip, if the setup states one."""
 
 
 class SetupKeys(BaseModel):
-    """What a session.yaml may say of a setup, whatever stands there."""
+    """Keys of a setup in a session.yaml that all kinds of sensor share."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     sensor: str = "leg"
     """The kind of sensor."""
     gauge: Name | None = None
-    """Which of the session's gauges; needed where there are several."""
+    """Name of the gauge; needed if the session has several."""
     postures: Annotated[list[Name], Field(min_length=1)] | None = None
-    """In a plan: the postures it is to be read in; all by default."""
+    """Postures to read, in a plan; all by default."""
     aligned_at: Name | None = None
     """Posture in which the operator aligned the gauge; by default the mechanical zero if the setup
     reads it, otherwise the posture nearest to it."""
     zero: GaugeZero | None = None
-    """Whether the gauge zero is estimated or known to be 0; that of the sensor by default."""
+    """Gauge zero: estimated, or known to be 0; that of the sensor by default."""
 
 
 class Sensor(Protocol):
-    """One standing of a sensor: all that a setup says of it."""
+    """A sensor as one setup describes it."""
 
     kind: ClassVar[str]
-    """Name of this kind of sensor: those of a kind and the same frames share one expression."""
+    """Name of the kind. Sensors of one kind with the same frames share one expression."""
     keys: ClassVar[type[SetupKeys]]
-    """What a session.yaml says of a setup with it."""
+    """Schema of its setups in a session.yaml."""
     ideal: ClassVar[str]
-    """What the place would be if there were no deviation, such as parallel."""
+    """State of the place without deviations, such as parallel."""
 
     # conditions: ClassVar[tuple[Condition, ...]], optional: conditions of a reading on which its
     # expression depends (`sensor_conditions`)
@@ -136,13 +136,13 @@ class Sensor(Protocol):
 
     @classmethod
     def from_keys(cls, keys: Any) -> Self:  # noqa: ANN401 - an instance of `keys`
-        """As a session.yaml describes it."""
+        """Build the sensor from the keys of a session.yaml."""
 
     def to_keys(self) -> dict[str, Any]:
-        """As a session.yaml describes it, without what every setup may say."""
+        """Keys for a session.yaml, without those that all setups share."""
 
     def require_fit(self, robot: Robot, *, where: str) -> None:
-        """Refuse what the robot does not have.
+        """Refuse legs, frames and places that the robot does not have.
 
         Raises:
             SessionError: Naming the key; `where` is the setup's file and key.
@@ -150,37 +150,37 @@ class Sensor(Protocol):
 
     @property
     def place(self) -> tuple[str, str]:
-        """What of the machine it stands at, as kind and name, such as leg and x."""
+        """Part of the machine that it measures, as kind and name, such as leg and x."""
 
     def describe(self) -> str:
-        """What it reads, in a few words: for tables."""
+        """Short description for tables."""
 
     def frames(self, robot: Robot) -> Frames:
-        """What it looks at."""
+        """Frames on which a reading depends."""
 
     def constants(self, robot: Robot) -> Array:
         """Constants of its expression, shape (n_constants,), [SI]."""
 
     @property
-    def unknowns(self) -> tuple[Unknown, ...]:
+    def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
         """What of it is not known exactly, besides the zero of its setup."""
 
-    def set_by(self, robot: Robot) -> Mapping[str, Sensor]:
-        """Unknowns that a hand sets by what it sees, by their names: what it sees.
+    def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
+        """Nuisance parameters that the operator aligns by eye, mapped to the virtual sensor.
 
-        Such an unknown counts from what that other sensor would show in the alignment posture of
-        the setup, less what it would show on the nominal machine.
+        Such a parameter is the deviation from the reading of the virtual sensor in the alignment
+        posture of the setup, relative to its reading on the nominal machine.
         """
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
-        """What it shows, its zero at 0, [m]."""
+        """Reading with the gauge zero at 0, [m]."""
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
-        """Where it touches.
+        """Contact with the machine in K postures.
 
         Args:
             frames: Poses of its frames in K postures, shape (K, 4, 4) each.
-            at_zero: Poses of its frames in the zero posture, shape (4, 4) each.
+            at_zero: Poses of its frames in the reference posture, shape (4, 4) each.
             robot: The robot.
         """
 

@@ -44,7 +44,7 @@ def register_sensor(kind: type[Sensor]) -> None:
 
 
 def unregister_sensor(kind: str) -> None:
-    """Forget a registered kind of sensor."""
+    """Remove a registered kind of sensor."""
     _KINDS.unregister(kind)
 
 
@@ -75,8 +75,8 @@ def read_setup(
     """
     name = data.get("sensor", DEFAULT)
     schema, build = _KINDS.find(name, where=f"{where}: {under}.sensor", error=error)
-    known = {k: v for k, v in (gauge or {}).items() if k in schema.model_fields}
-    data = {**known, **data}
+    defaults = {k: v for k, v in (gauge or {}).items() if k in schema.model_fields}
+    data = {**defaults, **data}
     keys = validate(schema, data, where=where, error=error, under=under)
     try:
         return keys, build(keys)
@@ -85,7 +85,7 @@ def read_setup(
 
 
 def write_sensor(sensor: Sensor) -> dict[str, Any]:
-    """A sensor as a document describes it."""
+    """Keys of a sensor in a document."""
     kind = {} if sensor.kind == DEFAULT else {"sensor": sensor.kind}
     return {**kind, **sensor.to_keys()}
 
@@ -100,4 +100,4 @@ def _read_recorded(data: object) -> Sensor:
 
 
 RECORDED = As(_read_recorded, write_sensor)
-"""A sensor in a record: as a document describes it."""
+"""Field type of a sensor in a record."""

@@ -1,7 +1,7 @@
-"""An indicator on a round rod of a leg, with a ball or a blade: what a dial really touches.
+"""An indicator on a round rod of a leg, with a ball or a blade.
 
-The tip begins in the rod as it lies in the mechanical zero of the nominal machine, at the setup's
-section along the leg; the zero of the setup takes what it is off along the plunger.
+At reading 0 the tip is on the axis of the nominal rod in the mechanical zero, at the section of the
+setup. The gauge zero of the setup contains its distance from there along the plunger.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from orthocal.sensors.leg_indicator import (
     direction_vector,
     read_direction,
 )
-from orthocal.sensors.mounting import EXACT, USUAL, Standing, stand
+from orthocal.sensors.mounting import EXACT, USUAL, Mounting, mount
 from orthocal.sensors.protocol import (
     Contact,
     Frames,
+    NuisanceParameter,
     Sensor,
     SetupKeys,
     TouchingTip,
-    Unknown,
     View,
 )
 from orthocal.sensors.tips import Tip, TipKeys, touch_by_ball, touch_by_blade
@@ -46,18 +46,18 @@ Matrix = Any
 
 
 OBLIQUITY_DEG = {"ball": 30.0, "blade": 10.0}
-"""How far from square to the leg a plunger may be: beyond that the rod pushes it aside, and a blade
-touches with its back."""
+"""Largest deviation of a plunger from square to the leg: beyond it the rod pushes the plunger
+aside, and a blade touches with its back."""
 
 
 LARGEST_BESIDE_MM = 500.0
-"""No rod moves further aside: it is a wrong unit."""
+"""Largest displacement across the leg; a larger one has a wrong unit."""
 
 EDGE = Tip("blade", 0.0)
-"""An eye that looks along a plunger."""
+"""Tip of the virtual sensor: a view along the plunger."""
 
 NOT_ACROSS = 1e-5
-"""How far from across leg and plunger a tip may be said to begin, [m]: what rounding leaves."""
+"""Largest component of `beside` along leg or plunger, [m]: rounding."""
 
 Millimetres = Annotated[Number, Field(ge=-LARGEST_BESIDE_MM, le=LARGEST_BESIDE_MM)]
 
@@ -95,12 +95,12 @@ class RodIndicator:
     leg: str
     rod: str
     direction: Direction
-    """Of a growing reading: x, y, z, -x, -y or -z of the world, or a vector."""
+    """Direction of a growing reading: x, y, z, -x, -y or -z of the world, or a vector."""
     section: Section
     tip: Tip
-    standing: Standing = USUAL
+    mounting: Mounting = USUAL
     beside: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where the tip begins, from where the rod lies in the mechanical zero, [m]."""
+    """Displacement of the tip from the nominal rod in the mechanical zero, [m]."""
 
     kind: ClassVar[str] = "leg"
     keys: ClassVar[type[SetupKeys]] = RodKeys
@@ -108,15 +108,15 @@ class RodIndicator:
 
     @classmethod
     def from_keys(cls, keys: Any) -> Self:  # noqa: ANN401 - RodKeys that name a rod and a tip
-        """As in a session.yaml."""
+        """Build from the keys of a session.yaml."""
         section, tip = Section.from_keys(keys.section), Tip.from_keys(keys.tip)
-        standing = Standing.from_keys(keys)
+        mounting = Mounting.from_keys(keys)
         x, y, z = keys.beside_mm or (0.0, 0.0, 0.0)
         beside = (x * MM, y * MM, z * MM)
-        return cls(keys.leg, keys.touches, read_direction(keys), section, tip, standing, beside)
+        return cls(keys.leg, keys.touches, read_direction(keys), section, tip, mounting, beside)
 
     def to_keys(self) -> dict[str, Any]:
-        """As in a session.yaml."""
+        """Keys for a session.yaml."""
         beside = {"beside_mm": [to_mm(v) for v in self.beside]} if any(self.beside) else {}
         return {**self._line.to_keys(), "touches": self.rod, "tip": self.tip.to_keys(), **beside}
 
@@ -155,50 +155,52 @@ class RodIndicator:
         return f"{words}, ({', '.join(f'{v / MM:g}' for v in self.beside)}) mm beside its zero"
 
     def frames(self, robot: Robot) -> Frames:
-        """Ends of the rod; the leg's root at zero, where a section may count from it."""
+        """Ends of the rod; the leg's root in the reference posture for sections from the root."""
         rod = self._rod(robot)
         return Frames((rod.root, rod.tip), self._line.frames(robot).at_zero)
 
     def constants(self, robot: Robot) -> Array:
-        """As of the line (8); the blade's edge (3), the tip across the leg (3), radii (1)."""
+        """Constants of the line model (8), blade edge (3), tip across the leg (3), radii (1)."""
         rod = self._rod(robot)
         across, radius = self._across(robot, rod), rod.radius + self.tip.radius
         return np.array([*self._line.constants(robot), *self._side(robot), *across, radius])
 
     @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        """How it stands."""
-        return self.standing.unknowns(ball=self.tip.form == "ball")
+    def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
+        """Nuisance parameters of the mounting."""
+        return self.mounting.nuisance_parameters(ball=self.tip.form == "ball")
 
-    def set_by(self, robot: Robot) -> Mapping[str, Sensor]:
-        """Where a ball is across leg and plunger: over the rod, wherever that lies."""
+    def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
+        """Virtual sensor of the lateral position: the operator centres a ball on the rod."""
         if self.tip.form != "ball":
             return {}
         x, y, z = self._side(robot).tolist()
         return {"lateral": RodByBlade(self.leg, self.rod, (x, y, z), self.section, EDGE, EXACT)}
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
-        """What it shows, [m]."""
+        """Reading with the gauge zero at 0, [m]."""
         del robot
         root, end = (pose.position for pose in view.frames)
         c = view.constants
         direction, plane, axis, side = c[:3], c[3], c[5:8], c[8:11]
         if view.at_zero:
             plane += c[4] * ca.dot(axis, view.at_zero[0].position)
-        stood = stand(self.unknowns, view.unknowns, direction=direction, side=side, axis=axis)
-        found = _touch(
+        gauge = mount(
+            self.nuisance_parameters, view.nuisance, direction=direction, side=side, axis=axis
+        )
+        reading = _touch(
             self.tip.form,
             at=root,
             along=end - root,
             radius=c[14],
-            tip=plane * axis + c[11:14] + stood.moved,
-            direction=stood.direction,
-            side=stood.edge,
+            tip=plane * axis + c[11:14] + gauge.displacement,
+            direction=gauge.direction,
+            side=gauge.edge,
         )
-        return ca.SX(stood.scale * found)
+        return ca.SX(gauge.scale * reading)
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
-        """Where the tip touches the rod's surface."""
+        """Points in which the tip touches the rod's surface."""
         rod, constants = self._rod(robot), self.constants(robot)
         direction, plane, axis, side = (
             constants[:3],
@@ -225,7 +227,7 @@ class RodIndicator:
     def _meet(
         self, roots: Array, ends: Array, start: Array, direction: Array, side: Array, rod: Rod
     ) -> tuple[Array, list[str]]:
-        """Where the tip touches in K postures, (K, 3), and why it cannot."""
+        """Points of contact in K postures, (K, 3), and reasons why the tip cannot touch."""
         along = ends - roots
         lengths = np.linalg.norm(along, axis=1)
         units = along / lengths[:, None]
@@ -249,9 +251,9 @@ class RodIndicator:
             normals, off = centres - feet, np.zeros(len(roots))
             normals /= np.linalg.norm(normals, axis=1)[:, None]
         surface = feet + rod.radius * normals
-        ways = np.einsum("ki,ki->k", feet - roots, units)
+        distances = np.einsum("ki,ki->k", feet - roots, units)
         problems = []
-        for k, way in enumerate(ways.tolist()):
+        for k, distance in enumerate(distances.tolist()):
             problem = ""
             if not np.isfinite(h[k]):
                 surface[k] = start
@@ -264,28 +266,28 @@ class RodIndicator:
                     f"the blade would slide off: it would touch {off[k] / MM:.1f} mm from its "
                     f"middle, and is {self.tip.width / MM:.1f} mm wide"
                 )
-            elif not 0.0 <= way <= lengths[k]:
+            elif not 0.0 <= distance <= lengths[k]:
                 problem = (
-                    f"the gauge would touch at {way / MM:.1f} mm from the root; the rod reaches "
-                    f"from 0 to {lengths[k] / MM:.1f} mm"
+                    f"the gauge would touch at {distance / MM:.1f} mm from the root; the rod "
+                    f"reaches from 0 to {lengths[k] / MM:.1f} mm"
                 )
             problems.append(problem)
         return surface, problems
 
     @property
     def _line(self) -> LegIndicator:
-        return LegIndicator(self.leg, self.direction, self.section, self.standing)
+        return LegIndicator(self.leg, self.direction, self.section, self.mounting)
 
     def _rod(self, robot: Robot) -> Rod:
         return robot.legs[self.leg].rods[self.rod]
 
     def _side(self, robot: Robot) -> Array:
-        """Across leg and plunger: the blade's edge, unit vector."""
+        """Unit vector across leg and plunger: the edge of a blade."""
         side = np.cross(robot.legs[self.leg].axis, direction_vector(self.direction))
         return np.asarray(side / np.linalg.norm(side))
 
     def _across(self, robot: Robot, rod: Rod) -> Array:
-        """Where the tip begins across the leg: in the rod as it lies in the mechanical zero."""
+        """Initial position of the tip across the leg: on the nominal rod in the mechanical zero."""
         axis = robot.legs[self.leg].axis
         plane, from_root = self._line.plane(robot)
         if from_root:
@@ -306,7 +308,7 @@ def _touch(
     direction: ca.SX,
     side: ca.SX,
 ) -> ca.SX:
-    """What a tip reads where a rod lies; of each form its own expression."""
+    """Reading of a ball or a blade on a rod, [m]."""
     if form == "ball":
         return touch_by_ball(at=at, along=along, radius=radius, tip=tip, direction=direction)
     return touch_by_blade(
@@ -316,19 +318,19 @@ def _touch(
 
 @lru_cache
 def _touching(form: str) -> ca.Function:
-    """The same as a function of rods, one a column."""
+    """Reading as a function of rods, one per column."""
     names = ("at", "along", "radius", "tip", "direction", "side")
     symbols = {n: ca.SX.sym(n, 1 if n == "radius" else 3) for n in names}
     return ca.Function("touching", list(symbols.values()), [_touch(form, **symbols)])
 
 
 class RodByBall(RodIndicator):
-    """With a ball: a class of its own, for sensors of one class share one expression."""
+    """Rod indicator with a ball. Sensors of one class share one expression."""
 
     __slots__ = ()
 
 
 class RodByBlade(RodIndicator):
-    """With a blade."""
+    """Rod indicator with a blade."""
 
     __slots__ = ()

@@ -1,14 +1,14 @@
-"""Where the tip of a plunger touches a round rod: closed forms.
+"""Contact of the tip of a plunger with a round rod: closed forms.
 
 A rod has the axis a + s u and the radius r. The plunger moves along the unit vector d, in which the
-reading h grows: it stands on the rod's d side. Its tip is at c + h d.
+reading h grows, on the rod's d side. Its tip is at c + h d.
 
 - A blade is an edge along e: it touches where the plane through the edge and along the rod is a
-  radius away from the rod's axis. With n = e × u, turned so that n · d > 0,
+  radius away from the rod's axis. With n = e × u, its sign such that n · d > 0,
 
       h = ((a − c) · n + r |n|)/(d · n);
 
-  without a radius that is where the edge meets the axis. A pin as edge adds its radius to r.
+  without a radius the edge meets the axis. A pin as edge adds its radius to r.
 - A ball of radius R touches where |(c + h d − a) × u| = r + R; of the two roots the larger. Where
   there is none the plunger passes the rod.
 """
@@ -25,13 +25,13 @@ from orthocal.io.documents import Number, PositiveNumber
 from orthocal.units import MM, to_mm
 
 LARGEST_TIP_MM = 100.0
-"""No ball and no blade of an indicator is larger: it is a wrong unit."""
+"""Largest ball or blade of an indicator; a larger one has a wrong unit."""
 
 
 def touch_by_blade(
     *, at: ca.SX, along: ca.SX, radius: ca.SX, edge: ca.SX, tip: ca.SX, direction: ca.SX
 ) -> ca.SX:
-    """What an indicator with a blade reads, [m].
+    """Reading of an indicator with a blade, [m].
 
     Args:
         at: A point of the rod's axis, shape (3,), [m].
@@ -47,7 +47,7 @@ def touch_by_blade(
 
 
 def touch_by_ball(*, at: ca.SX, along: ca.SX, radius: ca.SX, tip: ca.SX, direction: ca.SX) -> ca.SX:
-    """What an indicator with a ball reads, [m]; NaN where it passes the rod.
+    """Reading of an indicator with a ball, [m]; NaN if the ball passes the rod.
 
     Args:
         at: A point of the rod's axis, shape (3,), [m].
@@ -61,8 +61,8 @@ def touch_by_ball(*, at: ca.SX, along: ca.SX, radius: ca.SX, tip: ca.SX, directi
     apart = apart - ca.dot(apart, unit) * unit
     across = direction - ca.dot(direction, unit) * unit
     square, mixed = ca.dot(across, across), ca.dot(apart, across)
-    rest = mixed**2 - square * (ca.dot(apart, apart) - radius**2)
-    return (ca.sqrt(rest) - mixed) / square
+    discriminant = mixed**2 - square * (ca.dot(apart, apart) - radius**2)
+    return (ca.sqrt(discriminant) - mixed) / square
 
 
 class BallKeys(BaseModel):
@@ -84,7 +84,7 @@ class BladeKeys(BaseModel):
 
 
 class TipKeys(BaseModel):
-    """What touches, as in a session.yaml: one of them."""
+    """Keys of a tip in a session.yaml: ball or blade."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
@@ -101,7 +101,7 @@ class TipKeys(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Tip:
-    """What touches a rod."""
+    """Tip of a plunger."""
 
     form: Literal["ball", "blade"]
     radius: float
@@ -111,14 +111,14 @@ class Tip:
 
     @staticmethod
     def from_keys(keys: TipKeys) -> Tip:
-        """As in a session.yaml."""
+        """Build from the keys of a session.yaml."""
         if keys.ball is not None:
             return Tip("ball", keys.ball.radius_mm * MM)
         blade = keys.blade or BladeKeys(width_mm=1.0)
         return Tip("blade", blade.radius_mm * MM, blade.width_mm * MM)
 
     def to_keys(self) -> dict[str, dict[str, float]]:
-        """As in a session.yaml."""
+        """Keys for a session.yaml."""
         if self.form == "ball":
             return {"ball": {"radius_mm": to_mm(self.radius)}}
         radius = {"radius_mm": to_mm(self.radius)} if self.radius else {}

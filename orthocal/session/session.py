@@ -67,7 +67,7 @@ class Posture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setup:
-    """One standing of a sensor, with one unknown zero."""
+    """A sensor mounted at one place, with one gauge zero."""
 
     name: str
     sensor: Sensor

@@ -96,7 +96,7 @@ class Identifiability:
     """Independent readings: repeated ones once, less gauge zeros."""
     unseen: Many[str]
     """Parameters that move no reading by more than the threshold."""
-    told: Many[str]
+    resolvable: Many[str]
     """Parameters that the readings alone tell better than their tolerances."""
     alike: Many[Recorded]
     """Parameters that move the readings alike, two or more: only their sum is told."""
@@ -153,7 +153,7 @@ def analyse_identifiability(
     threshold = max(sigma, smallest) if sigma > 0.0 else smallest
     sizes = np.linalg.norm(factor, axis=0)
     names = [p.name for p in parameters]
-    told = information.determined(sigma=threshold if sigma > 0.0 else np.nan)
+    resolvable = information.determined(sigma=threshold if sigma > 0.0 else np.nan)
     return Identifiability(
         singular_values=s,
         threshold=threshold,
@@ -162,7 +162,7 @@ def analyse_identifiability(
         n_postures=n_postures,
         n_readings=n_readings,
         unseen=tuple(n for n, size in zip(names, sizes, strict=True) if size <= threshold),
-        told=tuple(n for n, ok in zip(names, told, strict=True) if ok),
+        resolvable=tuple(n for n, ok in zip(names, resolvable, strict=True) if ok),
         alike=_find_alike(factor, parameters, threshold),
         base=find_base_parameters(factor, parameters, threshold=threshold),
     )

@@ -394,7 +394,7 @@ def _weighting_sigma(study: AccuracyStudy, p: _Prepared) -> float:
     if np.allclose(projector @ p.truth.columns, p.truth.columns, atol=1e-12):
         return p.sigma
     measured = p.measure(study, range(min(PILOT_MACHINES, study.machines)))
-    options, sigmas = SolverOptions(solver="eliminated"), []
+    options, sigmas = SolverOptions(solver="variable-projection"), []
     for rows in measured.rows[measured.status == CALIBRATED]:
         with suppress(SolverError, ClosureError):
             sigmas.append(fit_problem(p.problem.with_values(rows), options=options).sigma)

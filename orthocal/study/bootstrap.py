@@ -98,7 +98,7 @@ class _Prepared:
     def of(cls, study: BootstrapStudy) -> _Prepared:
         session = study.session.unpack()
         problem = CalibrationProblem(session, study.choice.select(session.robot.parameters))
-        fit = fit_problem(problem, options=SolverOptions(solver="eliminated"))
+        fit = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
         return cls(
             fit=fit,
             values=problem.values,

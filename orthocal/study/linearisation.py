@@ -379,7 +379,7 @@ def _largest_difference(values: Array, problem: CalibrationProblem) -> Array:
 
 
 def _without_mounting_errors(sensor: Any) -> Any:  # noqa: ANN401 - any sensor with a mounting
-    return replace(sensor, standing=EXACT) if hasattr(sensor, "standing") else sensor
+    return replace(sensor, mounting=EXACT) if hasattr(sensor, "mounting") else sensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ from orthocal.estimation.problem import build_problem
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import cube
-from orthocal.sensors.mounting import Standing
+from orthocal.sensors.mounting import Mounting
 from orthocal.statistics.information import decompose
 
 OFFSETS = {"*.offset": 2e-3}
@@ -33,10 +33,10 @@ def space(orthoglide):
     return cube(orthoglide, points_a_side=5)
 
 
-def standing(plan, how):
+def mounted(plan, how):
     """The plan with gauges that are known so well where and how they stand."""
     setups = {
-        name: replace(s, sensor=replace(s.sensor, standing=how)) for name, s in plan.setups.items()
+        name: replace(s, sensor=replace(s.sensor, mounting=how)) for name, s in plan.setups.items()
     }
     return replace(plan, setups=setups)
 
@@ -90,13 +90,13 @@ def test_lines_tell_squareness_as_well_as_the_gauges_direction_is_known(
     root, space, monkeypatch, roll, left
 ):
     """Roll alone: the pitch of an edge, which the figures do not have, makes 1 to 5 % of it."""
-    plan = standing(
-        load_plan(root / "tests/sessions/lines/plan.yaml"), Standing(roll, 0.0, 0.0, 0.0)
+    plan = mounted(
+        load_plan(root / "tests/sessions/lines/plan.yaml"), Mounting(roll, 0.0, 0.0, 0.0)
     )
-    own = Standing.unknowns
+    own = Mounting.nuisance_parameters
     monkeypatch.setattr(
-        Standing,
-        "unknowns",
+        Mounting,
+        "nuisance_parameters",
         lambda self, *, ball: tuple(u for u in own(self, ball=ball) if u.name == "roll"),
     )
     shift, _ = bound(plan, space, sigma=SIGMA, free=JOINTS)

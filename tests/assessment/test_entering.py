@@ -84,7 +84,9 @@ def test_what_is_promised_with_the_offsets_entered_is_kept(quarter):
         drawn = machines.draw(np.random.default_rng(100 + seed))
         errors = machines.machine.split_errors(drawn)
         session = simulate_session(quarter, errors, seed=seed).session
-        full, alone = (calibrate(session, m, solver="eliminated") for m in ("full", "offsets"))
+        full, alone = (
+            calibrate(session, m, solver="variable-projection") for m in ("full", "offsets")
+        )
         space = find_tool(alone).workspace
         identified = np.array([e.identified for e in find_entries(full)])
         for name, offsets in (

@@ -128,7 +128,7 @@ def test_every_command_has_the_same_verdict(cases, case, tmp_path):
     for command in (
         ("check", tmp_path / "session"),
         ("calibrate", tmp_path / "session", "--out", tmp_path / "calibrated"),
-        ("calibrate", tmp_path / "session", "--model", "full", "--solver", "eliminated"),
+        ("calibrate", tmp_path / "session", "--model", "full", "--solver", "variable-projection"),
         ("compare", tmp_path / "session", "--models", "offsets"),
     ):
         done = run(*command, "--json")
@@ -149,7 +149,7 @@ def test_the_judgement_does_not_depend_on_the_model(cases, case):
     session, expected = cases[case]
     found = [f for f in judge_session(session).findings if f.severity != "note"]
     for model in ("offsets", "full"):
-        calibration = calibrate(session, model, solver="eliminated")
+        calibration = calibrate(session, model, solver="variable-projection")
         own = [f for f in calibration.assessment.findings if f.severity != "note"]
         assert [f.to_document() for f in own] == [f.to_document() for f in found]
         assert calibration.assessment.decision.verdict == expected
@@ -157,7 +157,7 @@ def test_the_judgement_does_not_depend_on_the_model(cases, case):
 
 def test_findings_have_known_kinds_units_and_load_again(cases, tmp_path):
     for case, (session, _) in cases.items():
-        calibration = calibrate(session, solver="eliminated")
+        calibration = calibrate(session, solver="variable-projection")
         document = json.loads(result_json(calibration))
         for finding in document["findings"]:
             assert finding["kind"] in get_args(FindingKind)
@@ -175,7 +175,7 @@ def test_findings_have_known_kinds_units_and_load_again(cases, tmp_path):
 
 NOTES = {
     "model error": lambda c, t: calibrate(t["2"]),
-    "no redundancy": lambda c, t: calibrate(c, "full", solver="eliminated"),
+    "no redundancy": lambda c, t: calibrate(c, "full", solver="variable-projection"),
     "noise unknown": lambda c, t: calibrate(
         replace(t["2"], readings=t["2"].readings[1:4]).with_gauge(Gauge(None, None, None))
     ),
@@ -223,7 +223,7 @@ def test_two_gauges_are_each_held_to_their_own_resolution(workshop):
 
 
 def test_the_tool_error_is_that_of_the_accuracy(workshop):
-    calibration = calibrate(workshop, solver="eliminated")
+    calibration = calibrate(workshop, solver="variable-projection")
     tool, accuracy = calibration.assessment.tool, assess_tool(calibration)
     known = accuracy.after.sizes.headline.rms
     left = accuracy.measure(accuracy.error_after_offsets).headline.rms

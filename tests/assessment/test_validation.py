@@ -82,7 +82,7 @@ def test_a_right_calibration_with_noise_alone_does_not_repeat_its_residuals(plan
     verdicts = []
     for seed in range(2, 42, 2):
         first = simulate_session(plan, TRUTH, seed=seed + 1).session
-        before = calibrate(first, solver="eliminated")
+        before = calibrate(first, solver="variable-projection")
         entered = np.round([p.value * 1e3 for p in before.free], 3) * 1e-3
         after = simulate_session(with_offsets(plan, entered), TRUTH, seed=seed).session
         result = validate_calibration(before, after)
@@ -224,11 +224,11 @@ def test_validate_and_calibrate_agree_on_the_same_session(root, name, model, see
     plan = load_plan(root / f"examples/{name}/plan.yaml")
     errors = draw_machine(plan.robot, seed)
     first = simulate_session(plan, errors, seed=seed).session
-    calibration = calibrate(first, model, solver="eliminated")
+    calibration = calibrate(first, model, solver="variable-projection")
     entered = np.round(entered_offsets(calibration), 6)
     session = simulate_session(plan.with_controller(entered), errors, seed=seed + 1000).session
     result = validate_calibration(calibration, session)
-    again = calibrate(session, model, solver="eliminated").assessment
+    again = calibrate(session, model, solver="variable-projection").assessment
     assert result.confirmed
     assert result.assessment.decision.verdict == again.decision.verdict == "enter"
     assert result.nothing_to_change is again.keeps_offsets
@@ -248,13 +248,15 @@ def test_validate_and_calibrate_agree_on_the_same_session(root, name, model, see
 def test_a_change_that_leaves_the_offsets_is_seen_by_validate_alone(plan):
     """The second exception of the test above: a drive's axis that turned by 1 mrad."""
     errors = draw_machine(plan.robot, 1)
-    calibration = calibrate(simulate_session(plan, errors, seed=1).session, solver="eliminated")
+    calibration = calibrate(
+        simulate_session(plan, errors, seed=1).session, solver="variable-projection"
+    )
     entered = plan.with_controller(entered_offsets(calibration))
     turned = {**errors, "x_slide.rz": errors["x_slide.rz"] + 1e-3}
     session = simulate_session(entered, turned, seed=5).session
     result = validate_calibration(calibration, session)
     assert result.nothing_to_change
-    assert calibrate(session, solver="eliminated").assessment.keeps_offsets
+    assert calibrate(session, solver="variable-projection").assessment.keeps_offsets
     assert result.confirmed is False
     assert result.mistake.explanation.parameters == ("x_slide.rz",)
     assert result.assessment.decision.exit_code == 3
@@ -271,7 +273,9 @@ def test_a_change_that_leaves_the_offsets_is_seen_by_validate_alone(plan):
 def test_values_to_enter_after_a_mistake(plan, slip, kind, by_calibration):
     """Those of the calibration if they were entered wrongly, else those from the new readings."""
     errors = draw_machine(plan.robot, 3)
-    calibration = calibrate(simulate_session(plan, errors, seed=3).session, solver="eliminated")
+    calibration = calibrate(
+        simulate_session(plan, errors, seed=3).session, solver="variable-projection"
+    )
     right = entered_offsets(calibration)
     measured = simulate_session(plan.with_controller(slip(right)), errors, seed=7).session
     claimed = plan.with_controller(right).with_values(measured.values)
@@ -292,7 +296,7 @@ def test_offsets_of_another_column_are_not_confirmed(plan):
     """The identified offsets of a full model, entered instead of those that belong there."""
     errors = draw_machine(plan.robot, 0)
     session = simulate_session(plan, errors, seed=3).session
-    calibration = calibrate(session, "full", solver="eliminated")
+    calibration = calibrate(session, "full", solver="variable-projection")
     identified = np.array([e.identified for e in find_entries(calibration)])
     right = entered_offsets(calibration)
     assert np.abs(identified - right).max() > 0.1e-3
@@ -314,7 +318,7 @@ def test_mistakes_are_named_of_readings_of_rods(root):
         errors = draw_errors(plan.robot, ["*"], seed=seed, tolerances=tolerances)
         session = simulate_session(plan, errors, seed=seed).session
         choice = Choice("full", tolerances=tolerances)
-        calibration = calibrate(session, choice, solver="eliminated")
+        calibration = calibrate(session, choice, solver="variable-projection")
         right = entered_offsets(calibration)
         for kind, factor in slips.items():
             entered = plan.with_controller(factor * right)

@@ -90,7 +90,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="What identification takes.")
     parser.add_argument("--large", action="store_true", help="up to 100 050 readings as well")
     kinds = get_args(SolverKind)
-    parser.add_argument("--solver", choices=kinds, default="eliminated", help="which one")
+    parser.add_argument("--solver", choices=kinds, default="variable-projection", help="which one")
     arguments = parser.parse_args()
     sizes = SIZES + (LARGE_SIZES if arguments.large else ())
     table = Table(box=box.SIMPLE, padding=(0, 0, 0, 1))

@@ -25,9 +25,9 @@ from orthocal.errors import CalibrationFileError
 CASES = [
     ("table1/experiment-2", "offsets", "squares", "ipopt"),
     ("raw-cycles", "offsets", "huber", "ipopt"),
-    ("raw-cycles", "lengths", "squares", "eliminated"),
+    ("raw-cycles", "lengths", "squares", "variable-projection"),
     ("sweep", "full", "squares", "ipopt"),
-    (["table1/experiment-2", "table1/experiment-3"], "offsets", "squares", "eliminated"),
+    (["table1/experiment-2", "table1/experiment-3"], "offsets", "squares", "variable-projection"),
 ]
 
 

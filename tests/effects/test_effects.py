@@ -412,7 +412,7 @@ def test_all_solvers_identify_it_alike(simulated):
         off = np.abs(other.theta - found[0].theta) / problem.theta_scale
         assert off.max() < SAME_OPTIMUM / 1e-4
         assert other.objective == pytest.approx(found[0].objective, rel=1e-9)
-    truth = {**TRUTH, **simulated.unknowns}
+    truth = {**TRUTH, **simulated.nuisance}
     expected = np.array([truth.get(n, 0.0) for n in problem.free])
     _, jacobian = problem.linearise(found[0].theta)
     zeros = problem.zero_incidence
@@ -448,7 +448,7 @@ def test_at_its_bound_it_stays(plan):
 
 
 def test_a_calibration_holds_it_and_its_conditions(simulated, tmp_path):
-    result = calibrate(simulated.session, Choice(free=FREE), solver="eliminated")
+    result = calibrate(simulated.session, Choice(free=FREE), solver="variable-projection")
     assert result["x_slide.slack"].value == pytest.approx(
         30e-6, abs=4 * result["x_slide.slack"].std
     )
@@ -474,7 +474,7 @@ def test_readings_without_the_condition_are_refused(tmp_path):
     session = simulate_session(load_plan(folder), {"x_slide.offset": 1e-4}, seed=1).session
     with pytest.raises(SessionError, match="needs the approach"):
         calibrate(session, Choice(free=FREE))
-    assert calibrate(session, "offsets", solver="eliminated").free
+    assert calibrate(session, "offsets", solver="variable-projection").free
 
 
 def test_a_session_from_files_is_the_same(simulated, folder, tmp_path):

@@ -37,7 +37,7 @@ def half(session, setups):
     )
 
 
-@pytest.mark.parametrize("solver", ["ipopt", "eliminated"])
+@pytest.mark.parametrize("solver", ["ipopt", "variable-projection"])
 @pytest.mark.parametrize("model", ["offsets", "full"])
 def test_two_halves_are_the_whole(sweep, model, solver):
     """Setups in two sessions of one gauge, without its σ: what they find is what one finds.
@@ -110,7 +110,7 @@ def test_deviations_of_mixed_sessions_are_those_of_many(root):
     """Offsets from a coarse and a fine session: z scores of 80 fits, as calibrations have them."""
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     plan = plan.with_gauge(replace(plan.gauge, sigma=None, resolution=None))
-    options, scores = SolverOptions(solver="eliminated"), []
+    options, scores = SolverOptions(solver="variable-projection"), []
     for seed in range(80):
         pair = [
             simulate_session(plan, TRUTH, seed=2 * seed + i, sigma=s).session

@@ -41,16 +41,18 @@ def test_solvers_agree_and_keep_known_zeros_at_0(session, loss):
     assert np.array_equal(o.zero_known, known)
     assert o.n_free_zeros == len(known) - known.sum()
     found = {}
-    for kind in ("ipopt", "eliminated"):
+    for kind in ("ipopt", "variable-projection"):
         options = SolverOptions(solver=kind, loss=Loss(loss))
         found[kind] = build_program(problem, options).solve(sigma=SIGMA)
         assert (found[kind].zeros[known] == 0.0).all()
-    batch = BatchProgram(problem, options=SolverOptions(solver="eliminated", loss=Loss(loss)))
+    batch = BatchProgram(
+        problem, options=SolverOptions(solver="variable-projection", loss=Loss(loss))
+    )
     together = batch.solve(problem.values[None], sigma=SIGMA)
     for theta in (found["ipopt"].theta, together.theta[0]):
-        assert np.abs(theta - found["eliminated"].theta).max() < 1e-8
+        assert np.abs(theta - found["variable-projection"].theta).max() < 1e-8
     truth = np.array([TRUTH[n] for n in problem.free])
-    assert np.abs(found["eliminated"].theta - truth).max() < 50e-6
+    assert np.abs(found["variable-projection"].theta - truth).max() < 50e-6
 
 
 def test_an_absolute_reading_is_one_more_equation(root):

@@ -67,7 +67,7 @@ def test_sessions_that_are_joined_keep_what_was_active_in_each(plan):
 
 def test_a_blade_and_what_is_known_exactly_are_as_drawn(plan):
     setups = {
-        n: replace(s, sensor=replace(s.sensor, standing=replace(s.sensor.standing, lateral=0.0)))
+        n: replace(s, sensor=replace(s.sensor, mounting=replace(s.sensor.mounting, lateral=0.0)))
         for n, s in plan.setups.items()
     }
     assert not ObservationModel(replace(plan, setups=setups)).alignment.aligned.any()
@@ -80,7 +80,7 @@ def test_both_solvers_find_one_optimum(plan, hessian):
     session = simulate_session(plan, errors, seed=1).session
     found = [
         calibrate(session, "full", solver=SolverOptions(**options))
-        for options in ({"solver": "eliminated"}, {"solver": "ipopt", "hessian": hessian})
+        for options in ({"solver": "variable-projection"}, {"solver": "ipopt", "hessian": hessian})
     ]
     a, b = ([*r.free, *r.sensors] for r in found)
     for p, q in zip(a, b, strict=True):

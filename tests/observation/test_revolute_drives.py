@@ -126,7 +126,7 @@ def test_what_was_identified_is_validated(tmp_path, robot):
         plan = load_plan(write_plan(folder, robot, f"{{offsets_mrad: {entered}}}"))
         second = simulate_session(plan, OFFSETS, seed=seed + 1000)
         # the same dial in both sessions: at 10 mm its scale matters more than its noise
-        scales = [1.0 + s.unknowns["gauge.scale"] for s in (first, second)]
+        scales = [1.0 + s.nuisance["gauge.scale"] for s in (first, second)]
         new = second.session.with_values(second.session.values * scales[0] / scales[1])
         result = validate_calibration(found, new)
         assert result.mistake is None

@@ -35,7 +35,7 @@ from orthocal.planning.equipment import Equipment, choose_box, find_box
 from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.plan import plan_readings
 from orthocal.planning.selection import SetupSearch
-from orthocal.sensors.mounting import EXACT, Standing
+from orthocal.sensors.mounting import EXACT, Mounting
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Gauge
 
@@ -62,7 +62,7 @@ def test_plans_are_better_than_manual_ones(orthoglide, tip, setups, each, most):
     sections = (0.2, 0.4, 0.6, 0.8)
     box = np.array([[-0.1, 0.06]] * 3)
     equipment = Equipment(
-        gauge=DIAL, tip=tip, mounting=Standing(lateral=0.0), sections=sections, box=box, along=9
+        gauge=DIAL, tip=tip, mounting=Mounting(lateral=0.0), sections=sections, box=box, along=9
     )
     forecast = ToolForecast(
         orthoglide, choice.select(orthoglide.parameters), cube(orthoglide, points_a_side=5)
@@ -177,7 +177,7 @@ def test_a_folder_is_ready_to_measure(planned, tmp_path):
     ]
     errors = draw_errors(again.robot, ["*"], seed=1, tolerances=OFFSETS)
     session = simulate_session(again, errors, seed=1).session
-    found = calibrate(session, Choice("full", tolerances=OFFSETS), solver="eliminated")
+    found = calibrate(session, Choice("full", tolerances=OFFSETS), solver="variable-projection")
     assert found.noise.cycles_dof == len(again.setups)
     for name in ("x_slide.offset", "y_slide.offset", "z_slide.offset"):
         assert abs(found[name].value - errors[name]) < 4.0 * found[name].std

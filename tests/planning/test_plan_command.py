@@ -55,7 +55,7 @@ def test_a_plan_is_written_ready_to_measure(monkeypatch, capsys, tmp_path):
     assert session.robot.parameters.stated == {"*.offset_mm": 0.5}
     assert session.gauge.range == (-1e-3, 1e-3)
     assert {s.sensor.tip.form for s in session.setups.values()} == {"blade"}
-    assert {s.sensor.standing.direction for s in session.setups.values()} == {5e-3}
+    assert {s.sensor.mounting.direction for s in session.setups.values()} == {5e-3}
     rows = (out / "readings.csv").read_text().splitlines()
     assert rows[0] == "setup,posture,cycle,reading_mm"
     assert all(row.endswith(",") for row in rows[1:])

@@ -91,11 +91,11 @@ def test_its_readings_are_those_of_the_tool(plan):
 def test_what_is_not_known_of_it_is_identified_beside_the_machine(plan):
     """Slopes of 2 and 3 in a thousand at 0.16 m of travel read to 2 µm: told to some 1e-5."""
     simulated = simulate_session(plan, TRUTH, seed=4)
-    assert set(simulated.unknowns) == {"dial.d.slope", "setup.tz.slope"}
+    assert set(simulated.nuisance) == {"dial.d.slope", "setup.tz.slope"}
     result = calibrate(simulated.session)
     for p in result.sensors:
         assert 0.0 < p.std_scatter < 0.2 * p.tolerance
-        assert abs(p.value - simulated.unknowns[p.name]) < 4.0 * p.std
+        assert abs(p.value - simulated.nuisance[p.name]) < 4.0 * p.std
     for name, value in TRUTH.items():
         assert abs(result[name].value - value) < 4.0 * result[name].std
     assert [p.name for p in result.free] == list(TRUTH)
@@ -103,11 +103,11 @@ def test_what_is_not_known_of_it_is_identified_beside_the_machine(plan):
 
 def test_its_deviations_are_those_of_many_simulated_calibrations(plan):
     """Offsets and slopes, both drawn: z scores of 60 fits, as calibrations have them."""
-    options, scores = SolverOptions(solver="eliminated"), []
+    options, scores = SolverOptions(solver="variable-projection"), []
     for seed in range(60):
         simulated = simulate_session(plan, TRUTH, seed=seed)
         fit = fit_problem(build_problem(simulated.session, model="offsets"), options=options)
-        truth = {**TRUTH, **simulated.unknowns}
+        truth = {**TRUTH, **simulated.nuisance}
         names, std = fit.problem.free, np.sqrt(np.diag(fit.covariance()))
         scores.append((fit.solution.theta - [truth[name] for name in names]) / std)
     spread = np.sqrt(np.mean(np.square(scores), axis=0))
@@ -126,8 +126,8 @@ def test_all_that_is_not_known_of_it_holds_on_machines_with_all_errors(plan):
     for seed in range(60):
         errors = {**draw_errors(plan.robot, others, seed=seed), **TRUTH}
         simulated = simulate_session(plan, errors, seed=seed)
-        result = calibrate(simulated.session, solver=SolverOptions(solver="eliminated"))
-        truth = {**TRUTH, **simulated.unknowns}
+        result = calibrate(simulated.session, solver=SolverOptions(solver="variable-projection"))
+        truth = {**TRUTH, **simulated.nuisance}
         estimates = (*result.free, *result.sensors)
         scores.append([(p.value - truth[p.name]) / p.std for p in estimates])
     spread = np.sqrt(np.mean(np.square(scores), axis=0))
@@ -210,7 +210,7 @@ def test_what_differs_between_setups_belongs_into_constants(plan):
             return np.zeros(0)
 
         def expression(self, view, robot):
-            return ca.dot(self._axis, view.frames[0].position) * (1.0 + view.unknowns[0])
+            return ca.dot(self._axis, view.frames[0].position) * (1.0 + view.nuisance[0])
 
     compile_reading(plan.robot, Selfish("x", 1e-3, None))
     compile_reading(plan.robot, Selfish("x", 2e-3, None))
@@ -289,7 +289,7 @@ def test_a_sensor_that_shows_no_number_is_named_by_setup_and_posture(plan):
 
     class Broken(ToolCoordinate):
         def expression(self, view, robot):
-            return ca.sqrt(view.frames[0].position[0] - 0.02) + 0.0 * view.unknowns[0]
+            return ca.sqrt(view.frames[0].position[0] - 0.02) + 0.0 * view.nuisance[0]
 
     broken = {
         name: replace(s, sensor=Broken("x", 1e-3, None)) if name == "tx" else s

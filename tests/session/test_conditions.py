@@ -177,7 +177,7 @@ def test_a_session_read_again_has_its_approaches_planned(tmp_path, root, monkeyp
     stated = Conditions("ppp", 21.0, datetime(2025, 3, 14, tzinfo=UTC))
     readings = tuple(replace(r, conditions=stated) for r in first.readings)
     write_session(replace(first, readings=readings), tmp_path / "first")
-    result = calibrate(load_session(tmp_path / "first"), "offsets", solver="eliminated")
+    result = calibrate(load_session(tmp_path / "first"), "offsets", solver="variable-projection")
     write_calibration(result, tmp_path / "calibration.json")
     words = ["again", tmp_path / "calibration.json", "--out", tmp_path / "second", "--anyway"]
     monkeypatch.setattr(sys, "argv", ["orthocal", *map(str, words)])
@@ -320,7 +320,7 @@ def test_the_times_of_a_clock_are_left_out_unless_they_are_asked_for(tmp_path):
 
 
 def test_a_calibration_keeps_them(session, tmp_path):
-    result = calibrate(session, Choice("offsets", prior=True), solver="eliminated")
+    result = calibrate(session, Choice("offsets", prior=True), solver="variable-projection")
     write_calibration(result, tmp_path / "calibration.json")
     again = load_calibration(tmp_path / "calibration.json")
     stated = [r.conditions for r in session.readings]

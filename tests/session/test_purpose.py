@@ -35,8 +35,8 @@ def stated(raw_cycles, tmp_path_factory):
 def test_what_a_session_says_is_what_options_would(raw_cycles, stated):
     assert stated.purpose == Purpose("full")
     found, expected = (
-        calibrate(stated, solver="eliminated"),
-        calibrate(raw_cycles, Choice("full", tolerances=TOLERANCES), solver="eliminated"),
+        calibrate(stated, solver="variable-projection"),
+        calibrate(raw_cycles, Choice("full", tolerances=TOLERANCES), solver="variable-projection"),
     )
     assert found.model == expected.model == "full"
     assert [p.tolerance for p in found.free] == [p.tolerance for p in expected.free]
@@ -44,7 +44,9 @@ def test_what_a_session_says_is_what_options_would(raw_cycles, stated):
 
 
 def test_tolerances_hold_for_what_is_left_out(raw_cycles, stated):
-    own, told = (calibrate(s, "offsets", solver="eliminated") for s in (raw_cycles, stated))
+    own, told = (
+        calibrate(s, "offsets", solver="variable-projection") for s in (raw_cycles, stated)
+    )
     np.testing.assert_allclose(*([p.value for p in c.free] for c in (own, told)), atol=1e-12)
     index = own.unmodelled.names.index(FORK)
     assert own.unmodelled.tolerances[index] == 1e-3
@@ -53,7 +55,7 @@ def test_tolerances_hold_for_what_is_left_out(raw_cycles, stated):
 
 
 def test_a_calibration_keeps_them(stated, tmp_path):
-    first = calibrate(stated, solver="eliminated")
+    first = calibrate(stated, solver="variable-projection")
     again = load_calibration(write_calibration(first, tmp_path / "calibration.json"))
     assert again.robot.parameters[FORK].tolerance == pytest.approx(3e-3)
     repeated = repeat_calibration(again, restore_session(again))
@@ -85,7 +87,7 @@ def test_where_nothing_is_said(raw_cycles, stated):
 
 def test_globs_instead_of_a_model(raw_cycles, tmp_path):
     session = say(raw_cycles, tmp_path, free=["*.offset", "!x_slide.offset"])
-    assert [p.name for p in calibrate(session, solver="eliminated").free] == [
+    assert [p.name for p in calibrate(session, solver="variable-projection").free] == [
         "y_slide.offset",
         "z_slide.offset",
     ]

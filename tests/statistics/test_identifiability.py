@@ -52,7 +52,7 @@ def analyse(columns, names, *, sigma=0.1, tolerances=None):
 def test_two_that_act_alike_are_told_as_a_sum():
     found = analyse([A, B, A], ["x_leg.length", "y.z", "x_slide.offset"])
     assert [c.words for c in found.alike] == ["x_leg.length and x_slide.offset: only their sum"]
-    assert found.told == ("y.z",)
+    assert found.resolvable == ("y.z",)
     assert found.rank == 2
 
 

@@ -1,4 +1,4 @@
-"""How far readings of what is really touched may be from those of a line in the air."""
+"""Model discrepancy of the line model: a gauge touches a rod, not the line between two rods."""
 
 from __future__ import annotations
 
@@ -9,53 +9,62 @@ from numpy.typing import NDArray
 
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
-from orthocal.sensors.idealised import real_sensors
+from orthocal.robot.model import Robot
+from orthocal.sensors.leg_indicator import LegIndicator
+from orthocal.sensors.protocol import Sensor
+from orthocal.sensors.rod_indicator import RodByBlade
+from orthocal.sensors.tips import Tip
 from orthocal.session.session import Session
 from orthocal.statistics.zeros import project_out_zeros
 
 Array = NDArray[np.float64]
 
 MOST_READINGS = 60
-"""Of a session that are looked at, spread over it."""
+"""Largest number of readings that are compared, spread over the session."""
+
+EDGE = Tip("blade", 0.0, 1.0)
+"""Tip that differs least from one that touches a line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Idealised:
-    """Readings of something that nothing touches."""
+    """Largest difference between the line model and a rod that the gauge may touch."""
 
     setup: str
-    """Where that matters most."""
+    """Setup with the largest difference."""
     touches: str
-    """What may be touched there, the first of its kind."""
+    """Name of the rod that the gauge may touch."""
     size: float
-    """How far a reading of it may be from what is modelled: one standard deviation of a machine
-    within its tolerances, gauge zeros taken off, [m]."""
+    """Difference of a reading, gauge zeros eliminated: one standard deviation over machines drawn
+    from the priors, [m]."""
 
 
 def find_idealised(session: Session) -> Idealised | None:
-    """Where a session's sensors are idealised most, and how much that may be; None where not."""
-    real = {
-        name: found
+    """Largest difference of a session's readings from those of a rod; None without a line model."""
+    rods = {
+        name: sensors
         for name, s in session.setups.items()
-        if (found := real_sensors(s.sensor, session.robot))
+        if (sensors := _rod_sensors(s.sensor, session.robot))
     }
-    if not real:
+    if not rods:
         return None
-    chosen = [r for r in session.readings if r.setup in real]
+    chosen = [r for r in session.readings if r.setup in rods]
     few = tuple(chosen[:: -(-len(chosen) // MOST_READINGS)])
     if not few:
         return None
     part = replace(session.select(few), parts=())
-    as_said = _first_order(part)
-    touched = {n: next(iter(real[n])) for n in part.setups}
-    setups = {n: replace(s, sensor=real[n][touched[n]]) for n, s in part.setups.items()}
-    sizes = np.linalg.norm(_first_order(replace(part, setups=setups)) - as_said, axis=1)
+    of_line = _first_order(part)
+    touched = {n: next(iter(rods[n])) for n in part.setups}
+    setups = {n: replace(s, sensor=rods[n][touched[n]]) for n, s in part.setups.items()}
+    sizes = np.linalg.norm(_first_order(replace(part, setups=setups)) - of_line, axis=1)
     worst = int(sizes.argmax())
     return Idealised(few[worst].setup, touched[few[worst].setup], float(sizes[worst]))
 
 
 def _first_order(session: Session) -> Array:
-    """Readings of the nominal machine, and of one tolerance of each error, zeros taken off, [m].
+    """Nominal readings and their change by one standard deviation of each error, [m].
+
+    Gauge zeros are eliminated.
 
     Shape (n_readings, 1 + n_errors).
     """
@@ -64,3 +73,13 @@ def _first_order(session: Session) -> Array:
     o = problem.observations
     columns = np.column_stack([h, jacobian[:, : problem.n_machine]])
     return np.asarray(o.rows(project_out_zeros(columns, o)))
+
+
+def _rod_sensors(sensor: Sensor, robot: Robot) -> dict[str, Sensor]:
+    """Sensors on the rods that a gauge of the line model may touch, by rod; empty for others."""
+    if not isinstance(sensor, LegIndicator):
+        return {}
+    return {
+        rod: RodByBlade(sensor.leg, rod, sensor.direction, sensor.section, EDGE, sensor.mounting)
+        for rod in robot.legs[sensor.leg].rods
+    }

@@ -139,8 +139,8 @@ def measure_unmodelled(fit: Fit, others: OtherErrors) -> tuple[Unmodelled, Array
     """What errors of the machine that were not free do to an estimate.
 
     Returns:
-        That, of the machine's parameters; and standard deviations of what the sensors' unknowns
-        take on, shape (n_unknowns,), [SI].
+        Effect on the machine's parameters; and standard deviations of the effect on the nuisance
+        parameters, shape (n_nuisance,), [SI].
     """
     problem = fit.problem
     n = problem.n_machine

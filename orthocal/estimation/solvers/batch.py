@@ -64,7 +64,7 @@ class BatchProgram:
         self, problem: CalibrationProblem, *, options: SolverOptions | None = None
     ) -> None:
         self.problem = problem
-        self.options = options or SolverOptions(solver="eliminated")
+        self.options = options or SolverOptions(solver="variable-projection")
 
     def solve(self, values: ArrayLike, *, sigma: float) -> BatchSolution:
         """Solve for each set of readings.

@@ -10,7 +10,7 @@ from orthocal.estimation.solvers.program import Program
 def build_program(problem: CalibrationProblem, options: SolverOptions | None = None) -> Program:
     """A problem prepared for the chosen solver; Ipopt by default."""
     chosen = options or SolverOptions()
-    if chosen.solver == "eliminated":
+    if chosen.solver == "variable-projection":
         from orthocal.estimation.solvers.variable_projection import VariableProjection
 
         return VariableProjection(problem, options=chosen)

@@ -205,12 +205,12 @@ class SymbolicProblem:
             sensor = setups[int(problem.observations.setup[group.entries[0]])].sensor
             frames = sensor.frames(robot)
             values = ca.SX.sym("constants", group.constants.shape[1])
-            unknowns = ca.SX.sym("nuisance", group.nuisance.shape[1])
+            symbols = ca.SX.sym("nuisance", group.nuisance.shape[1])
             poses = [machine.frame_pose(f) for f in frames.in_posture]
             at_zero = [at_reference.frame_pose(f) for f in frames.at_zero]
             constants.append(values)
-            nuisance.append(unknowns)
-            readings.append(express_reading(robot, sensor, poses, at_zero, values, unknowns))
+            nuisance.append(symbols)
+            readings.append(express_reading(robot, sensor, poses, at_zero, values, symbols))
         scale = closure_row_units(robot) / LENGTH_SCALE
         return DirectExpressions(
             theta,

@@ -51,7 +51,7 @@ class VariableProjection:
         self, problem: CalibrationProblem, *, options: SolverOptions | None = None
     ) -> None:
         self.problem = problem
-        self.options = options or SolverOptions(solver="eliminated")
+        self.options = options or SolverOptions(solver="variable-projection")
 
     def with_problem(self, problem: CalibrationProblem) -> VariableProjection:
         """The same solver for another problem; nothing is built."""

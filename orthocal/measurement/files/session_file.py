@@ -33,7 +33,7 @@ from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, Ga
 from orthocal.measurement.files.session_robot import build_offsets, require_given_zero
 from orthocal.observation.contacts import locate_contacts
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import Sensor, SetupKeys, Unknown, default_zero
+from orthocal.sensors.protocol import NuisanceParameter, Sensor, SetupKeys, default_zero
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge, Posture, Purpose, Reading, Session, Setup
 from orthocal.units import DRIVE_UNITS, MM
@@ -298,9 +298,9 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
 
 def _check_shared(setups: Mapping[str, Setup], file: str) -> None:
     """Refuse setups that share what they cannot: at another place, or known otherwise."""
-    first: dict[tuple[str, str], tuple[Setup, Unknown]] = {}
+    first: dict[tuple[str, str], tuple[Setup, NuisanceParameter]] = {}
     for setup in setups.values():
-        for unknown in setup.sensor.unknowns:
+        for unknown in setup.sensor.nuisance_parameters:
             owner = f"gauge {setup.gauge}" if unknown.of_gauge else unknown.shared_by
             if owner is None:
                 continue

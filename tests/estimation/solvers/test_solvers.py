@@ -42,7 +42,7 @@ CHOICES = {
 }
 
 
-SOLVERS = ("eliminated",)
+SOLVERS = ("variable-projection",)
 """Held against Ipopt."""
 
 
@@ -141,7 +141,7 @@ def test_a_calibration_says_by_which_solver_it_was_found(root, tmp_path):
     session = exact(load_session(root / "examples/table1/experiment-2"))
     found = {
         kind: calibrate(session, solver=SolverOptions(solver=kind))
-        for kind in ("ipopt", "eliminated", "linearised")
+        for kind in ("ipopt", "variable-projection", "linearised")
     }
     for kind, result in found.items():
         assert result.solver.name == kind
