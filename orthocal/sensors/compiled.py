@@ -68,7 +68,7 @@ def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
     if reading.probe is not None and _probe(pattern) != reading.probe:
         raise OrthocalError(
             f"the expression of a sensor '{sensor.kind}' depends on more than its frames, "
-            "constants and nuisance parameters: what differs between setups belongs into `constants`"
+            "constants and nuisance parameters: put what differs between setups into `constants`"
         )
     return reading
 

@@ -1,8 +1,8 @@
 """Line model of the paper: an indicator on the base measures the line of a leg.
 
 The gauge touches the leg where its line, from root to tip, crosses the plane of the section, like
-an edge across leg and plunger. If the plunger is square to the leg, the reading is the coordinate of
-that point along the direction of the plunger:
+an edge across leg and plunger. If the plunger is square to the leg, the reading is the coordinate
+of that point along the direction of the plunger:
 
     h = d · (root + t (tip − root)),  t = (c − a · root)/(a · (tip − root))
 

@@ -214,7 +214,7 @@ def test_what_differs_between_setups_belongs_into_constants(plan):
 
     compile_reading(plan.robot, Selfish("x", 1e-3, None))
     compile_reading(plan.robot, Selfish("x", 2e-3, None))
-    with pytest.raises(OrthocalError, match="belongs into `constants`"):
+    with pytest.raises(OrthocalError, match="into `constants`"):
         compile_reading(plan.robot, Selfish("y", 1e-3, None))
 
 
