@@ -1,10 +1,10 @@
 """What all errors of a machine are worth to somebody with a dial, and what spoils it.
 
-Simulated: machines with all errors at tolerance, read as a workshop reads them, by a ball on a rod
-with a dial that stands as crooked as a hand makes it: the paper's seven postures, 18 readings. The
-main loop twice: measure, calibrate, enter the offsets, measure again. No calibration reads the
-truth; it is used at the end to see how far each one is from it. Errors of the tool are told with
-shift and rotation of the whole region taken out: a workpiece is aligned on the machine.
+Simulated: machines with all errors within their tolerances, read by a ball on a rod with a dial
+that stands as crooked as a hand makes it: the paper's seven postures, 18 readings. The main loop
+twice: measure, calibrate, enter the offsets, measure again. No calibration reads the truth; it is
+used at the end to see how far each one is from it. Errors of the tool are told with shift and
+rotation of the whole region taken out: a workpiece is aligned on the machine.
 """
 
 from collections import defaultdict
@@ -23,8 +23,8 @@ from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.mounting import EXACT
 
 MACHINES = 4
-FIRST = {"*.offset_mm": 2.0}  # the workshop's word for its offsets, one sigma
-AGAIN = {"*.offset_mm": 0.5}  # once they were entered
+FIRST = {"*.offset_mm": 4.0}  # limits of the offsets, ±2 standard deviations
+AGAIN = {"*.offset_mm": 1.0}  # once they were entered
 
 plan = orthocal.load_plan(Path(__file__).parent / "workshop/plan.yaml")
 robot, space = plan.robot, cube(plan.robot, points_a_side=5)  # ±60 mm around the mechanical zero

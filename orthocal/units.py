@@ -39,6 +39,9 @@ EDGE_UNITS: dict[Unit, tuple[str, float]] = {
 }
 """SI unit to the unit in which users read errors, and its size."""
 
+LIMIT = 2.0
+"""Prior standard deviations in a tolerance that users state or read."""
+
 DRIVE_UNITS: dict[Unit, tuple[str, float]] = {"m": ("mm", MM), "rad": ("deg", DEG)}
 """SI unit to the unit in which users read drive and joint coordinates, and its size."""
 
@@ -58,6 +61,16 @@ class InUnit:
     def edge_factor(self) -> float:
         """Factor from SI to the unit that users read."""
         return 1.0 / EDGE_UNITS[self.unit][1]
+
+
+def read_limit(value: float) -> float:
+    """Prior standard deviation of a stated tolerance, a limit of ±2 prior standard deviations."""
+    return value / LIMIT
+
+
+def show_limit(std: float) -> float:
+    """Tolerance that states a prior standard deviation; inverse of `read_limit`."""
+    return std * LIMIT
 
 
 def to_mm(value: float) -> float:

@@ -106,10 +106,10 @@ DIAL = """
 sigma_mm: 0.005
 resolution_mm: 0.01
 range_mm: [-5, 5]
-scale_tolerance: 0.002
+scale_tolerance: 0.004
 tip: {ball: {radius_mm: 1.5}}
-direction_tolerance_mrad: 10
-section_tolerance_mm: 0.5
+direction_tolerance_mrad: 20
+section_tolerance_mm: 1
 """
 
 STUDY = SimpleNamespace(document={"kind": "none", "draws": 4}, digest="0" * 64, task_sizes=[2] * 4)

@@ -144,7 +144,7 @@ CALIBRATE = f"calibrate {EXPERIMENT}"
         (
             "docs/planning.md",
             "Expected tool error",
-            "plan orthoglide --tolerance '*.offset_mm=2' --out out/monday",
+            "plan orthoglide --tolerance '*.offset_mm=4' --out out/monday",
         ),
         (
             "docs/planning.md",
@@ -215,6 +215,6 @@ def test_the_session_that_a_page_shows_can_be_read(tmp_path):
     loaded = load_session(tmp_path)
     np.testing.assert_allclose(loaded.values, [0.0, 0.21e-3, -0.18e-3], rtol=1e-12)
     assert loaded.purpose == Purpose("full")
-    assert loaded.robot.parameters.stated == {"*.offset_mm": 2.0}
+    assert loaded.robot.parameters.stated == {"*.offset_mm": 4.0}
     with pytest.raises(NotIdentifiableError, match=r"do not determine z_slide\.offset"):
         calibrate(loaded, "offsets")  # "If readings leave an offset open, orthocal says so."

@@ -297,7 +297,7 @@ def talk(command, answers, cwd):
 def test_invalid_answers_are_asked_for_again(root, tmp_path):
     answers = ["250000\n", "\n", "250\n", "10:600\n", "100:320\n", "30\n", "60\n", "40\n", "4\n"]
     answers += ["sideways\n", "up,down,up\n", "0\n", "90\n", "40:30\n", "-50:60,-50:60,-40:40\n"]
-    answers += ["0\n", "1.5\n"]
+    answers += ["0\n", "3\n"]
     command = [sys.executable, "-m", "orthocal", "new", str(tmp_path / "mill"), "--paper"]
     code, said = talk(command, answers, root)
     assert code == 0, said
@@ -308,14 +308,14 @@ def test_invalid_answers_are_asked_for_again(root, tmp_path):
     assert "  found 'sideways'; expected up or down" in said
     assert "  the machine does not reach the workspace ±90 mm" in said
     assert "  found '40:30'; expected half the side of a cube" in said
-    assert "  found 0 mm; expected more than 0, and at most 50 mm" in said
+    assert "  found 0 mm; expected more than 0, and at most 100 mm" in said
     assert "Plan: 24 readings in 6 setups." in said
     robot = load_robot(tmp_path / "mill")
     assert robot.workspace.tolist() == [[-0.05, 0.06], [-0.05, 0.06], [-0.04, 0.04]]
     assert [d.direction for d in robot.drives] == [1, -1, 1]
     assert robot.legs["x"].rods["a"].radius == pytest.approx(0.004)
     session = load_plan(tmp_path / "mill/first")
-    assert session.robot.parameters.stated == {"*.offset_mm": 1.5}
+    assert session.robot.parameters.stated == {"*.offset_mm": 3.0}
 
 
 def test_nothing_is_written_when_the_input_ends(root, tmp_path):
@@ -345,7 +345,7 @@ def test_options_are_not_asked_for(monkeypatch):
 
 @pytest.mark.slow
 def test_without_paper_a_plan_is_chosen(capsys, tmp_path):
-    given = [*options(), "--tolerance", "*.offset_mm=2"]
+    given = [*options(), "--tolerance", "*.offset_mm=4"]
     code, out, err = run(capsys, "new", tmp_path / "mill", *given)
     assert code == 0
     steps = [line.split()[1] for line in err.splitlines()]
@@ -360,7 +360,7 @@ def test_without_paper_a_plan_is_chosen(capsys, tmp_path):
     session = load_plan(first)
     assert {s.sensor.tip.form for s in session.setups.values()} == {"ball"}
     assert session.purpose == Purpose("full")
-    assert session.robot.parameters.stated == {"*.offset_mm": 2.0}
+    assert session.robot.parameters.stated == {"*.offset_mm": 4.0}
     assert session.robot.parameters["y_slide.offset"].tolerance == 2e-3
     machine = load_robot(tmp_path / "mill")  # what is planned for it later goes by them, too
     assert machine.parameters["y_slide.offset"].tolerance == 2e-3

@@ -44,7 +44,7 @@ def test_main_job(root, workplace):
 def test_prepare_measure_calibrate_and_use(root, workplace):
     words = ["--leg-mm", 250, "--travel-mm", "100:325", "--attachment-mm", 30]
     words += ["--rods-apart-mm", 60, "--rod-radius-mm", 4, "--counts", "up,up,up"]
-    run("new", "mill", *words, "--at-zero-mm", 0, "--tolerance", "*.offset_mm=2", cwd=workplace)
+    run("new", "mill", *words, "--at-zero-mm", 0, "--tolerance", "*.offset_mm=4", cwd=workplace)
     assert (workplace / "mill/first/sheet.html").is_file()
     run("view", "mill", "--html", "mill.html", cwd=workplace)
     draw = ["--draw", "*", "--seed", 3]

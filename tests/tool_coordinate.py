@@ -14,6 +14,7 @@ import numpy as np
 from orthocal.errors import SessionError
 from orthocal.io.documents import Name, PositiveNumber
 from orthocal.sensors.protocol import Contact, Frames, NuisanceParameter, SetupKeys
+from orthocal.units import read_limit
 
 
 class ToolKeys(SetupKeys):
@@ -60,7 +61,7 @@ class ToolCoordinate:
     @property
     def nuisance_parameters(self):
         shared = None if self.dial is None else f"dial.{self.dial}"
-        return (NuisanceParameter("slope", "1", self.slope_tolerance, shared),)
+        return (NuisanceParameter("slope", "1", read_limit(self.slope_tolerance), shared),)
 
     def aligned_to(self, robot):
         return {}

@@ -110,7 +110,7 @@ def compare_models(
     Args:
         sessions: The session, or several, or paths to them.
         models: Models of the robot's YAML; all by default.
-        tolerances: Name or glob with its unit, such as `*.offset_mm`, to another standard deviation
+        tolerances: Name or glob with its unit, such as `*.offset_mm`, to another tolerance
             than the robot's.
         repeat: Another session of the same rows, or several: whether what remains repeats.
         options: Which solver, and how it is run.

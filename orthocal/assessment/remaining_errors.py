@@ -15,7 +15,7 @@ from orthocal.calibration.calibration import Calibration
 Array = NDArray[np.float64]
 
 NOTABLE = 0.1
-"""Tolerances by which a parameter must be off to be named in a combination."""
+"""Prior standard deviations by which a parameter must be off to be named in a combination."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +25,7 @@ class RemainingError:
     rms: float
     """Over the workspace, shift and rotation taken out, [m]."""
     parts: tuple[tuple[str, float], ...]
-    """Parameters and by how many tolerances each is off, the largest first."""
+    """Parameters and by how many prior standard deviations each is off, the largest first."""
 
 
 def find_remaining_errors(

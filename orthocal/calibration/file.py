@@ -32,7 +32,7 @@ from orthocal.text import shorten
 
 Array = NDArray[np.float64]
 
-SCHEMA = "orthocal/calibration/6"
+SCHEMA = "orthocal/calibration/7"
 
 FOLLOWS = 1e-9
 """Relative difference up to which a number is what it follows from: both are sums of doubles."""

@@ -19,10 +19,10 @@ AXES = "xyz"
 Box = tuple[tuple[float, float], ...]
 Answer = TypeVar("Answer")
 
-USUAL_OFFSET = "2"
+USUAL_OFFSET = "4"
 """Proposed tolerance of the home switches, [mm]."""
 
-LARGEST_OFFSET = 50.0
+LARGEST_OFFSET = 100.0
 """Largest tolerance of the home switches, [mm]."""
 
 
@@ -212,7 +212,7 @@ def ask_tolerance() -> list[str]:
         return [f"*.offset_mm={size:g}"]
 
     return _ask_until_valid(
-        "How far may the zeros of the joints be off, one standard deviation, mm? Enter alone: "
+        "By how much may the zeros of the joints be off, ± limit in mm? Enter alone: "
         f"{USUAL_OFFSET}, usual for home switches that were never measured",
         "--tolerance",
         read,

@@ -97,7 +97,10 @@ Free = Annotated[
 ]
 Tolerances = Annotated[
     list[str] | None,
-    Option(metavar="GLOB=VALUE", help="Tolerance instead of the robot's, such as '*.offset_mm=2'."),
+    Option(
+        metavar="GLOB=VALUE",
+        help="Tolerance (± limit) instead of the robot's, such as '*.offset_mm=4'.",
+    ),
 ]
 Error = Annotated[
     list[str] | None,

@@ -17,15 +17,15 @@ from orthocal.effects.protocol import Effect, EffectKeys, Symbols
 from orthocal.io.documents import PositiveNumber
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError
-from orthocal.units import MM, MRAD, PPM
+from orthocal.units import MM, MRAD, PPM, read_limit
 
 
 class DriveTolerances(EffectKeys):
-    """Tolerances of the drives, under `orthocal.tolerances`."""
+    """Tolerances of the drives under `orthocal.tolerances`: ±2 prior standard deviations."""
 
-    offset_mm: PositiveNumber = 5.0
-    offset_mrad: PositiveNumber = 10.0
-    scale_ppm: PositiveNumber = 100.0
+    offset_mm: PositiveNumber = 10.0
+    offset_mrad: PositiveNumber = 20.0
+    scale_ppm: PositiveNumber = 200.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +42,14 @@ class DriveErrors(Effect):
     @classmethod
     def from_keys(cls, keys: DriveTolerances, robot: Robot) -> Self:
         """The effect of a robot; arguments as for `Effect.from_keys`."""
-        size = {"m": keys.offset_mm * MM, "rad": keys.offset_mrad * MRAD}
+        size = {"m": read_limit(keys.offset_mm) * MM, "rad": read_limit(keys.offset_mrad) * MRAD}
         offsets = (
             ElementaryError(
                 f"{d.name}.offset", "offset", d.name, d.unit, size[d.unit], complete=True
             )
             for d in robot.drives
         )
-        scale = keys.scale_ppm * PPM
+        scale = read_limit(keys.scale_ppm) * PPM
         scales = (
             ElementaryError(f"{d.name}.scale", "scale", d.name, "1", scale, complete=True)
             for d in robot.drives

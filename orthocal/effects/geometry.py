@@ -22,14 +22,14 @@ from orthocal.io.documents import PositiveNumber
 from orthocal.robot.frames import hangs_on
 from orthocal.robot.model import Robot, joint_axis
 from orthocal.robot.parameters import AXES, ElementaryError
-from orthocal.units import MM, MRAD
+from orthocal.units import MM, MRAD, read_limit
 
 
 class GeometryTolerances(EffectKeys):
-    """Tolerances of placements, under `orthocal.tolerances`."""
+    """Tolerances of placements under `orthocal.tolerances`: ±2 prior standard deviations."""
 
-    translation_mm: PositiveNumber = 0.1
-    rotation_mrad: PositiveNumber = 1.0
+    translation_mm: PositiveNumber = 0.2
+    rotation_mrad: PositiveNumber = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +88,13 @@ def _error(
     owner: str, axis: int, keys: GeometryTolerances, *, complete: bool, of_frame: bool
 ) -> ElementaryError:
     translation = axis < 3
+    limit = keys.translation_mm * MM if translation else keys.rotation_mrad * MRAD
     return ElementaryError(
         name=f"{'frame.' if of_frame else ''}{owner}.{AXES[axis]}",
         kind="translation" if translation else "rotation",
         owner=owner,
         unit="m" if translation else "rad",
-        tolerance=keys.translation_mm * MM if translation else keys.rotation_mrad * MRAD,
+        tolerance=read_limit(limit),
         of_frame=of_frame,
         axis=axis,
         complete=complete,

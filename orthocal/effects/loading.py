@@ -25,7 +25,7 @@ MODELS: Mapping[str, Sequence[str]] = {"offsets": ("*.offset",), "full": COMPLET
 
 
 class ToleranceKeys(GeometryTolerances, DriveTolerances):
-    """Keys under `orthocal.tolerances`: one standard deviation of each kind of error."""
+    """Keys under `orthocal.tolerances`: ±2 prior standard deviations of each kind of error."""
 
     overrides: dict[str, PositiveNumber] = Field(default_factory=dict)
     """Parameter name or glob, with the unit as suffix, to value; later ones win."""

@@ -11,6 +11,7 @@ from orthocal.errors import ParameterError
 from orthocal.estimation.selection import Known, Selection, complete_model, select_parameters
 from orthocal.robot.parameters import ParameterSet
 from orthocal.session.session import Purpose, Session
+from orthocal.units import read_limit
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +27,9 @@ class Choice:
         free: Names or globs that are free too, or instead where no model is named; '!' takes out.
         prior: Whether tolerances act as a prior; by default not where only offsets are free.
         known: Name with its unit to a known value, which is then held, or to a value and its
-            standard deviation, which then act as prior.
-        tolerances: Name or glob with its unit to another standard deviation than the robot's.
+            tolerance, a limit of ±2 standard deviations, which then act as prior.
+        tolerances: Name or glob with its unit to another tolerance than the robot's, a limit of
+            ±2 prior standard deviations.
         bounds: Name or glob with its unit to lowest and highest value, ±inf for open.
         base: Identify base parameters instead, without any prior: of what the readings cannot
             tell apart one parameter stays, and stands for the whole combination.
@@ -136,7 +138,7 @@ def _known(known: Mapping[str, Known], parameters: ParameterSet) -> dict[str, Kn
         if name in result:
             raise ParameterError(f"'{name}' is given twice", where="known")
         if isinstance(value, tuple):
-            result[name] = (value[0] * factor, value[1] * factor)
+            result[name] = (value[0] * factor, read_limit(value[1]) * factor)
         else:
             result[name] = value * factor
     return result

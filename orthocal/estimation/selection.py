@@ -15,7 +15,7 @@ from orthocal.io.documents import parse_number
 from orthocal.io.fields import read_only
 from orthocal.robot.parameters import Parameter, ParameterSet, require_tolerance
 from orthocal.text import composed
-from orthocal.units import Unit
+from orthocal.units import Unit, show_limit
 
 Array = NDArray[np.float64]
 Known = float | tuple[float, float]
@@ -295,9 +295,10 @@ def _label(model: str | None, free: Sequence[str]) -> str:
 def _refuse_length(value: float, parameter: Parameter) -> None:
     if abs(value) > LARGEST_KNOWN * parameter.tolerance:
         factor, unit = parameter.edge_factor, parameter.edge_unit
+        limit = show_limit(parameter.tolerance) * factor
         raise ParameterError(
             f"'{parameter.name}' is {value * factor:g} {unit}; expected the deviation from nominal "
-            f"(its tolerance is {parameter.tolerance * factor:g} {unit}), not the whole length"
+            f"(its tolerance is {limit:g} {unit}), not the whole length"
         )
 
 

@@ -49,15 +49,17 @@ def draw_errors(
     seed: int,
     tolerances: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
-    """Errors drawn from the tolerances: independent, normal with mean 0, or half-normal.
+    """Errors drawn from their priors: independent, normal with mean 0, or half-normal.
+
+    A tolerance is a limit of ±2 standard deviations, so about one error in twenty exceeds it.
 
     Args:
         robot: The robot.
         patterns: Names or globs of the parameters to draw; '!' takes out. Of a sum and the errors
             that it is made of only these are drawn.
         seed: Of the random numbers.
-        tolerances: Name or glob with its unit, such as `*.offset_mm`, to another standard deviation
-            than the robot's.
+        tolerances: Name or glob with its unit, such as `*.offset_mm`, to another tolerance than
+            the robot's, a limit of ±2 standard deviations.
 
     Raises:
         ParameterError: If a pattern matches nothing.

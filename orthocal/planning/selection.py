@@ -253,7 +253,7 @@ class SetupSearch:
                 f"no setup can have {count} readings within the gauge's range, of which the "
                 f"tolerances of the machine need {self.candidates.spare_range / MM:.2g} mm to "
                 "either side; expected fewer readings a setup, a larger range, smaller tolerances "
-                "such as --tolerance '*.offset_mm=1', or more postures",
+                "such as --tolerance '*.offset_mm=2', or more postures",
                 where="plan",
             )
         return ranked[0]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from orthocal.arguments import require_numbers
 from orthocal.errors import ParameterError
 from orthocal.text import composed
-from orthocal.units import UNIT_SUFFIXES, InUnit, Unit
+from orthocal.units import UNIT_SUFFIXES, InUnit, Unit, read_limit, show_limit
 
 COMPLETE: Literal["complete"] = "complete"
 """A model of every error that changes something."""
@@ -241,8 +241,9 @@ class ParameterSet:
         """Errors with some tolerances replaced.
 
         Args:
-            given: Name or glob with its unit, such as `*.offset_mm`, to one standard deviation in
-                that unit; they come on top of those that are stated already, and later ones win.
+            given: Name or glob with its unit, such as `*.offset_mm`, to a limit of ±2 prior
+                standard deviations in that unit. They are added to those that are stated already;
+                later ones win.
 
         Raises:
             ParameterError: If a name or unit is unknown, or a number makes no sense.
@@ -293,7 +294,10 @@ class ParameterSet:
         return glob, factor
 
     def read_tolerances(self, given: Mapping[str, float]) -> dict[str, float]:
-        """Names or globs with their units to numbers, as names or globs to numbers in SI.
+        """Prior standard deviations of stated tolerances: name or glob to value, [SI].
+
+        Args:
+            given: Name or glob with its unit to a limit of ±2 prior standard deviations.
 
         Raises:
             ParameterError: If a name or unit is unknown.
@@ -305,7 +309,7 @@ class ParameterSet:
                 glob, factor = self.read_glob(key)
             except ParameterError as e:
                 raise ParameterError(e.problem, where=e.where or "tolerances") from None
-            result[glob] = value * factor
+            result[glob] = read_limit(value) * factor
         return result
 
     def expand(self, values: Mapping[str, float]) -> dict[str, float]:
@@ -337,7 +341,7 @@ def require_tolerance(value: float, parameter: Parameter) -> float:
     Raises:
         ParameterError: Naming both.
     """
-    unit, factor = parameter.edge_unit, parameter.edge_factor
+    unit, factor = parameter.edge_unit, show_limit(parameter.edge_factor)
     if not (math.isfinite(value) and value >= SMALLEST_TOLERANCE):
         raise ParameterError(
             f"the tolerance of '{parameter.name}' is {value * factor:g} {unit}; expected at least "
@@ -378,7 +382,8 @@ def build_parameters(
     Args:
         elementary: All elementary errors, in order.
         sums: Name of a sum to names of elementary errors; a leading '-' subtracts.
-        overrides: Parameter name or glob with its unit as suffix to a tolerance; later ones win.
+        overrides: Parameter name or glob with its unit as suffix to a tolerance, a limit of ±2
+            prior standard deviations; later ones win.
         models: Model name to patterns, or to COMPLETE.
         find_redundant: As for `ParameterSet`.
 
@@ -404,7 +409,7 @@ def build_parameters(
             )
         for name in found:
             _check_unit(key, unit, parameters[name])
-            parameters[name] = replace(parameters[name], tolerance=value * factor)
+            parameters[name] = replace(parameters[name], tolerance=read_limit(value) * factor)
     result = ParameterSet(elementary, parameters.values(), models, find_redundant=find_redundant)
     for model, patterns in models.items():
         if patterns == COMPLETE:

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from orthocal.io.documents import Name, Number
 from orthocal.sensors.protocol import NuisanceParameter
-from orthocal.units import MM, MRAD, tidy
+from orthocal.units import MM, MRAD, read_limit, show_limit, tidy
 
 DIRECTION = 10 * MRAD
 """Direction of a plunger aligned by eye, [rad]."""
@@ -31,9 +31,9 @@ SCALE = 0.002
 SQUARE = 0.1 * MRAD
 """Squareness of a block, [rad]."""
 
-LARGEST_TOLERANCE_MM = 20.0
-LARGEST_TOLERANCE_MRAD = 200.0
-LARGEST_SCALE = 0.2
+LARGEST_TOLERANCE_MM = 40.0
+LARGEST_TOLERANCE_MRAD = 400.0
+LARGEST_SCALE = 0.4
 
 Millimetres = Annotated[Number, Field(ge=0.0, le=LARGEST_TOLERANCE_MM)]
 Milliradians = Annotated[Number, Field(ge=0.0, le=LARGEST_TOLERANCE_MRAD)]
@@ -44,11 +44,11 @@ class MountingKeys(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
-    direction_tolerance_mrad: Milliradians = DIRECTION / MRAD
-    section_tolerance_mm: Millimetres = SECTION / MM
-    lateral_tolerance_mm: Millimetres = SECTION / MM
+    direction_tolerance_mrad: Milliradians = show_limit(DIRECTION) / MRAD
+    section_tolerance_mm: Millimetres = show_limit(SECTION) / MM
+    lateral_tolerance_mm: Millimetres = show_limit(SECTION) / MM
     """Lateral position of a ball; other tips have none."""
-    scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] = SCALE
+    scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] = show_limit(SCALE)
     """Scale of the dial: one for all setups with the same gauge."""
     stand: Name | None = None
     """Square block that several setups of this leg share, with its roll."""
@@ -83,12 +83,12 @@ class Mounting:
         """Build from the keys of a session.yaml."""
         square = keys.square_tolerance_mrad
         return Mounting(
-            direction=tidy(keys.direction_tolerance_mrad * MRAD),
-            section=tidy(keys.section_tolerance_mm * MM),
-            lateral=tidy(keys.lateral_tolerance_mm * MM),
-            scale=keys.scale_tolerance,
+            direction=tidy(read_limit(keys.direction_tolerance_mrad) * MRAD),
+            section=tidy(read_limit(keys.section_tolerance_mm) * MM),
+            lateral=tidy(read_limit(keys.lateral_tolerance_mm) * MM),
+            scale=read_limit(keys.scale_tolerance),
             stand=keys.stand,
-            square=SQUARE if square is None else tidy(square * MRAD),
+            square=SQUARE if square is None else tidy(read_limit(square) * MRAD),
         )
 
     def to_keys(self) -> dict[str, Any]:
@@ -100,7 +100,9 @@ class Mounting:
             "scale_tolerance": (self.scale, USUAL.scale, 1.0),
             "square_tolerance_mrad": (self.square, USUAL.square, MRAD),
         }
-        keys = {k: tidy(v / unit) for k, (v, usual, unit) in values.items() if v != usual}
+        keys = {
+            k: tidy(show_limit(v) / unit) for k, (v, usual, unit) in values.items() if v != usual
+        }
         return keys if self.stand is None else {**keys, "stand": self.stand}
 
     def nuisance_parameters(self, *, ball: bool) -> tuple[NuisanceParameter, ...]:

@@ -296,7 +296,7 @@ class Session:
         """Session of the robot with other tolerances.
 
         Args:
-            given: Name or glob with its unit to one standard deviation.
+            given: Name or glob with its unit to a limit of ±2 prior standard deviations.
 
         Raises:
             ParameterError: If a name or unit is unknown, or a number makes no sense.

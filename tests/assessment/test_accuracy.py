@@ -295,7 +295,7 @@ def test_a_robot_without_a_tool_is_refused(fivebar):
 @pytest.fixture(scope="module")
 def calibrated(root):
     return calibrate(
-        root / "examples/sweep", Choice(model="lengths", tolerances={"*.offset_m": 2e-3})
+        root / "examples/sweep", Choice(model="lengths", tolerances={"*.offset_m": 4e-3})
     )
 
 
@@ -324,11 +324,11 @@ def test_what_is_entered_is_in_where_the_tool_is_then(calibrated):
 def test_offsets_alone_are_as_good_as_the_machines_are(root):
     """What is promised of them, whatever scatters; all errors but those of rods' ends and drives
     are in the independent model's 0.102 and 0.045 mm."""
-    choice = Choice("offsets", tolerances={"*.offset_m": 2e-3})
+    choice = Choice("offsets", tolerances={"*.offset_m": 4e-3})
     found = assess_tool(calibrate(root / "examples/sweep", choice))
     assert found.after.sizes.relative.rms * 1e3 == pytest.approx(0.102, rel=0.05)
     assert found.after.sizes.aligned.rms * 1e3 == pytest.approx(0.045, rel=0.06)
-    full = calibrate(root / "examples/sweep", Choice(model="full", tolerances={"*.offset_m": 2e-3}))
+    full = calibrate(root / "examples/sweep", Choice(model="full", tolerances={"*.offset_m": 4e-3}))
     # the same model's bound with all errors, fitted to their full model (0.0127), is below this
     assert 0.0120 < assess_tool(full).after.sizes.aligned.rms * 1e3 < 0.0145
 
@@ -342,7 +342,7 @@ def test_the_truth_behind_the_examples_is_where_it_should_be(root):
     real = LoopClosure(robot, fixed=truth).forward(drives)
     for name, model, largest in (("sweep", "offsets", 2.0), ("lines", "full", 1.5)):
         result = calibrate(
-            session_folder(root, name), Choice(model=model, tolerances={"*.offset_m": 2e-3})
+            session_folder(root, name), Choice(model=model, tolerances={"*.offset_m": 4e-3})
         )
         error = space.remove_motion(result.machine.forward(drives) - real, space.points)
         found = np.sqrt(space.weights @ (error**2).sum(axis=1))
@@ -351,7 +351,7 @@ def test_the_truth_behind_the_examples_is_where_it_should_be(root):
 
 def test_remaining_errors_add_up_to_what_is_not_known(root):
     result = calibrate(
-        root / "examples/sweep", Choice(model="full", tolerances={"*.offset_m": 2e-3})
+        root / "examples/sweep", Choice(model="full", tolerances={"*.offset_m": 4e-3})
     )
     found = assess_tool(result)
     parts = find_remaining_errors(result, found, count=177)

@@ -18,7 +18,7 @@ from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.statistics.zeros import project_out_zeros
 
-OFFSETS = {"*.offset_mm": 2.0}
+OFFSETS = {"*.offset_mm": 4.0}
 
 
 @pytest.fixture(scope="module")

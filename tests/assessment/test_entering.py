@@ -113,7 +113,7 @@ def summed(tmp_path_factory, root):
     described = folder / "machine/machine.yaml"
     listed = "  parameters:\n    common: [x_slide.offset, y_slide.offset, -z_slide.offset]\n"
     text = described.read_text().replace("  parameters:\n", listed, 1)
-    described.write_text(text.replace("{offset_mm: 5,", "{offset_mm: 0.05,"))  # one by one
+    described.write_text(text.replace("{offset_mm: 10,", "{offset_mm: 0.1,"))  # one by one
     text = (root / "examples/raw-cycles/plan.yaml").read_text()
     (folder / "plan.yaml").write_text(text.replace("robot: orthoglide", "robot: machine"))
     plan = load_plan(folder / "plan.yaml")

@@ -23,7 +23,7 @@ from orthocal.statistics.chance import confidence_factor
 from orthocal.statistics.information import decompose
 
 SIGMA = 5e-6
-OFFSETS = {"*.offset_mm": 2.0}
+OFFSETS = {"*.offset_mm": 4.0}
 IN_SI = {"*.offset": 2e-3}
 MACHINES = {"sweep": 100, "lines": 40}
 """What the sweep leaves open is a handful of directions: the error of 20 machines scatters by 13 %,

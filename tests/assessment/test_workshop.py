@@ -78,7 +78,7 @@ def test_the_error_at_the_tool_is_what_is_predicted(root, name, offsets_mm, most
     drives = LoopClosure(robot).inverse(space.points)
     tool = ToolSensitivity(robot, free=names)(drives)
     program = VariableProjection(problem)
-    drawn = {"*.offset_mm": offsets_mm}
+    drawn = {"*.offset_mm": 2.0 * offsets_mm}
     squares, promised, hits = [], [], []
     for seed in range(MACHINES):
         rng = np.random.default_rng(seed)

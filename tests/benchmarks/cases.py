@@ -150,7 +150,7 @@ def resimulate(session: Session, *, seed: int) -> Session:
         session.robot,
         parameters.patterns(MODEL),
         seed=seed,
-        tolerances={f"{axis}_slide.offset_m": OFFSET_SIGMA for axis in plans.AXES},
+        tolerances={f"{axis}_slide.offset_m": 2.0 * OFFSET_SIGMA for axis in plans.AXES},
     )
     return simulate_session(session, errors, seed=seed, sigma=SIGMA).session
 

@@ -83,7 +83,7 @@ def test_bounds_are_open_where_none_is_given(parameters):
         ({"free": ["w_*"]}, r"'w_\*' matches no error parameter"),
         ({"model": "all"}, "'all' is not a model"),
         ({"tolerances": {"x_leg.length": 1e-4}}, "matches no free parameter"),
-        ({"tolerances": {"*.offset": 1e-12}}, "is 1e-09 mm; expected at least 1e-06 mm"),
+        ({"tolerances": {"*.offset": 1e-12}}, "is 2e-09 mm; expected at least 2e-06 mm"),
         ({"model": "full", "tolerances": {"x_*": 1e-3}}, "matches parameters in m, ppm and rad"),
         ({"bounds": {"*.offset": (1e-3, -1e-3)}}, "bounds: those of"),
         ({"known": {"x_slid.offset": 0.0}}, "did you mean x_slide.offset"),
@@ -106,11 +106,11 @@ def test_a_known_zero_of_a_sum_leaves_its_parts_free(parameters):
 
 def test_texts_carry_their_units(parameters):
     known = read_known(
-        ["x_leg.length_mm=0.12±0.02", "x_coupler.rx_mrad=-0.5+-0.1", "y_leg.length_um=7"],
+        ["x_leg.length_mm=0.12±0.04", "x_coupler.rx_mrad=-0.5+-0.2", "y_leg.length_um=7"],
         parameters,
         where="--known",
     )
-    tolerances = read_tolerances(["*.offset_mm=2"], parameters, where="-")
+    tolerances = read_tolerances(["*.offset_mm=4"], parameters, where="-")
     bounds = read_bounds(["x_slide.offset_mm=-2:", "x_coupler.rx_mrad=:1"], parameters, where="-")
     choice = Choice("lengths", known=known, tolerances=tolerances, bounds=bounds)
     selection = choice.select(parameters)

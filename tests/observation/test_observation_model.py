@@ -24,9 +24,9 @@ postures:
   x_min: {tcp_mm: [-100, 0, 0]}
   corner: {tcp_mm: [50, -40, 30]}
 setups:
-  tx: {sensor: tool, tool: x, slope_tolerance: 0.002, dial: d, gauge: fine}
-  ty: {sensor: tool, tool: y, slope_tolerance: 0.002, dial: d, gauge: fine}
-  tz: {sensor: tool, tool: z, slope_tolerance: 0.003, gauge: fine}
+  tx: {sensor: tool, tool: x, slope_tolerance: 0.004, dial: d, gauge: fine}
+  ty: {sensor: tool, tool: y, slope_tolerance: 0.004, dial: d, gauge: fine}
+  tz: {sensor: tool, tool: z, slope_tolerance: 0.006, gauge: fine}
   line: {leg: x, direction: y, section: {fraction: 0.5}, gauge: dial}
   rod: {leg: x, direction: z, section: {fraction: 0.4}, gauge: dial, touches: a,
     tip: {blade: {width_mm: 50, radius_mm: 0.5}}}

@@ -39,7 +39,7 @@ from orthocal.sensors.mounting import EXACT, Mounting
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Gauge
 
-OFFSETS = {"*.offset_mm": 2.0}
+OFFSETS = {"*.offset_mm": 4.0}
 DIAL = Gauge(5e-6, None, (-5e-3, 5e-3))
 BALL = Tip("ball", 1.5e-3)
 
@@ -111,7 +111,7 @@ def simulate_tool_error(plan, workspace, *, machines):
     names = problem.machine_selection.names
     truths = []
     for seed in range(machines):
-        drawn = draw_errors(robot, names, seed=seed, tolerances={"*.offset_mm": 0.2})
+        drawn = draw_errors(robot, names, seed=seed, tolerances={"*.offset_mm": 0.4})
         own = rng.normal(size=problem.n_free - problem.n_machine)
         truths.append([*(drawn[n] for n in names), *(own * problem.theta_scale[len(names) :])])
     theta = np.array(truths)
@@ -307,7 +307,7 @@ def test_the_memory_of_a_plan_is_released_with_it(orthoglide):
 def test_usual_plans_that_the_dial_cannot_read_have_no_expected_error(orthoglide):
     """The paper's readings differ by more than ±0.4 mm; they were listed as the better plan."""
     equipment = Equipment(gauge=Gauge(5e-6, 10e-6, (-4e-4, 4e-4)), sections=(0.5,), across=0.0)
-    choice = Choice("full", tolerances={"*.offset_mm": 0.2})
+    choice = Choice("full", tolerances={"*.offset_mm": 0.4})
     plan = plan_readings(orthoglide, choice, equipment=equipment, starts=1)
     assert [(a.name, a.expected) for a in plan.compared] == [("the paper's", None), ("even", None)]
     assert summarize(plan).count(OUT_OF_RANGE) == 2

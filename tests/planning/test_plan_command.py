@@ -24,7 +24,7 @@ DIAL = """sigma_mm: 0.002
 resolution_mm: 0.001
 range_mm: [-1, 1]
 tip: {blade: {width_mm: 20}}
-direction_tolerance_mrad: 5
+direction_tolerance_mrad: 10
 """
 
 
@@ -40,7 +40,7 @@ def test_a_plan_is_written_ready_to_measure(monkeypatch, capsys, tmp_path):
     dial = tmp_path / "dial.yaml"
     dial.write_text(DIAL)
     out = tmp_path / "monday"
-    entered = ["--tolerance", "*.offset_mm=0.5"]
+    entered = ["--tolerance", "*.offset_mm=1"]
     words = ["plan", "orthoglide", *QUICK, *entered, "--gauge", dial, "--out", out]
     code, text, err = run(monkeypatch, capsys, *words)
     assert code == 0
@@ -52,7 +52,7 @@ def test_a_plan_is_written_ready_to_measure(monkeypatch, capsys, tmp_path):
     }
     session = load_plan(out)
     assert session.purpose == Purpose("full")
-    assert session.robot.parameters.stated == {"*.offset_mm": 0.5}
+    assert session.robot.parameters.stated == {"*.offset_mm": 1.0}
     assert session.gauge.range == (-1e-3, 1e-3)
     assert {s.sensor.tip.form for s in session.setups.values()} == {"blade"}
     assert {s.sensor.mounting.direction for s in session.setups.values()} == {5e-3}
@@ -86,7 +86,7 @@ def test_one_process_gives_the_plan_of_two(monkeypatch, capsys, tmp_path, much):
 
 def test_an_error_in_a_worker_process_is_reported(monkeypatch, capsys):
     monkeypatch.setattr(cores, "can_fork", lambda: True)
-    words = ["orthoglide", *QUICK[:-1], 2, "--tolerance", "*.offset_mm=40", "--workers", 2]
+    words = ["orthoglide", *QUICK[:-1], 2, "--tolerance", "*.offset_mm=80", "--workers", 2]
     code, out, err = run(monkeypatch, capsys, "plan", *words)
     assert (code, out) == (2, "")
     last = err.splitlines()[-1]
@@ -219,7 +219,7 @@ def test_each_criterion_is_better_met_by_its_own_plan(orthoglide, for_the_headli
         (["orthoglide", "--touches", "c"], "touches: 'c' is not a rod of leg x; rods: a, b"),
         (["orthoglide", "--model", "all"], "'all' is not a model of this robot; models: offsets"),
         (
-            ["orthoglide", *QUICK, "--tolerance", "*.offset_mm=40"],
+            ["orthoglide", *QUICK, "--tolerance", "*.offset_mm=80"],
             "plan: no setup can have 3 readings within the gauge's range, of which the tolerances "
             "of the machine need",
         ),

@@ -90,13 +90,13 @@ def test_a_machine_is_made_again_from_its_sizes_in_one_place(tmp_path):
     assert {p.name: p.read_text() for p in folder.iterdir()} == before
     file.write_text(file.read_text().replace("leg_mm: 250", "leg_mm: 260"))
     yaml = folder / "mine.yaml"  # what else was changed there stays
-    yaml.write_text(yaml.read_text().replace("offset_mm: 5,", "offset_mm: 2,"))
+    yaml.write_text(yaml.read_text().replace("offset_mm: 10,", "offset_mm: 4,"))
     robot = remake_robot(folder)
     fresh = make_robot(replace(SMALL, leg=0.26), tmp_path / "mine.fresh", counting=COUNTING)
     assert (folder / "mine.urdf").read_text() == fresh.urdf.read_text()
     assert robot.drive_zero == pytest.approx([0.26] * 3)
     assert robot.parameters["x_slide.offset"].tolerance == pytest.approx(2e-3)
-    assert yaml.read_text().replace("offset_mm: 2,", "offset_mm: 5,").replace(
+    assert yaml.read_text().replace("offset_mm: 4,", "offset_mm: 10,").replace(
         "mine", ""
     ) == fresh.yaml.read_text().replace("mine.fresh", "")
 

@@ -18,7 +18,7 @@ postures:
   x_max: {tcp_mm: [60, 0, 0]}
 gauge: {sigma_mm: 0.002}
 setups:
-  tx: {sensor: tool, tool: x, slope_tolerance: 0.002}
+  tx: {sensor: tool, tool: x, slope_tolerance: 0.004}
 """
 
 

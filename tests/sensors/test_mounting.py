@@ -152,8 +152,8 @@ def test_what_is_known_exactly_is_no_unknown(tmp_path):
 
 
 def test_it_is_written_and_read(tmp_path):
-    own = ", stand: block, square_tolerance_mrad: 0.05, direction_tolerance_mrad: 4"
-    made = plan(tmp_path / "plan", yx=own, zx=own, yz=", lateral_tolerance_mm: 0.2")
+    own = ", stand: block, square_tolerance_mrad: 0.1, direction_tolerance_mrad: 8"
+    made = plan(tmp_path / "plan", yx=own, zx=own, yz=", lateral_tolerance_mm: 0.4")
     truth = {n: v for n, v in ERRORS.items() if n.endswith("offset")}
     session = simulate_session(made, truth, seed=1).session
     again = load_session(write_session(session, tmp_path / "session"))
@@ -168,11 +168,12 @@ def test_it_is_written_and_read(tmp_path):
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"yx": ", square_tolerance_mrad: 0.1"}, "setups.yx.square_tolerance_mrad: found without"),
+        ({"yx": ", square_tolerance_mrad: 0.2"}, "setups.yx.square_tolerance_mrad: found without"),
         ({"yx": BLOCK, "yz": BLOCK}, "setups.yz: shares the roll of 'stand.block' with 'yx'"),
         (
-            {"yx": BLOCK, "zx": f"{BLOCK}, direction_tolerance_mrad: 5"},
-            "setups.zx: shares the roll of 'stand.block' with 'yx', which has it known to 0.01 rad",
+            {"yx": BLOCK, "zx": f"{BLOCK}, direction_tolerance_mrad: 10"},
+            "setups.zx: shares the roll of 'stand.block' with 'yx', which states a tolerance of "
+            "0.02 rad",
         ),
         ({"zx": ", direction_tolerance_mrad: 900"}, "setups.zx.direction_tolerance_mrad"),
         ({"zx": ", section_tolerance_mm: -1"}, "setups.zx.section_tolerance_mm"),

@@ -53,9 +53,9 @@ postures:
   other: {tcp_mm: [-50, 40, -60]}
 controller: {offsets_mm: [0, 0, 0]}
 setups:
-  tx: {sensor: tool, tool: x, slope_tolerance: 0.002, dial: d, gauge: fine}
-  ty: {sensor: tool, tool: y, slope_tolerance: 0.002, dial: d, gauge: fine}
-  tz: {sensor: tool, tool: z, slope_tolerance: 0.003, gauge: fine}
+  tx: {sensor: tool, tool: x, slope_tolerance: 0.004, dial: d, gauge: fine}
+  ty: {sensor: tool, tool: y, slope_tolerance: 0.004, dial: d, gauge: fine}
+  tz: {sensor: tool, tool: z, slope_tolerance: 0.006, gauge: fine}
   yx: {leg: x, direction: y, section: {fraction: 0.5}, gauge: dial, postures: [zero, x_max, x_min]}
   zy: {leg: y, direction: z, section: {fraction: 0.5}, gauge: dial, postures: [zero, y_max, y_min]}
 cycles: 2

@@ -17,7 +17,7 @@ from orthocal.measurement.joining import join_sessions
 from orthocal.session.session import Purpose
 from orthocal.study.portable_session import PortableSession
 
-TOLERANCES = {"*_fork.rx_mrad": 3.0, "*_swivel.rx_mrad": 2.0, "*.offset_mm": 0.4}
+TOLERANCES = {"*_fork.rx_mrad": 6.0, "*_swivel.rx_mrad": 4.0, "*.offset_mm": 0.8}
 FORK = "x_fork.rx"
 
 
@@ -70,7 +70,7 @@ def test_options_come_before_what_a_session_says(stated):
     assert choose(Choice(free=["*.offset"]), stated).model is None
     only_known = choose(Choice(known={"x_leg.length_mm": 0.1}), stated)
     assert (only_known.model, dict(only_known.known)) == ("full", {"x_leg.length_mm": 0.1})
-    narrower = choose(Choice(tolerances={"x_fork.rx_mrad": 0.5}), stated).select(parameters)
+    narrower = choose(Choice(tolerances={"x_fork.rx_mrad": 1.0}), stated).select(parameters)
     sizes = {p.name: p.tolerance for p in narrower.parameters}
     assert sizes[FORK] == pytest.approx(0.5e-3)
     assert sizes["y_fork.rx"] == pytest.approx(3e-3)
@@ -94,10 +94,10 @@ def test_globs_instead_of_a_model(raw_cycles, tmp_path):
 
 
 def test_sessions_agree_or_are_asked(raw_cycles, stated, tmp_path):
-    also = say(raw_cycles, tmp_path / "also", model="full", tolerances={"*.scale_ppm": 50.0})
+    also = say(raw_cycles, tmp_path / "also", model="full", tolerances={"*.scale_ppm": 100.0})
     joined = join_sessions([stated, also])
     assert joined.purpose == Purpose("full")
-    assert joined.robot.parameters.stated == {**TOLERANCES, "*.scale_ppm": 50.0}
+    assert joined.robot.parameters.stated == {**TOLERANCES, "*.scale_ppm": 100.0}
     offsets = say(raw_cycles, tmp_path / "offsets", model="offsets")
     joined = join_sessions([stated, offsets])
     with pytest.raises(ParameterError) as e:
@@ -112,11 +112,11 @@ def test_sessions_agree_or_are_asked(raw_cycles, stated, tmp_path):
 
 
 def test_one_machine_has_one_tolerance(raw_cycles, stated, tmp_path):
-    other = say(raw_cycles, tmp_path, model="full", tolerances={"*.offset_mm": 2.0})
+    other = say(raw_cycles, tmp_path, model="full", tolerances={"*.offset_mm": 4.0})
     with pytest.raises(SessionError) as e:
         join_sessions([stated, other])
     assert str(e.value) == (
-        f"{other.path}: calibration.tolerances.*.offset_mm: is 2; it is 0.4 in {stated.path}, and "
+        f"{other.path}: calibration.tolerances.*.offset_mm: is 4; it is 0.8 in {stated.path}, and "
         "the machine is the same"
     )
 
@@ -128,10 +128,10 @@ def test_a_worker_gets_them(stated):
 
 
 def test_later_ones_come_on_top(orthoglide):
-    parameters = orthoglide.parameters.with_tolerances({"*.offset_mm": 2.0})
-    parameters = parameters.with_tolerances({"x_slide.offset_mm": 1.0})
+    parameters = orthoglide.parameters.with_tolerances({"*.offset_mm": 4.0})
+    parameters = parameters.with_tolerances({"x_slide.offset_mm": 2.0})
     assert [parameters[f"{a}_slide.offset"].tolerance for a in "xyz"] == [1e-3, 2e-3, 2e-3]
-    parameters = parameters.with_tolerances({"*.offset_mm": 0.5})
+    parameters = parameters.with_tolerances({"*.offset_mm": 1.0})
     assert {parameters[f"{a}_slide.offset"].tolerance for a in "xyz"} == {0.5e-3}
     assert parameters.own is orthoglide.parameters
     assert parameters.redundant == orthoglide.parameters.redundant

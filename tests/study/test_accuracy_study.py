@@ -23,7 +23,7 @@ from orthocal.study.paper_plan import Displacements, build_paper_plan
 from orthocal.study.runner import StudyTable, run_study
 from orthocal.study.study import run_task
 
-NEAR = {"*.offset_mm": 0.2}
+NEAR = {"*.offset_mm": 0.4}
 SIGMA = 5e-6
 
 
@@ -52,7 +52,7 @@ def test_standard_errors_of_the_papers_plan():
     """1.942 σ of a single reading, computed independently: twelve differences, weighted."""
     robot = load_robot("orthoglide")
     plan = build_paper_plan(robot, Displacements(), Gauge(SIGMA, None, None))
-    choice = Choice("offsets", tolerances={"*.offset_mm": 0.05})
+    choice = Choice("offsets", tolerances={"*.offset_mm": 0.1})
     study = build_accuracy_study(plan, choice, drawn=["*.offset"], machines=2000)
     columns = run_study(study).columns
     errors = np.array([columns[f"error.{a}_slide.offset_mm"] for a in "xyz"])
@@ -63,7 +63,7 @@ def test_standard_errors_of_the_papers_plan():
 
 def test_estimates_without_noise_equal_the_truth(orthoglide):
     plan = build_paper_plan(orthoglide, Displacements(), Gauge(1e-12, None, None))
-    choice = Choice("offsets", tolerances={"*.offset_mm": 2.0})
+    choice = Choice("offsets", tolerances={"*.offset_mm": 4.0})
     table = run_study(build_accuracy_study(plan, choice, drawn=["*.offset"], machines=60))
     for axis in "xyz":
         missed = np.array(table.columns[f"error.{axis}_slide.offset_mm"])

@@ -22,12 +22,12 @@ def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
 
 
 def beyond_tolerances(scale: float, limit: float) -> Finding:
-    """Errors of the machine would have to be many times their tolerances."""
+    """Only many times the stated tolerances would explain the readings."""
     return Finding(
         "beyond tolerances",
         "reject",
-        f"The errors of the machine would have to be {scale:.1f} times their tolerances to explain "
-        f"these readings. More than {limit:g} times is no machine in working order.",
+        f"Only a machine with {scale:.1f} times the stated tolerances explains these readings. "
+        f"More than {limit:g} times is no machine in working order.",
         "Check signs, rows and setups. If they are right, adjust the machine mechanically first.",
         numbers={"tolerance_scale": scale},
     )
@@ -38,7 +38,7 @@ def above_tolerances(scale: float) -> Finding:
     return Finding(
         "above tolerances",
         "note",
-        f"The errors of this machine are about {scale:.1f} times their tolerances.",
+        f"The errors of this machine correspond to {scale:.1f} times the stated tolerances.",
         numbers={"tolerance_scale": scale},
     )
 

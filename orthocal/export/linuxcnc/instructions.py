@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from orthocal.assessment.assess import expanded_uncertainty
 from orthocal.assessment.controller_entries import entered_offsets, find_entries
 from orthocal.calibration.calibration import Calibration
 from orthocal.export.linuxcnc.approximation import (
@@ -89,7 +90,7 @@ def _line(name: str, home: JointHome, value: float | None) -> str:
 
 def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str:
     """README.md for offsets that are entered as HOME_OFFSET."""
-    std = {e.drive: e.std for e in find_entries(calibration)}
+    half = {e.drive: expanded_uncertainty(calibration, e) for e in find_entries(calibration)}
     rows = []
     for i, home in enumerate(homes):
         change = home.show(home.change, sign=True)
@@ -97,7 +98,7 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
             entered = f"present value {change}"
         else:
             entered = f"{home.show(home.old)} → **{home.show(home.new)}**"
-        of_drive = std.get(home.drive, math.nan)
+        of_drive = half.get(home.drive, math.nan)
         uncertainty = "" if math.isnan(of_drive) else f"± {home.show(of_drive)}"
         cells = (
             f"JOINT_{i}",
@@ -123,9 +124,11 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
 
 {scope} Enter them as HOME_OFFSET; the kinematics do not change.
 
-| section | drive | counts | HOME_OFFSET | change | one σ | unit |
+| section | drive | counts | HOME_OFFSET | change | ± | unit |
 |---|---|---|---|---|---|---|
 {table}
+
+±: expanded uncertainty (k = 2).
 
 1. Copy your INI file, so that you can restore it.
 2. Enter HOME_OFFSET of the table in each section. Add the same change to MIN_LIMIT and MAX_LIMIT:

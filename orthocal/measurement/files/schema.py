@@ -117,7 +117,7 @@ class CalibrationKeys(_Keys):
     free: Annotated[list[str], Field(max_length=MOST_NAMES)] = []
     """Names or globs that are free too, or instead of a model."""
     tolerances: Annotated[dict[str, PositiveNumber], Field(max_length=MOST_NAMES)] = {}
-    """Name or glob with its unit to another standard deviation than the robot's."""
+    """Name or glob with its unit to another tolerance than the robot's, ±2 standard deviations."""
 
 
 class SessionKeys(_Keys):

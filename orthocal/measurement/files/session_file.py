@@ -36,7 +36,7 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import NuisanceParameter, Sensor, SetupKeys, default_zero
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge, Posture, Purpose, Reading, Session, Setup
-from orthocal.units import DRIVE_UNITS, MM
+from orthocal.units import DRIVE_UNITS, MM, show_limit
 
 Array = NDArray[np.float64]
 
@@ -308,7 +308,7 @@ def _check_shared(setups: Mapping[str, Setup], file: str) -> None:
             if not unknown.of_gauge and before.sensor.place != setup.sensor.place:
                 problem = f"stands at {' '.join(before.sensor.place)}"
             elif known.tolerance != unknown.tolerance:
-                problem = f"has it known to {known.tolerance:g} {known.unit}"
+                problem = f"states a tolerance of {show_limit(known.tolerance):g} {known.unit}"
             else:
                 continue
             raise SessionError(

@@ -39,7 +39,7 @@ from orthocal.output.text.tables import (
     render_readings,
     render_sensors,
 )
-from orthocal.units import MM
+from orthocal.units import MM, show_limit
 from orthocal.viewer.scene import frame_of
 
 FEW_ROWS = 40
@@ -54,7 +54,8 @@ MOST_NAMED = 9
 GLOSSARY = (
     "σ: standard deviation of one reading. It comes from repeated cycles, else from the residuals, "
     "else from the gauge as stated.",
-    "tolerance: prior standard deviation of an error, from the robot's YAML or --tolerance.",
+    "tolerance: limit of an error before the calibration (±2 prior standard deviations), from the "
+    "robot's YAML or --tolerance.",
     "resolved: share of the prior variance that the readings remove.",
     "before: measured less nominal with the active offsets. after: measured less calibrated. Both "
     "use the best gauge zeros.",
@@ -64,7 +65,7 @@ GLOSSARY = (
     "standard deviation of the parameter.",
     "workpiece aligned on the machine: tool error after the best alignment, which removes one "
     "translation and one rotation of the workspace.",
-    "uncertainty before calibration: standard deviation of the tool position with every error at "
+    "uncertainty before calibration: RMS uncertainty of the tool position with every error within "
     "its tolerance. After calibration: with the readings. worst point: the largest value in the "
     "workspace.",
     "combination: a direction in parameter space. It is identifiable if a change by its prior "
@@ -152,8 +153,8 @@ def _maps(calibration: Calibration, accuracy: ToolAccuracy) -> str:
         "translation and one rotation are removed.",
         "entered": "Actual less commanded position of the tool with the offsets above, without any "
         "other correction.",
-        "uncertainty": "Uncertainty of the tool position after calibration: one standard "
-        f"deviation in space, with unidentified errors at {times}their tolerances.",
+        "uncertainty": "Uncertainty of the tool position after calibration: RMS in space, "
+        f"with unidentified errors within {times}their tolerances.",
     }
     return "".join(
         _figure(plot_tool_map(calibration, accuracy, which=which), caption)
@@ -275,10 +276,10 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
             known.append(f"{p.name} {p.value * f:g} {unit}")
             continue
         if p.prior and (p.mean != 0.0 or not calibration.prior):
-            known.append(f"{p.name} {p.mean * f:g} ± {p.tolerance * f:g} {unit}")
+            known.append(f"{p.name} {p.mean * f:g} ± {show_limit(p.tolerance) * f:g} {unit}")
         elif p.tolerance != usual[p.name].tolerance:
-            usually = usual[p.name].tolerance * f
-            tolerances.append(f"{p.name} {p.tolerance * f:g} {unit} instead of {usually:g}")
+            limit, usually = (show_limit(q.tolerance) * f for q in (p, usual[p.name]))
+            tolerances.append(f"{p.name} {limit:g} {unit} instead of {usually:g}")
         if p.lower is not None or p.upper is not None:
             low, high = ("∞" if v is None else f"{v * f:g}" for v in (p.lower, p.upper))
             bounds.append(f"{p.name} {low} … {high} {unit}".replace(" ∞ …", " −∞ …"))

@@ -28,7 +28,7 @@ Field = Literal["now", "entered", "uncertainty"]
 TITLES: dict[Field, str] = {
     "now": "Tool error now, workpiece aligned on the machine",
     "entered": "Tool error with the offsets entered, workpiece aligned on the machine",
-    "uncertainty": "Uncertainty of the tool error, one standard deviation, workpiece aligned",
+    "uncertainty": "Uncertainty of the tool error, RMS, workpiece aligned",
 }
 
 FINEST = 1e-3
@@ -128,7 +128,7 @@ def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Fiel
         _draw_size(axes, x, y, size, levels, taken)
     label = "size of the tool error [µm]; arrows: its part in the plane"
     if which == "uncertainty":
-        label = "standard deviation in space [µm]"
+        label = "RMS uncertainty in space [µm]"
         scale = calibration.tolerance_scale
         if scale > 1.0:
             label += f", tolerances × {scale:.1f}"

@@ -56,7 +56,7 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     region = accuracy.workspace.words.removeprefix("the workspace ")
     now, entered = (accuracy.align(d) for d in (accuracy.deviation, accuracy.error_after_offsets))
     now_largest, entered_largest = (_largest(d) for d in (now, entered))
-    # the standard deviation in space, as in all tables; axes of an ellipsoid are shorter
+    # RMS in space, as in all tables; axes of an ellipsoid are shorter
     after, excess = assess_remaining(calibration, accuracy), calibration.tolerance_scale
     spread = 0.0 if after is None else after.sizes.headline.largest
     largest = max(now_largest, entered_largest, spread)
@@ -77,13 +77,10 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     if after is not None:
         _draw_ellipsoids(scene, targets, after.aligned_covariance[chosen])
         wider = f", errors at {excess:.1f} × tolerances" if excess > 1.0 else ""
-        text = (
-            f"Tool error, all corrected: up to {um(spread)} µm, one standard deviation"
-            f"{wider} ({scale})"
-        )
+        text = f"Tool error, all corrected: up to {um(spread)} µm RMS{wider} ({scale})"
         colour = css(UNCERTAINTY_COLOUR)
         scene.explain(LegendEntry(text, (TOOL_UNCERTAINTY,), colour, "ball", shown))
-        headline += f" With all corrected: {um(spread)} µm or less, one standard deviation."
+        headline += f" With all corrected: {um(spread)} µm RMS or less."
     return headline
 
 

@@ -26,14 +26,14 @@ from orthocal.assessment.words.entries import describe_tool_error
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
 from orthocal.output.text.layout import add_row, print_rich, table_of, um
-from orthocal.units import MM, UM
+from orthocal.units import MM, UM, read_limit
 
 Array = NDArray[np.float64]
 
 POINT_COLUMNS = (
     *("x_mm", "y_mm", "z_mm"),
     *("deviation_x_um", "deviation_y_um", "deviation_z_um"),
-    *("sigma_x_um", "sigma_y_um", "sigma_z_um"),
+    *("std_x_um", "std_y_um", "std_z_um"),
 )
 """Commanded tool position; actual less commanded position; standard deviation of the actual one."""
 
@@ -43,8 +43,7 @@ COLUMNS_NOTE = (
 )
 
 UNCERTAINTY_NOTE = (
-    "Uncertainty: one standard deviation in space. Errors that were not identified are included "
-    "with their tolerances."
+    "Uncertainty: RMS in space. Errors that were not identified are included with their tolerances."
 )
 
 MOST_PARTS = 5
@@ -106,7 +105,9 @@ def describe_remaining(errors: Iterable[RemainingError]) -> list[str]:
     """Combinations of errors with the largest remaining tool errors, one per line."""
     lines = []
     for error in errors:
-        parts = ", ".join(f"{name} {size:+.1f}" for name, size in error.parts[:MOST_PARTS])
+        parts = ", ".join(
+            f"{name} {read_limit(size):+.2f}" for name, size in error.parts[:MOST_PARTS]
+        )
         if error.rms > UM:
             combination = f"{parts} tolerances" if parts else "small errors"
             lines.append(f"Contribution of {um(error.rms)} µm RMS: {combination}.")

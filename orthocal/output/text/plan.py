@@ -25,9 +25,9 @@ FORMS: dict[Criterion, str] = {
     "relative": "RMS tool error, translation removed",
     "absolute": "RMS tool error, absolute",
     "worst": "tool error at the worst point, workpiece aligned on the machine",
-    "A": "mean variance of the errors, in their tolerances",
-    "D": "determinant of the covariance of the errors, in their tolerances",
-    "E": "largest variance of a combination of errors, in their tolerances",
+    "A": "mean variance of the errors, in prior standard deviations",
+    "D": "determinant of the covariance of the errors, in prior standard deviations",
+    "E": "largest variance of a combination of errors, in prior standard deviations",
 }
 """Criteria in words."""
 
@@ -165,7 +165,7 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
         "curve": [stage(s) for s in plan.curve],
         "enough": None if plan.enough is None else stage(plan.enough),
         "remaining": [
-            {"rms_um": r.rms / UM, "parts": [{"name": n, "tolerances": t} for n, t in r.parts]}
+            {"rms_um": r.rms / UM, "parts": [{"name": n, "prior_stds": t} for n, t in r.parts]}
             for r in plan.find_remaining()
         ],
     }

@@ -25,7 +25,7 @@ from orthocal.output.text.layout import (
     table_of,
 )
 from orthocal.statistics.chance import expanded_uncertainty
-from orthocal.units import MM, UM
+from orthocal.units import MM, UM, show_limit
 
 MANY_PARAMETERS = 12
 """Number of parameters above which only identified ones are listed."""
@@ -264,7 +264,7 @@ def render_sensors(calibration: Calibration) -> RenderableType | None:
             half = float(expanded_uncertainty(p.std, p.std_scatter, dof=calibration.dof))
             values = (
                 signed(p.value * p.edge_factor),
-                *(plain(v * p.edge_factor) for v in (half, p.tolerance)),
+                *(plain(v * p.edge_factor) for v in (half, show_limit(p.tolerance))),
             )
             add_row(table, p.name, *values, p.edge_unit)
         parts += [table, Text("Estimated together with the errors of the machine.")]

@@ -473,14 +473,14 @@ def test_few_parameters_are_in_their_own_unit(table1):
     assert not axes.containers
 
 
-def test_many_parameters_are_in_prior_standard_deviations_the_best_determined_first(sweep):
+def test_many_parameters_are_in_tolerances_the_best_determined_first(sweep):
     figure = parameter_plots.plot_parameters.figure(sweep, most=30)
     axes, beside = figure.axes
     assert (
         title(figure)
         == "Estimates with 95 % intervals: 30 of 129, offsets, then the best determined"
     )
-    assert axes.get_xlabel() == "estimate [prior standard deviations]"
+    assert axes.get_xlabel() == "estimate [tolerances]"
     names = row_names(axes)
     assert len(names) == 30
     assert all(n.endswith(".offset") for n in names[:3])
@@ -489,7 +489,7 @@ def test_many_parameters_are_in_prior_standard_deviations_the_best_determined_fi
     others = [p.data_share for p in sweep.free if p.name not in names]
     assert max(others) <= shares[-1]
     x, _ = line(axes, "estimate")
-    scale = np.array([1.0 / sweep[n].tolerance for n in names])
+    scale = np.array([0.5 / sweep[n].tolerance for n in names])
     np.testing.assert_allclose(x, [sweep[n].value for n in names] * scale, atol=UNIT)
     ends, _ = segments(axes)
     own = dict(zip([p.name for p in sweep.free], sweep.intervals, strict=True))
@@ -514,7 +514,7 @@ def test_the_band_of_a_parameter_is_where_its_prior_was(sweep):
     names = row_names(axes)
     assert len(bars) == 29
     assert names.index(without.name) not in bars
-    np.testing.assert_allclose(bars[names.index(known.name)], (1.0, 2.0), atol=UNIT)
+    np.testing.assert_allclose(bars[names.index(known.name)], (0.0, 2.0), atol=UNIT)
 
 
 def test_a_parameter_at_its_bound_is_marked_as_such(bound):

@@ -147,7 +147,7 @@ def test_a_machine_worse_than_its_tolerances_is_known_less_well(experiment_2):
     sizes = tool_map._error_parts(calibration, accuracy, "uncertainty")[:, 0]
     np.testing.assert_allclose(sizes, np.sqrt(variance) * 1e6, rtol=GRID)
     shown = texts(tool_map.plot_tool_map(calibration, accuracy, which="uncertainty"))
-    label = f"standard deviation in space [µm], tolerances × {excess:.1f}"
+    label = f"RMS uncertainty in space [µm], tolerances × {excess:.1f}"
     assert label in shown
 
 
