@@ -72,9 +72,6 @@ Number = Annotated[
 Count = Annotated[int, Field(ge=0, le=10**9)]
 """A whole number from 0 to 10⁹."""
 
-Finite = Annotated[float, BeforeValidator(_refuse_truth_values), Field(allow_inf_nan=False)]
-"""A finite number of any size, for derived values."""
-
 PositiveNumber = Annotated[Number, Field(gt=0.0), _at_least(SMALLEST_POSITIVE)]
 """A number from SMALLEST_POSITIVE to LARGEST_NUMBER."""
 

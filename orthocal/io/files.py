@@ -54,20 +54,15 @@ def read_file(
     Raises:
         OrthocalError: Of kind `error`, if the file is missing, not regular, or too large.
     """
-    descriptor = _open_regular(path, error)
     try:
-        with open(descriptor, "rb", closefd=False) as stream:
-            size = os.fstat(descriptor).st_size
-            content = b"" if size > largest else stream.read(largest + 1)
-            if content is None:
-                raise error("cannot be read: it is not ready", where=str(path))
+        with open(_open_regular(path, error, largest), "rb") as stream:
+            content = stream.read(largest + 1)
     except OSError as e:
         raise error(f"cannot be read: {e.strerror}", where=str(path)) from None
-    finally:
-        os.close(descriptor)
-    if max(size, len(content)) > largest:
-        actual = f"{size / 2**20:.0f} MiB" if size > largest else "more"
-        raise error(f"has {actual}; expected at most {largest / 2**20:g} MiB", where=str(path))
+    if content is None:
+        raise error("cannot be read: it is not ready", where=str(path))
+    if len(content) > largest:  # some files state no size
+        raise error(f"has more; expected at most {largest / 2**20:g} MiB", where=str(path))
     return content
 
 
@@ -142,31 +137,30 @@ def require_file(
     Raises:
         OrthocalError: Of kind `error`, as `read_file`.
     """
-    descriptor = _open_regular(path, error)
-    size = os.fstat(descriptor).st_size
-    os.close(descriptor)
-    if size > largest:
-        raise error(
-            f"has {size / 2**20:.0f} MiB; expected at most {largest / 2**20:g} MiB",
-            where=str(path),
-        )
+    os.close(_open_regular(path, error, largest))
 
 
-def _open_regular(path: Path, error: type[OrthocalError]) -> int:
-    """Descriptor of a regular file; the check is on the opened file, not on its name."""
+def _open_regular(path: Path, error: type[OrthocalError], largest: int | None = None) -> int:
+    """Descriptor of a regular file; the checks are on the opened file, not on its name."""
     try:
         descriptor = os.open(path, _READ_FLAGS)
-        mode = os.fstat(descriptor).st_mode
+        status = os.fstat(descriptor)
     except FileNotFoundError:
         raise error("there is no such file", where=str(path)) from None
     except ValueError:
         raise error("contains a character that file names cannot have", where=str(path)) from None
     except OSError as e:
         raise error(f"cannot be read: {e.strerror}", where=str(path)) from None
-    if not stat.S_ISREG(mode):
+    if not stat.S_ISREG(status.st_mode):
         os.close(descriptor)
-        kind = "a directory" if stat.S_ISDIR(mode) else "a device, a pipe or a socket"
+        kind = "a directory" if stat.S_ISDIR(status.st_mode) else "a device, a pipe or a socket"
         raise error(f"is {kind}; expected a file", where=str(path))
+    if largest is not None and status.st_size > largest:
+        os.close(descriptor)
+        raise error(
+            f"has {status.st_size / 2**20:.0f} MiB; expected at most {largest / 2**20:g} MiB",
+            where=str(path),
+        )
     return descriptor
 
 
@@ -215,20 +209,8 @@ def require_plain_name(path: Path, *, error: type[OrthocalError] = OrthocalError
         )
 
 
-def is_folder(path: Path) -> bool:
-    """True for an existing directory; False for invalid names."""
-    try:
-        return path.is_dir()
-    except (OSError, ValueError):
-        return False
-
-
-def exists(path: Path) -> bool:
-    """True for an existing file or directory; False for invalid names."""
-    try:
-        return path.exists()
-    except (OSError, ValueError):
-        return False
+is_folder, exists = os.path.isdir, os.path.exists
+"""Tests of a path that are False for invalid names, for which those of pathlib may raise."""
 
 
 def require_writable(folder: Path, names: Iterable[str] = ()) -> None:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.error_map import ErrorMap, error_map
 from orthocal.kinematics.function_cache import cached_function, cached_per_robot, function_key
-from orthocal.kinematics.se3 import log6, log6_jacobian
-from orthocal.kinematics.symbolic import Pose, SymbolicTree
+from orthocal.kinematics.se3 import log6_jacobian
+from orthocal.kinematics.symbolic import Pose, SymbolicTree, closure_residual
 from orthocal.robot.frames import hangs_on
 from orthocal.robot.model import Closure, Robot, closure_row_units, joint_axis
 
@@ -105,14 +105,7 @@ class RobotFunctions:
     @cached_property
     def closure(self) -> ca.SX:
         """Residual g of all closures, shape (closure_rows,), [m]; rotations times the length."""
-        errors = []
-        for c in self.robot.closures:
-            a, b = (self.tree.frame_pose(self.robot.frame_id(f)) for f in (c.frame_a, c.frame_b))
-            relative = a.relative(b)
-            translation = c.kind == "3d"
-            error = relative.position if translation else log6(relative.rotation, relative.position)
-            errors.append(error[list(c.rows)])
-        return ca.vertcat(ca.SX(0, 1), *errors) * closure_row_units(self.robot)
+        return closure_residual(self.robot, self.tree) * closure_row_units(self.robot)
 
     @cached_property
     def _closure_derivatives(self) -> tuple[ca.SX, ca.SX]:

@@ -21,7 +21,7 @@ from orthocal.effects.protocol import Condition, Placement
 from orthocal.errors import RobotError
 from orthocal.kinematics.se3 import exp6, log6
 from orthocal.robot.frames import hangs_on
-from orthocal.robot.model import Closure, Robot, joint_axis
+from orthocal.robot.model import Robot, joint_axis
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,20 +204,29 @@ class SymbolicRobot:
         """Pose of a named frame in the world."""
         return self.tree.frame_pose(self.robot.frame_id(name))
 
-    def closure_error(self, closure: Closure) -> ca.SX:
-        """Constrained rows of a closure's pose error: position of b in a, or log6, [m, rad]."""
-        a, b = self.frame_pose(closure.frame_a), self.frame_pose(closure.frame_b)
-        relative = a.relative(b)
-        error = (
-            relative.position
-            if closure.kind == "3d"
-            else log6(relative.rotation, relative.position)
-        )
-        return error[list(closure.rows)]
-
     def closure_residual(self) -> ca.SX:
         """g(q, θ) of all closures, shape (closure_rows,), [m, rad]."""
-        return ca.vertcat(*(self.closure_error(c) for c in self.robot.closures))
+        return closure_residual(self.robot, self.tree)
+
+
+def closure_residual(robot: Robot, tree: SymbolicTree) -> ca.SX:
+    """Constrained rows of all closures: position of frame b in a, or log6 of its pose in a.
+
+    Args:
+        robot: Robot with the closures.
+        tree: Forward kinematics.
+
+    Returns:
+        Shape (closure_rows,), [m, rad].
+    """
+    errors = []
+    for c in robot.closures:
+        a, b = (tree.frame_pose(robot.frame_id(name)) for name in (c.frame_a, c.frame_b))
+        relative = a.relative(b)
+        point = c.kind == "3d"
+        error = relative.position if point else log6(relative.rotation, relative.position)
+        errors.append(error[list(c.rows)])
+    return ca.vertcat(ca.SX(0, 1), *errors)
 
 
 def erroneous_placements(

@@ -1,7 +1,7 @@
-"""Error parameters of a robot: names, units, tolerances, and the elementary errors they consist of.
+"""Error parameters of a robot: names, units, tolerances and elementary errors.
 
-Effects say which elementary errors a machine has and how these act (`orthocal.effects`). A
-parameter is one elementary error or a named sum of several. All are 0 for the nominal machine.
+Effects define the elementary errors of a machine (`orthocal.effects`). A parameter is one
+elementary error or a named sum of several. All are 0 for the nominal machine.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from orthocal.text import composed
 from orthocal.units import UNIT_SUFFIXES, InUnit, Unit, read_limit, show_limit
 
 COMPLETE: Literal["complete"] = "complete"
-"""A model of every error that changes something."""
+"""Keyword for a model of all observable errors."""
 
 LARGEST_TOLERANCE = 200.0
-"""Times the robot's own tolerance that no other is: it is in another unit."""
+"""Largest tolerance relative to the robot's; a larger one is in another unit."""
 
 SMALLEST_TOLERANCE = 1e-9
-"""[m, rad or 1]. Parameters are scaled by their tolerances: with less they would hardly move."""
+"""Smallest tolerance, [m, rad or 1]: parameters are scaled by their tolerances."""
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Components of a twist, translation first."""
@@ -51,13 +51,13 @@ class ElementaryError:
     tolerance: float
     """One standard deviation, [unit]."""
     of_frame: bool = False
-    """Whether the owner is a frame, not a joint."""
+    """True if the owner is a frame, False if it is a joint."""
     axis: int = -1
     """Component of the twist of a placement, 0 to 5; -1 for errors of other kinds."""
     complete: bool = False
-    """Whether the complete model of a machine holds it, unless it changes nothing."""
+    """True if it is part of the complete model, unless it is redundant."""
     positive: bool = False
-    """Whether it is never negative; its prior is half-normal then."""
+    """True for a value of at least 0 with a half-normal prior."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +83,9 @@ class Parameter(InUnit):
     tolerance: float
     """One standard deviation, [unit]."""
     terms: tuple[tuple[str, float], ...]
-    """Elementary errors it adds to, with coefficients."""
+    """Elementary errors of which it is the sum, with coefficients."""
     positive: bool = False
-    """Whether it is never negative; its prior is half-normal then."""
+    """True for a value of at least 0 with a half-normal prior."""
 
 
 class ParameterSet:
@@ -111,9 +111,9 @@ class ParameterSet:
         self._models = dict(models)
         self._find_redundant = find_redundant
         self.own: ParameterSet = self
-        """The same with the tolerances of the robot's YAML."""
+        """Parameters with the tolerances of the robot's YAML."""
         self.stated: Mapping[str, float] = {}
-        """Tolerances that hold instead of those; see `with_tolerances`."""
+        """Tolerances in place of those; see `with_tolerances`."""
 
     def __iter__(self) -> Iterator[Parameter]:
         return iter(self._parameters.values())
@@ -143,7 +143,7 @@ class ParameterSet:
         return tuple(self._models)
 
     def patterns(self, model: str) -> tuple[str, ...]:
-        """Names and globs that a model frees, as for `select`.
+        """Patterns of the free parameters of a model, as for `select`.
 
         Raises:
             ParameterError: If there is no such model.
@@ -152,20 +152,19 @@ class ParameterSet:
             raise ParameterError(
                 f"'{model}' is not a model of this robot; models: {', '.join(self._models)}"
             )
-        given = self._models[model]
-        return tuple(escape(n) for n in self.complete) if given == COMPLETE else tuple(given)
+        patterns = self._models[model]
+        if patterns == COMPLETE:
+            return tuple(escape(name) for name in self.complete)
+        return tuple(patterns)
 
     @cached_property
     def complete(self) -> tuple[str, ...]:
-        """Elementary errors of the complete model, in order: those that change something.
-
-        What changes something is found by rank, not by a list. Sums of errors are no further ones.
-        """
+        """Elementary errors of the complete model, in order: all that are not redundant."""
         return tuple(n for n in self.of_parts if n not in self.redundant)
 
     @cached_property
     def of_parts(self) -> tuple[str, ...]:
-        """Elementary errors of drives, joints and ends of loops, in order."""
+        """Elementary errors of drives, joints and closure frames, in order."""
         return tuple(e.name for e in self.elementary.values() if e.complete)
 
     @cached_property
@@ -196,7 +195,7 @@ class ParameterSet:
         return all(self.elementary[term].kind == "offset" for term, _ in self[name].terms)
 
     def are_rigid(self, name: str) -> bool:
-        """Whether placements and drives with offset and scale express a parameter.
+        """True if placement errors, drive offsets and drive scales can express a parameter.
 
         Raises:
             ParameterError: If the name is unknown.
@@ -205,29 +204,28 @@ class ParameterSet:
         return all(e.axis >= 0 or e.kind in ("offset", "scale") for e in errors)
 
     def select(self, patterns: Iterable[str]) -> tuple[str, ...]:
-        """Names that a list of globs leaves, in the order of the set.
+        """Names selected by a list of globs, in the order of the set.
 
-        Each pattern adds the names it matches; one that begins with '!' takes them out again.
+        A pattern adds the matching names; a pattern that begins with '!' removes them.
 
         Raises:
             ParameterError: If a pattern matches no parameter.
         """
         chosen: set[str] = set()
         for pattern in patterns:
-            without = pattern.startswith("!")
             glob = composed(pattern.removeprefix("!"))
-            found = self._matched(glob)
-            if not found:
+            names = [glob] if glob in self._parameters else []
+            if has_magic(glob):
+                names = [name for name in self._parameters if fnmatchcase(name, glob)]
+            if not names:
                 raise ParameterError(
                     f"'{glob}' matches no error parameter{_suggest(glob, self._parameters)}"
                 )
-            chosen.difference_update(found) if without else chosen.update(found)
+            if pattern.startswith("!"):
+                chosen.difference_update(names)
+            else:
+                chosen.update(names)
         return tuple(name for name in self._parameters if name in chosen)
-
-    def _matched(self, glob: str) -> list[str]:
-        if has_magic(glob):
-            return [name for name in self._parameters if fnmatchcase(name, glob)]
-        return [glob] if glob in self._parameters else []
 
     def select_model(self, model: str) -> tuple[str, ...]:
         """Names of the free parameters of a model of the robot's YAML.
@@ -266,31 +264,24 @@ class ParameterSet:
         return found
 
     def read_quantity(self, key: str, value: float) -> tuple[str, float]:
-        """Parameter name and SI value of a key that carries its unit, such as x_slide.offset_mm.
+        """Parameter name and SI value of a key with its unit, such as x_slide.offset_mm.
 
         Raises:
             ParameterError: If the suffix is missing or of another unit, or the name unknown.
         """
         name, unit, factor = split_unit(key)
-        if name not in self._parameters:
-            raise ParameterError(
-                f"'{name}' is not an error parameter{_suggest(name, self._parameters)}"
-            )
         _check_unit(key, unit, self[name])
         return name, value * factor
 
     def read_glob(self, key: str) -> tuple[str, float]:
-        """Glob and factor to SI of a key that carries its unit, such as *.offset_mm.
+        """Glob and factor to SI of a key with its unit, such as *.offset_mm.
 
         Raises:
             ParameterError: If the suffix is missing, or of another unit than what the glob matches.
         """
         glob, unit, factor = split_unit(key)
         for name in self.select([glob]):
-            if self[name].unit != unit:
-                raise ParameterError(
-                    f"'{key}' has the wrong unit; {name} is in {self[name].edge_unit}"
-                )
+            _check_unit(key, unit, self[name])
         return glob, factor
 
     def read_tolerances(self, given: Mapping[str, float]) -> dict[str, float]:
@@ -313,7 +304,7 @@ class ParameterSet:
         return result
 
     def expand(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Elementary errors that parameter values amount to; only those that are not zero.
+        """Nonzero elementary errors of parameter values.
 
         Args:
             values: Parameter name to value, [unit of the parameter].
@@ -332,7 +323,7 @@ class ParameterSet:
 
 
 def require_tolerance(value: float, parameter: Parameter) -> float:
-    """Refuse a standard deviation that no machine's error has.
+    """Refuse an implausible standard deviation.
 
     Args:
         value: [unit of the parameter].
@@ -356,7 +347,7 @@ def require_tolerance(value: float, parameter: Parameter) -> float:
 
 
 def split_unit(key: str) -> tuple[str, Unit, float]:
-    """Name, unit and factor to SI of a key that carries its unit as suffix.
+    """Name, unit and factor to SI of a key with its unit as suffix.
 
     Raises:
         ParameterError: If there is no known suffix.
@@ -377,7 +368,7 @@ def build_parameters(
     models: Mapping[str, Sequence[str]],
     find_redundant: Callable[[], frozenset[str]],
 ) -> ParameterSet:
-    """The parameter set of a robot.
+    """Build the parameter set of a robot.
 
     Args:
         elementary: All elementary errors, in order.
@@ -435,7 +426,7 @@ def _sum_errors(
                 f"parameters.{name}: '{plain}' is not an elementary error{_suggest(plain, errors)}"
             )
         if plain in terms:
-            raise ParameterError(f"parameters.{name}: '{plain}' stands twice")
+            raise ParameterError(f"parameters.{name}: '{plain}' occurs twice")
         terms[plain] = -1.0 if plain != member else 1.0
     first = errors[next(iter(terms))]
     for plain in terms:
@@ -448,12 +439,14 @@ def _sum_errors(
 
 
 def _check_unit(key: str, unit: Unit, parameter: Parameter) -> None:
+    """Refuse a key whose unit is not that of the parameter."""
     if unit != parameter.unit:
         raise ParameterError(
             f"'{key}' has the wrong unit; {parameter.name} is in {parameter.edge_unit}"
         )
 
 
-def _suggest(name: str, known: Iterable[str]) -> str:
-    close = difflib.get_close_matches(name, list(known), n=3, cutoff=0.5)
+def _suggest(name: str, names: Iterable[str]) -> str:
+    """Hint with similar names, for messages."""
+    close = difflib.get_close_matches(name, list(names), n=3, cutoff=0.5)
     return f"; did you mean {', '.join(close)}?" if close else ""
