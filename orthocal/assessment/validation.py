@@ -44,6 +44,7 @@ from orthocal.calibration.assessment_record import (
 )
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.recorded_robot import require_calibrated_robot
 from orthocal.calibration.refit import repeat_fit, restore_session
 from orthocal.errors import SessionError
 from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomaly
@@ -229,12 +230,7 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
     Raises:
         SessionError: If it is of another robot, or states other offsets.
     """
-    if session.robot.sha256 != calibration.robot_record.sha256:
-        raise SessionError(
-            f"is of robot '{session.robot.name}'; the calibration is of another, or of another "
-            f"version of '{calibration.robot_record.name}'",
-            where=None if session.path is None else str(session.path),
-        )
+    require_calibrated_robot(calibration, session)
     drives = [d.name for d in session.robot.drives]
     entries = {drives.index(e.drive): e for e in find_entries(calibration)}
     if session.controller_offsets is None:

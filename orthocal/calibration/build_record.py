@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
+from importlib.metadata import version
 from typing import Literal
 
 import numpy as np
@@ -13,14 +16,15 @@ from numpy.typing import NDArray
 from orthocal import __version__
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.file import require_loadable
+from orthocal.calibration.recorded_robot import record_robot
 from orthocal.calibration.records import (
     GaugeRecord,
     ParameterEstimate,
     PostureRecord,
-    RobotRecord,
     SessionRecord,
     SetupRecord,
     SolverRecord,
+    Versions,
 )
 from orthocal.errors import ClosureError
 from orthocal.estimation.diagnostics.cross_validation import predict_unseen
@@ -35,8 +39,7 @@ from orthocal.estimation.fit import Fit
 from orthocal.estimation.linear import Linearisation, linearise_at_reference
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.weighting import split_by_gauge
-from orthocal.io.fields import read_only
-from orthocal.robot.loading import packaged_robots
+from orthocal.io.fields import finite_or_none, read_only
 from orthocal.robot.parameters import Parameter
 from orthocal.session.session import Session
 from orthocal.statistics.chance import confidence_factor
@@ -89,7 +92,7 @@ def assemble_calibration(
     diagnostics = diagnose_readings(fit)
     residuals = _residual_rows(fit, diagnostics, nominal)
     calibration = Calibration(
-        robot_record=_robot_record(session),
+        robot_record=record_robot(session),
         session=_session_record(session),
         model=problem.selection.label,
         prior=bool(problem.machine_selection.prior.any()),
@@ -115,12 +118,16 @@ def assemble_calibration(
         residuals=residuals,
         critical=diagnostics.critical,
         postures=tuple(
-            PostureRecord(p.name, tuple(p.drives.tolist()), tuple(fit.solution.passive[i].tolist()))
+            PostureRecord(
+                p.name,
+                p.form,
+                *(tuple(v.tolist()) for v in (p.values, p.drives, fit.solution.passive[i])),
+            )
             for i, p in zip(problem.states.first_of_posture, session.postures.values(), strict=True)
         ),
         setups=_setup_records(fit),
         gauges=_gauge_records(fit),
-        version=__version__,
+        versions=_versions(),
         robot=session.robot,
     )
     require_loadable(calibration)
@@ -197,8 +204,8 @@ def _estimates(
             start=float(problem.reference[i]),
             prior=bool(selection.prior[i]),
             mean=float(problem.prior_mean[i]),
-            lower=_bound(selection.lower[i]),
-            upper=_bound(selection.upper[i]),
+            lower=finite_or_none(selection.lower[i]),
+            upper=finite_or_none(selection.upper[i]),
             at_bound=words[int(solution.at_bound[i])],
             interval=intervals.get(p.name),
         )
@@ -233,23 +240,10 @@ def _held_estimates(problem: CalibrationProblem) -> tuple[ParameterEstimate, ...
     return tuple(estimates)
 
 
-def _bound(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def _robot_record(session: Session) -> RobotRecord:
-    robot = session.robot
-    packaged = packaged_robots().get(session.robot_reference)
-    folder = None if packaged is not None else str(robot.folder.resolve())
-    return RobotRecord(
-        name=robot.name,
-        reference=session.robot_reference,
-        folder=folder,
-        sha256=robot.sha256,
-        legs=tuple((name, leg.length) for name, leg in robot.legs.items()),
-        travel=tuple((d.name, d.unit, _bound(d.lower), _bound(d.upper)) for d in robot.drives),
-        tolerances=tuple(robot.parameters.stated.items()),
-    )
+@cache
+def _versions() -> Versions:
+    names = ("pin", "casadi", "numpy", "scipy")
+    return Versions(__version__, platform.python_version(), *(version(name) for name in names))
 
 
 def _session_record(session: Session) -> SessionRecord:
@@ -263,6 +257,8 @@ def _session_record(session: Session) -> SessionRecord:
         gauge_sigma=session.gauge.sigma,
         gauge_resolution=session.gauge.resolution,
         controller_offsets=None if offsets is None else tuple(offsets.tolist()),
+        purpose=session.purpose,
+        seed=session.seed,
         parts=tuple(_session_record(part) for part in session.parts),
     )
 

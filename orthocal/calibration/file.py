@@ -25,6 +25,7 @@ from orthocal.calibration.recorded_robot import (
 from orthocal.calibration.records import CalibrationRecord
 from orthocal.errors import CalibrationFileError, SolverError
 from orthocal.io.documents import read_json, validate, write_plain
+from orthocal.io.fields import finite_or_none
 from orthocal.io.files import exists, is_folder, write_file
 from orthocal.robot.model import Robot
 from orthocal.statistics.identifiability import Identifiability
@@ -140,7 +141,7 @@ def _read_document(
     _check_unmodelled(record, file)
     _check_estimates(record, file)
     _check_singular_values(record.identifiability, file)
-    known = load_recorded_robot(record.robot_record, file=path) if robot is None else robot
+    known = load_recorded_robot(record.robot_record, file=file) if robot is None else robot
     prefix = "" if path is None else f"{path}: "
     require_parameters(known, record.parameters, record.unmodelled.names, prefix=prefix)
     require_rows(known, record.setups, record.postures, record.residuals, prefix=prefix)
@@ -162,11 +163,11 @@ _Place = tuple[str, int | None, str]
 
 def _derive(c: Calibration) -> Iterator[tuple[_Place, Any]]:
     """Numbers that follow from a record, and where they stand."""
-    yield ("", None, "sigma"), _number(c.sigma)
-    yield ("", None, "dof"), _number(c.dof)
+    yield ("", None, "sigma"), finite_or_none(c.sigma)
+    yield ("", None, "dof"), finite_or_none(c.dof)
     for name in ("rms_before", "rms_after", "largest_before", "largest_after"):
         yield ("", None, name), getattr(c, name)
-    yield ("identifiability", None, "condition"), _number(c.identifiability.condition)
+    yield ("identifiability", None, "condition"), finite_or_none(c.identifiability.condition)
     yield ("identifiability", None, "observability"), c.identifiability.observability
     for i, row in enumerate(c.residuals):
         yield ("residuals", i, "residual"), row.residual
@@ -289,7 +290,3 @@ def _check_unmodelled(record: CalibrationRecord, file: str) -> None:
             f"expected {n_free} × {count} numbers, free parameters by names",
             where=f"{file}: unmodelled.leakage",
         )
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None

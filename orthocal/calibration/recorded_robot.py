@@ -1,67 +1,183 @@
-"""The robot that a calibration names, loaded and held against what the calibration says of it.
+"""The robot in calibration.json: its files, and checks of what the calibration says of it.
 
-The file of a calibration can be edited, and the robot's files can change.
+The embedded robot is the calibrated one. The directory that it came from may be gone or changed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+import base64
+import binascii
+import hashlib
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
 
-from orthocal.calibration.records import ParameterEstimate, PostureRecord, RobotRecord, SetupRecord
-from orthocal.effects.loading import load_robot
+from orthocal.calibration.records import (
+    CalibrationRecord,
+    ParameterEstimate,
+    PostureRecord,
+    RobotFile,
+    RobotRecord,
+    SetupRecord,
+)
+from orthocal.effects.loading import load_robot, load_robot_content
 from orthocal.errors import CalibrationFileError, ParameterError, RobotError, SessionError
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
-from orthocal.io.files import is_folder
+from orthocal.io.fields import finite_or_none
 from orthocal.measurement.files.readings_checks import check_conditions
-from orthocal.robot.loading import packaged_robots
+from orthocal.robot.files import LARGEST_MESHES, MESH_FORMATS, collect_files
+from orthocal.robot.loading import content_digest, packaged_robots, robot_digest
 from orthocal.robot.model import Robot
+from orthocal.session.session import Session
+from orthocal.text import printable, shorten, text_problem
 
 
-def load_recorded_robot(record: RobotRecord, *, file: Path | None) -> Robot:
+def record_robot(session: Session) -> RobotRecord:
+    """Record of a session's robot, with its files."""
+    robot = session.robot
+    packaged = session.robot_reference in packaged_robots()
+    return RobotRecord(
+        name=robot.name,
+        reference=session.robot_reference,
+        directory=None if packaged or robot.folder is None else str(robot.folder.resolve()),
+        sha256=robot.sha256,
+        files=_record_files(robot),
+        legs=tuple((name, leg.length) for name, leg in robot.legs.items()),
+        travel=tuple(
+            (d.name, d.unit, finite_or_none(d.lower), finite_or_none(d.upper)) for d in robot.drives
+        ),
+        tolerances=tuple(robot.parameters.stated.items()),
+    )
+
+
+@lru_cache(maxsize=8)
+def _record_files(robot: Robot) -> tuple[RobotFile, ...]:
+    files = []
+    for name, content in collect_files(robot).items():
+        text: str | None = content.decode(errors="surrogateescape")
+        binary = None
+        if text_problem(text):
+            text, binary = None, base64.b64encode(content).decode()
+        files.append(RobotFile(name, hashlib.sha256(content).hexdigest(), text, binary))
+    return tuple(files)
+
+
+def load_recorded_robot(record: RobotRecord, *, file: str) -> Robot:
     """The nominal robot of a record, with the tolerances that are stated there.
 
+    The robot is built from the embedded files. If its directory is there and unchanged, the robot
+    of that directory is the same one and is returned. If it has changed, a warning is logged.
+
     Args:
-        record: What a calibration says of its robot.
-        file: The calibration's, if it is from one: a robot is looked for beside it, too.
+        record: Record of the robot in a calibration.json.
+        file: Name of that file, for messages.
 
     Raises:
-        RobotError: If the robot cannot be loaded.
-        CalibrationFileError: If it cannot be found or has changed since, or a tolerance is none.
+        CalibrationFileError: Naming the key, if a file or a tolerance is invalid.
     """
-    where = None if file is None else str(file)
-    if record.folder is None:
-        if record.name not in packaged_robots():
-            raise CalibrationFileError(
-                f"names the robot '{record.name}', which does not come with this orthocal",
-                where=where,
-            )
-        robot = load_robot(record.name)
-    else:
-        folder = Path(record.folder)
-        if not is_folder(folder) and file is not None:
-            folder = file.parent / record.reference
-        try:
-            robot = load_robot(folder)
-        except RobotError as e:
-            if e.where is not None:
-                raise
-            raise CalibrationFileError(
-                f"'{record.reference}' is neither a robot of orthocal "
-                f"({', '.join(packaged_robots())}) nor a folder ({folder})",
-                where=None if where is None else f"{where}: robot",
-            ) from None
-    if robot.sha256 != record.sha256:
+    content = {
+        f.name: _read_content(f, f"{file}: robot.files[{i}]") for i, f in enumerate(record.files)
+    }
+    urdf, yaml = _require_robot_files(content, len(record.files), f"{file}: robot.files")
+    if content_digest(urdf, yaml) != record.sha256:
         raise CalibrationFileError(
-            f"was made for another version of robot '{record.name}': the files in "
-            f"{robot.folder} have changed since",
-            where=where,
+            f"found {shorten(record.sha256)}; the embedded URDF and YAML have "
+            f"{content_digest(urdf, yaml)}",
+            where=f"{file}: robot.sha256",
+        )
+    packaged = record.reference in packaged_robots()
+    source = record.reference if packaged and record.directory is None else record.directory
+    present = None if source is None else robot_digest(source)
+    try:
+        if source is not None and present == record.sha256:
+            robot = load_robot(source)
+        else:
+            robot = load_robot_content(record.name, content)
+    except RobotError as e:
+        place = (e.where or "").removeprefix(str(Path(record.name)) + os.sep)
+        raise CalibrationFileError(e.problem, where=f"{file}: robot.files: {place}") from None
+    if present not in (None, record.sha256):
+        logging.getLogger(__name__).warning(
+            "%s: the files of robot '%s' in %s have changed since the calibration. The robot is "
+            "used as it was calibrated.",
+            *(printable(text) for text in (file, record.name, str(source))),
         )
     try:
         return robot.with_tolerances(dict(record.tolerances))
     except ParameterError as e:
-        at = "robot.tolerances" if where is None else f"{where}: robot.tolerances"
-        raise CalibrationFileError(e.problem, where=at) from None
+        raise CalibrationFileError(e.problem, where=f"{file}: robot.tolerances") from None
+
+
+def _read_content(file: RobotFile, where: str) -> bytes:
+    """Content of an embedded file, held against its checksum."""
+    if (file.text is None) == (file.base64 is None):
+        raise CalibrationFileError("expected either text or base64", where=where)
+    try:
+        if file.base64 is None:
+            content = (file.text or "").encode()
+        else:
+            content = base64.b64decode(file.base64, validate=True)
+    except (binascii.Error, ValueError):
+        raise CalibrationFileError("is not base64", where=f"{where}.base64") from None
+    digest = hashlib.sha256(content).hexdigest()
+    if digest != file.sha256:
+        raise CalibrationFileError(
+            f"found {shorten(file.sha256)}; the content of {file.name} has {digest}",
+            where=f"{where}.sha256",
+        )
+    return content
+
+
+def _require_robot_files(
+    content: Mapping[str, bytes], count: int, where: str
+) -> tuple[bytes, bytes]:
+    """URDF and YAML of an embedded robot; all else must be meshes of limited size."""
+    if len(content) != count:
+        raise CalibrationFileError("has two files of one name", where=where)
+    texts = sorted(
+        (name for name in content if "/" not in name and name.endswith((".urdf", ".yaml"))),
+        key=lambda name: name[-5:],
+    )
+    if [name[-5:] for name in texts] != [".urdf", ".yaml"]:
+        raise CalibrationFileError(
+            f"expected one .urdf and one .yaml; found {shorten(', '.join(texts)) or 'none'}",
+            where=where,
+        )
+    meshes = content.keys() - set(texts)
+    for name in sorted(meshes):
+        folders = {parent.as_posix() for parent in PurePosixPath(name).parents}
+        if not name.lower().endswith(MESH_FORMATS) or folders & content.keys():
+            raise CalibrationFileError(
+                f"'{shorten(name)}' is neither the URDF nor the YAML nor a mesh "
+                f"({', '.join(MESH_FORMATS)})",
+                where=where,
+            )
+    size = sum(len(content[name]) for name in meshes)
+    if size > LARGEST_MESHES:
+        raise CalibrationFileError(
+            f"has meshes of {size / 2**20:.1f} MiB; expected at most "
+            f"{LARGEST_MESHES / 2**20:g} MiB",
+            where=where,
+        )
+    urdf, yaml = texts
+    return content[urdf], content[yaml]
+
+
+def require_calibrated_robot(calibration: CalibrationRecord, session: Session) -> None:
+    """Refuse a session on another robot than the calibrated one.
+
+    Raises:
+        SessionError: Naming both robots.
+    """
+    record = calibration.robot_record
+    if session.robot.sha256 != record.sha256:
+        raise SessionError(
+            f"is of robot '{session.robot.name}'; the calibration is of another, or of another "
+            f"version of '{record.name}'",
+            where=None if session.path is None else str(session.path),
+        )
 
 
 def require_parameters(
@@ -126,6 +242,7 @@ def require_rows(
             raise CalibrationFileError(e.problem, where=e.where) from None
     for i, posture in enumerate(postures):
         for key, values, count, kind in (
+            ("values", posture.values, len(robot.drives), "drive"),
             ("drives", posture.drives, len(robot.drives), "drive"),
             ("passive", posture.passive, robot.passive_index.size, "passive joint"),
         ):

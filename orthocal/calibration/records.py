@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from orthocal.calibration.assessment_record import Assessment
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
@@ -15,26 +15,69 @@ from orthocal.estimation.loss import LossKind
 from orthocal.estimation.options import SolverKind
 from orthocal.io.documents import Count, Number, PositiveInSI, PositiveNumber
 from orthocal.io.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN
+from orthocal.robot.files import MOST_FILES, is_inner_path
 from orthocal.sensors.protocol import GaugeZero, Sensor
 from orthocal.sensors.registry import RECORDED
+from orthocal.session.session import PostureForm, Purpose
 from orthocal.statistics.identifiability import Identifiability
 from orthocal.statistics.noise import Noise
+from orthocal.text import shorten
 from orthocal.units import InUnit, Unit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RobotRecord:
-    """The robot that was calibrated."""
+class Versions:
+    """Versions of the software that made a calibration."""
 
     __pydantic_config__ = CLOSED
 
-    name: str
-    reference: str
-    """As the session names it: a packaged name or a path."""
-    folder: str | None
-    """Folder of a robot that does not come with orthocal."""
+    orthocal: str
+    python: str
+    pin: str
+    casadi: str
+    numpy: str
+    scipy: str
+
+
+def _require_inner_path(name: str) -> str:
+    if not is_inner_path(name):
+        raise ValueError(f"found '{shorten(name)}'; expected a path inside the robot's directory")
+    return name
+
+
+InnerPath = Annotated[str, AfterValidator(_require_inner_path)]
+
+
+@dataclass(frozen=True, slots=True)
+class RobotFile:
+    """A file of the robot that was calibrated."""
+
+    __pydantic_config__ = CLOSED
+
+    name: InnerPath
+    """Path in the robot's directory."""
     sha256: str
-    """Of its URDF and YAML."""
+    text: str | None = None
+    """Content of a text file."""
+    base64: str | None = None
+    """Content of another file."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotRecord:
+    """The robot that was calibrated, with its files."""
+
+    __pydantic_config__ = CLOSED
+
+    name: InnerPath
+    reference: str
+    """Packaged name or path, as in the session."""
+    directory: str | None
+    """Directory of the files at the time of the calibration; None for a packaged robot."""
+    sha256: str
+    """Of the URDF and the YAML."""
+    files: Annotated[Many[RobotFile], Field(max_length=MOST_FILES)]
+    """URDF, YAML, and the meshes of drawings."""
     legs: Many[tuple[str, PositiveInSI]]
     """Legs and their nominal lengths, [m]."""
     travel: Many[tuple[str, Unit, Number | None, Number | None]]
@@ -61,6 +104,10 @@ class SessionRecord:
     """[m]."""
     controller_offsets: Many[Number] | None
     """Offsets active in the controller, [m, rad]; None where not stated."""
+    purpose: Purpose | None
+    """Model and free errors that the session states."""
+    seed: Count | None
+    """Seed of simulated readings; None for measured readings."""
     parts: Many[SessionRecord] = ()
     """The sessions that were joined into this one."""
 
@@ -147,8 +194,11 @@ class PostureRecord:
     __pydantic_config__ = CLOSED
 
     name: str
+    form: PostureForm
+    values: Many[Number]
+    """Commanded coordinates of the tool or the drives, by `form`, [m, rad]."""
     drives: Many[Number]
-    """Commanded drive coordinates, controller offsets taken off, [m, rad]."""
+    """Commanded drive coordinates without the controller's offsets, [m, rad]."""
     passive: Many[Number]
     """Passive coordinates of the calibrated machine, [m, rad]."""
 
@@ -204,8 +254,7 @@ class CalibrationRecord:
 
     __pydantic_config__ = CLOSED
 
-    version: Annotated[str, Field(alias="orthocal")]
-    """Of orthocal."""
+    versions: Versions
     robot_record: Annotated[RobotRecord, Field(alias="robot")]
     session: SessionRecord
     model: str

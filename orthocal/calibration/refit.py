@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,6 @@ from orthocal.estimation.selection import Selection
 from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.io.fields import read_only
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
-from orthocal.robot.model import Robot
 from orthocal.session.session import Gauge, Posture, Reading, Session, Setup
 from orthocal.statistics.information import decompose
 
@@ -106,7 +104,7 @@ def restore_session(calibration: Calibration) -> Session:
         source=record.source,
         gauges={g.name: Gauge(g.sigma, g.resolution, g.range) for g in calibration.gauges},
         postures={
-            p.name: Posture(p.name, _form(robot), np.array(p.drives), np.array(p.drives))
+            p.name: Posture(p.name, p.form, np.array(p.values), np.array(p.drives))
             for p in calibration.postures
         },
         setups={
@@ -138,8 +136,6 @@ def restore_session(calibration: Calibration) -> Session:
         readings_path=None if record.readings_path is None else Path(record.readings_path),
         sha256=record.sha256,
         joined=bool(record.parts),
+        purpose=record.purpose,
+        seed=record.seed,
     )
-
-
-def _form(robot: Robot) -> Literal["joints_mm", "joints_deg"]:
-    return "joints_mm" if all(d.unit == "m" for d in robot.drives) else "joints_deg"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 from orthocal.calibration.calibration import Calibration
+from orthocal.io.fields import finite_or_none
 from orthocal.session.session import Conditions
 
 Record = dict[str, str | float | int | bool | None]
@@ -33,10 +34,10 @@ def parameter_table(calibration: Calibration) -> list[Record]:
                     "unit": p.unit,
                     "value": p.value,
                     "linearised": p.linear,
-                    "std": _known(p.std),
-                    "std_scatter": _known(p.std_scatter),
-                    "low": _known(low),
-                    "high": _known(high),
+                    "std": finite_or_none(p.std),
+                    "std_scatter": finite_or_none(p.std_scatter),
+                    "low": finite_or_none(low),
+                    "high": finite_or_none(high),
                     "tolerance": p.tolerance,
                     "free": p.free,
                     "identifiable": p.identifiable,
@@ -56,12 +57,12 @@ def reading_table(calibration: Calibration) -> list[Record]:
             "cycle": r.cycle,
             "measured": r.measured,
             "nominal": r.nominal,
-            "linearised": _known(r.linear),
+            "linearised": finite_or_none(r.linear),
             "predicted": r.predicted,
             "deviation": r.deviation,
             "residual": r.residual,
-            "unseen": _known(r.unseen),
-            "studentised": _known(r.studentised),
+            "unseen": finite_or_none(r.unseen),
+            "studentised": finite_or_none(r.studentised),
             "file": r.file or calibration.session.readings_path,
             "line": r.line,
             **_conditions(r.conditions or Conditions()),
@@ -77,7 +78,3 @@ def _conditions(conditions: Conditions) -> Record:
         "temperature_C": conditions.temperature,
         "time": None if time is None else time.isoformat(),
     }
-
-
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None

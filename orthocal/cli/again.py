@@ -12,7 +12,7 @@ from orthocal.cli.files import require_new_files
 from orthocal.cli.options import Anyway, CalibrationPath, OutDirectory, app
 from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.sheet import sheet_or_problem
-from orthocal.errors import ParameterError, SessionError
+from orthocal.errors import ParameterError
 
 if TYPE_CHECKING:
     from orthocal.calibration.calibration import Calibration
@@ -75,17 +75,20 @@ def again(
 def _plan_again(calibration: Calibration, path: Path | None) -> Session:
     """The rows of a session, with the offsets to enter as active offsets."""
     from orthocal.assessment.controller_entries import entered_offsets
+    from orthocal.calibration.recorded_robot import require_calibrated_robot
+    from orthocal.calibration.refit import restore_session
     from orthocal.measurement.files.session_file import load_plan
 
-    file = calibration.session.path if path is None else path
-    if file is None:
+    if path is not None:
+        planned = load_plan(path)
+        require_calibrated_robot(calibration, planned)
+    elif calibration.session.parts:
         raise ParameterError(
             "is missing: the calibration is of several sessions; choose one of them",
             where="--session",
         )
-    planned = load_plan(file)
-    if planned.robot.sha256 != calibration.robot.sha256:
-        raise SessionError("is of another robot than the calibration", where=str(file))
+    else:
+        planned = restore_session(calibration)
     offsets = entered_offsets(calibration).round(DIGITS) + 0.0
     title = planned.title.removeprefix("Simulated: ")
-    return replace(planned.with_controller(offsets), title=title, source="")
+    return replace(planned.with_controller(offsets), title=title, source="", seed=None)

@@ -15,7 +15,7 @@ from orthocal.effects.protocol import Effect
 from orthocal.effects.registry import find_effect
 from orthocal.errors import OrthocalError, ParameterError, RobotError
 from orthocal.io.documents import PositiveNumber, validate
-from orthocal.robot.loading import MAX_LOADED, load_bare_robot
+from orthocal.robot.loading import MAX_LOADED, load_bare_content, load_bare_robot
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import COMPLETE, ElementaryError, build_parameters
 from orthocal.robot.redundant import find_redundant_errors
@@ -44,6 +44,22 @@ def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
         RobotError: Naming file and line or key, what was found and what was expected.
     """
     return _add_parameters(load_bare_robot(robot, beside=beside))
+
+
+def load_robot_content(
+    name: str, content: Mapping[str, bytes], *, folder: Path | None = None
+) -> Robot:
+    """Load a robot from the content of its files, as `load_robot` does from a directory.
+
+    Args:
+        name: Name of the robot.
+        content: Files by name: one URDF and one YAML, and meshes.
+        folder: Directory that they were read from, which need not exist any more.
+
+    Raises:
+        RobotError: Naming file and line or key, as in NAME/FILE.
+    """
+    return _add_parameters(load_bare_content(name, content, folder=folder))
 
 
 @lru_cache(maxsize=MAX_LOADED)

@@ -15,8 +15,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
-from orthocal.errors import ExportError, RobotError
-from orthocal.io.files import read_file
+from orthocal.errors import ExportError
 from orthocal.robot.description import load_description
 from orthocal.robot.frames import find_frame
 from orthocal.robot.model import Robot, joint_axis
@@ -42,15 +41,11 @@ def export_urdf(calibration: Calibration) -> dict[str, str]:
         ExportError: If the URDF cannot express an error.
     """
     robot = calibration.robot
-    content, description = (read_file(p, error=RobotError) for p in (robot.urdf, robot.yaml))
+    urdf, description = (robot.content[p.name].decode() for p in (robot.urdf, robot.yaml))
     errors = robot.parameters.expand(calibration.errors)
-    try:
-        text = content.decode()
-    except UnicodeDecodeError:
-        raise ExportError("its URDF is not UTF-8", where=str(robot.urdf)) from None
-    text = _correct(text, _find_twists(robot, errors), robot)
+    text = _correct(urdf, _find_twists(robot, errors), robot)
     _require_same(robot.with_errors(calibration.errors), text)
-    files = {robot.urdf.name: text, robot.yaml.name: description.decode()}
+    files = {robot.urdf.name: text, robot.yaml.name: description}
     scales = [
         f"{e.owner},{tidy(value / PPM)}\n"
         for name, value in errors.items()
@@ -90,7 +85,8 @@ def _find_twists(robot: Robot, errors: Mapping[str, float]) -> dict[str, list[Ar
 def _mounts(robot: Robot) -> dict[str, str]:
     """Links and fixed joints, mapped to the fixed joint that places them."""
     mounts = {}
-    for joint in parse_urdf(robot.urdf).findall("joint"):
+    content = robot.content[robot.urdf.name]
+    for joint in parse_urdf(robot.urdf, content=content).findall("joint"):
         if joint.get("type") == "fixed":
             name = str(joint.get("name"))
             mounts[name] = name
@@ -195,7 +191,7 @@ def _require_same(machine: Robot, text: str) -> None:
     Raises:
         ExportError: Naming the first joint or frame with another placement.
     """
-    keys = load_description(machine.yaml)
+    keys = load_description(machine.yaml, content=machine.content[machine.yaml.name])
     model = load_urdf(machine.urdf, content=text.encode(), joint_types=keys.joint_types)
     used = {f for c in machine.closures for f in (c.frame_a, c.frame_b)}
     used |= {f for leg in machine.legs.values() for f in (leg.root, leg.tip)}

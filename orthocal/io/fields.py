@@ -44,13 +44,14 @@ def _null_for(unknown: float) -> WrapValidator:
     return WrapValidator(read)
 
 
-def _finite_or_null(value: float) -> float | None:
+def finite_or_none(value: float) -> float | None:
+    """A finite number; None for NaN and infinity."""
     return float(value) if math.isfinite(value) else None
 
 
-NumberOrNaN = Annotated[Number, _null_for(math.nan), PlainSerializer(_finite_or_null)]
-SizeOrNaN = Annotated[Size, _null_for(math.nan), PlainSerializer(_finite_or_null)]
-SizeOrInf = Annotated[Size, _null_for(math.inf), PlainSerializer(_finite_or_null)]
+NumberOrNaN = Annotated[Number, _null_for(math.nan), PlainSerializer(finite_or_none)]
+SizeOrNaN = Annotated[Size, _null_for(math.nan), PlainSerializer(finite_or_none)]
+SizeOrInf = Annotated[Size, _null_for(math.inf), PlainSerializer(finite_or_none)]
 """Numbers that may be unknown or infinite."""
 
 

@@ -74,6 +74,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         path=None,
         readings_path=None,
         sha256="",
+        seed=None,
         parts=tuple(sessions),
         joined=True,
         purpose=purposes.pop() if len(purposes) == 1 else None,

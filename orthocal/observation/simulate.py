@@ -144,6 +144,7 @@ def simulate_session(
         source=f"Simulated by orthocal, not measured (seed {seed})",
         path=None,
         readings_path=None,
+        seed=seed,
     )
     found = {p.name: float(v) for p, v in zip(unknown, drawn, strict=True)}
     return SimulatedSession(session, dict(errors), zeros, found)

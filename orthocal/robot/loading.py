@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pinocchio as pin
@@ -83,24 +85,73 @@ def load_bare_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
     return _load_folder(folder)
 
 
+def load_bare_content(
+    name: str, content: Mapping[str, bytes], *, folder: Path | None = None
+) -> Robot:
+    """Load a robot from the content of its files: `load_bare_robot` without a directory.
+
+    Args:
+        name: Name of the robot.
+        content: Files by name: one URDF and one YAML, and meshes.
+        folder: Directory that they were read from, which need not exist any more.
+
+    Raises:
+        RobotError: Naming file and line or key, as in NAME/FILE.
+    """
+    urdf, yaml = (
+        next((file for file in content if file.endswith(suffix)), "")
+        for suffix in (".urdf", ".yaml")
+    )
+    if not urdf or not yaml:
+        raise RobotError("expected a URDF file and a YAML file")
+    place = Path(name) if folder is None else folder
+    return _build_robot(name, folder, place / yaml, place / urdf, tuple(content.items()))
+
+
+def robot_digest(robot: str | Path) -> str | None:
+    """SHA-256 of the URDF and the YAML of a packaged robot or a robot directory; None without."""
+    try:
+        _, _, (urdf, yaml) = _read_folder(packaged_robots().get(str(robot), Path(robot)))
+    except RobotError:
+        return None
+    return content_digest(urdf, yaml)
+
+
+def content_digest(urdf: bytes, yaml: bytes) -> str:
+    """SHA-256 of the URDF and the YAML of a robot."""
+    return hashlib.sha256(urdf + b"\0" + yaml).hexdigest()
+
+
 def _load_folder(folder: Path) -> Robot:
     require_plain_name(folder.resolve(), error=RobotError)
-    yaml_path, urdf_path = _find_files(folder)
-    urdf, description = (read_file(p, error=RobotError) for p in (urdf_path, yaml_path))
+    urdf_path, yaml_path, content = _read_folder(folder)
     name = folder.resolve().name
+    files = tuple(zip((urdf_path.name, yaml_path.name), content, strict=True))
     with content_withheld_outside(folder, yaml_path, urdf_path):
-        return _build_robot(name, folder, yaml_path, urdf_path, urdf, description)
+        return _build_robot(name, folder, yaml_path, urdf_path, files)
+
+
+def _read_folder(folder: Path) -> tuple[Path, Path, tuple[bytes, bytes]]:
+    """URDF and YAML of a robot directory, and their contents."""
+    yaml_path, urdf_path = _find_files(folder)
+    urdf, yaml = (read_file(p, error=RobotError) for p in (urdf_path, yaml_path))
+    return urdf_path, yaml_path, (urdf, yaml)
 
 
 @lru_cache(maxsize=MAX_LOADED)
 def _build_robot(
-    name: str, folder: Path, yaml_path: Path, urdf_path: Path, urdf: bytes, description: bytes
+    name: str,
+    folder: Path | None,
+    yaml_path: Path,
+    urdf_path: Path,
+    files: tuple[tuple[str, bytes], ...],
 ) -> Robot:
     """Build a robot from the content of its files."""
+    content = MappingProxyType(dict(files))
+    urdf, description = content[urdf_path.name], content[yaml_path.name]
     keys = load_description(yaml_path, content=description)
     where = str(yaml_path)
     model = load_urdf(urdf_path, content=urdf, joint_types=keys.joint_types, declared_in=where)
-    digest = hashlib.sha256(urdf + b"\0" + description).hexdigest()
 
     drives = tuple(_build_drive(model, motor, keys, where) for motor in keys.name_mot)
     drive_index = [model.joints[model.getJointId(d.name)].idx_v for d in drives]
@@ -111,7 +162,8 @@ def _build_robot(
         folder=folder,
         urdf=urdf_path,
         yaml=yaml_path,
-        sha256=digest,
+        content=content,
+        sha256=content_digest(urdf, description),
         model=model,
         constraints=build_constraints(model, closures),
         drives=drives,

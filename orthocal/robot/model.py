@@ -128,9 +128,13 @@ class Robot:
     """
 
     name: str
-    folder: Path
+    folder: Path | None
+    """Directory of its files; None for a robot that is embedded in another file."""
     urdf: Path
     yaml: Path
+    """Files of these names, for messages; their content is in `content`."""
+    content: Mapping[str, bytes]
+    """Content of its files by name: URDF and YAML, and the meshes of an embedded robot."""
     sha256: str
     """Digest of the URDF and the YAML."""
     model: pin.Model

@@ -30,9 +30,15 @@ ALIKE = 9
 """Decimals to which distances of postures from the mechanical zero are compared, [m, rad]."""
 
 
+PostureForm = Literal["tcp_mm", "joints_mm", "joints_deg"]
+"""Key of a posture in session.yaml: coordinates of the tool or of the drives, and their unit."""
+
+
 @dataclass(frozen=True, slots=True)
 class Purpose:
     """Default model and free errors of `calibrate`."""
+
+    __pydantic_config__ = CLOSED
 
     model: str | None = None
     """A model of the robot's YAML."""
@@ -57,10 +63,9 @@ class Posture:
     """A commanded machine position."""
 
     name: str
-    form: Literal["tcp_mm", "joints_mm", "joints_deg"]
-    """How it was given."""
+    form: PostureForm
     values: Array
-    """As given, in SI: tool coordinates or drive coordinates, [m] or [rad]."""
+    """Commanded coordinates of the tool or the drives, by `form`, [m] or [rad]."""
     drives: Array
     """Commanded drive coordinates ρ with the controller's offsets taken off, [m, rad]."""
 
@@ -175,7 +180,9 @@ class Session:
     joined: bool = False
     """Whether several were, so that names begin with that of their session and a slash."""
     purpose: Purpose | None = None
-    """What it is measured for, where it says so."""
+    """Model and free errors that the session states."""
+    seed: int | None = None
+    """Seed of simulated readings; None for measured readings."""
 
     @property
     def gauge(self) -> Gauge:

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import tempfile
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from orthocal.effects.loading import load_robot
-from orthocal.errors import RobotError
-from orthocal.io.files import is_folder, read_file
+from orthocal.effects.loading import load_robot_content
 from orthocal.measurement.files.write_session import session_document
-from orthocal.robot.loading import packaged_robots
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session
 
@@ -23,47 +18,25 @@ class PortableRobot:
     """Files of a robot."""
 
     name: str
-    folder: str
-    """Directory of the files; where it does not exist, the robot is loaded from their content."""
+    folder: Path | None
+    """Directory of the files, for messages."""
     sha256: str
-    urdf: bytes
-    description: bytes
+    content: tuple[tuple[str, bytes], ...]
+    """Names and contents of the files."""
     tolerances: tuple[tuple[str, float], ...] = ()
     """Prior standard deviations that a session states in place of the robot's."""
 
     @classmethod
     def of(cls, robot: Robot) -> PortableRobot:
-        """Files of a nominal robot.
-
-        Raises:
-            RobotError: If a file cannot be read any more.
-        """
-        urdf, description = (read_file(p, error=RobotError) for p in (robot.urdf, robot.yaml))
-        folder = str(robot.folder.resolve())
+        """Files of a nominal robot."""
         stated = tuple(robot.parameters.stated.items())
-        return cls(robot.name, folder, robot.sha256, urdf, description, stated)
+        content = tuple(robot.content.items())
+        return cls(robot.name, robot.folder, robot.sha256, content, stated)
 
     def unpack(self) -> Robot:
-        """The robot, from its directory if the files there are unchanged."""
-        return _unpack(self).with_tolerances(dict(self.tolerances))
-
-
-@lru_cache(maxsize=4)
-def _unpack(portable: PortableRobot) -> Robot:
-    packaged = packaged_robots()
-    folder = Path(portable.folder)
-    sources: list[str | Path] = [portable.name] if portable.name in packaged else []
-    sources += [folder] if is_folder(folder) else []
-    for source in sources:
-        robot = load_robot(source)
-        if robot.sha256 == portable.sha256:
-            return robot
-    with tempfile.TemporaryDirectory() as above:
-        folder = Path(above) / portable.name
-        folder.mkdir()
-        (folder / f"{portable.name}.urdf").write_bytes(portable.urdf)
-        (folder / f"{portable.name}.yaml").write_bytes(portable.description)
-        return load_robot(folder)
+        """The robot."""
+        robot = load_robot_content(self.name, dict(self.content), folder=self.folder)
+        return robot.with_tolerances(dict(self.tolerances))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

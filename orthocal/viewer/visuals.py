@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 
 from orthocal.errors import RobotError
 from orthocal.io.files import exists, read_file, require_file
+from orthocal.robot.files import MESH_FORMATS, mesh_path, robot_directory
 from orthocal.robot.model import Robot
 from orthocal.robot.urdf import LARGEST_PLACE, captured_stderr, parse_urdf
 from orthocal.viewer.shapes import Colour, cylinder, pose_along
 
 Array = NDArray[np.float64]
-
-MESH_FORMATS = (".stl", ".obj", ".dae", ".ply")
 
 LARGEST_REPETITION = 10 * 2**20
 """Largest size of the repetitions of a mesh file, [bytes]."""
@@ -56,33 +55,38 @@ def load_visuals(robot: Robot) -> tuple[Visual, ...]:
     Raises:
         RobotError: If a mesh file is missing, unreadable or outside the robot's directory.
     """
-    text = _with_absolute_meshes(robot)
-    try:
-        with captured_stderr():
-            geometry = pin.buildGeomFromUrdfString(robot.model, text, pin.GeometryType.VISUAL)
-    except (ValueError, RuntimeError) as e:
-        # without the place in the source of the library, and its hint
-        reason = " ".join(str(e).split("message:")[-1].split("Hint:")[0].split())
-        raise RobotError(f"its visuals cannot be loaded: {reason}", where=str(robot.urdf)) from None
+    with robot_directory(robot) as folder:
+        text = _with_absolute_meshes(robot, folder)
+        try:
+            with captured_stderr():
+                geometry = pin.buildGeomFromUrdfString(robot.model, text, pin.GeometryType.VISUAL)
+        except (ValueError, RuntimeError) as e:
+            # without the place in the source of the library, and its hint
+            reason = " ".join(str(e).split("message:")[-1].split("Hint:")[0].split())
+            raise RobotError(
+                f"its visuals cannot be loaded: {reason}", where=str(robot.urdf)
+            ) from None
     visuals = tuple(_visual(robot, part) for part in geometry.geometryObjects)
     return visuals or tuple(_sticks(robot))
 
 
-def _with_absolute_meshes(robot: Robot) -> str:
-    """Text of the URDF with absolute paths of its meshes."""
-    root = parse_urdf(robot.urdf)
-    folder = robot.folder.resolve()
+def _with_absolute_meshes(robot: Robot, folder: Path) -> str:
+    """Text of the URDF with absolute paths of its meshes; those not embedded are not drawn."""
+    root = parse_urdf(robot.urdf, content=robot.content[robot.urdf.name])
     uses: Counter[Path] = Counter()
-    for mesh in root.iter("mesh"):
+    for mesh in list(root.iter("mesh")):
         name = mesh.get("filename") or ""
         where = f"{robot.urdf}:{mesh.sourceline}"
-        path = (folder / _relative(name)).resolve()
+        path = (folder / mesh_path(name)).resolve()
         if not path.is_relative_to(folder):
             raise RobotError(
                 f"the mesh '{name}' lies outside of the robot's directory", where=where
             )
         if path.suffix.lower() not in MESH_FORMATS:
             raise RobotError(f"the mesh '{name}' is none of {', '.join(MESH_FORMATS)}", where=where)
+        if robot.folder is None and not exists(path):
+            mesh.getparent().getparent().getparent().remove(mesh.getparent().getparent())
+            continue
         if not exists(path):
             raise RobotError(f"there is no mesh file {path}", where=where)
         require_file(path, error=RobotError)
@@ -109,13 +113,6 @@ def _require_short_lines(path: Path, where: str) -> None:
             f"the mesh {path} has a line of {longest} characters; expected at most {LONGEST_LINE}",
             where=where,
         )
-
-
-def _relative(name: str) -> Path:
-    """Path of a mesh in the robot's directory, without package name or file://."""
-    if name.startswith("package://"):
-        return Path(*Path(name.removeprefix("package://")).parts[1:])
-    return Path(name.removeprefix("file://"))
 
 
 def _visual(robot: Robot, part: pin.GeometryObject) -> Visual:

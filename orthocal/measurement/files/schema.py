@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from orthocal.io.documents import Name, Number, PositiveNumber
+from orthocal.io.documents import Count, Name, Number, PositiveNumber
 from orthocal.sensors.mounting import LARGEST_SCALE
 from orthocal.sensors.tips import TipKeys
 from orthocal.units import DEG, MM, MRAD, Unit
@@ -138,6 +138,8 @@ class SessionKeys(_Keys):
     cycles: Annotated[int, Field(ge=1, le=1000)] = 1
     """In a plan: how often the postures are gone through."""
     readings: str | None = None
+    seed: Count | None = None
+    """Seed of simulated readings."""
 
     @model_validator(mode="after")
     def _one_form_of_gauges(self) -> SessionKeys:

@@ -293,6 +293,7 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         readings_path=None,
         sha256="",
         purpose=purpose,
+        seed=keys.seed,
     )
 
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from orthocal.io.files import write_files
-from orthocal.robot.loading import packaged_robots
+from orthocal.errors import SessionError
+from orthocal.io.files import exists, write_file, write_files
+from orthocal.robot.loading import packaged_robots, robot_digest
 from orthocal.sensors.protocol import default_zero
 from orthocal.sensors.registry import write_sensor
 from orthocal.session.session import Conditions, Gauge, Purpose, Reading, Session
@@ -37,6 +38,8 @@ def session_document(session: Session, *, readings: str = "readings.csv") -> dic
         document["title"] = session.title
     if session.source:
         document["source"] = session.source
+    if session.seed is not None:
+        document["seed"] = session.seed
     gauges = {name: _gauge_document(g) for name, g in session.gauges.items()}
     if "" not in gauges:
         document["gauges"] = gauges
@@ -106,6 +109,8 @@ def write_session(
 ) -> Path:
     """Write session.yaml and readings.csv into a folder, both or neither.
 
+    The files of a robot that has no directory are written into a subdirectory before.
+
     Args:
         session: The session.
         folder: Made if need be.
@@ -122,8 +127,7 @@ def write_session(
     """
     folder = Path(folder)
     document = session_document(session)
-    if session.robot_reference not in packaged_robots():
-        document["robot"] = os.path.relpath(session.robot.folder.resolve(), folder.resolve())
+    document["robot"] = _place_robot(session, folder)
     head = "".join(f"# {line}\n" for line in comment.splitlines())
     text = head + yaml.safe_dump(
         document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
@@ -133,6 +137,25 @@ def write_session(
     files = {"session.yaml": text, "readings.csv": table, **(extra or {})}
     write_files(folder, files)
     return folder / "session.yaml"
+
+
+def _place_robot(session: Session, folder: Path) -> str:
+    """Reference to the robot in a session.yaml; files of an embedded robot are written.
+
+    Raises:
+        SessionError: If the robot's directory exists and holds another robot.
+    """
+    robot = session.robot
+    if robot.folder is not None:
+        if session.robot_reference in packaged_robots():
+            return session.robot_reference
+        return os.path.relpath(robot.folder.resolve(), folder.resolve())
+    target = folder / robot.name
+    if exists(target) and robot_digest(target) != robot.sha256:
+        raise SessionError("exists already and holds another robot", where=str(target))
+    for name, content in robot.content.items():
+        write_file(target / name, content)
+    return f"./{robot.name}"
 
 
 def readings_table(

@@ -6,6 +6,7 @@ The page is self-contained and needs no network.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
 
@@ -261,7 +262,7 @@ def _provenance(calibration: Calibration) -> str:
             f"{solver.name}, {solver.status}, {solver.iterations} iterations, "
             f"{solver.hessian} Hessian, loss: {solver.loss}",
         ),
-        ("orthocal", calibration.version),
+        ("Software", ", ".join(f"{n} {v}" for n, v in asdict(calibration.versions).items())),
     ]
     return table(("", ""), rows, left=2)
 

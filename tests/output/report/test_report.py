@@ -112,7 +112,7 @@ def test_every_reading_is_listed(calibration, read):
 def test_provenance_has_check_sums_of_files(calibration, page):
     assert calibration.session.sha256 in page
     assert calibration.robot_record.sha256 in page
-    assert calibration.version in page
+    assert calibration.versions.orthocal in page
     assert "Pashkevich, Chablat, Wenger (2006)" in page
 
 

@@ -1,0 +1,234 @@
+"""calibration.json embeds its robot: it needs no other file, and a changed directory is named."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import platform
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from tolerances import KINEMATICS
+
+import orthocal
+from orthocal import (
+    calibrate,
+    draw_scene,
+    load_calibration,
+    load_session,
+    simulate_session,
+    validate_calibration,
+    write_calibration,
+)
+from orthocal.calibration.file import calibration_document
+from orthocal.errors import CalibrationFileError, SessionError
+from orthocal.measurement.files.write_session import write_session
+from orthocal.robot.files import LARGEST_MESHES, is_inner_path
+from orthocal.robot.loading import content_digest
+
+BOX = '<geometry><box size="0.36 0.05 0.018"/></geometry>'
+MESH = '<geometry><mesh filename="package://mill/parts/rail.stl"/></geometry>'
+STL = b"\0" * 80 + (1).to_bytes(4, "little") + np.eye(4, 3, -1, dtype="<f4").tobytes() + b"\0\0"
+
+
+@pytest.fixture(scope="module")
+def made(root, tmp_path_factory):
+    """Directory with a machine that has a mesh, a session on it, and its calibration."""
+    above = tmp_path_factory.mktemp("made")
+    folder = above / "mill"
+    shutil.copytree(root / "robots/orthoglide", folder)
+    urdf = (folder / "orthoglide.urdf").read_text()
+    assert BOX in urdf
+    (folder / "orthoglide.urdf").write_text(urdf.replace(BOX, MESH))
+    (folder / "parts").mkdir()
+    (folder / "parts/rail.stl").write_bytes(STL)
+    session = above / "first"
+    shutil.copytree(root / "examples/raw-cycles", session)
+    text = (session / "session.yaml").read_text()
+    (session / "session.yaml").write_text(text.replace("robot: orthoglide", "robot: ../mill"))
+    write_calibration(calibrate(session), above / "calibration.json")
+    return above
+
+
+@pytest.fixture
+def mill(made, tmp_path):
+    """A copy of the directory, to be changed."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "calibration.json"
+    path.write_text(path.read_text().replace(str(made / "mill"), str(tmp_path / "mill")))
+    return tmp_path
+
+
+COMMANDS = """
+import sys
+from orthocal.cli import main
+from orthocal import load_calibration, load_plan, simulate_session
+from orthocal.measurement.files.write_session import write_session
+
+def run(line):
+    sys.argv = ["orthocal", *line.split()]
+    try:
+        main()
+    except SystemExit as e:
+        if e.code:
+            sys.exit(f"{line}: {e.code}")
+
+open("joints.csv", "w").write("x_slide_mm,y_slide_mm,z_slide_mm\\n310,310,310\\n")
+open("points.csv", "w").write("x_mm,y_mm,z_mm\\n0,0,0\\n")
+open("part.ngc", "w").write("G21 G90 G54\\nG0 X0 Y0 Z0\\nG1 X10 F1000\\nM2\\n")
+for format in ("yaml", "table", "urdf", "linuxcnc"):
+    run(f"export calibration.json --to {format} --out {format}")
+run("correct calibration.json part.ngc --work-offset-mm 0,0,0 --out corrected.ngc")
+run("forward calibration.json joints.csv")
+run("inverse calibration.json points.csv")
+run("accuracy calibration.json points.csv")
+run("view calibration.json --html scene.html")
+run("report calibration.json")
+run("again calibration.json --out second")
+run("view second --html second.html")
+calibration = load_calibration("calibration.json")
+measured = simulate_session(load_plan("second"), calibration.errors, seed=3).session
+write_session(measured, "third")
+run("validate calibration.json third")
+"""
+
+
+def test_every_command_works_without_the_robot_directory(mill, tmp_path_factory):
+    empty = tmp_path_factory.mktemp("elsewhere")
+    shutil.move(mill / "calibration.json", empty)
+    shutil.rmtree(mill)
+    done = subprocess.run(
+        [sys.executable, "-c", COMMANDS], cwd=empty, capture_output=True, text=True, timeout=240
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert (empty / "second/mill/parts/rail.stl").read_bytes() == STL
+    assert (empty / "corrected.ngc").exists()
+
+
+def test_an_embedded_robot_is_the_robot_of_its_directory(mill):
+    first = load_calibration(mill / "calibration.json")
+    assert first.robot.folder == mill / "mill"
+    drawn = draw_scene(first).nodes
+    shutil.rmtree(mill / "mill")
+    again = load_calibration(mill / "calibration.json")
+    assert again.robot.folder is None
+    assert calibration_document(again) == calibration_document(first)
+    joints = np.full(3, 0.31)
+    assert np.abs(again.machine.forward(joints) - first.machine.forward(joints)).max() < KINEMATICS
+    assert draw_scene(again).nodes == drawn
+
+
+def test_files_versions_and_seed_are_in_the_file(mill):
+    document = json.loads((mill / "calibration.json").read_text())
+    files = {f["name"]: f for f in document["robot"]["files"]}
+    assert list(files) == ["orthoglide.urdf", "orthoglide.yaml", "parts/rail.stl"]
+    for name, file in files.items():
+        content = (mill / "mill" / name).read_bytes()
+        assert file["sha256"] == hashlib.sha256(content).hexdigest()
+        assert file["text"] == (None if name.endswith(".stl") else content.decode())
+    versions = document["versions"]
+    assert set(versions) == {"orthocal", "python", "pin", "casadi", "numpy", "scipy"}
+    assert versions["python"] == platform.python_version()
+    assert versions["orthocal"] == orthocal.__version__
+    assert document["session"]["seed"] is None
+    plan = orthocal.load_plan(mill / "first")
+    session = simulate_session(plan, {"x_slide.offset": 1e-3}, seed=7).session
+    loaded = load_session(write_session(session, mill / "simulated"))
+    assert calibration_document(calibrate(loaded))["session"]["seed"] == 7
+
+
+def test_a_changed_directory_is_named_and_the_embedded_robot_is_used(mill, caplog):
+    before = load_calibration(mill / "calibration.json")
+    yaml = mill / "mill/orthoglide.yaml"
+    yaml.write_text(yaml.read_text().replace("zero_mm: 310.25", "zero_mm: 310.2"))
+    with caplog.at_level(logging.WARNING):
+        after = load_calibration(mill / "calibration.json")
+    (record,) = caplog.records
+    assert str(mill / "calibration.json") in record.getMessage()
+    assert str(mill / "mill") in record.getMessage()
+    assert after.robot.sha256 == before.robot.sha256
+    assert np.array_equal(after.robot.drive_zero, before.robot.drive_zero)
+    with pytest.raises(SessionError, match="is of robot 'mill'"):
+        validate_calibration(after, load_session(mill / "first"))
+
+
+def test_large_meshes_are_left_out_and_not_drawn(mill):
+    (mill / "mill/parts/rail.stl").write_bytes(STL + b"\0" * LARGEST_MESHES)
+    path = write_calibration(calibrate(mill / "first"), mill / "large.json")
+    shutil.rmtree(mill / "mill")
+    loaded = load_calibration(path)
+    assert len(loaded.robot_record.files) == 2
+    assert draw_scene(loaded).nodes
+
+
+def set_file(index, **values):
+    return lambda files: files[index].update(values)
+
+
+HOSTILE = {
+    "parent": (set_file(2, name="../rail.stl"), "robot.files[2].name"),
+    "absolute": (set_file(2, name="/tmp/rail.stl"), "robot.files[2].name"),
+    "drive letter": (set_file(2, name="c:rail.stl"), "robot.files[2].name"),
+    "backslash": (set_file(2, name="..\\rail.stl"), "robot.files[2].name"),
+    "empty name": (set_file(2, name=""), "robot.files[2].name"),
+    "long name": (set_file(2, name="a" * 300 + ".stl"), "robot.files[2].name"),
+    "other kind": (set_file(2, name="rail.py"), "robot.files"),
+    "inside a file": (set_file(2, name="orthoglide.urdf/rail.stl"), "robot.files"),
+    "same name": (set_file(0, name="orthoglide.yaml"), "robot.files"),
+    "nested URDF": (set_file(0, name="parts/orthoglide.urdf"), "robot.files"),
+    "no URDF": (lambda files: files.pop(0), "robot.files"),
+    "two YAML": (lambda files: files.append({**files[1], "name": "b.yaml"}), "robot.files"),
+    "too many": (lambda files: files.extend(files * 1000), "robot.files"),
+    "checksum": (set_file(0, sha256="0" * 64), "robot.files[0].sha256"),
+    "content": (set_file(1, text="robot: {}"), "robot.files[1].sha256"),
+    "no base64": (set_file(2, base64="%"), "robot.files[2].base64"),
+    "text and base64": (set_file(2, text=""), "robot.files[2]"),
+    "neither": (set_file(2, base64=None), "robot.files[2]"),
+    "unknown key": (set_file(0, mode=0o777), "robot.files[0].mode"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_files_of_a_stranger(mill, case):
+    change, key = HOSTILE[case]
+    path = mill / "calibration.json"
+    document = json.loads(path.read_text())
+    change(document["robot"]["files"])
+    path.write_text(json.dumps(document))
+    with pytest.raises(CalibrationFileError) as caught:
+        load_calibration(path)
+    assert caught.value.where == f"{path}: {key}"
+
+
+def test_an_embedded_robot_that_does_not_load_names_file_and_line(mill):
+    path = mill / "calibration.json"
+    document = json.loads(path.read_text())
+    text = document["robot"]["files"][0]["text"].replace("</robot>", "")
+    files = document["robot"]["files"]
+    files[0] |= {"text": text, "sha256": hashlib.sha256(text.encode()).hexdigest()}
+    document["robot"]["sha256"] = content_digest(text.encode(), files[1]["text"].encode())
+    path.write_text(json.dumps(document))
+    with pytest.raises(CalibrationFileError) as caught:
+        load_calibration(path)
+    line = text.count("\n") + 1
+    assert caught.value.where == f"{path}: robot.files: orthoglide.urdf:{line}"
+
+
+def test_the_robot_checksum_belongs_to_the_files(mill):
+    path = mill / "calibration.json"
+    document = json.loads(path.read_text())
+    document["robot"]["sha256"] = "0" * 64
+    path.write_text(json.dumps(document))
+    with pytest.raises(CalibrationFileError) as caught:
+        load_calibration(path)
+    assert caught.value.where == f"{path}: robot.sha256"
+
+
+@pytest.mark.parametrize("name", ["a.stl", "parts/a.stl", "my robot.urdf", "é.yaml", "...stl"])
+def test_inner_paths(name):
+    assert is_inner_path(name)
