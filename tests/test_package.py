@@ -74,7 +74,7 @@ def test_the_installed_wheel_calibrates_from_elsewhere(wheel, root, tmp_path):
     )
     document = json.loads(done.stdout)
     assert document["parameters"][0]["value"] == pytest.approx(-0.5268e-3, abs=5e-6)
-    assert document["robot"]["folder"] is None
+    assert document["robot"]["directory"] is None
     assert (elsewhere / "out/report.html").stat().st_size > 1e6
     where = subprocess.run(
         [python, "-c", "import orthocal; print(orthocal.__file__)"],

@@ -236,6 +236,11 @@ def test_error_of_a_frame_on_a_moving_link_is_refused(orthoglide):
         "frame.x_crossbar.x", "translation", "x_crossbar", "m", 1e-4, of_frame=True, axis=0
     )
     parameters = SimpleNamespace(elementary={error.name: error})
-    robot = SimpleNamespace(parameters=parameters, urdf=orthoglide.urdf, model=orthoglide.model)
+    robot = SimpleNamespace(
+        parameters=parameters,
+        urdf=orthoglide.urdf,
+        content=orthoglide.content,
+        model=orthoglide.model,
+    )
     with pytest.raises(ExportError, match="is an error of a frame on a moving link"):
         _find_twists(robot, {error.name: 1e-3})
