@@ -233,7 +233,7 @@ while True:
 def test_whenever_it_is_killed_no_two_generations_stand_side_by_side(tmp_path):
     """SIGKILL at random moments, then the next run begins: old pair, new pair, or no report."""
     rng, found = random.Random(0), set()
-    for _ in range(12):
+    for _ in range(6):
         process = subprocess.Popen(
             [sys.executable, "-c", WRITE, str(tmp_path)], stdout=subprocess.PIPE, text=True
         )

@@ -9,13 +9,19 @@ import pytest
 import yaml
 from fuzzing import DIAL, ERRORS, PLAN, SESSION
 
-from orthocal.io import strict_yaml
+from orthocal.errors import SessionError
+from orthocal.io import documents, strict_yaml
 
 FOREIGN = 'title: "a \\u00e9 – 机器"\nkeys: [~, yes, 1e3]\n'
 
 DOCUMENTS = (SESSION, SESSION + PLAN, ERRORS, DIAL, FOREIGN)
 
 LETTERS = "abc:-?,[]{}#&*!|>'\"%@` \n\t\\~0123\x85\u2028\xa0\ufeff\x07\x00é机\r"
+
+FOREIGN_TAGS = (
+    *("!!set {a, b}", "!!map [a]", "!!omap [a: 1]", "!!pairs [a: 1]", "!!binary aGVsbG8="),
+    *("!!str [1]", "!!seq {a: 1}", "!!timestamp 2020-01-01", "!<x> 1", "!!map 5", "!!set [a]"),
+)
 
 STRANGE = (*LETTERS, "\ud800", ": ", "<<")
 
@@ -68,12 +74,36 @@ def test_mutated_documents(load):
         ("? [1]\n: 2", "a key is a list or a mapping"),
         ("a: !!python/object:os.system 1", "tag"),
         ('a: "\\x07"', "control character"),
-        (f"a: {'[' * 30}{']' * 30}", "nested more than 20 deep"),
-        (f"a: {'9' * 101}", "does not fit its tag !!int"),
+        *((f"a: {'[' * n}{']' * n}", "nested more than 20 deep") for n in (21, 5000, 100_000)),
+        ("title: [" + "1," * 250_000 + "]", "holds more than 50000 keys and values"),
+        *(
+            (f"a: {form.format('9' * digits)}", "does not fit its tag !!")
+            for form in ("{}", "-{}", "0x{}", "{}.5")
+            for digits in (101, 4301, 100_000)
+        ),
+        *(
+            (f"title: {value}", "could not determine a constructor for the tag")
+            for value in FOREIGN_TAGS
+        ),
     ],
+    ids=lambda v: v[:20],
 )
 def test_refused_documents(load, text, problem):
     with pytest.raises(yaml.MarkedYAMLError) as caught:
         load(text)
     assert problem in caught.value.problem
+    assert len(caught.value.problem) < 500
     assert caught.value.problem_mark is not None
+
+
+def test_redundant_tags_are_accepted(load):
+    text = "{a: !!str 5, b: !!float 1, c: !!seq [!!int 2], d: !!map {e: ! 7}}"
+    assert load(text) == {"a": "5", "b": 1.0, "c": [2], "d": {"e": 7}}
+
+
+def test_large_files_are_refused_before_they_are_parsed(tmp_path, monkeypatch):
+    monkeypatch.setattr(documents, "load_yaml", None)
+    path = tmp_path / "file"
+    path.write_bytes(b" " * (strict_yaml.LARGEST_YAML + 1))
+    with pytest.raises(SessionError, match="expected at most 1 MiB"):
+        documents.read_yaml(path, error=SessionError)

@@ -1,4 +1,4 @@
-"""What is left out of a complete model changes nothing; what is in it changes something."""
+"""Redundant errors have no effect; all others have one."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ STEP = 1e-6
 """[m, rad]"""
 
 
-def seen_by(robot, errors, drives):
-    """Tool and ends of all rods of a machine, loops closed anew, shape (K, n), [m]."""
+def observed_points(robot, errors, drives):
+    """Tool and ends of all rods of a machine with closed loops, shape (K, n), [m]."""
     closure = LoopClosure(robot, fixed=errors)
     passive, machine = closure.close(drives), closure.geometry()
     frames = [robot.tcp.frame] + [
@@ -31,34 +31,31 @@ def seen_by(robot, errors, drives):
 
 @pytest.fixture(scope="module")
 def effects(orthoglide):
-    """Of every elementary error by central differences, loops closed anew, [m/m, m/rad]."""
+    """Effect of every elementary error, by central differences, [m/m, m/rad]."""
     rng = np.random.default_rng(7)
     tool = rng.uniform(-0.08, 0.05, (4, 3))
     drives = LoopClosure(orthoglide).inverse(tool)
     found = {}
     for name in orthoglide.parameters.elementary:
-        plus, minus = (seen_by(orthoglide, {name: s}, drives) for s in (STEP, -STEP))
+        plus, minus = (observed_points(orthoglide, {name: s}, drives) for s in (STEP, -STEP))
         found[name] = np.abs(plus - minus).max() / (2.0 * STEP)
     return found
 
 
-def test_idle_errors_change_nothing_and_all_others_do(orthoglide, effects):
-    idle = orthoglide.parameters.redundant
+def test_redundant_errors_have_no_effect_and_all_others_have(orthoglide, effects):
     for name, size in effects.items():
-        if name in idle:
-            assert size < 1e-6, name
-        else:
-            assert size > 1e-3, name
+        redundant = name in orthoglide.parameters.redundant
+        assert (size < 1e-6) if redundant else (size > 1e-3), name
 
 
-def test_hinges_take_up_errors_about_their_own_axes(orthoglide):
-    idle = orthoglide.parameters.redundant
-    assert {f"{k}_{j}" for k in "xyz" for j in ("swivel.rz", "bar_a.ry", "wrist.rz")} <= idle
-    assert {f"frame.{k}_crossbar_end.rx" for k in "xyz"} <= idle
-    assert not any(n.endswith((".offset", ".scale")) for n in idle)
+def test_rotations_about_hinge_axes_are_redundant(orthoglide):
+    redundant = orthoglide.parameters.redundant
+    assert {f"{k}_{j}" for k in "xyz" for j in ("swivel.rz", "bar_a.ry", "wrist.rz")} <= redundant
+    assert {f"frame.{k}_crossbar_end.rx" for k in "xyz"} <= redundant
+    assert not any(n.endswith((".offset", ".scale")) for n in redundant)
 
 
-def test_the_complete_model_is_the_parts_errors_without_idle_ones(orthoglide):
+def test_the_complete_model_has_no_redundant_errors(orthoglide):
     """Of 177 errors (126 of joints and offsets, ends of loops, scales) 129 change something."""
     p = orthoglide.parameters
     full = p.select_model("full")
@@ -71,7 +68,7 @@ def test_the_complete_model_is_the_parts_errors_without_idle_ones(orthoglide):
     )
 
 
-def test_a_robot_that_nothing_is_seen_of_has_no_idle_errors(fivebar, biglide):
+def test_without_observations_no_error_is_redundant(fivebar, biglide):
     assert fivebar.parameters.redundant == frozenset()
     # two drives on one rail each: only what leaves the plane is taken up by nothing
     assert biglide.parameters.complete

@@ -1,4 +1,4 @@
-"""What is kept on disk: trusted only where nobody else can have written it, and never needed."""
+"""Disk cache: content is trusted only if nobody else can have written it; failures are harmless."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def only_file(folder):
     return path
 
 
-def test_what_is_kept_comes_back_and_nobody_else_may_write_it(folder):
+def test_content_is_returned_and_is_private(folder):
     assert cache.load(KEY) is None
     cache.store(KEY, b"content")
     assert cache.load(KEY) == b"content"
@@ -38,7 +38,7 @@ def test_what_is_kept_comes_back_and_nobody_else_may_write_it(folder):
 
 
 @pytest.mark.parametrize("value", ["off", "OFF", "0", "", "none"])
-def test_it_can_be_switched_off(monkeypatch, tmp_path, value):
+def test_the_cache_can_be_disabled(monkeypatch, tmp_path, value):
     monkeypatch.setenv(cache.VARIABLE, value)
     monkeypatch.chdir(tmp_path)
     cache.store(KEY, b"content")
@@ -47,7 +47,7 @@ def test_it_can_be_switched_off(monkeypatch, tmp_path, value):
     assert not list(tmp_path.iterdir())
 
 
-def test_it_is_where_the_desktop_says(monkeypatch, tmp_path):
+def test_the_default_directory(monkeypatch, tmp_path):
     monkeypatch.delenv(cache.VARIABLE, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache.cache_folder() == tmp_path / "orthocal"
@@ -56,61 +56,55 @@ def test_it_is_where_the_desktop_says(monkeypatch, tmp_path):
     assert cache.cache_folder() == tmp_path / ".cache/orthocal"
 
 
-@pytest.mark.parametrize("mode", [0o770, 0o702])
-def test_a_folder_that_others_can_write_to_is_not_used(folder, mode):
+def link_elsewhere(path):
+    target = path.with_name(f"{path.name}-elsewhere")
+    path.rename(target)
+    path.symlink_to(target)
+
+
+def replace_by_pipe(path):
+    path.unlink()
+    os.mkfifo(path, 0o600)
+
+
+@pytest.mark.parametrize(
+    "spoil", [lambda p: p.chmod(0o770), lambda p: p.chmod(0o702), link_elsewhere]
+)
+def test_an_untrusted_directory_is_not_used(folder, spoil):
     cache.store(KEY, b"content")
-    folder.chmod(mode)
+    spoil(folder)
     assert cache.load(KEY) is None
     cache.store("another", b"content")
     assert len(list(folder.iterdir())) == 1
 
 
-def test_a_folder_of_another_user_is_not_used(folder, monkeypatch):
+@pytest.mark.parametrize("spoil", [lambda p: p.chmod(0o620), link_elsewhere, replace_by_pipe])
+def test_an_untrusted_file_is_not_used(folder, spoil):
+    cache.store(KEY, b"content")
+    spoil(only_file(folder))
+    assert cache.load(KEY) is None
+
+
+def test_a_directory_of_another_user_is_not_used(folder, monkeypatch):
     cache.store(KEY, b"content")
     monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
     assert cache.load(KEY) is None
 
 
-def test_a_link_to_a_folder_is_not_used(folder, tmp_path):
-    cache.store(KEY, b"content")
-    elsewhere = tmp_path / "elsewhere"
-    folder.rename(elsewhere)
-    folder.symlink_to(elsewhere)
-    assert cache.load(KEY) is None
-    cache.store("another", b"content")
-    assert len(list(elsewhere.iterdir())) == 1
-
-
-def test_a_link_to_a_file_and_one_that_others_can_write_to_are_not_used(folder, tmp_path):
+@pytest.mark.parametrize("spoil", [lambda b: b[:-1], lambda b: b + b"!", lambda b: b""])
+def test_a_file_of_another_length_is_not_used(folder, spoil):
     cache.store(KEY, b"content")
     path = only_file(folder)
-    path.chmod(0o620)
-    assert cache.load(KEY) is None
-    path.chmod(0o600)
-    assert cache.load(KEY) == b"content"
-    path.rename(tmp_path / "elsewhere")
-    path.symlink_to(tmp_path / "elsewhere")
+    path.write_bytes(spoil(path.read_bytes()))
     assert cache.load(KEY) is None
 
 
-def test_a_pipe_is_not_waited_for(folder):
+def test_a_changed_byte_is_noticed_and_the_file_replaced(folder):
     cache.store(KEY, b"content")
     path = only_file(folder)
-    path.unlink()
-    os.mkfifo(path, 0o600)
-    assert cache.load(KEY) is None
-
-
-@pytest.mark.parametrize("spoil", [lambda b: b[:-1], lambda b: b + b"!", lambda b: b"", None])
-def test_a_spoiled_file_is_not_trusted_and_is_made_anew(folder, spoil):
-    cache.store(KEY, b"content")
-    path = only_file(folder)
-    whole = path.read_bytes()
-    if spoil is not None:
-        path.write_bytes(spoil(whole))
-        assert cache.load(KEY) is None
-    for place in range(len(whole)):
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+    data = path.read_bytes()
+    for i in range(len(data)):
+        path.write_bytes(data[:i] + bytes([data[i] ^ 1]) + data[i + 1 :])
         assert cache.load(KEY) is None
     cache.store(KEY, b"content")
     assert cache.load(KEY) == b"content"
@@ -122,7 +116,7 @@ def test_a_file_of_another_key_is_not_trusted(folder):
     assert cache.load(KEY) is None
 
 
-def test_its_size_is_bounded_and_the_oldest_go_first(folder, monkeypatch):
+def test_the_size_is_bounded_and_the_oldest_are_removed(folder, monkeypatch):
     monkeypatch.setattr(cache, "LARGEST_TOTAL", 1000)
     for i in range(10):
         cache.store(f"key {i}", bytes(200))
@@ -138,7 +132,7 @@ def test_its_size_is_bounded_and_the_oldest_go_first(folder, monkeypatch):
     assert cache.load("key 11") is None
 
 
-def test_a_file_is_never_half_written(folder, monkeypatch):
+def test_a_failed_write_leaves_the_old_content(folder, monkeypatch):
     cache.store(KEY, b"old")
 
     def full(*args, **kwargs):
@@ -150,7 +144,7 @@ def test_a_file_is_never_half_written(folder, monkeypatch):
     assert len(list(folder.iterdir())) == 1
 
 
-def test_a_folder_that_cannot_be_made_stops_nothing(tmp_path, monkeypatch):
+def test_a_missing_directory_is_harmless(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file/kept"))
     cache.store(KEY, b"content")
@@ -158,7 +152,7 @@ def test_a_folder_that_cannot_be_made_stops_nothing(tmp_path, monkeypatch):
     assert load_afresh("orthoglide").name == "orthoglide"
 
 
-def test_functions_that_were_kept_are_those_that_are_built(folder):
+def test_cached_functions_equal_built_ones(folder):
     built = RobotFunctions(load_afresh("orthoglide"))
     where = built.robot.drive_zero[None], built.robot.reference_passive[None]
     where = (*where, built.errors.placements(np.full(len(built.errors.names), 1e-3)))
@@ -172,7 +166,7 @@ def test_functions_that_were_kept_are_those_that_are_built(folder):
         assert np.array_equal(ours, theirs)
 
 
-def test_functions_of_another_machine_are_others(folder, orthoglide):
+def test_another_machine_has_other_functions(folder, orthoglide):
     _ = RobotFunctions(orthoglide).closure_by_passive
     count = len(list(folder.glob("*.kept")))
     machine = orthoglide.with_errors({"x_coupler.x": 1e-3})
@@ -180,7 +174,7 @@ def test_functions_of_another_machine_are_others(folder, orthoglide):
     assert len(list(folder.glob("*.kept"))) == count + 1
 
 
-def test_yourdfpy_is_asked_once_for_the_same_bytes(folder, monkeypatch):
+def test_yourdfpy_checks_the_same_content_once(folder, monkeypatch):
     asked = []
     ask = urdf._ask_yourdfpy
     monkeypatch.setattr(urdf, "_ask_yourdfpy", lambda text, path: asked.append(ask(text, path)))
