@@ -25,7 +25,7 @@ from orthocal.hypotheses.families.sessions import MOST_DRIVES, changes_between_s
 from orthocal.hypotheses.families.single_reading import wrong_readings
 from orthocal.hypotheses.families.swapped_rows import swapped_rows
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
-from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, marks
+from orthocal.hypotheses.hypothesis import Family, Rows, marks
 from orthocal.hypotheses.hypothesis_set import (
     HypothesisSet,
     Term,
@@ -77,6 +77,10 @@ MOST_PAIRS_REFITTED = 12
 COARSE = 2.0
 """Logarithm of the Bayes factor below 1 at which a pair is left out after the coarse grid: the sum
 over the full grid of scales may exceed its largest term by that and `WORTH_REFITTING`."""
+
+FAR_BEHIND = CLEARLY + NEARLY
+"""Logarithm of the Bayes factor by which a pair is left out that explains less than a single
+hypothesis."""
 
 MOST_COMBINED = 5
 """Most likely single hypotheses that are combined in pairs where none by itself leaves readings
@@ -433,47 +437,39 @@ class _Search:
     ) -> tuple[list[tuple[Term, Term]], float]:
         """The most likely pairs of hypotheses, and the log evidence of all of them together."""
         few = self.values.size <= MOST_PAIRED
-        rows = Rows(self.session, state.corrected)
-        families = [f for f, _ in scored if _is_paired(f)]
+        edits = [f for f, _ in scored if f.edits is not None and _is_paired(f)]
+        effects = [f for f, _ in scored if f.effects is not None and _is_paired(f)]
+        families = [*edits, *effects]
         if not few or not families or len(state.terms) + 2 > MOST_ANOMALIES:
             return [], -np.inf
         likelihood = state.about.likelihood
-        sound = likelihood.score(likelihood.products(state.remaining[None]))[0]
-        perfect = likelihood.score(likelihood.products(np.zeros_like(state.remaining)[None]))[0]
-        prior = np.concatenate([_prior(f) for f in families])
-        if perfect - sound + 2.0 * prior.max() < WORTH_REFITTING:
-            return [], -np.inf
-        found = find_pairs(
-            likelihood,
-            state.remaining,
-            self._singles(families, prior),
-            least=float(sound) - COARSE,
+        sound = float(likelihood.score(likelihood.products(state.remaining[None]))[0])
+        single = max(float(e.max(initial=-np.inf)) for _, e in scored)
+        rows = [
+            np.vstack(
+                [np.zeros((0, self.values.size)), *(p.to_sparse().toarray() for p in part if p)]
+            )
+            for part in ([f.edits for f in edits], [f.effects for f in effects])
+        ]
+        singles = Singles(
+            self.model.entries(rows[0]),
+            self.model.entries(rows[1]),
+            np.concatenate([_prior(f) for f in families]),
+            np.vstack(rows) != 0.0,
         )
+        least = sound + max(-COARSE, single - FAR_BEHIND)
+        found = find_pairs(likelihood, state.remaining, singles, least=least)
         evidence = found.log_posterior - sound
         if not evidence.size:
             return [], -np.inf
-        which = np.repeat(np.arange(len(families)), [f.count for f in families])
-        begin = np.cumsum([0, *(f.count for f in families)])
+        hypotheses = [(f, h) for f in families for h in range(f.count)]
+        corrected = Rows(self.session, state.corrected)
 
         def term(m: int) -> Term:
-            i = int(which[m])
-            return self._term(families[i], m - int(begin[i]), rows)
+            return self._term(*hypotheses[m], corrected)
 
-        chosen = [
-            m for m, e in zip(found.members, evidence, strict=True) if e > WORTH_REFITTING - NEARLY
-        ][:MOST_PAIRS_REFITTED]
-        return [(term(int(a)), term(int(b))) for a, b in chosen], float(log_of_sum(evidence))
-
-    def _singles(self, families: list[Family], prior: Array) -> Singles:
-        n = self.values.size
-
-        def dense(patterns: Patterns | None, count: int) -> Array:
-            return np.zeros((count, n)) if patterns is None else patterns.to_sparse().toarray()
-
-        edits = np.concatenate([dense(f.edits, f.count) for f in families])
-        effects = np.concatenate([dense(f.effects, f.count) for f in families])
-        entries = self.model.entries
-        return Singles(entries(edits), entries(effects), prior, (edits != 0.0) | (effects != 0.0))
+        chosen = found.members[evidence > WORTH_REFITTING - NEARLY][:MOST_PAIRS_REFITTED]
+        return [(term(a), term(b)) for a, b in chosen.tolist()], float(log_of_sum(evidence))
 
     def _result(
         self, state: HypothesisSet, near: list[tuple[HypothesisSet, HypothesisSet]]

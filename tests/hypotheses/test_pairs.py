@@ -10,21 +10,22 @@ import pytest
 from orthocal.hypotheses.likelihood import build_likelihood
 from orthocal.hypotheses.pairs import Singles, find_pairs
 
-N, ROWS = 9, 20
+N, ROWS, EDITS = 9, 20, 14
 
 
 @pytest.fixture(scope="module")
 def case():
-    """Twenty hypotheses: twelve edits, six effects, two edits with an effect."""
+    """Fourteen edits and six effects."""
     rng = np.random.default_rng(2)
     likelihood, _, _ = build_likelihood(rng.normal(size=(N, 4)), sigma=0.3, dof=N, stated=True)
-    edits = rng.normal(size=(ROWS, N))
-    effects = rng.normal(size=(ROWS, N))
-    edits[14:], effects[:12] = 0.0, 0.0
-    order = rng.permutation(ROWS)
     touched = np.zeros((ROWS, N), dtype=bool)
     touched[np.arange(ROWS), np.arange(ROWS) % N] = True
-    singles = Singles(edits[order], effects[order], rng.normal(size=ROWS), touched)
+    singles = Singles(
+        rng.normal(size=(EDITS, N)),
+        rng.normal(size=(ROWS - EDITS, N)),
+        rng.normal(size=ROWS),
+        touched,
+    )
     return likelihood, 2.0 * rng.normal(size=N), singles
 
 
@@ -33,11 +34,10 @@ def brute_force(likelihood, deviation, singles):
     for a, b in combinations(range(ROWS), 2):
         if (singles.touched[a] & singles.touched[b]).any():
             continue
-        effects = [w for w in (singles.effects[a], singles.effects[b]) if w.any()]
-        changed = deviation + singles.edits[a] + singles.edits[b]
-        groups = [np.array(effects)] if effects else []
-        score = likelihood.score_set(changed, groups).log_likelihood
-        found[a, b] = score + singles.prior[a] + singles.prior[b]
+        changed = deviation + sum(singles.edits[m] for m in (a, b) if m < EDITS)
+        effects = [singles.effects[m - EDITS] for m in (a, b) if m >= EDITS]
+        score = likelihood.score_set(changed, [np.array(effects)] if effects else [])
+        found[a, b] = score.log_likelihood + singles.prior[a] + singles.prior[b]
     return found
 
 
