@@ -16,7 +16,6 @@ from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import null_space
 
 from orthocal.hypotheses.likelihood import AMOUNTS, NOISE_SCALES, Likelihood, log_of_sum
 
@@ -109,8 +108,8 @@ def find_pairs(
         singles: The single hypotheses.
         least: Log posterior on the coarse grid below which pairs are left out.
     """
-    directions = likelihood.directions
-    basis = np.hstack([directions.T, null_space(directions)])
+    # the directions, up to their signs, and a basis of what is perpendicular to them
+    basis = np.linalg.qr(likelihood.directions.T, mode="complete").Q
     vectors = (deviation @ basis, singles.edits @ basis, singles.effects @ basis)
     taus = (AMOUNTS * likelihood.sigma) ** 2
     places = [e * NOISE_SCALES.size + s for e in COARSE_TOLERANCES for s in COARSE_NOISES]
