@@ -22,7 +22,7 @@ class DrawnMachines:
         robot = plan.robot
         self.machine = build_problem(plan, free=machine_errors(robot), prior=True)
         self.is_offset = np.array([n.endswith(".offset") for n in self.machine.free])
-        self.tolerances = np.array([p.tolerance for p in self.machine.parameters])
+        self.prior_stds = np.array([p.prior_std for p in self.machine.parameters])
         problem = build_problem(plan, model=model)
         # the same optimum as Ipopt's (`test_solvers`), in less time
         self.nominal = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
@@ -30,7 +30,7 @@ class DrawnMachines:
 
     def draw(self, rng, *, level=1.0):
         """Errors of a machine, all but its offsets so many times their tolerances, [SI]."""
-        scale = np.where(self.is_offset, 1.0, level) * self.tolerances
+        scale = np.where(self.is_offset, 1.0, level) * self.prior_stds
         return scale * rng.normal(size=scale.size)
 
     def read(self, rng, errors, *, sigma=None):

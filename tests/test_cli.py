@@ -287,8 +287,8 @@ def test_what_is_free_known_and_bounded_by_option(orthocal, experiment, root):
         "z_slide.offset",
     ]  # fmt: skip
     assert found["x_slide.offset"]["at_bound"] == "upper"
-    assert found["y_slide.offset"]["tolerance"] == 2e-3
-    assert (found["y_leg.length"]["mean"], found["y_leg.length"]["tolerance"]) == (5e-5, 1e-5)
+    assert found["y_slide.offset"]["prior_std"] == 2e-3
+    assert (found["y_leg.length"]["mean"], found["y_leg.length"]["prior_std"]) == (5e-5, 1e-5)
     assert found["y_leg.length"]["interval"][0] < found["y_leg.length"]["value"]
     assert found["z_slide.offset"]["free"] is False
     assert found["z_slide.offset"]["value"] == 0.2e-3

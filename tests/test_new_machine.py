@@ -361,9 +361,9 @@ def test_without_paper_a_plan_is_chosen(capsys, tmp_path):
     assert {s.sensor.tip.form for s in session.setups.values()} == {"ball"}
     assert session.purpose == Purpose("full")
     assert session.robot.parameters.stated == {"*.offset_mm": 4.0}
-    assert session.robot.parameters["y_slide.offset"].tolerance == 2e-3
+    assert session.robot.parameters["y_slide.offset"].prior_std == 2e-3
     machine = load_robot(tmp_path / "mill")  # what is planned for it later goes by them, too
-    assert machine.parameters["y_slide.offset"].tolerance == 2e-3
-    assert machine.parameters["x_leg.length"].tolerance == 1e-4
-    assert remake_robot(tmp_path / "mill").parameters["y_slide.offset"].tolerance == 2e-3
+    assert machine.parameters["y_slide.offset"].prior_std == 2e-3
+    assert machine.parameters["x_leg.length"].prior_std == 1e-4
+    assert remake_robot(tmp_path / "mill").parameters["y_slide.offset"].prior_std == 2e-3
     assert "of the middle of a hinge" not in (first / "sheet.html").read_text()

@@ -139,10 +139,10 @@ def error_covariance(calibration: Calibration, *, excess: float = 1.0) -> Array:
 
     Args:
         calibration: The calibration.
-        excess: How many times their tolerances the unmodelled errors are taken to be.
+        excess: Factor of the priors of unmodelled errors.
     """
     unmodelled = calibration.unmodelled
-    variance = (excess * unmodelled.tolerances) ** 2
+    variance = (excess * unmodelled.prior_stds) ** 2
     taken_on = unmodelled.leakage * variance
     return np.block(
         [

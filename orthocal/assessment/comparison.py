@@ -135,12 +135,12 @@ def compare_models(
     for model in dict.fromkeys(models or parameters.models):
         free = set(parameters.select_model(model))
         own = {g: v for g, v in given.items() if free & set(parameters.select([g]))}
-        problem = build_problem(session, model=model, tolerances=own)
+        problem = build_problem(session, model=model, prior_stds=own)
         try:
             results.append(score_model(problem, noise=noise.sigma, options=options))
         except NotIdentifiableError:
             # larger models have a prior: a small one shall not be worse off for having none
-            held = build_problem(session, model=model, tolerances=own, prior=True)
+            held = build_problem(session, model=model, prior_stds=own, prior=True)
             try:
                 results.append(
                     score_model(held, noise=noise.sigma, by_choice=False, options=options)

@@ -70,7 +70,7 @@ def _residuals(calibration: Calibration) -> list[Finding]:
 
 def _standstill(calibration: Calibration) -> list[Finding]:
     """Finding about a fit that moved no parameter."""
-    if any(abs(p.value - p.start) > STANDSTILL * p.tolerance for p in calibration.free):
+    if any(abs(p.value - p.start) > STANDSTILL * p.prior_std for p in calibration.free):
         return []
     if len(calibration.identifiability.unseen) == len(calibration.free):
         return [words.nothing_depends([p.name for p in calibration.free])]

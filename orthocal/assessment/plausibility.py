@@ -198,7 +198,7 @@ def _legs(robot: Robot) -> Finding | None:
     if len(lengths) < 2 or len(drives) > 1:
         return None
     errors = [e.name for e in robot.parameters.elementary.values() if e.kind == "translation"]
-    tolerance = max((robot.parameters[n].tolerance for n in errors), default=0.0)
+    tolerance = max((robot.parameters[n].prior_std for n in errors), default=0.0)
     if max(lengths.values()) - min(lengths.values()) < DIFFERENT * tolerance:
         return None
     return words.legs_differ(describe_legs(lengths), lengths)

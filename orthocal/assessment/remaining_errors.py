@@ -36,12 +36,12 @@ def find_remaining_errors(
     Principal directions of what is not known of the parameters, weighed by the mean square that it
     makes at the tool with shift and rotation taken out; the largest first.
     """
-    tolerances = np.r_[[p.tolerance for p in calibration.free], calibration.unmodelled.tolerances]
+    prior_stds = np.r_[[p.prior_std for p in calibration.free], calibration.unmodelled.prior_stds]
     return rank_errors(
         accuracy.align(accuracy.jacobian),
         error_covariance(calibration),
         weights=accuracy.workspace.weights,
-        tolerances=tolerances,
+        prior_stds=prior_stds,
         names=accuracy.names,
         count=count,
     )
@@ -52,7 +52,7 @@ def rank_errors(
     covariance: Array,
     *,
     weights: Array,
-    tolerances: Array,
+    prior_stds: Array,
     names: Sequence[str],
     count: int,
 ) -> tuple[RemainingError, ...]:
@@ -62,7 +62,7 @@ def rank_errors(
         field: What the parameters do at the tool, shape (K, 3, n), [m per parameter unit].
         covariance: Of them, shape (n, n), [SI].
         weights: Of the points, shape (K,).
-        tolerances: Shape (n,), [SI].
+        prior_stds: Shape (n,), [SI].
         names: Of the parameters.
         count: Of combinations.
     """
@@ -73,16 +73,16 @@ def rank_errors(
     for direction in directions.T[::-1][:count]:
         change = root @ direction
         moved = field @ change
-        in_tolerances = change / tolerances
-        order = np.argsort(-np.abs(in_tolerances))
-        lead = np.sign(in_tolerances[order[0]]) or 1.0
+        in_prior_stds = change / prior_stds
+        order = np.argsort(-np.abs(in_prior_stds))
+        lead = np.sign(in_prior_stds[order[0]]) or 1.0
         found.append(
             RemainingError(
                 rms=float(np.sqrt(weights @ (moved**2).sum(axis=1))),
                 parts=tuple(
-                    (names[i], float(lead * in_tolerances[i]))
+                    (names[i], float(lead * in_prior_stds[i]))
                     for i in order
-                    if abs(in_tolerances[i]) > NOTABLE
+                    if abs(in_prior_stds[i]) > NOTABLE
                 ),
             )
         )

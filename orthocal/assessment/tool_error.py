@@ -224,8 +224,8 @@ def _assess(
     calibration: Calibration, tool: CalibratedTool, names: Sequence[str] | None
 ) -> ToolAccuracy:
     unmodelled = calibration.unmodelled
-    tolerances = np.r_[[p.tolerance for p in calibration.free], unmodelled.tolerances]
-    jacobian = tool.jacobian[:, :, : len(tolerances)]
+    prior_stds = np.r_[[p.prior_std for p in calibration.free], unmodelled.prior_stds]
+    jacobian = tool.jacobian[:, :, : len(prior_stds)]
     space, where = tool.workspace, tool.targets
     after = None
     if np.isfinite(calibration.model_covariance).all():
@@ -234,11 +234,11 @@ def _assess(
     return ToolAccuracy(
         workspace=space,
         targets=where,
-        names=tool.sensitivity.free[: len(tolerances)],
+        names=tool.sensitivity.free[: len(prior_stds)],
         jacobian=jacobian,
         deviation=read_only(tool.deviation(calibration.active_offsets, names=names)),
         error_after_offsets=read_only(left),
-        before=measure_uncertainty(jacobian, np.diag(tolerances**2), space, where),
+        before=measure_uncertainty(jacobian, np.diag(prior_stds**2), space, where),
         after=after,
     )
 

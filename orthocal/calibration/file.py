@@ -280,10 +280,10 @@ def _check_singular_values(found: Identifiability, file: str) -> None:
 def _check_unmodelled(record: CalibrationRecord, file: str) -> None:
     found, n_free = record.unmodelled, len(record.model_covariance)
     count = len(found.names)
-    if found.tolerances.shape != (count,):
+    if found.prior_stds.shape != (count,):
         raise CalibrationFileError(
-            f"has {found.tolerances.size} numbers; expected {count}, as names",
-            where=f"{file}: unmodelled.tolerances",
+            f"has {found.prior_stds.size} numbers; expected {count}, as names",
+            where=f"{file}: unmodelled.prior_stds",
         )
     if found.leakage.shape != (n_free, count):
         raise CalibrationFileError(

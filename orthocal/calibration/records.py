@@ -158,15 +158,15 @@ class ParameterEstimate(InUnit):
     errors of the machine that were not identified. NaN if unknown."""
     std_scatter: SizeOrNaN
     """Part of `std` that is due to the noise of the readings, [unit]."""
-    tolerance: PositiveInSI
+    prior_std: PositiveInSI
     """One standard deviation before the calibration, [unit]."""
     free: bool
     identifiable: bool
-    """True if the readings alone determine it better than its tolerance."""
+    """True if the readings alone determine it better than its prior."""
     start: Number
     """What the controller already corrects: the point of linearisation, [unit]."""
     prior: bool
-    """Whether its tolerance acted as a prior."""
+    """Whether its prior was used."""
     mean: Number
     """Mean of that prior, [unit]."""
     lower: Number | None
@@ -184,7 +184,7 @@ class ParameterEstimate(InUnit):
         """Share of the prior variance that the readings removed, 0 to 1; NaN without a prior."""
         if not (self.free and self.prior) or self.at_bound or math.isnan(self.std):
             return math.nan
-        return max(1.0 - (self.std / self.tolerance) ** 2, 0.0)
+        return max(1.0 - (self.std / self.prior_std) ** 2, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -259,7 +259,7 @@ class CalibrationRecord:
     session: SessionRecord
     model: str
     prior: bool
-    """Whether tolerances acted as a prior."""
+    """Whether priors were used."""
     solver: SolverRecord
     parameters: Annotated[Many[ParameterEstimate], Field(min_length=1)]
     """Free parameters, then those held at a known value."""

@@ -77,7 +77,7 @@ def _repeat_problem(calibration: Calibration, session: Session) -> CalibrationPr
     parameters = session.robot.parameters
     selection = Selection(
         label=calibration.model,
-        parameters=tuple(replace(parameters[p.name], tolerance=p.tolerance) for p in free),
+        parameters=tuple(replace(parameters[p.name], prior_std=p.prior_std) for p in free),
         prior=np.array([p.prior for p in free]),
         mean=read_only([p.mean for p in free]),
         lower=read_only([-np.inf if p.lower is None else p.lower for p in free]),

@@ -18,7 +18,7 @@ def parameter_table(calibration: Calibration) -> list[Record]:
     """A record for each parameter: free ones, held ones, then those of sensors.
 
     `value`, `linearised`, `std` (everything unknown included), `std_scatter` (the part that is due
-    to noise), `low` and `high` (value ± expanded uncertainty) and `tolerance` are in `unit`.
+    to noise), `low` and `high` (value ± expanded uncertainty) and `prior_std` are in `unit`.
     """
     intervals = dict(
         zip((p.name for p in calibration.free), calibration.intervals, strict=True),
@@ -38,7 +38,7 @@ def parameter_table(calibration: Calibration) -> list[Record]:
                     "std_scatter": finite_or_none(p.std_scatter),
                     "low": finite_or_none(low),
                     "high": finite_or_none(high),
-                    "tolerance": p.tolerance,
+                    "prior_std": p.prior_std,
                     "free": p.free,
                     "identifiable": p.identifiable,
                     "at_bound": p.at_bound,

@@ -94,7 +94,7 @@ def _error(
         kind="translation" if translation else "rotation",
         owner=owner,
         unit="m" if translation else "rad",
-        tolerance=read_limit(limit),
+        prior_std=read_limit(limit),
         of_frame=of_frame,
         axis=axis,
         complete=complete,

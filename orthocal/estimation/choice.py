@@ -25,7 +25,7 @@ class Choice:
         model: A model of the robot's YAML: `offsets`, `lengths`, `full` or one's own; by default
             what the session states, otherwise the complete model.
         free: Names or globs that are free too, or instead where no model is named; '!' takes out.
-        prior: Whether tolerances act as a prior; by default not where only offsets are free.
+        prior: Whether parameters have priors; by default not where only offsets are free.
         known: Name with its unit to a known value, which is then held, or to a value and its
             tolerance, a limit of ±2 standard deviations, which then act as prior.
         tolerances: Name or glob with its unit to another tolerance than the robot's, a limit of
@@ -90,7 +90,7 @@ class Choice:
             free=self.free,
             prior=self.prior,
             known=_known(self.known, parameters),
-            tolerances=parameters.read_tolerances(self.tolerances),
+            prior_stds=parameters.read_tolerances(self.tolerances),
             bounds=_bounds(self.bounds, parameters),
         )
 

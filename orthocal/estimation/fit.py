@@ -73,7 +73,7 @@ class Fit:
     prediction: Array
     """h at the solution, gauge zeros at 0, shape (n_entries,), [m]."""
     jacobian: Array
-    """dh/dθ̂ at the solution, shape (n_entries, n_free), [m per tolerance]."""
+    """dh/dθ̂ at the solution, shape (n_entries, n_free), [m per prior std]."""
     information: Information
     """Of that Jacobian."""
 
@@ -104,7 +104,7 @@ class Fit:
 
     @property
     def machine_information(self) -> Information:
-        """What the readings say of the machine, sensors known to their tolerances."""
+        """What the readings say of the machine, sensors known to their priors."""
         return marginalise(self.information, self.problem.n_machine, sigma=self.sigma)
 
     @property

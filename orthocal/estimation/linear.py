@@ -154,7 +154,7 @@ class Linearisation:
     residual: Array
     """y − h there, less the mean of those with the same gauge zero, shape (n_entries,), [m]."""
     slopes: Array
-    """dh/dθ̂ there, zeros eliminated likewise, shape (n_entries, n_free), [m per tolerance]."""
+    """dh/dθ̂ there, zeros eliminated likewise, shape (n_entries, n_free), [m per prior std]."""
     information: Information
 
     def solve(self, *, sigma: float, use: NDArray[np.bool_] | None = None) -> Array:

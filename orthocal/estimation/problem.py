@@ -1,6 +1,6 @@
 """The calibration problem: free parameters with their priors, readings, and their prediction.
 
-    min over θ, z, q_1..q_K   Σ ρ((y − h(q_k, θ) − z)/σ) + ½ Σ ((θ − mean)/tolerance)²
+    min over θ, z, q_1..q_K   Σ ρ((y − h(q_k, θ) − z)/σ) + ½ Σ ((θ − mean)/prior std)²
     s.t.                      g(q_k, θ) = 0 for every posture k
 
 θ holds errors of the machine and nuisance parameters of the sensors; a known gauge zero z is 0.
@@ -67,7 +67,7 @@ class CalibrationProblem:
         self.observations: Observations = build_observations(session)
         self.noise = np.ones(self.observations.size) if noise is None else noise
         self.states = self.observations.states
-        self.theta_scale = selection.tolerances
+        self.theta_scale = selection.prior_stds
         self.prior_precision = selection.prior.astype(np.float64)
         self.prior_mean = np.where(selection.prior, selection.mean, 0.0)
         self.passive_scale = LENGTH_SCALE / coordinate_units(self.robot)[self.robot.passive_index]
@@ -270,7 +270,7 @@ class CalibrationProblem:
         theta: ArrayLike,
         passive: Array | None = None,
         *,
-        units: Literal["tolerance", "SI"] = "tolerance",
+        units: Literal["prior_std", "SI"] = "prior_std",
     ) -> tuple[Array, Array]:
         """Predicted readings and identification Jacobian, with closed loops.
 
@@ -279,7 +279,7 @@ class CalibrationProblem:
         Args:
             theta: Shape (n_free,), or (S, n_free) for a batch, [SI].
             passive: Passive coordinates with closed loops at theta; solved here by default.
-            units: Unit of the columns. "tolerance": dh/dθ̂ in metres per prior standard deviation
+            units: Unit of the columns. "prior_std": dh/dθ̂ in metres per prior standard deviation
                 of the parameter, as the solvers use it. "SI": dh/dθ in metres per metre or radian.
 
         Returns:
@@ -292,7 +292,7 @@ class CalibrationProblem:
         q = self.close(theta) if passive is None else passive
         linear = self.linearisation(theta, q)
         jacobian = linear.jacobian
-        return linear.reading, jacobian if units == "tolerance" else jacobian / self.theta_scale
+        return linear.reading, jacobian if units == "prior_std" else jacobian / self.theta_scale
 
     def linearisation(self, theta: ArrayLike, passive: Array) -> Linearisation:
         """Readings to first order about parameters and passive coordinates near closed loops.
@@ -340,9 +340,9 @@ class CalibrationProblem:
 
     @cached_property
     def columns(self) -> Array:
-        """Elementary errors of one tolerance of each machine parameter, (n_errors, n_machine)."""
+        """Elementary errors of one prior std of each machine parameter, (n_errors, n_machine)."""
         selection = self.machine_selection
-        return self.functions.errors.columns(selection.names) * selection.tolerances
+        return self.functions.errors.columns(selection.names) * selection.prior_stds
 
 
 def build_problem(
@@ -352,7 +352,7 @@ def build_problem(
     free: Sequence[str] = (),
     prior: bool | None = None,
     known: Mapping[str, Known] | None = None,
-    tolerances: Mapping[str, float] | None = None,
+    prior_stds: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> CalibrationProblem:
     """The problem of a model of the robot; arguments as for `select_parameters`."""
@@ -362,7 +362,7 @@ def build_problem(
         free=free,
         prior=prior,
         known=known,
-        tolerances=tolerances,
+        prior_stds=prior_stds,
         bounds=bounds,
     )
     return CalibrationProblem(session, selection)

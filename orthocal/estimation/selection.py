@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthocal.errors import ParameterError
 from orthocal.io.documents import parse_number
 from orthocal.io.fields import read_only
-from orthocal.robot.parameters import Parameter, ParameterSet, require_tolerance
+from orthocal.robot.parameters import Parameter, ParameterSet, require_prior_std
 from orthocal.text import composed
 from orthocal.units import Unit, show_limit
 
@@ -43,9 +43,9 @@ class Selection:
     label: str
     """Model, and what was added to it or taken from it."""
     parameters: tuple[Parameter, ...]
-    """The free ones, with the tolerances that hold here."""
+    """The free ones, with the priors that hold here."""
     prior: NDArray[np.bool_]
-    """Whether a parameter's tolerance acts as prior, shape (n_free,)."""
+    """Whether a parameter has a prior, shape (n_free,)."""
     mean: Array
     """Mean of each prior, shape (n_free,), [SI]."""
     lower: Array
@@ -61,12 +61,12 @@ class Selection:
         return tuple(p.name for p in self.parameters)
 
     @property
-    def tolerances(self) -> Array:
+    def prior_stds(self) -> Array:
         """One standard deviation of each free parameter, shape (n_free,), [SI]."""
-        return np.array([p.tolerance for p in self.parameters])
+        return np.array([p.prior_std for p in self.parameters])
 
     def with_known(self, parameters: Sequence[Parameter]) -> Selection:
-        """The same with further parameters, each known to its tolerance beforehand."""
+        """The same with further parameters, each with a prior of its own."""
         n = len(parameters)
         return replace(
             self,
@@ -97,7 +97,7 @@ def select_parameters(
     free: Sequence[str] = (),
     prior: bool | None = None,
     known: Mapping[str, Known] | None = None,
-    tolerances: Mapping[str, float] | None = None,
+    prior_stds: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> Selection:
     """Choose what is free.
@@ -107,10 +107,10 @@ def select_parameters(
         model: A model of the robot's YAML; the complete one if neither a model nor `free` is
             given.
         free: Names or globs that are free too, after the model's; '!' takes out again.
-        prior: Whether tolerances act as a prior; by default not where only offsets are free.
+        prior: Whether parameters have priors; by default not where only offsets are free.
         known: Name to a known value, which is then held, or to a value and its standard
             deviation, which then act as prior of a free parameter, [SI].
-        tolerances: Name or glob to another standard deviation than the robot's, [SI].
+        prior_stds: Name or glob to another prior standard deviation than the robot's, [SI].
         bounds: Name or glob to lowest and highest value, ±inf for open, [SI].
 
     Raises:
@@ -130,7 +130,7 @@ def select_parameters(
             parameter = parameters[name]
             _refuse_length(entry[0] if isinstance(entry, tuple) else entry, parameter)
             if isinstance(entry, tuple):
-                spread = require_tolerance(entry[1], parameters.own[name])
+                spread = require_prior_std(entry[1], parameters.own[name])
                 own_prior[name] = (_finite(entry[0], name), spread)
                 chosen.add(name)
             else:
@@ -141,12 +141,12 @@ def select_parameters(
         raise ParameterError("no free parameters: there is nothing to identify")
     _refuse_overlap(parameters, [*names, *(n for n, v in held.items() if v != 0.0)])
 
-    tolerance = {n: parameters[n].tolerance for n in names}
-    for glob, value in (tolerances or {}).items():
+    stds = {n: parameters[n].prior_std for n in names}
+    for glob, value in (prior_stds or {}).items():
         with _named("tolerances"):
             for name in _match_free(parameters, glob, names):
-                tolerance[name] = require_tolerance(value, parameters.own[name])
-    tolerance.update({n: s for n, (_, s) in own_prior.items()})
+                stds[name] = require_prior_std(value, parameters.own[name])
+    stds.update({n: s for n, (_, s) in own_prior.items()})
     lower = np.array([_lowest(parameters[n]) for n in names])
     upper = np.full(len(names), np.inf)
     for glob, (low, high) in (bounds or {}).items():
@@ -160,7 +160,7 @@ def select_parameters(
     everywhere = not only_offsets if prior is None else prior
     return Selection(
         label=_label(base, free),
-        parameters=tuple(replace(parameters[n], tolerance=tolerance[n]) for n in names),
+        parameters=tuple(replace(parameters[n], prior_std=stds[n]) for n in names),
         prior=np.array([everywhere or n in own_prior for n in names]),
         mean=read_only([own_prior.get(n, (0.0, 0.0))[0] for n in names]),
         lower=read_only(lower),
@@ -293,9 +293,9 @@ def _label(model: str | None, free: Sequence[str]) -> str:
 
 
 def _refuse_length(value: float, parameter: Parameter) -> None:
-    if abs(value) > LARGEST_KNOWN * parameter.tolerance:
+    if abs(value) > LARGEST_KNOWN * parameter.prior_std:
         factor, unit = parameter.edge_factor, parameter.edge_unit
-        limit = show_limit(parameter.tolerance) * factor
+        limit = show_limit(parameter.prior_std) * factor
         raise ParameterError(
             f"'{parameter.name}' is {value * factor:g} {unit}; expected the deviation from nominal "
             f"(its tolerance is {limit:g} {unit}), not the whole length"

@@ -125,7 +125,7 @@ def leverages(
     """What the parameters take of each entry, shape (n_entries,); their sum is how many they are.
 
     Args:
-        jacobian: dh/dθ̂, shape (n_entries, n_free), [m per tolerance].
+        jacobian: dh/dθ̂, shape (n_entries, n_free), [m per prior std].
         observations: Which zero each entry has.
         covariance: Of θ̂, shape (n_free, n_free).
         sigma: Standard deviation of a reading, [m].

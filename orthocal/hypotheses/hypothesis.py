@@ -87,7 +87,7 @@ class MachineShift:
     sessions: NDArray[np.bool_]
     """Sessions in which it differs, shape (n_sessions,)."""
     direction: Array
-    """Difference of the free parameters, [tolerances]; per unit of the amount where that is
+    """Difference of the free parameters, [prior std]; per unit of the amount where that is
     unknown. Shape (n_free,)."""
     unit: float = 1.0
     """Unit of the amount, [SI]."""

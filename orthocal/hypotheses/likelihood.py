@@ -241,7 +241,7 @@ def build_likelihood(
     """Likelihood about a linearisation.
 
     Args:
-        jacobian: ∂h per tolerance of each error, zeros projected out, (n_entries, n_free), [m].
+        jacobian: ∂h per prior std of each error, zeros projected out, (n_entries, n_free), [m].
         sigma: Standard deviation of a reading, [m].
         dof: Number of entries less that of gauge zeros.
         stated: Whether that standard deviation is stated.

@@ -29,16 +29,16 @@ MOST_ROUNDS = 2
 """Relinearisations per hypothesis."""
 
 NEAR = 0.2
-"""Change of the errors, in tolerances, below which a linearisation is kept."""
+"""Change of the errors, in prior std, below which a linearisation is kept."""
 
 FURTHEST = 6.0
-"""Errors, in tolerances, beyond which a hypothesis is not relinearised."""
+"""Errors, in prior std, beyond which a hypothesis is not relinearised."""
 
 MOST_STEPS = 8
 """Gauss-Newton steps to the most likely machine."""
 
 SETTLED = 0.02
-"""Change of the errors, in tolerances, below which the most likely machine is found."""
+"""Change of the errors, in prior std, below which the most likely machine is found."""
 
 LEAST_SIGMA = 1e-9
 """Least standard deviation of a reading, [m]."""
@@ -54,22 +54,22 @@ class Linearisation:
     expected: Array
     """Predictions for the reference machine, to first order, shape (n_entries,), [m]."""
     slopes: Array
-    """∂h per tolerance of each error, shape (n_entries, n_free), [m]; empty where no hypothesis
+    """∂h per prior std of each error, shape (n_entries, n_free), [m]; empty where no hypothesis
     needs them."""
     likelihood: Likelihood
     errors: Array
-    """Errors per principal direction, shape (n_free, r), [tolerances]."""
+    """Errors per principal direction, shape (n_free, r), [prior std]."""
     sizes: Array
     """Singular values, shape (r,), [m]."""
     theta: Array
-    """Errors at the point of linearisation less the reference, shape (n_free,), [tolerances]."""
+    """Errors at the point of linearisation less the reference, shape (n_free,), [prior std]."""
     passive: Array
     """Passive coordinates there, shape (n_states, n_passive), [m, rad]."""
 
     def errors_for(
         self, deviation: Array, *, tolerance_scale: float = 1.0, noise_scale: float = 1.0
     ) -> Array:
-        """Most likely errors for a deviation, shape (n_free,), [tolerances]."""
+        """Most likely errors for a deviation, shape (n_free,), [prior std]."""
         e2 = tolerance_scale**2
         variance = e2 * self.sizes**2 + (noise_scale * self.likelihood.sigma) ** 2
         along = self.likelihood.directions @ deviation
@@ -161,7 +161,7 @@ class LinearModel:
         """Linearise the model.
 
         Args:
-            theta: Errors less the reference, shape (n_free,), [tolerances].
+            theta: Errors less the reference, shape (n_free,), [prior std].
             shifts: Known differences of the machine in some of the sessions.
             start: Passive coordinates to start from.
             slopes: Whether to keep the derivatives.
@@ -240,7 +240,7 @@ class LinearModel:
     def _approach(self, entries: Array, effect: Array) -> Linearisation:
         """Linearise about the most likely machine, beside an effect of unknown amount.
 
-        Gauss-Newton steps end when the errors change by less than SETTLED tolerances, or before the
+        Gauss-Newton steps end when the errors change by less than SETTLED prior std, or before the
         first machine that cannot reach a posture. Readings are not linear over offsets of some mm.
 
         Args:

@@ -100,7 +100,7 @@ LARGEST_VOLUME = float(np.log(1000.0))
 
 
 LEAST_EFFECT = 1e-3
-"""Part of the noise by which a change of one tolerance must move the readings to be considered."""
+"""Part of the noise by which a change of one prior std must move the readings to be considered."""
 
 CHUNK = 4096
 """Hypotheses that are scored at a time, for their memory."""
@@ -383,8 +383,8 @@ class _Search:
         if family.known:
             return likelihood.score(likelihood.products(state.remaining - vectors))
         size = np.abs(vectors).max(axis=1, keepdims=True)
-        tolerances = np.array([np.abs(s.direction).max() for s in family.shifts])[:, None]
-        seen = size > LEAST_EFFECT * self.model.sigma * tolerances
+        prior_stds = np.array([np.abs(s.direction).max() for s in family.shifts])[:, None]
+        seen = size > LEAST_EFFECT * self.model.sigma * prior_stds
         vectors = np.where(seen, vectors, 0.0) / np.where(seen, size, 1.0)
         base = likelihood.products(np.broadcast_to(state.remaining, vectors.shape))
         return likelihood.score(base, likelihood.products(vectors), vectors @ state.remaining)

@@ -58,11 +58,11 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
             of_setup.append(())
             continue
         own = [
-            Parameter(f"{_owner(u, setup, session)}.{u.name}", u.unit, u.tolerance, ())
+            Parameter(f"{_owner(u, setup, session)}.{u.name}", u.unit, u.prior_std, ())
             for u in setup.sensor.nuisance_parameters
         ]
         own += [
-            Parameter(f"setup.{setup.name}.{e.name}", e.unit, e.tolerance, (), e.positive)
+            Parameter(f"setup.{setup.name}.{e.name}", e.unit, e.prior_std, (), e.positive)
             for effect in reading_effects(session.robot)
             for e in effect.setup_errors
         ]

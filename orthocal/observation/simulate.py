@@ -78,7 +78,7 @@ def draw_errors(
     )
     given = parameters.read_tolerances(tolerances or {})
     own = {n: value for g, value in given.items() for n in parameters.select([g])}
-    drawn = {n: float(rng.normal() * own.get(n, parameters[n].tolerance)) for n in chosen}
+    drawn = {n: float(rng.normal() * own.get(n, parameters[n].prior_std)) for n in chosen}
     return {n: abs(v) if parameters[n].positive else v for n, v in drawn.items()}
 
 
@@ -116,7 +116,7 @@ def simulate_session(
     if unknown and not exact:
         # a separate generator: the noise does not depend on the nuisance parameters
         normal = np.random.default_rng((seed, 1)).normal(size=len(unknown))
-        drawn = normal * [p.tolerance for p in unknown]
+        drawn = normal * [p.prior_std for p in unknown]
         drawn = np.where([p.positive for p in unknown], np.abs(drawn), drawn)
     entries = predict_readings(plan, errors, observations=observations, nuisance=drawn)
     entries, zeros = show_readings(plan, observations, entries, rng=rng, sigma=sigma, exact=exact)

@@ -79,7 +79,7 @@ class CandidateSetup:
     rows: Indices
     """Rows of its readings, shape (m,)."""
     jacobian: Array
-    """Sensitivity of the readings to the state, shape (m, n_state), [m per tolerance]; with the
+    """Sensitivity of the readings to the state, shape (m, n_state), [m per prior std]; with the
     gauge aligned on the mean of the postures."""
     covariance: Array
     """Covariance of the readings from the setup's nuisance parameters and zero, (m, m), [m²]."""
@@ -229,7 +229,7 @@ def _list_aligned(
     """Nuisance parameters that are aligned to the machine, by setup.
 
     Each has its index among the free parameters, and its sensitivity to the machine's parameters
-    in each of the setup's readings, shape (m, n_machine), [SI per tolerance].
+    in each of the setup's readings, shape (m, n_machine), [SI per prior std].
     """
     aligned: dict[str, dict[str, Setup]] = {}
     for name, setup in session.setups.items():

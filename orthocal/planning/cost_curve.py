@@ -31,7 +31,7 @@ class Stage:
     readings: int
     minutes: float
     error: float
-    """Value of the criterion, [m] or tolerances."""
+    """Value of the criterion, [m] or prior std."""
 
 
 def compute_curve(

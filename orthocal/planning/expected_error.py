@@ -45,7 +45,7 @@ Array = NDArray[np.float64]
 Criterion = Literal["aligned", "relative", "absolute", "worst", "A", "D", "E"]
 """Criterion of a plan: the RMS tool error in its three forms, the error at the worst point with
 translation and rotation removed, or the trace (A), determinant (D) or largest eigenvalue (E) of the
-covariance of the parameters, in their tolerances."""
+covariance of the parameters, in prior std."""
 
 CRITERIA: tuple[Criterion, ...] = ("aligned", "relative", "absolute", "worst", "A", "D", "E")
 
@@ -56,10 +56,10 @@ MACHINES = 12
 """Number of machines over which the expected error is averaged."""
 
 ENTERED = 0.1
-"""Standard deviation of offsets after they were entered, in tolerances."""
+"""Standard deviation of offsets after they were entered, in prior std."""
 
 VAGUE = 1e-8
-"""Inverse variance of a parameter without a prior, [1 per tolerance²]."""
+"""Inverse variance of a parameter without a prior, [1 per prior std²]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +69,7 @@ class Expected:
     tool: ToolUncertainty
     names: tuple[str, ...]
     """Identified parameters of the machine, then those that are not identified."""
-    tolerances: Array
+    prior_stds: Array
     """[SI]."""
     covariance: Array
     """Covariance of the errors of the estimate, shape (n, n), [SI]."""
@@ -94,8 +94,8 @@ class ToolForecast:
     Args:
         robot: The robot.
         selection: Parameters that are identified.
-        others: Parameters that are not identified, with their tolerances, [SI]; by default all
-            others of the machine.
+        others: Parameters that are not identified, with prior standard deviations, [SI]; by
+            default all others of the machine.
         workspace: Region over which the tool error is computed; by default the robot's.
 
     Raises:
@@ -122,8 +122,8 @@ class ToolForecast:
             if not determined & {term for term, _ in parameters[n].terms}
         )
         self.names = (*free, *self.others)
-        own = {**(others or {}), **{p.name: p.tolerance for p in selection.parameters}}
-        self.tolerances = np.array([own.get(n, parameters[n].tolerance) for n in self.names])
+        own = {**(others or {}), **{p.name: p.prior_std for p in selection.parameters}}
+        self.prior_stds = np.array([own.get(n, parameters[n].prior_std) for n in self.names])
         nominal = nominal_closure(robot)
         drives, passive = nominal.reach(self.workspace.points)
         self.positions = nominal.tcp(drives, passive)
@@ -134,7 +134,7 @@ class ToolForecast:
     @property
     def before(self) -> Expected:
         """Expected tool error of a machine without calibration."""
-        return self._expected(np.diag(self.tolerances**2))
+        return self._expected(np.diag(self.prior_stds**2))
 
     def align(self, field: Array) -> Array:
         """Tool errors with translation and rotation removed, shape (K, 3, ...)."""
@@ -157,7 +157,7 @@ class ToolForecast:
     ) -> Expected:
         """Expected tool error after a calibration from a session's readings.
 
-        The mean of machines drawn from the tolerances, with mounting errors of their gauges. Each
+        The mean of machines drawn from the priors, with mounting errors of their gauges. Each
         is linearised about itself, because a ball beside the crest of its rod is less sensitive.
 
         Args:
@@ -166,7 +166,7 @@ class ToolForecast:
             weight: Standard deviation with which readings are weighted, [m]: more than sigma if
                 the model omits errors; by default the same.
             entered: Whether the identified offsets have been entered before, so that those of the
-                drives are small; else they are drawn from their tolerances.
+                drives are small; else they are drawn from their priors.
             machines: Machines instead of drawn ones: free parameters of the session's problem,
                 shape (n_free,) each, [SI].
 
@@ -208,12 +208,12 @@ class ToolForecast:
         return self._expected(covariance)
 
     def _jacobian_of_others(self, session: Session) -> Array | None:
-        """Change of a session's readings by one tolerance of what is not identified, [m]."""
+        """Change of a session's readings by one prior std of what is not identified, [m]."""
         if not self.others:
             return None
         n = len(self.selection.names)
-        own = dict(zip(self.others, self.tolerances[n:].tolist(), strict=True))
-        free = build_problem(session, free=self.others, prior=True, tolerances=own)
+        own = dict(zip(self.others, self.prior_stds[n:].tolist(), strict=True))
+        free = build_problem(session, free=self.others, prior=True, prior_stds=own)
         problem = weigh_readings(free)
         _, slopes = problem.linearise(np.zeros(problem.n_free))
         return slopes[:, : len(self.others)]
@@ -225,7 +225,7 @@ class ToolForecast:
             drawn = np.random.default_rng(seed).normal(size=problem.n_free) * problem.theta_scale
             if entered:
                 drawn[offsets] *= ENTERED
-            # parameters without a prior are drawn from their tolerances, too
+            # parameters that are free without a prior are drawn, too
             yield problem.reference + drawn
 
     def _posterior(
@@ -265,18 +265,18 @@ class ToolForecast:
             return known, lost
         other = project_out_zeros(others[good], part)
         leak = (inverse @ (slopes.T @ other) / weight**2)[:n] * scale[:, None]
-        variance = np.diag(self.tolerances[n:] ** 2)
-        across = leak * self.tolerances[n:]
+        variance = np.diag(self.prior_stds[n:] ** 2)
+        across = leak * self.prior_stds[n:]
         return np.block([[known + leak @ leak.T, -across], [-across.T, variance]]), lost
 
     def _expected(self, covariance: Array) -> Expected:
         tool = measure_uncertainty(self.jacobian, covariance, self.workspace, self.positions)
-        return Expected(tool, self.names, self.tolerances, covariance)
+        return Expected(tool, self.names, self.prior_stds, covariance)
 
     def weigh(self, criterion: Criterion, n_state: int) -> Weigher:
         """Weight of a criterion for a state that begins with the identified parameters."""
         n = len(self.selection.names)
-        scaled = self.jacobian[:, :, :n] * self.tolerances[:n]
+        scaled = self.jacobian[:, :, :n] * self.prior_stds[:n]
         if criterion in ("aligned", "worst"):
             field = self.align(scaled)
         elif criterion == "relative":
@@ -293,7 +293,7 @@ class Weigher:
 
     Args:
         criterion: The criterion.
-        field: Tool errors by the state, shape (K, 3, n_state), [m per tolerance].
+        field: Tool errors by the state, shape (K, 3, n_state), [m per prior std].
         weights: Weights of the points, shape (K,).
         n: Number of parameters of the machine, which are the first of the state.
     """

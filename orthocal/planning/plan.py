@@ -78,7 +78,7 @@ class MeasuringPlan:
     criterion: Criterion
     minutes: float
     known: Expected
-    """Expected error before: from the tolerances of the machine, and from measured readings."""
+    """Expected error before: from the priors of the machine, and from measured readings."""
     expected: Expected
     """Expected error after, with offsets that are near those that the controller corrects."""
     first_round: Expected
@@ -102,7 +102,7 @@ class MeasuringPlan:
             forecast.align(forecast.jacobian),
             self.expected.covariance,
             weights=forecast.workspace.weights,
-            tolerances=self.expected.tolerances,
+            prior_stds=self.expected.prior_stds,
             names=self.expected.names,
             count=count,
         )
@@ -346,7 +346,7 @@ def _setup_name(candidate: str, used_names: set[str]) -> str:
 
 
 def _prior(candidates: Candidates, forecast: ToolForecast, measured: Session | None) -> Array:
-    """Inverse covariance of the state before: from tolerances, and from measured readings."""
+    """Inverse covariance of the state before: from priors, and from measured readings."""
     problem = candidates.problem
     index = [problem.free.index(name) for name in candidates.state]
     prior = np.diag(np.maximum(problem.prior_precision[index], VAGUE))

@@ -27,11 +27,11 @@ from orthocal.units import UNIT_SUFFIXES, InUnit, Unit, read_limit, show_limit
 COMPLETE: Literal["complete"] = "complete"
 """Keyword for a model of all observable errors."""
 
-LARGEST_TOLERANCE = 200.0
-"""Largest tolerance relative to the robot's; a larger one is in another unit."""
+LARGEST_PRIOR_STD = 200.0
+"""Largest prior standard deviation relative to the robot's; a larger one is in another unit."""
 
-SMALLEST_TOLERANCE = 1e-9
-"""Smallest tolerance, [m, rad or 1]: parameters are scaled by their tolerances."""
+SMALLEST_PRIOR_STD = 1e-9
+"""Smallest prior standard deviation, [m, rad or 1]: parameters are scaled by it."""
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Components of a twist, translation first."""
@@ -48,8 +48,8 @@ class ElementaryError:
     owner: str
     """Name of the drive, joint or frame; of the leg, rod or setup for other effects."""
     unit: Unit
-    tolerance: float
-    """One standard deviation, [unit]."""
+    prior_std: float
+    """Standard deviation before the calibration, [unit]."""
     of_frame: bool = False
     """True if the owner is a frame, False if it is a joint."""
     axis: int = -1
@@ -80,8 +80,8 @@ class Parameter(InUnit):
 
     name: str
     unit: Unit
-    tolerance: float
-    """One standard deviation, [unit]."""
+    prior_std: float
+    """Standard deviation before the calibration, [unit]."""
     terms: tuple[tuple[str, float], ...]
     """Elementary errors of which it is the sum, with coefficients."""
     positive: bool = False
@@ -252,8 +252,8 @@ class ParameterSet:
         parameters = {p.name: p for p in self.own}
         for glob, value in self.own.read_tolerances(stated).items():
             for name in self.own.select([glob]):
-                size = require_tolerance(value, self.own[name])
-                parameters[name] = replace(parameters[name], tolerance=size)
+                size = require_prior_std(value, self.own[name])
+                parameters[name] = replace(parameters[name], prior_std=size)
         found = ParameterSet(
             self.elementary.values(),
             parameters.values(),
@@ -322,7 +322,7 @@ class ParameterSet:
         return {name: value for name, value in total.items() if value != 0.0}
 
 
-def require_tolerance(value: float, parameter: Parameter) -> float:
+def require_prior_std(value: float, parameter: Parameter) -> float:
     """Refuse an implausible standard deviation.
 
     Args:
@@ -333,15 +333,15 @@ def require_tolerance(value: float, parameter: Parameter) -> float:
         ParameterError: Naming both.
     """
     unit, factor = parameter.edge_unit, show_limit(parameter.edge_factor)
-    if not (math.isfinite(value) and value >= SMALLEST_TOLERANCE):
+    if not (math.isfinite(value) and value >= SMALLEST_PRIOR_STD):
         raise ParameterError(
             f"the tolerance of '{parameter.name}' is {value * factor:g} {unit}; expected at least "
-            f"{SMALLEST_TOLERANCE * factor:g} {unit}"
+            f"{SMALLEST_PRIOR_STD * factor:g} {unit}"
         )
-    if value > LARGEST_TOLERANCE * parameter.tolerance:
+    if value > LARGEST_PRIOR_STD * parameter.prior_std:
         raise ParameterError(
             f"the tolerance of '{parameter.name}' is {value * factor:g} {unit}; expected at most "
-            f"{LARGEST_TOLERANCE:g} times the robot's own, {parameter.tolerance * factor:g} {unit}"
+            f"{LARGEST_PRIOR_STD:g} times the robot's own, {parameter.prior_std * factor:g} {unit}"
         )
     return float(value)
 
@@ -383,7 +383,7 @@ def build_parameters(
     """
     by_name = {e.name: e for e in elementary}
     parameters = {
-        e.name: Parameter(e.name, e.unit, e.tolerance, ((e.name, 1.0),), e.positive)
+        e.name: Parameter(e.name, e.unit, e.prior_std, ((e.name, 1.0),), e.positive)
         for e in elementary
     }
     for name, members in sums.items():
@@ -400,7 +400,7 @@ def build_parameters(
             )
         for name in found:
             _check_unit(key, unit, parameters[name])
-            parameters[name] = replace(parameters[name], tolerance=read_limit(value) * factor)
+            parameters[name] = replace(parameters[name], prior_std=read_limit(value) * factor)
     result = ParameterSet(elementary, parameters.values(), models, find_redundant=find_redundant)
     for model, patterns in models.items():
         if patterns == COMPLETE:
@@ -435,7 +435,7 @@ def _sum_errors(
                 f"parameters.{name}: '{plain}' is in {errors[plain].unit}, "
                 f"'{first.name}' in {first.unit}; a sum needs one unit"
             )
-    return Parameter(name, first.unit, first.tolerance, tuple(terms.items()))
+    return Parameter(name, first.unit, first.prior_std, tuple(terms.items()))
 
 
 def _check_unit(key: str, unit: Unit, parameter: Parameter) -> None:

@@ -118,7 +118,7 @@ class Mounting:
             parameters.append(NuisanceParameter("square", "rad", self.square))
         if ball:
             parameters.append(NuisanceParameter("lateral", "m", self.lateral))
-        return tuple(p for p in parameters if p.tolerance > 0.0)
+        return tuple(p for p in parameters if p.prior_std > 0.0)
 
 
 USUAL = Mounting()

@@ -37,7 +37,7 @@ class NuisanceParameter:
     name: str
     """Unique within its setup, or within the setups that share it."""
     unit: Unit
-    tolerance: float
+    prior_std: float
     """One standard deviation, [unit]; its mean is 0."""
     shared_by: str | None = None
     """Name of the object at one place that setups of a session share, such as a square block; None

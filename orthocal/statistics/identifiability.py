@@ -1,9 +1,9 @@
 """Which parameters the readings tell, and which they cannot tell apart.
 
 All is read off the identification Jacobian with gauge zeros eliminated, each column scaled by its
-parameter's tolerance: an entry says how far one tolerance moves a reading. A direction counts as
-seen where one tolerance along it moves all readings together by more than the noise of one: then
-the readings say more of it than the workshop's tolerance did.
+parameter's prior std: an entry says how far one prior std moves a reading. A direction counts as
+seen where one prior std along it moves all readings together by more than the noise of one: then
+the readings say more of it than the prior did.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from orthocal.statistics.information import RANK_THRESHOLD, Information
 Array = NDArray[np.float64]
 
 NEGLIGIBLE = 1e-9
-"""Coefficients of a combination below this, in tolerances, are rounding."""
+"""Coefficients of a combination below this, in prior std, are rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,9 +84,9 @@ class Identifiability:
 
     singular_values: Vector
     """Of the scaled identification Jacobian of the free parameters, descending, shape (n_free,),
-    [m per tolerance]; of base parameters it is the reduced one, of their columns."""
+    [m per prior std]; of base parameters it is the reduced one, of their columns."""
     threshold: Number
-    """Singular values above it count as seen, [m per tolerance]."""
+    """Singular values above it count as seen, [m per prior std]."""
     rank: Count
     """Number of singular values above the threshold."""
     structural_rank: Count
@@ -97,7 +97,7 @@ class Identifiability:
     unseen: Many[str]
     """Parameters that move no reading by more than the threshold."""
     resolvable: Many[str]
-    """Parameters that the readings alone tell better than their tolerances."""
+    """Parameters that the readings alone tell better than their priors."""
     alike: Many[Recorded]
     """Parameters that move the readings alike, two or more: only their sum is told."""
     base: Many[Recorded]
@@ -111,7 +111,7 @@ class Identifiability:
 
     @property
     def observability(self) -> dict[str, float]:
-        """Observability indices O1 to O5 over the singular values that count, [m per tolerance].
+        """Observability indices O1 to O5 over the singular values that count, [m per prior std].
 
         O1 = (∏ s)^(1/r)/√postures (Borm and Menq 1991), O2 = s_r/s_1 (Driels and Pathre 1990, [1]),
         O3 = s_r and O4 = s_r²/s_1 (Nahvi and Hollerbach 1994, 1996), O5 = 1/Σ 1/s (Sun and
@@ -177,10 +177,10 @@ def find_base_parameters(
     columns count, each of one leading parameter and what cannot be told from it.
 
     Args:
-        factor: The Jacobian, zeros eliminated, shape (n, n_free), [m per tolerance].
+        factor: The Jacobian, zeros eliminated, shape (n, n_free), [m per prior std].
         parameters: The free parameters, in its order.
         threshold: A column counts if what it adds to those before moves the readings together
-            by more than this a tolerance, [m].
+            by more than this per prior std, [m].
     """
     if not np.any(factor):
         return ()
@@ -201,7 +201,7 @@ def find_base_parameters(
         terms = [(lead.name, 1.0)]
         for j in np.flatnonzero(np.abs(regroup[i]) > NEGLIGIBLE):
             other = parameters[order[count + j]]
-            coefficient = regroup[i, j] * lead.tolerance / other.tolerance
+            coefficient = regroup[i, j] * lead.prior_std / other.prior_std
             terms.append((other.name, float(coefficient)))
         result.append(Combination(tuple(terms)))
     place = {p.name: i for i, p in enumerate(parameters)}
@@ -229,7 +229,7 @@ def _find_alike(
             terms = []
             for i in members:
                 scaled = products[lead, i] / products[lead, first]
-                ratio = scaled * parameters[first].tolerance / parameters[i].tolerance
+                ratio = scaled * parameters[first].prior_std / parameters[i].prior_std
                 terms.append((parameters[i].name, float(ratio)))
             found.append((first, Combination(tuple(terms))))
         left = [i for i, ok in zip(rest, same, strict=True) if not ok]

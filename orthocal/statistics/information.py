@@ -1,6 +1,6 @@
 """What the readings say of the parameters, and how well: rank, covariance, what nothing determines.
 
-Everything is in scaled parameters θ̂ = θ/tolerance, with gauge zeros eliminated.
+Everything is in scaled parameters θ̂ = θ/(prior std), with gauge zeros eliminated.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class Information:
     """What the readings say of the parameters: the identification Jacobian, zeros eliminated."""
 
     factor: Array
-    """A matrix with the same product FᵀF as the Jacobian, shape (n, n_free), [m per tolerance]."""
+    """A matrix with the same product FᵀF as the Jacobian, shape (n, n_free), [m per prior std]."""
     singular_values: Array
-    """Descending, shape (n_free,), padded with zeros, [m per tolerance]."""
+    """Descending, shape (n_free,), padded with zeros, [m per prior std]."""
     directions: Array
     """Right singular vectors as rows, shape (n_free, n_free)."""
 
@@ -50,7 +50,7 @@ class Information:
         return np.asarray(np.sqrt((null**2).sum(axis=0)) < 1e-6)
 
     def determined(self, *, sigma: float) -> NDArray[np.bool_]:
-        """Whether the readings alone tell a parameter better than its tolerance, shape (n_free,).
+        """Whether the readings alone tell a parameter better than its prior, shape (n_free,).
 
         Args:
             sigma: Standard deviation of one reading, [m]; if not known, what is structurally
@@ -151,7 +151,7 @@ def posterior_covariance(factor: Array, *, sigma: float, precision: Array) -> Ar
     """As `Information.covariance` of a factor that needs no decomposition, (n_free, n_free).
 
     Args:
-        factor: A Jacobian, zeros eliminated, shape (n, n_free), [m per tolerance].
+        factor: A Jacobian, zeros eliminated, shape (n, n_free), [m per prior std].
         sigma: Standard deviation of one reading, [m].
         precision: Diagonal of P, shape (n_free,).
     """
@@ -160,7 +160,7 @@ def posterior_covariance(factor: Array, *, sigma: float, precision: Array) -> Ar
 
 
 def marginalise(information: Information, kept: int, *, sigma: float) -> Information:
-    """What readings say of the first parameters, the others known to their tolerances at most.
+    """What readings say of the first parameters, the others known from their priors at least.
 
     Args:
         information: Of all parameters.
@@ -186,7 +186,7 @@ def decompose(jacobian: Array, observations: Observations) -> Information:
     """Decompose an identification Jacobian.
 
     Args:
-        jacobian: dh/dθ̂, shape (n_entries, n_free), [m per tolerance].
+        jacobian: dh/dθ̂, shape (n_entries, n_free), [m per prior std].
         observations: Which zero each entry has.
     """
     return _information(project_out_zeros(jacobian, observations))

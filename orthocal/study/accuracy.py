@@ -349,7 +349,7 @@ def build_accuracy_study(
         session=PortableSession.of(session.with_values(np.zeros(len(session.readings)))),
         choice=chosen,
         drawn=names,
-        prior_std={n: stated.get(n, parameters[n].tolerance) for n in names},
+        prior_std={n: stated.get(n, parameters[n].prior_std) for n in names},
         fixed=fixed,
         machines=machines,
         seed=seed,
@@ -369,7 +369,7 @@ def _without_sums(names: Sequence[str], parameters: ParameterSet) -> tuple[str, 
 def _true_selection(study: AccuracyStudy, robot: Robot) -> Selection:
     """All errors of the machines: random ones with their priors, and fixed ones."""
     parameters = tuple(
-        replace(robot.parameters[n], tolerance=study.prior_std[n]) for n in study.drawn
+        replace(robot.parameters[n], prior_std=study.prior_std[n]) for n in study.drawn
     )
     n = len(parameters)
     return Selection(
@@ -473,7 +473,7 @@ def summarise_accuracy(study: AccuracyStudy, table: StudyTable) -> AccuracySumma
         values = column(f"error.{p.name}_{p.edge_unit}") / p.edge_factor
         rms, standard_error = _root_mean_square(values)
         std = np.nan if predicted is None else float(np.sqrt(predicted.covariance[i, i]))
-        relative = rms / study.prior_std.get(p.name, p.tolerance)
+        relative = rms / study.prior_std.get(p.name, p.prior_std)
         errors.append(EstimationError(p, rms, standard_error, std, relative))
     after, standard_error = tool("tool_um")
     return AccuracySummary(

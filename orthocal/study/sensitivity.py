@@ -74,7 +74,7 @@ class SensitivityStudy(Study):
         for i in range(o.size):
             key = postures[o.posture[i]], setups[o.setup[i]]
             by_std.setdefault(key, jacobian[i] * problem.noise[i])
-        scales = np.array([p.tolerance * p.edge_factor for p in parameters])
+        scales = np.array([p.prior_std * p.edge_factor for p in parameters])
         n = len(by_std)
         return {
             "posture": [posture for posture, _ in by_std for _ in parameters],

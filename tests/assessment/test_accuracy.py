@@ -87,7 +87,7 @@ def jacobian(tool, workspace):
 @pytest.fixture(scope="module")
 def tolerances(orthoglide, tool):
     scale = [
-        OFFSET_SIGMA if n.endswith(".offset") else orthoglide.parameters[n].tolerance
+        OFFSET_SIGMA if n.endswith(".offset") else orthoglide.parameters[n].prior_std
         for n in tool.free
     ]
     return np.array(scale)
@@ -96,7 +96,7 @@ def tolerances(orthoglide, tool):
 @pytest.mark.parametrize("size", [0.0, 3.0])
 def test_the_sensitivity_is_the_derivative_of_the_forward_kinematics(orthoglide, size):
     names = orthoglide.parameters.select(["*", "!frame.*", "frame.tcp.*"])
-    scale = np.array([orthoglide.parameters[n].tolerance for n in names])
+    scale = np.array([orthoglide.parameters[n].prior_std for n in names])
     at = size * np.random.default_rng(0).normal(size=len(names))
     drives = np.array([0.33, 0.29, 0.27])
     values = dict(zip(names, at * scale, strict=True))
@@ -260,7 +260,7 @@ def test_what_three_plans_are_worth(
 ):
     session = exact(load_plan(plans.write(tmp_path, plan())))
     own = dict(zip(tool.free, tolerances, strict=True))
-    problem = build_problem(session, free=tool.free, tolerances=own)
+    problem = build_problem(session, free=tool.free, prior_stds=own)
     _, slopes = problem.linearise(np.zeros(problem.n_free))
     information = decompose(slopes, problem.observations)
     scale = np.outer(tolerances, tolerances)

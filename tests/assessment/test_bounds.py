@@ -51,7 +51,7 @@ def bound(plan, space, *, sigma, free):
     """R.m.s. error at the tool that the posterior leaves: shift out, and rotation too, [µm]."""
     robot = plan.robot
     names = robot.parameters.select(free)
-    problem = build_problem(plan, free=names, prior=True, tolerances=OFFSETS)
+    problem = build_problem(plan, free=names, prior=True, prior_stds=OFFSETS)
     n = problem.n_machine
     tool = ToolSensitivity(robot, free=problem.free[:n])(LoopClosure(robot).inverse(space.points))
     _, slopes = problem.linearise(np.zeros(problem.n_free))

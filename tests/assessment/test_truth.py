@@ -39,7 +39,7 @@ class Machines:
 
     def __init__(self, root, name):
         self.plan = exact(load_plan(session_folder(root, name) / "plan.yaml"))
-        self.problem = build_problem(self.plan, free=JOINTS, prior=True, tolerances=IN_SI)
+        self.problem = build_problem(self.plan, free=JOINTS, prior=True, prior_stds=IN_SI)
         self.batch = BatchProgram(self.problem)
         self.workspace = cube(self.plan.robot, points_a_side=5)
         closure = LoopClosure(self.plan.robot)
@@ -103,7 +103,7 @@ def test_perfect_readings_give_the_tool_where_they_determine_it(machines):
     truth = m.draw(7)
     plan = m.plan.with_gauge(Gauge(None, None, None))  # nothing is rounded
     session = plan.with_values(problem.observations.rows(problem.predict(truth)))
-    fit = fit_problem(build_problem(session, free=JOINTS, prior=True, tolerances=IN_SI))
+    fit = fit_problem(build_problem(session, free=JOINTS, prior=True, prior_stds=IN_SI))
     accuracy = assess_tool(assemble_calibration(fit), m.workspace)
     error = m.tool(fit.solution.theta) - m.tool(truth)
     error -= m.workspace.weights @ error

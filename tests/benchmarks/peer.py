@@ -38,7 +38,7 @@ class PeerSolution:
     errors: Array
     """Error parameters, shape (n_free,), [m, rad]."""
     objective: float
-    """½ Σ ((y − h − z)/σ)² + ½ Σ (θ/tolerance)², as orthocal's."""
+    """½ Σ ((y − h − z)/σ)² + ½ Σ (θ/prior std)², as orthocal's."""
     seconds: float
     evaluations: int
     """How often all loops were closed."""
@@ -108,7 +108,7 @@ class PeerProblem:
         self.robot = robot
         self.names = tuple(names)
         self.sigma = sigma
-        self.tolerances = np.array([robot.parameters[n].tolerance for n in names])
+        self.prior_stds = np.array([robot.parameters[n].prior_std for n in names])
         self.evaluations = 0
         self._readings = session.values
         self._zero_drives = session.zero_drives[0]  # one session
@@ -167,7 +167,7 @@ class PeerProblem:
         self.evaluations += 1
         left = self._readings - self.predict(errors)
         means = np.bincount(self._setup, left) / np.bincount(self._setup)
-        return np.concatenate([(left - means[self._setup]) / self.sigma, errors / self.tolerances])
+        return np.concatenate([(left - means[self._setup]) / self.sigma, errors / self.prior_stds])
 
     def solve(self) -> PeerSolution:
         """Estimate the errors, from 0.
@@ -181,7 +181,7 @@ class PeerProblem:
             self.residuals,
             np.zeros(len(self.names)),
             method="lm",
-            x_scale=self.tolerances,
+            x_scale=self.prior_stds,
             ftol=STOP,
             xtol=STOP,
         )

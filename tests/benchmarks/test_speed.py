@@ -143,7 +143,7 @@ def offsets(names):
 def test_the_peer_predicts_the_same_readings(session):
     names = session.robot.parameters.select_model(MODEL)
     problem = PeerProblem(session, names=names, sigma=SIGMA)
-    errors = np.random.default_rng(0).normal(size=len(names)) * problem.tolerances
+    errors = np.random.default_rng(0).normal(size=len(names)) * problem.prior_stds
     expected = predict_readings(session, dict(zip(names, errors, strict=True)))
     assert np.abs(problem.predict(errors) - expected).max() < KINEMATICS
 

@@ -74,7 +74,7 @@ def test_the_file_has_what_was_promised(result):
         "value",
         "std",
         "std_scatter",
-        "tolerance",
+        "prior_std",
         "free",
         "identifiable",
     } <= set(document["parameters"][0])

@@ -40,7 +40,7 @@ def test_a_file_makes_its_calibration_again(root, tmp_path, name, model, loss, s
     again = repeat_calibration(loaded, restore_session(loaded))
     for p, q in zip(made.parameters, again.parameters, strict=True):
         assert q.name == p.name
-        assert q.value == pytest.approx(p.value, abs=1e-6 * p.tolerance)
+        assert q.value == pytest.approx(p.value, abs=1e-6 * p.prior_std)
         assert q.std == pytest.approx(p.std, rel=1e-5, nan_ok=True)
         assert q.at_bound == p.at_bound
     for p, q in zip(made.residuals, again.residuals, strict=True):

@@ -144,7 +144,7 @@ def point(problem, size=0.7):
 
 def test_its_parameters_are_those_of_the_robot(plan):
     parameters = plan.robot.parameters
-    assert parameters["x_slide.slack"].tolerance == 0.04e-3
+    assert parameters["x_slide.slack"].prior_std == 0.04e-3
     assert parameters["rods.growth"].unit == "1/K"
     assert parameters.read_quantity("rods.growth_ppm_per_K", 3.0) == ("rods.growth", 3e-6)
     assert [e.name for e in robot_effects(plan.robot)] == ["drive", "geometry", "slack"]

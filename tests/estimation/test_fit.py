@@ -164,9 +164,9 @@ def test_correlations_are_those_of_the_covariance(session):
 def test_how_much_the_readings_said_of_each_parameter(session):
     """Of a length that other errors make worse than its prior they said nothing."""
     p = calibrate(session, "full")["x_slide.offset"]
-    assert p.data_share == pytest.approx(1.0 - (p.std / p.tolerance) ** 2)
+    assert p.data_share == pytest.approx(1.0 - (p.std / p.prior_std) ** 2)
     assert 0.0 < p.data_share < 1.0
     worse = calibrate(session, "lengths")["x_leg.length"]
-    assert worse.std > worse.tolerance
+    assert worse.std > worse.prior_std
     assert worse.data_share == 0.0
     assert np.isnan(calibrate(session)["x_slide.offset"].data_share)

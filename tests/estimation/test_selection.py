@@ -52,9 +52,9 @@ def test_globs_come_instead_of_a_model_or_on_top_of_it(parameters):
 
 def test_a_tolerance_holds_for_what_its_glob_matches(parameters):
     chosen = select_parameters(
-        parameters, model="lengths", tolerances={"*.offset": 2e-3, "x_slide.offset": 1e-3}
+        parameters, model="lengths", prior_stds={"*.offset": 2e-3, "x_slide.offset": 1e-3}
     )
-    assert chosen.tolerances == pytest.approx([1e-3, 2e-3, 2e-3, 1e-4, 1e-4, 1e-4])
+    assert chosen.prior_stds == pytest.approx([1e-3, 2e-3, 2e-3, 1e-4, 1e-4, 1e-4])
 
 
 def test_known_values_are_held_or_become_a_prior(parameters):
@@ -63,7 +63,7 @@ def test_known_values_are_held_or_become_a_prior(parameters):
     assert chosen.names[-1] == "x_leg.length"
     assert list(chosen.prior) == [False, False, False, True]
     assert chosen.mean[-1] == 0.12e-3
-    assert chosen.tolerances[-1] == 0.02e-3
+    assert chosen.prior_stds[-1] == 0.02e-3
     assert chosen.fixed == {"y_leg.length": 0.05e-3}
 
 
@@ -82,9 +82,9 @@ def test_bounds_are_open_where_none_is_given(parameters):
         ({"free": ["*.offset", "!*"]}, "nothing to identify"),
         ({"free": ["w_*"]}, r"'w_\*' matches no error parameter"),
         ({"model": "all"}, "'all' is not a model"),
-        ({"tolerances": {"x_leg.length": 1e-4}}, "matches no free parameter"),
-        ({"tolerances": {"*.offset": 1e-12}}, "is 2e-09 mm; expected at least 2e-06 mm"),
-        ({"model": "full", "tolerances": {"x_*": 1e-3}}, "matches parameters in m, ppm and rad"),
+        ({"prior_stds": {"x_leg.length": 1e-4}}, "matches no free parameter"),
+        ({"prior_stds": {"*.offset": 1e-12}}, "is 2e-09 mm; expected at least 2e-06 mm"),
+        ({"model": "full", "prior_stds": {"x_*": 1e-3}}, "matches parameters in m, ppm and rad"),
         ({"bounds": {"*.offset": (1e-3, -1e-3)}}, "bounds: those of"),
         ({"known": {"x_slid.offset": 0.0}}, "did you mean x_slide.offset"),
         ({"known": {"x_slide.offset": float("nan")}}, "expected a finite number"),
@@ -121,7 +121,7 @@ def test_texts_carry_their_units(parameters):
         ("x_slide.offset", 0.0, 2e-3),
     ):
         assert selection.mean[at[name]] == pytest.approx(mean)
-        assert selection.tolerances[at[name]] == pytest.approx(spread)
+        assert selection.prior_stds[at[name]] == pytest.approx(spread)
     assert selection.fixed == {"y_leg.length": pytest.approx(7e-6)}
     slide, coupler = at["x_slide.offset"], at["x_coupler.rx"]
     assert (selection.lower[slide], selection.upper[slide]) == (-2e-3, np.inf)

@@ -128,7 +128,7 @@ def change(document, keys, value):
         (["identifiability", "singular_values", 0], 0.0, "the largest first"),
         (["identifiability", "rank"], 4, "identifiability.rank: found 4"),
         (["model_covariance"], [], "covariance: expected 3 × 3 numbers"),
-        (["parameters", 0, "tolerance"], 0, "expected greater than 0"),
+        (["parameters", 0, "prior_std"], 0, "expected greater than 0"),
         (["robot", "directory"], "a\x00b", "a text contains a control character"),
         (["session", "title"], "\ud800", "half of a surrogate pair"),
         (["residuals"], [0] * 300_000, "residuals[0]: found '0'; expected keys and values"),

@@ -53,7 +53,7 @@ def test_offsets_and_lengths_act_as_in_the_closed_forms(orthoglide):
 def test_batches_equal_pinocchios_own_newton(orthoglide):
     names = orthoglide.parameters.select_model("full")
     rng = np.random.default_rng(4)
-    scale = np.array([orthoglide.parameters[n].tolerance for n in names])
+    scale = np.array([orthoglide.parameters[n].prior_std for n in names])
     values = 5.0 * scale * rng.normal(size=len(names))
     joints = closed_form.inverse(reachable_points(20, seed=5), length=LENGTH)
     passive = LoopClosure(orthoglide, free=names).close(joints, theta=values)

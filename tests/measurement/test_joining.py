@@ -52,7 +52,7 @@ def test_two_halves_are_the_whole(sweep, model, solver):
     joined = calibrate(parts, model, solver=options)
     assert whole.noise.source == joined.noise.source == "gauge"
     for p, q in zip(whole.free, joined.free, strict=True):
-        assert q.value == pytest.approx(p.value, abs=1e-9 * p.tolerance)
+        assert q.value == pytest.approx(p.value, abs=1e-9 * p.prior_std)
         assert q.std == pytest.approx(p.std, rel=1e-9)
     assert [r.measured for r in joined.residuals] == [r.measured for r in whole.residuals]
     left = np.array([[r.residual for r in c.residuals] for c in (whole, joined)])

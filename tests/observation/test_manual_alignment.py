@@ -84,7 +84,7 @@ def test_both_solvers_find_one_optimum(plan, hessian):
     ]
     a, b = ([*r.free, *r.sensors] for r in found)
     for p, q in zip(a, b, strict=True):
-        assert abs(p.value - q.value) < 1e-4 * p.tolerance
+        assert abs(p.value - q.value) < 1e-4 * p.prior_std
 
 
 def test_a_ball_over_its_rod_is_recovered_as_such(plan):
@@ -95,4 +95,4 @@ def test_a_ball_over_its_rod_is_recovered_as_such(plan):
     for name, value in truth.items():
         assert result[name].value == pytest.approx(value, abs=1e-9)
     for p in result.sensors:
-        assert abs(p.value) < 1e-6 * p.tolerance
+        assert abs(p.value) < 1e-6 * p.prior_std

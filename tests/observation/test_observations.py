@@ -50,7 +50,7 @@ def test_readings_equal_those_of_a_pinocchio_machine_with_all_errors(root):
     # frame errors of a root would let it move with its swivel; all else is in the full model
     names = plan.robot.parameters.select(["*", "!frame.*_leg_root.*"])
     rng = np.random.default_rng(3)
-    errors = {n: 5.0 * plan.robot.parameters[n].tolerance * rng.normal() for n in names}
+    errors = {n: 5.0 * plan.robot.parameters[n].prior_std * rng.normal() for n in names}
     ours = predict_readings(plan, errors, observations=o)
     machine = plan.robot.with_errors(errors)
     seen = set()

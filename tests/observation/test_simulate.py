@@ -83,7 +83,7 @@ def test_the_shipped_session_is_what_its_truth_gives(root, plan):
 def test_drawn_errors_have_their_tolerances(orthoglide):
     draws = [draw_errors(orthoglide, ["*", "!frame.*"], seed=s) for s in range(60)]
     scaled = np.array(
-        [[v / orthoglide.parameters[n].tolerance for n, v in d.items()] for d in draws]
+        [[v / orthoglide.parameters[n].prior_std for n, v in d.items()] for d in draws]
     )
     assert abs(scaled.std() - 1.0) < 4.0 / np.sqrt(2 * scaled.size)
     assert abs(scaled.mean()) < 4.0 / np.sqrt(scaled.size)

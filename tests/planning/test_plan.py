@@ -205,7 +205,7 @@ def test_sections_near_the_tool_are_best_for_the_papers_six_equations(orthoglide
     assert {s.section.value for s in chosen} == {0.8}
     # all six, or three of them twice, one a leg, which say exactly as much
     assert sorted(s.leg for s in chosen) == list("xxyyzz")
-    tolerance = np.array([orthoglide.parameters[name].tolerance for name in candidates.state])
+    tolerance = np.array([orthoglide.parameters[name].prior_std for name in candidates.state])
     std = tolerance * np.sqrt(np.linalg.inv(found.information).diagonal())
     assert std / (np.sqrt(2.0) * 5e-6) == pytest.approx([1.3448] * 3, abs=1e-4)
 

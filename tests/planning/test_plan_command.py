@@ -187,7 +187,7 @@ def test_each_criterion_is_better_met_by_its_own_plan(orthoglide, for_the_headli
     for plan in (own, other):
         assert plan.curve[stage].error > 0.0
     n = len(own.forecast.selection.names)
-    scale = own.forecast.tolerances[:n]
+    scale = own.forecast.prior_stds[:n]
 
     def size(plan):
         covariance = plan.forecast.about_nominal(plan.session).covariance[:n, :n]

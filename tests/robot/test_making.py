@@ -95,7 +95,7 @@ def test_a_machine_is_made_again_from_its_sizes_in_one_place(tmp_path):
     fresh = make_robot(replace(SMALL, leg=0.26), tmp_path / "mine.fresh", counting=COUNTING)
     assert (folder / "mine.urdf").read_text() == fresh.urdf.read_text()
     assert robot.drive_zero == pytest.approx([0.26] * 3)
-    assert robot.parameters["x_slide.offset"].tolerance == pytest.approx(2e-3)
+    assert robot.parameters["x_slide.offset"].prior_std == pytest.approx(2e-3)
     assert yaml.read_text().replace("offset_mm: 4,", "offset_mm: 10,").replace(
         "mine", ""
     ) == fresh.yaml.read_text().replace("mine.fresh", "")

@@ -54,6 +54,6 @@ def test_named_sums_spread_over_their_elementary_errors(orthoglide):
 
 def test_tolerances_are_those_of_the_yaml(orthoglide):
     p = orthoglide.parameters
-    assert p["x_slide.offset"].tolerance == 5e-3
-    assert p["x_coupler.x"].tolerance == 1e-4
-    assert p["x_coupler.rz"].tolerance == 1e-3
+    assert p["x_slide.offset"].prior_std == 5e-3
+    assert p["x_coupler.x"].prior_std == 1e-4
+    assert p["x_coupler.rz"].prior_std == 1e-3

@@ -82,7 +82,7 @@ def test_crooked_readings_are_those_of_solids_that_touch(tmp_path, tip, oblique)
     setups, missed = list(session.setups), 0
     for _ in range(40):
         values = 3.0 * rng.normal(size=len(known.parameters))
-        values *= [p.tolerance for p in known.parameters]
+        values *= [p.prior_std for p in known.parameters]
         found = predict_readings(session, ERRORS, observations=o, nuisance=values)
         said = dict(zip(names(session), (values + beside).tolist(), strict=True))
         for i, r in enumerate(session.readings):
@@ -100,7 +100,7 @@ def test_a_line_is_read_as_by_an_edge_without_a_radius(tmp_path, root):
     session = load_plan(root / "tests/sessions/lines/plan.yaml")
     o, rng = build_observations(session), np.random.default_rng(1)
     known = nuisance_parameters(session)
-    values = rng.normal(size=len(known.parameters)) * [p.tolerance for p in known.parameters]
+    values = rng.normal(size=len(known.parameters)) * [p.prior_std for p in known.parameters]
     said = dict(zip(names(session), values.tolist(), strict=True))
     found = predict_readings(session, ERRORS, observations=o, nuisance=values)
     workshop = Workshop(session, ERRORS)
@@ -162,7 +162,7 @@ def test_it_is_written_and_read(tmp_path):
     loaded = load_calibration(write_calibration(found, tmp_path / "calibration.json"))
     assert [s.sensor for s in loaded.setups] == [s.sensor for s in made.setups.values()]
     assert [p.name for p in loaded.sensors] == names(made)
-    assert {p.tolerance for p in loaded.sensors if p.name.endswith("square")} == {0.05e-3}
+    assert {p.prior_std for p in loaded.sensors if p.name.endswith("square")} == {0.05e-3}
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ def test_what_is_not_known_of_it_is_identified_beside_the_machine(plan):
     assert set(simulated.nuisance) == {"dial.d.slope", "setup.tz.slope"}
     result = calibrate(simulated.session)
     for p in result.sensors:
-        assert 0.0 < p.std_scatter < 0.2 * p.tolerance
+        assert 0.0 < p.std_scatter < 0.2 * p.prior_std
         assert abs(p.value - simulated.nuisance[p.name]) < 4.0 * p.std
     for name, value in TRUTH.items():
         assert abs(result[name].value - value) < 4.0 * result[name].std

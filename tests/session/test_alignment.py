@@ -42,7 +42,7 @@ def calibration(workshop):
 @pytest.mark.parametrize("how", ORDER)
 def test_the_order_of_rows_changes_no_estimate(how, workshop, calibration):
     other = calibrate(ordered(workshop, how), Choice("full"), solver="variable-projection")
-    scale = np.array([p.tolerance for p in calibration.free])
+    scale = np.array([p.prior_std for p in calibration.free])
     expected, found = (np.array([p.value for p in c.free]) for c in (calibration, other))
     np.testing.assert_allclose(found / scale, expected / scale, atol=1e-9)
     unit = np.outer(scale, scale)

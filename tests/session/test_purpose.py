@@ -39,7 +39,7 @@ def test_what_a_session_says_is_what_options_would(raw_cycles, stated):
         calibrate(raw_cycles, Choice("full", tolerances=TOLERANCES), solver="variable-projection"),
     )
     assert found.model == expected.model == "full"
-    assert [p.tolerance for p in found.free] == [p.tolerance for p in expected.free]
+    assert [p.prior_std for p in found.free] == [p.prior_std for p in expected.free]
     assert [(p.value, p.std) for p in found.free] == [(p.value, p.std) for p in expected.free]
 
 
@@ -49,15 +49,15 @@ def test_tolerances_hold_for_what_is_left_out(raw_cycles, stated):
     )
     np.testing.assert_allclose(*([p.value for p in c.free] for c in (own, told)), atol=1e-12)
     index = own.unmodelled.names.index(FORK)
-    assert own.unmodelled.tolerances[index] == 1e-3
-    assert told.unmodelled.tolerances[index] == pytest.approx(3e-3)
+    assert own.unmodelled.prior_stds[index] == 1e-3
+    assert told.unmodelled.prior_stds[index] == pytest.approx(3e-3)
     assert told.unmodelled.residual_rms > own.unmodelled.residual_rms
 
 
 def test_a_calibration_keeps_them(stated, tmp_path):
     first = calibrate(stated, solver="variable-projection")
     again = load_calibration(write_calibration(first, tmp_path / "calibration.json"))
-    assert again.robot.parameters[FORK].tolerance == pytest.approx(3e-3)
+    assert again.robot.parameters[FORK].prior_std == pytest.approx(3e-3)
     repeated = repeat_calibration(again, restore_session(again))
     np.testing.assert_allclose(
         [p.value for p in repeated.free], [p.value for p in first.free], atol=1e-12
@@ -71,7 +71,7 @@ def test_options_come_before_what_a_session_says(stated):
     only_known = choose(Choice(known={"x_leg.length_mm": 0.1}), stated)
     assert (only_known.model, dict(only_known.known)) == ("full", {"x_leg.length_mm": 0.1})
     narrower = choose(Choice(tolerances={"x_fork.rx_mrad": 1.0}), stated).select(parameters)
-    sizes = {p.name: p.tolerance for p in narrower.parameters}
+    sizes = {p.name: p.prior_std for p in narrower.parameters}
     assert sizes[FORK] == pytest.approx(0.5e-3)
     assert sizes["y_fork.rx"] == pytest.approx(3e-3)
 
@@ -124,14 +124,14 @@ def test_one_machine_has_one_tolerance(raw_cycles, stated, tmp_path):
 def test_a_worker_gets_them(stated):
     there = PortableSession.of(stated).unpack()
     assert there.purpose == stated.purpose
-    assert there.robot.parameters[FORK].tolerance == pytest.approx(3e-3)
+    assert there.robot.parameters[FORK].prior_std == pytest.approx(3e-3)
 
 
 def test_later_ones_come_on_top(orthoglide):
     parameters = orthoglide.parameters.with_tolerances({"*.offset_mm": 4.0})
     parameters = parameters.with_tolerances({"x_slide.offset_mm": 2.0})
-    assert [parameters[f"{a}_slide.offset"].tolerance for a in "xyz"] == [1e-3, 2e-3, 2e-3]
+    assert [parameters[f"{a}_slide.offset"].prior_std for a in "xyz"] == [1e-3, 2e-3, 2e-3]
     parameters = parameters.with_tolerances({"*.offset_mm": 1.0})
-    assert {parameters[f"{a}_slide.offset"].tolerance for a in "xyz"} == {0.5e-3}
+    assert {parameters[f"{a}_slide.offset"].prior_std for a in "xyz"} == {0.5e-3}
     assert parameters.own is orthoglide.parameters
     assert parameters.redundant == orthoglide.parameters.redundant

@@ -29,9 +29,9 @@ def information(jacobian):
     return Information(jacobian, padded, directions)
 
 
-def parameters(*names, tolerances=None):
-    tolerances = tolerances or [1.0] * len(names)
-    return [Parameter(n, "m", t, ((n, 1.0),)) for n, t in zip(names, tolerances, strict=True)]
+def parameters(*names, prior_stds=None):
+    prior_stds = prior_stds or [1.0] * len(names)
+    return [Parameter(n, "m", t, ((n, 1.0),)) for n, t in zip(names, prior_stds, strict=True)]
 
 
 A = np.array([3.0, 0.0, 0.0, 0.0])
@@ -39,10 +39,10 @@ B = np.array([0.0, 2.0, 0.0, 0.0])
 C = np.array([0.0, 0.0, 0.5, 0.0])
 
 
-def analyse(columns, names, *, sigma=0.1, tolerances=None):
+def analyse(columns, names, *, sigma=0.1, prior_stds=None):
     return analyse_identifiability(
         information(np.column_stack(columns)),
-        parameters(*names, tolerances=tolerances),
+        parameters(*names, prior_stds=prior_stds),
         sigma=sigma,
         n_postures=4,
         n_readings=4,
@@ -63,7 +63,7 @@ def test_two_that_act_oppositely_are_told_as_a_difference():
 
 def test_coefficients_count_in_units_not_in_tolerances():
     """One tolerance of b, 0.5, moves as far as one of a, 2: in units b moves four times as far."""
-    found = analyse([A, A, B], ["a", "b", "c"], tolerances=[2.0, 0.5, 1.0])
+    found = analyse([A, A, B], ["a", "b", "c"], prior_stds=[2.0, 0.5, 1.0])
     assert found.alike[0].terms == (("a", 1.0), ("b", pytest.approx(4.0)))
     assert found.alike[0].words == "a and b: only a + 4 b"
 

@@ -48,7 +48,7 @@ def test_derivatives_agree_with_central_differences(orthoglide):
     assert set(found.parameters) == set(names)
     for i, name in enumerate(found.parameters):
         parameter = orthoglide.parameters[name]
-        step = 0.1 * parameter.tolerance
+        step = 0.1 * parameter.prior_std
         ends = [
             place(orthoglide.with_errors({name: s * step}), posture.drives, "tcp") for s in (1, -1)
         ]
@@ -58,7 +58,7 @@ def test_derivatives_agree_with_central_differences(orthoglide):
         assert np.abs(np.array(own) - edge).max() < 1e-6 * max(1.0, np.abs(edge).max())
         assert found.units[i] == f"mm/{parameter.edge_unit}"
         along_x = found.rows.index(("point_1", "tool x"))
-        expected_um = expected[0] * parameter.tolerance
+        expected_um = expected[0] * parameter.prior_std
         assert found.per_prior_std[along_x, i] == pytest.approx(expected_um, abs=1e-10)
 
 

@@ -5,7 +5,7 @@ errors. To first order the estimate moves by L θᵤ for unmodelled errors θᵤ
 
     L = A⁻¹ Jᵀ Jᵤ/σ²,  A = Jᵀ J/σ² + P
 
-and with θᵤ within the tolerances this is known as a spread. It belongs into every honest ±.
+and with θᵤ drawn from the priors this is known as a spread. It belongs into every honest ±.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ WHOLE_MODEL = "full"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unmodelled:
-    """Errors that an estimate leaves out, at their tolerances."""
+    """Errors that an estimate leaves out, with their priors."""
 
     __pydantic_config__ = CLOSED
 
     names: Many[str]
-    tolerances: Sizes
+    prior_stds: Sizes
     """One standard deviation of each, shape (n_unmodelled,), [SI]."""
     leakage: Matrix
     """L: what the free parameters take on, shape (n_free, n_unmodelled), [SI per SI]."""
@@ -52,7 +52,7 @@ class Unmodelled:
     @property
     def bias_covariance(self) -> Array:
         """Covariance of what the free parameters take on, shape (n_free, n_free), [SI]."""
-        spread = self.leakage * self.tolerances
+        spread = self.leakage * self.prior_stds
         return np.asarray(spread @ spread.T)
 
 
@@ -61,10 +61,10 @@ class OtherErrors:
     """Errors that a machine has and a fit left out, and how they move the readings."""
 
     names: tuple[str, ...]
-    tolerances: Array
+    prior_stds: Array
     """One standard deviation of each, shape (n_others,), [SI]."""
     slopes: Array
-    """∂h of one tolerance of each, gauge zeros eliminated, shape (n_entries, n_others), [m]."""
+    """∂h of one prior std of each, gauge zeros eliminated, shape (n_entries, n_others), [m]."""
 
 
 @cached_per_robot(maxsize=8)
@@ -107,15 +107,15 @@ def find_other_errors(fit: Fit, *, spoken_for: Collection[str] = ()) -> OtherErr
     o = problem.observations
     if not names:
         return OtherErrors((), read_only([]), read_only(np.zeros((o.size, 0))))
-    tolerances = read_only([parameters[n].tolerance for n in names])
-    return OtherErrors(tuple(names), tolerances, read_only(error_slopes(fit, names)))
+    prior_stds = read_only([parameters[n].prior_std for n in names])
+    return OtherErrors(tuple(names), prior_stds, read_only(error_slopes(fit, names)))
 
 
 def error_slopes(fit: Fit, names: Sequence[str]) -> Array:
     """How errors of the machine move the readings at the solution of a fit that has them not free.
 
     Returns:
-        ∂h of one tolerance of each, gauge zeros eliminated, shape (n_entries, n_names), [m].
+        ∂h of one prior std of each, gauge zeros eliminated, shape (n_entries, n_names), [m].
     """
     problem = fit.problem
     chosen = tuple(problem.robot.parameters[n] for n in names)
@@ -157,8 +157,8 @@ def measure_unmodelled(fit: Fit, others: OtherErrors) -> tuple[Unmodelled, Array
     taken = scaled * problem.theta_scale[:, None]
     found = Unmodelled(
         names=others.names,
-        tolerances=others.tolerances,
-        leakage=read_only((taken / others.tolerances)[:n]),
+        prior_stds=others.prior_stds,
+        leakage=read_only((taken / others.prior_stds)[:n]),
         residual_rms=float(np.sqrt((left**2).sum() / len(left))),
         residual_dof=_independent_parts(left),
     )

@@ -20,12 +20,12 @@ from orthocal.estimation.solvers.variable_projection import VariableProjection
 Array = NDArray[np.float64]
 
 SETTLED = 1e-8
-"""Estimated next step at which a set has converged, [tolerances]."""
+"""Estimated next step at which a set has converged, [prior std]."""
 
 MAX_STEPS = 30
 
 MAX_STEP_SIZE = 100.0
-"""Longer steps mark a set that is solved alone, [tolerances]."""
+"""Longer steps mark a set that is solved alone, [prior std]."""
 
 MAX_NUMBERS = 2**21
 """Numbers in the Jacobians of the sets that are solved together."""
@@ -186,7 +186,7 @@ class _Shared:
         Args:
             theta: θ̂, shape (S, n_free).
             residual: Shape (S, n_entries), [σ].
-            jacobian: Shape (S, n_entries, n_free), [m per tolerance].
+            jacobian: Shape (S, n_entries, n_free), [m per prior std].
         """
         rows = jacobian / self.sigma
         gradient = (self.loss.influence(residual)[:, None] @ rows)[:, 0]

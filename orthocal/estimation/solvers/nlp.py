@@ -240,10 +240,10 @@ class ProgramFunctions:
         count, n_u = one.nuisance_index.shape
         variant = self._variant(one)
         references = problem.model.reference_commands[variant]
-        tolerances = ca.DM(problem.theta_scale[one.nuisance_index].T)
+        prior_stds = ca.DM(problem.theta_scale[one.nuisance_index].T)
         separate = [
             ca.reshape(x[local[:, :n_u].reshape(-1).tolist()], n_u, count),
-            ca.MX(tolerances),
+            ca.MX(prior_stds),
             x[local[:, n_u].tolist()].T,
             ca.reshape(x[local[:, n_u + 1 :].reshape(-1).tolist()], -1, count),
             p[one.entries.tolist()].T,
@@ -286,11 +286,11 @@ class ProgramFunctions:
         sigma, width, loss = ca.SX.sym("sigma"), ca.SX.sym("width"), self.loss
         n_t, n_u = one.theta_index.size, one.nuisance.numel()
         noise, scaled = ca.SX.sym("noise"), ca.SX.sym("scaled", n_u)
-        tolerances = ca.SX.sym("tolerances", n_u)
+        prior_stds = ca.SX.sym("prior_stds", n_u)
         residual = (y - one.reading / noise - zero * LENGTH_SCALE) / sigma
         row = -ca.horzcat(
             one.by_theta / noise,
-            one.by_nuisance @ ca.diag(tolerances) / noise,
+            one.by_nuisance @ ca.diag(prior_stds) / noise,
             LENGTH_SCALE,
             one.by_passive / noise,
         )
@@ -303,8 +303,8 @@ class ProgramFunctions:
         bend = loss.curvature(residual, width) if exact else loss.secant(residual, width)
         second = weight * bend * (row.T @ row)
         if exact:
-            second += influence * self._reading_curvature(one, tolerances) / (-sigma * noise)
-        inputs = [scaled, tolerances, zero, one.passive, y, weight, noise]
+            second += influence * self._reading_curvature(one, prior_stds) / (-sigma * noise)
+        inputs = [scaled, prior_stds, zero, one.passive, y, weight, noise]
         inputs += [one.command, one.reference, one.constants, sigma, width]
         inputs += self._symbolic.error_map.symbols
 
@@ -318,7 +318,7 @@ class ProgramFunctions:
             "gradient": [gradient[:n_t], gradient[n_t:]],
             "hessian": [pick(*triangle[0]), pick(*triangle[1])],
         }
-        nuisance = scaled * tolerances
+        nuisance = scaled * prior_stds
         return {
             name: ca.Function(
                 name,
@@ -331,7 +331,7 @@ class ProgramFunctions:
             for name, values in outputs.items()
         }
 
-    def _reading_curvature(self, one: ReadingExpressions, tolerances: ca.SX) -> ca.SX:
+    def _reading_curvature(self, one: ReadingExpressions, prior_stds: ca.SX) -> ca.SX:
         """Second derivatives of h by (θ̂, ν̂, ẑ, q̂)."""
         direct = self._symbolic.direct
         theta = direct.theta[one.theta_index.tolist()]
@@ -341,7 +341,7 @@ class ProgramFunctions:
         second, _ = ca.hessian(direct.readings[one.group], u)
         n_t, n = theta.numel(), u.numel()
         scale = ca.diag(
-            ca.vertcat(ca.SX.ones(n_t), tolerances, ca.SX.ones(n - n_t - nuisance.numel()))
+            ca.vertcat(ca.SX.ones(n_t), prior_stds, ca.SX.ones(n - n_t - nuisance.numel()))
         )
         function = ca.Function(
             "curvature",
@@ -410,7 +410,7 @@ class ProgramFunctions:
     def _alignment_constraints(self) -> tuple[ca.DM, ca.DM]:
         """Matrix and constants of A x + b = 0 for the manually aligned nuisance parameters.
 
-        In units of its tolerance: alignment (a function of the errors) plus deviation minus value.
+        In prior std: alignment (a function of the errors) plus deviation minus value.
         """
         problem, n = self.problem, self.problem.n_machine
         index, scale = self._aligned - n, problem.theta_scale[self._aligned]

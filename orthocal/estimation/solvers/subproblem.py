@@ -21,7 +21,7 @@ from orthocal.observation.model import Linearisation
 Array = NDArray[np.float64]
 
 SETTLED_WITHIN = 1e-11
-"""Last step of a subproblem with a robust loss, [tolerances]."""
+"""Last step of a subproblem with a robust loss, [prior std]."""
 
 MOST_STEPS_WITHIN = 100
 
@@ -154,7 +154,7 @@ class Task:
 
         Args:
             state: The point of linearisation.
-            jacobian: dh/dθ̂ there, shape (n_entries, n_free), [σ per tolerance].
+            jacobian: dh/dθ̂ there, shape (n_entries, n_free), [σ per prior std].
         """
         at = state
         if not self.loss.robust:

@@ -2,7 +2,7 @@
 
 The variables are scaled to order one:
 
-    θ̂ = θ/tolerance,  q̂ = q · (1 or characteristic length)/1 mm,  ĝ = g · (1 or length)/1 mm
+    θ̂ = θ/(prior std),  q̂ = q · (1 or characteristic length)/1 mm,  ĝ = g · (1 or length)/1 mm
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 SETTLED = 1e-8
 """Estimated next step at which the solver has converged, extrapolated from the ratio of the last
-steps, [tolerances]."""
+steps, [prior std]."""
 
 NEARLY_CLOSED = 1e-3
 """Largest correction of a passive coordinate that readings are taken to follow to first order,
@@ -138,8 +138,8 @@ class VariableProjection:
                 return state, jacobian, iterations
             linear = task.linearise(state.theta, state.passive)
         raise SolverError(
-            f"did not converge: the step is still {sizes[-1]:.2g} tolerances after {most} "
-            f"iterations; {no_convergence(self.options)}",
+            f"did not converge: the step is still {sizes[-1]:.2g} prior standard deviations "
+            f"after {most} iterations; {no_convergence(self.options)}",
             status="Maximum_Iterations_Exceeded",
             iterations=most,
         )

@@ -308,8 +308,8 @@ def _check_shared(setups: Mapping[str, Setup], file: str) -> None:
             before, known = first.setdefault((owner, unknown.name), (setup, unknown))
             if not unknown.of_gauge and before.sensor.place != setup.sensor.place:
                 problem = f"stands at {' '.join(before.sensor.place)}"
-            elif known.tolerance != unknown.tolerance:
-                problem = f"states a tolerance of {show_limit(known.tolerance):g} {known.unit}"
+            elif known.prior_std != unknown.prior_std:
+                problem = f"states a tolerance of {show_limit(known.prior_std):g} {known.unit}"
             else:
                 continue
             raise SessionError(

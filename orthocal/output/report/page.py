@@ -277,9 +277,9 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
             known.append(f"{p.name} {p.value * f:g} {unit}")
             continue
         if p.prior and (p.mean != 0.0 or not calibration.prior):
-            known.append(f"{p.name} {p.mean * f:g} ± {show_limit(p.tolerance) * f:g} {unit}")
-        elif p.tolerance != usual[p.name].tolerance:
-            limit, usually = (show_limit(q.tolerance) * f for q in (p, usual[p.name]))
+            known.append(f"{p.name} {p.mean * f:g} ± {show_limit(p.prior_std) * f:g} {unit}")
+        elif p.prior_std != usual[p.name].prior_std:
+            limit, usually = (show_limit(q.prior_std) * f for q in (p, usual[p.name]))
             tolerances.append(f"{p.name} {limit:g} {unit} instead of {usually:g}")
         if p.lower is not None or p.upper is not None:
             low, high = ("∞" if v is None else f"{v * f:g}" for v in (p.lower, p.upper))

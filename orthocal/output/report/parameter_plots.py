@@ -92,7 +92,7 @@ def plot_parameters(calibration: Calibration, *, most: int = 30) -> Figure:
     names = [f"{short_name(p.name)}{f' at {p.at_bound} bound' if p.at_bound else ''}" for p in rows]
     in_unit = len(rows) <= FEW_PARAMETERS and len({p.unit for p in rows}) == 1
     figure, axes = open_list(title, names, share=calibration.prior)
-    scale = np.array([p.edge_factor if in_unit else 1.0 / show_limit(p.tolerance) for p in rows])
+    scale = np.array([p.edge_factor if in_unit else 1.0 / show_limit(p.prior_std) for p in rows])
     y, values = np.arange(len(rows)), np.array([p.value for p in rows]) * scale
     prior = np.array([i for i, p in enumerate(rows) if p.prior], dtype=int)
     if prior.size and not in_unit:
@@ -112,7 +112,7 @@ def plot_parameters(calibration: Calibration, *, most: int = 30) -> Figure:
         axes.plot(values[bound], y[bound], label="at its bound", **BOUND_LOOK)
     if not known.any() and not bound.all():
         axes.plot([], [], linestyle="none", label="no intervals: the noise is unknown")
-    axes.set_xlabel(f"estimate [{rows[0].edge_unit}]" if in_unit else "estimate [tolerances]")
+    axes.set_xlabel(f"estimate [{rows[0].edge_unit}]" if in_unit else "estimate [prior std]")
     draw_legend(figure, axes)
     if calibration.prior:
         _draw_shares(figure.axes[1], rows)

@@ -264,7 +264,7 @@ def render_sensors(calibration: Calibration) -> RenderableType | None:
             half = float(expanded_uncertainty(p.std, p.std_scatter, dof=calibration.dof))
             values = (
                 signed(p.value * p.edge_factor),
-                *(plain(v * p.edge_factor) for v in (half, show_limit(p.tolerance))),
+                *(plain(v * p.edge_factor) for v in (half, show_limit(p.prior_std))),
             )
             add_row(table, p.name, *values, p.edge_unit)
         parts += [table, Text("Estimated together with the errors of the machine.")]

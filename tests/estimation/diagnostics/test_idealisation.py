@@ -31,7 +31,7 @@ def test_a_rod_differs_from_the_line_as_placements_say(raw_cycles):
 
     total = 0.0
     for name in machine_errors(robot):
-        step = 0.1 * robot.parameters[name].tolerance
+        step = 0.1 * robot.parameters[name].prior_std
         plus, minus = (difference(robot.with_errors({name: s * step})) for s in (1.0, -1.0))
         total += ((plus - minus) / 0.2) ** 2
     found = find_idealised(raw_cycles)

@@ -20,7 +20,7 @@ SHOWN = 8
 """Sets that are solved alone too."""
 
 AGREED = 1e-6
-"""[tolerances]"""
+"""[prior std]"""
 
 
 def draw(problem, spread=0.4, sets=SETS):

@@ -26,7 +26,7 @@ from orthocal.estimation.solvers.linearised import LinearisedProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 
 AGREED = 1e-6
-"""Largest difference of two solvers' parameters, [tolerances]."""
+"""Largest difference of two solvers' parameters, [prior std]."""
 
 EXAMPLES = (
     "table1/experiment-1-printed",

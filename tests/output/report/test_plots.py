@@ -480,7 +480,7 @@ def test_many_parameters_are_in_tolerances_the_best_determined_first(sweep):
         title(figure)
         == "Estimates with 95 % intervals: 30 of 129, offsets, then the best determined"
     )
-    assert axes.get_xlabel() == "estimate [tolerances]"
+    assert axes.get_xlabel() == "estimate [prior std]"
     names = row_names(axes)
     assert len(names) == 30
     assert all(n.endswith(".offset") for n in names[:3])
@@ -489,7 +489,7 @@ def test_many_parameters_are_in_tolerances_the_best_determined_first(sweep):
     others = [p.data_share for p in sweep.free if p.name not in names]
     assert max(others) <= shares[-1]
     x, _ = line(axes, "estimate")
-    scale = np.array([0.5 / sweep[n].tolerance for n in names])
+    scale = np.array([0.5 / sweep[n].prior_std for n in names])
     np.testing.assert_allclose(x, [sweep[n].value for n in names] * scale, atol=UNIT)
     ends, _ = segments(axes)
     own = dict(zip([p.name for p in sweep.free], sweep.intervals, strict=True))
@@ -503,7 +503,7 @@ def test_many_parameters_are_in_tolerances_the_best_determined_first(sweep):
 
 
 def test_the_band_of_a_parameter_is_where_its_prior_was(sweep):
-    known = replace(sweep.parameters[0], mean=0.01, tolerance=0.005, std=0.004)
+    known = replace(sweep.parameters[0], mean=0.01, prior_std=0.005, std=0.004)
     without = replace(sweep.parameters[1], prior=False)
     parameters = (known, without, *sweep.parameters[2:])
     axes = parameter_plots.plot_parameters.figure(
