@@ -85,12 +85,12 @@ class MachineScene:
 
     def _corners(self, poses: Mapping[str, Array]) -> Array:
         """Corners of all visuals in F frames, shape (F, n, 3), [m]."""
-        found = []
+        corners = []
         for visual in self.visuals:
             pose = poses[visual.link]
             turned = visual.corners @ pose[:, :3, :3].transpose(0, 2, 1)
-            found.append(turned + pose[:, None, :3, 3])
-        return np.concatenate(found, axis=1)
+            corners.append(turned + pose[:, None, :3, 3])
+        return np.concatenate(corners, axis=1)
 
     def draw_machine(
         self,

@@ -199,7 +199,7 @@ def _body_of(model: pin.Model, joint: int) -> int:
 
 
 def _is_mounted_on(model: pin.Model, frame: pin.Frame, body: int) -> bool:
-    """Whether a link is mounted on another by one fixed joint."""
+    """True if one fixed joint mounts a link on another."""
     mount = model.frames[frame.parentFrame]
     return mount.type == pin.FrameType.FIXED_JOINT and int(mount.parentFrame) == body
 

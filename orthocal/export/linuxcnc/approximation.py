@@ -158,10 +158,8 @@ def approximate(
             raise failure
         expected, passive = tip.reach(checks)
     except ClosureError as e:
-        raise ExportError(
-            f"the machine does not reach {describe_box(box)} ({e.reason}); "
-            "give a smaller --half-side-mm"
-        ) from None
+        reason = f"the machine does not reach {describe_box(box)} ({e.reason})"
+        raise ExportError(f"{reason}; give a smaller --half-side-mm") from None
     form = find_nominal_form(robot, middle, half)
     corrections = drives - form(middle + half * nodes)[0]
     best = np.inf
@@ -173,15 +171,17 @@ def approximate(
             error = RESERVE * _tip_error(tip, checks, inverse(checks), passive)
         best = min(best, error)
         if error <= within:
+            nominal = None
+            if not isinstance(form, Tangent):
+                active = calibration.active_offsets
+                nominal = _error_or_none(tip, checks, form(checks)[0] - active)
             return Approximation(
                 inverse=inverse,
                 tool=tip.tool,
                 coordinates=tuple(tip.coordinates),
                 achieved=error,
                 checked=len(checks),
-                nominal=None
-                if isinstance(form, Tangent)
-                else _error_or_none(tip, checks, form(checks)[0] - calibration.active_offsets),
+                nominal=nominal,
                 beyond=_error_beyond(tip, inverse, calibration),
                 longer=_error_of_longer_tool(tip, expected, passive),
             )

@@ -102,15 +102,15 @@ def plot_parameters(calibration: Calibration, *, most: int = 30) -> Figure:
     bound = np.array([p.at_bound is not None for p in rows])
     intervals = {p.name: i for p, i in zip(free, calibration.intervals, strict=True)}
     ends = np.array([intervals[p.name] for p in rows]) * scale[:, None]
-    known = np.isfinite(ends).all(axis=1) & ~bound
-    if known.any():
+    finite = np.isfinite(ends).all(axis=1) & ~bound
+    if finite.any():
         look: Look = {"color": AFTER, "linewidth": 1.6, "label": "95 % interval"}
-        axes.hlines(y[known], *ends[known].T, **look)
+        axes.hlines(y[finite], *ends[finite].T, **look)
     if not bound.all():
         axes.plot(values[~bound], y[~bound], label="estimate", **AFTER_LOOK)
     if bound.any():
         axes.plot(values[bound], y[bound], label="at its bound", **BOUND_LOOK)
-    if not known.any() and not bound.all():
+    if not finite.any() and not bound.all():
         axes.plot([], [], linestyle="none", label="no intervals: the noise is unknown")
     axes.set_xlabel(f"estimate [{rows[0].edge_unit}]" if in_unit else "estimate [prior std]")
     draw_legend(figure, axes)
@@ -139,15 +139,15 @@ def plot_correlations(calibration: Calibration, *, most: int = 40) -> Figure | N
         most: Largest number of parameters: those with the strongest correlations.
     """
     matrix = calibration.correlation
-    known = np.flatnonzero(np.isfinite(np.diag(matrix)))
-    if known.size < 2:
+    finite = np.flatnonzero(np.isfinite(np.diag(matrix)))
+    if finite.size < 2:
         return None
-    size = np.abs(matrix[np.ix_(known, known)] - np.eye(known.size))
-    chosen = np.sort(known[np.argsort(-size.max(axis=1), kind="stable")[:most]])
+    size = np.abs(matrix[np.ix_(finite, finite)] - np.eye(finite.size))
+    chosen = np.sort(finite[np.argsort(-size.max(axis=1), kind="stable")[:most]])
     names = [short_name(calibration.free[i].name, LONGEST_IN_MATRIX) for i in chosen]
     title = "Correlations of the estimates"
-    if chosen.size < known.size:
-        title += f": the {chosen.size} of {known.size} parameters with the strongest"
+    if chosen.size < finite.size:
+        title += f": the {chosen.size} of {finite.size} parameters with the strongest"
     few, count = chosen.size <= FEW_PARAMETERS, chosen.size - 1
     side = (0.3 if few else 0.145) * max(count, 2)
     flat = count <= 2
@@ -193,16 +193,18 @@ def _mark_signs(
 @plot("singular-values")
 def plot_singular_values(calibration: Calibration) -> Figure | None:
     """Singular values of the readings beside their noise; nothing if all are zero."""
-    found = calibration.identifiability
-    if not found.structural_rank:
+    spectrum = calibration.identifiability
+    if not spectrum.structural_rank:
         return None
-    count = found.singular_values.size
-    values = found.singular_values[: found.structural_rank] / MM
-    title = f"Singular values: {found.rank} of {count} parameter combinations are above the noise"
+    count = spectrum.singular_values.size
+    values = spectrum.singular_values[: spectrum.structural_rank] / MM
+    title = (
+        f"Singular values: {spectrum.rank} of {count} parameter combinations are above the noise"
+    )
     figure = open_figure(2.9, title)
     axes = figure.subplots()
     index = np.arange(1, values.size + 1)
-    above = values > found.threshold / MM
+    above = values > spectrum.threshold / MM
     for chosen, face, label in (
         (above, AFTER, "above the noise"),
         (~above, "white", "below the noise"),
@@ -211,10 +213,10 @@ def plot_singular_values(calibration: Calibration) -> Figure | None:
             look = {**AFTER_LOOK, "markerfacecolor": face}
             axes.plot(index[chosen], values[chosen], label=label, **look)
     noise = calibration.noise.sigma
-    kind = "σ of a reading" if noise >= found.threshold else "rounding: the noise is unknown"
-    label = f"{kind}: {found.threshold / MM:.2g} mm"
-    axes.axhline(found.threshold / MM, color="black", linestyle="--", label=label)
-    scale_log(axes, "y", np.r_[values, found.threshold / MM])
+    kind = "σ of a reading" if noise >= spectrum.threshold else "rounding: the noise is unknown"
+    label = f"{kind}: {spectrum.threshold / MM:.2g} mm"
+    axes.axhline(spectrum.threshold / MM, color="black", linestyle="--", label=label)
+    scale_log(axes, "y", np.r_[values, spectrum.threshold / MM])
     axes.grid(True, axis="y")
     axes.set_xlim(0.5, values.size + 0.5)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
@@ -229,8 +231,8 @@ def _linearisation_shifts(calibration: Calibration) -> list[tuple[float, Paramet
     """Exact less linearised estimates in σ, the largest first."""
     if not calibration.solver.tells_linearisation:
         return []
-    known = [p for p in calibration.free if math.isfinite(p.std) and p.std > 0.0]
-    shifts = [((p.value - p.linear) / p.std, p) for p in known]
+    finite = [p for p in calibration.free if math.isfinite(p.std) and p.std > 0.0]
+    shifts = [((p.value - p.linear) / p.std, p) for p in finite]
     return sorted(shifts, key=lambda s: -abs(s[0]))[:MOST_SHIFTS]
 
 

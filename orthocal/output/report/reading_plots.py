@@ -95,10 +95,10 @@ def plot_setups(calibration: Calibration, *, most: int = 40) -> Figure:
         (_unseen, 0.2, "predicted from all other setups", UNSEEN_LOOK),
     ):
         sizes = np.array([root_mean_square(map(get, groups[n])) for n in names])
-        known = np.isfinite(sizes)
-        if known.any():
-            sizes = np.maximum(sizes[known], SMALLEST_LENGTH) / MM
-            axes.plot(sizes, y[known] + shift, label=label, **look)
+        finite = np.isfinite(sizes)
+        if finite.any():
+            sizes = np.maximum(sizes[finite], SMALLEST_LENGTH) / MM
+            axes.plot(sizes, y[finite] + shift, label=label, **look)
             shown.append(sizes)
     if math.isfinite(calibration.sigma) and calibration.sigma > SMALLEST_LENGTH:
         sigma = calibration.sigma / MM

@@ -188,7 +188,7 @@ def _choose_levels(size: Array) -> Array:
 
 
 def _is_constant(size: Array) -> bool:
-    """Whether an error is constant."""
+    """True if an error is constant over a plane."""
     return float(np.ptp(size)) < max(EVEN * float(size.max()), FINEST)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,24 +111,8 @@ def draw_readings(
         # arrows of gauges with the same contact are beside each other
         beside = sum(float(np.linalg.norm(contact.points[0] - p)) < dial for p in points)
         points.append(contact.points[0])
-        distance = (FIRST_ARROW + NEXT_ARROW * beside) * dial
-        tips = [contact.points[0] for _ in stops]
-        for node in nodes:
-            foot = contact.points[0] + (distance if node == AFTER else -distance) * contact.along
-            lengths = [_deviation(row, node) * scene.arrow_scale for row in rows]
-            draw_arrow(
-                scene,
-                f"{node}/{node_name(setup.name)}",
-                pose_along(foot, contact.direction),
-                np.repeat(lengths, 2).tolist(),
-                width=arrow_width(dial),
-                colour=COLOURS[node],
-                times=timeline.rests,
-            )
-            ends = [foot + length * contact.direction for length in lengths]
-            drawing.lower_ground(min(float(end[2]) for end in ends))
-            if node == BEFORE:
-                tips = ends
+        arrows = _Arrows(setup.name, contact, dial, beside)
+        tips = _draw_arrows(drawing, arrows, nodes, rows, timeline)
         texts = ["" if row is None else _label(row, measured) for row in rows]
         if animated and setup.name not in labelled:  # the overview is the first and last stop
             texts = ["" if s is stops[0] else t for s, t in zip(stops, texts, strict=True)]
@@ -139,6 +124,48 @@ def draw_readings(
         overview if animated and s is stops[0] else _caption(s, measured) for s in stops
     ]  # the last stop may be the first again
     write_steps(scene, stops, timeline, captions)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Arrows:
+    """Place of the arrows at a gauge."""
+
+    setup: str
+    contact: Contact
+    dial: float
+    """Radius of the dial, [m]."""
+    beside: int
+    """Number of gauges with the same contact that are drawn already."""
+
+
+def _draw_arrows(
+    drawing: MachineScene,
+    arrows: _Arrows,
+    nodes: Sequence[str],
+    rows: Sequence[Deviation | None],
+    timeline: Timeline,
+) -> list[Array]:
+    """Draw the arrows at a gauge; return the tip of the first at every stop, shape (3,), [m]."""
+    scene, contact = drawing.scene, arrows.contact
+    distance = (FIRST_ARROW + NEXT_ARROW * arrows.beside) * arrows.dial
+    tips = [contact.points[0] for _ in rows]
+    for node in nodes:
+        foot = contact.points[0] + (distance if node == AFTER else -distance) * contact.along
+        lengths = [_deviation(row, node) * scene.arrow_scale for row in rows]
+        draw_arrow(
+            scene,
+            f"{node}/{node_name(arrows.setup)}",
+            pose_along(foot, contact.direction),
+            np.repeat(lengths, 2).tolist(),
+            width=arrow_width(arrows.dial),
+            colour=COLOURS[node],
+            times=timeline.rests,
+        )
+        ends = [foot + length * contact.direction for length in lengths]
+        drawing.lower_ground(min(float(end[2]) for end in ends))
+        if node == BEFORE:
+            tips = ends
+    return tips
 
 
 def arrow_width(dial: float) -> float:

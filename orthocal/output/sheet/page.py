@@ -26,10 +26,10 @@ from orthocal.output.sheet.gauge_position import (
     name_tip,
 )
 from orthocal.output.sheet.pictures import draw_machine, draw_section
-from orthocal.output.text.layout import counted
+from orthocal.output.text.layout import counted, true_minus
 from orthocal.robot.model import Robot
 from orthocal.session.session import Gauge, Session
-from orthocal.units import DRIVE_UNITS, MM
+from orthocal.units import DRIVE_UNITS, MM, format_fixed
 from orthocal.viewer.visuals import load_visuals
 
 Array = NDArray[np.float64]
@@ -119,8 +119,8 @@ def _front(
         f"{_approach(robot, motions[0].side)}. The programs do this. Do the same if you jog.",
         "Keep the tip on its rod from the first reading of a setup to the last. Lift the plunger "
         "only where the sheet says so.",
-        "Do not touch bezel, stand or arm of the gauge after you have set the gauge zero. If the "
-        "gauge was bumped, start that setup again.",
+        "After you have set the gauge zero, do not touch the bezel, the stand or the arm of the "
+        "gauge. If the gauge was bumped, start that setup again.",
         "Write down what the dial shows, with its sign. Estimate the last digit. If you took no "
         "reading, leave the box empty.",
     ]
@@ -176,7 +176,7 @@ def _setup(
 
 
 def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[str]:
-    """What to do before the readings of a setup."""
+    """Steps before the readings of a setup."""
     first = motion.stops[0]
     side = name_direction(gauge.contact.direction)
     opposite = name_direction(-gauge.contact.direction)
@@ -409,8 +409,7 @@ def _joint_values(robot: Robot, drives: Array) -> list[str]:
 
 def _number(value: float, decimals: int, *, sign: bool = False) -> str:
     """A number with a true minus and no negative zero."""
-    text = f"{round(value, decimals) + 0.0:{'+' if sign else ''}.{decimals}f}"
-    return text.replace("-", "−")
+    return true_minus(format_fixed(value, decimals, sign=sign))
 
 
 def _short(value: float) -> str:

@@ -53,26 +53,26 @@ def render_answer(
         heading: Whether to begin with the machine and its readings.
         saved: Directory in which the calibration was written, for the next step.
     """
-    found = assessment_of(calibration)
+    assessment = assessment_of(calibration)
     parts: list[RenderableType] = [render_subject(calibration), Text()] if heading else []
-    parts += [_decision(found.decision), Text()]
-    if found.entries and found.decision.verdict != "reject":
+    parts += [_decision(assessment.decision), Text()]
+    if assessment.entries and assessment.decision.verdict != "reject":
         parts += [
             _indented(short_entry_table(calibration)),
-            *_entry_notes(calibration, found),
+            *_entry_notes(calibration, assessment),
             Text(),
         ]
-    parts += _tool(calibration, found)
-    parts.append(bullets([f.words for f in _listed(calibration, found)]))
-    parts.append(Text.assemble(("Next: ", "bold"), _next_step(found, saved)))
+    parts += _tool(calibration, assessment)
+    parts.append(bullets([f.words for f in _listed(calibration, assessment)]))
+    parts.append(Text.assemble(("Next: ", "bold"), _next_step(assessment, saved)))
     return Group(*parts)
 
 
-def render_decision(found: Assessment) -> RenderableType:
+def render_decision(assessment: Assessment) -> RenderableType:
     """A decision about readings, all findings, and the next step."""
-    decision = found.decision
+    decision = assessment.decision
     parts: list[RenderableType] = [_decision(decision)]
-    further = [f.words for f in found.findings if f.text != decision.reason]
+    further = [f.words for f in assessment.findings if f.text != decision.reason]
     if further:
         parts += [Text(), bullets(further)]
     if decision.action:
@@ -80,9 +80,9 @@ def render_decision(found: Assessment) -> RenderableType:
     return Group(*parts)
 
 
-def print_decision(found: Assessment) -> None:
+def print_decision(assessment: Assessment) -> None:
     """Print a decision about readings: in colour on a terminal."""
-    print_rich(render_decision(found))
+    print_rich(render_decision(assessment))
 
 
 def _decision(decision: Decision) -> Text:
@@ -90,13 +90,13 @@ def _decision(decision: Decision) -> Text:
     return Text.assemble(headline, f" {decision.reason}".rstrip())
 
 
-def _entry_notes(calibration: Calibration, found: Assessment) -> list[RenderableType]:
+def _entry_notes(calibration: Calibration, assessment: Assessment) -> list[RenderableType]:
     """Notes on entering the values."""
-    unstated = found.of_kind("controller not stated")
+    unstated = assessment.of_kind("controller not stated")
     if unstated:
         return [_indented(Text(unstated[0].words))]
     down = [d.name for d in calibration.robot.drives if d.direction < 0]
-    if not down or found.of_kind("no change needed"):
+    if not down or assessment.of_kind("no change needed"):
         return []
     verb = "counts" if len(down) == 1 else "count"
     return [
@@ -109,35 +109,35 @@ def _entry_notes(calibration: Calibration, found: Assessment) -> list[Renderable
     ]
 
 
-def _tool(calibration: Calibration, found: Assessment) -> list[RenderableType]:
+def _tool(calibration: Calibration, assessment: Assessment) -> list[RenderableType]:
     """The expected tool error."""
-    if found.tool is None:
-        unreached = found.of_kind("out of reach")
+    if assessment.tool is None:
+        unreached = assessment.of_kind("out of reach")
         return [Text(unreached[0].text if unreached else "The tool error is unknown.")]
-    lines = [Text(f.text) for f in found.of_kind("tool error")]
+    lines = [Text(f.text) for f in assessment.of_kind("tool error")]
     if not calibration.only_offsets:
-        lines.append(Text(describe_compensated(found.tool.compensated)))
+        lines.append(Text(describe_compensated(assessment.tool.compensated)))
     return [*lines]
 
 
-def _listed(calibration: Calibration, found: Assessment) -> Sequence[Finding]:
+def _listed(calibration: Calibration, assessment: Assessment) -> Sequence[Finding]:
     """Further findings that matter before anything is entered, the gravest first."""
     listed = [
         f
-        for f in found.findings
-        if (f.severity != "note" or f.kind in LISTED) and f.text != found.decision.reason
+        for f in assessment.findings
+        if (f.severity != "note" or f.kind in LISTED) and f.text != assessment.decision.reason
     ]
-    if found.of_kind("no change needed"):
+    if assessment.of_kind("no change needed"):
         listed = [f for f in listed if f.kind != "not significant"]
     if calibration.only_offsets:  # legs and axes are left out, which matters more
         listed = [f for f in listed if f.kind != "line assumed"]
     return listed[:MOST_LISTED]
 
 
-def _next_step(found: Assessment, saved: Path | None) -> str:
+def _next_step(assessment: Assessment, saved: Path | None) -> str:
     """The next command or action."""
-    decision = found.decision
-    if decision.verdict != "enter" or found.keeps_offsets:
+    decision = assessment.decision
+    if decision.verdict != "enter" or assessment.keeps_offsets:
         return decision.action or "none."
     if saved is None:
         return "keep the result with --out DIRECTORY; then `orthocal again DIRECTORY`."

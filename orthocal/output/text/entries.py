@@ -14,13 +14,13 @@ from orthocal.output.text.layout import EXPANDED, add_row, plain, signed, table_
 
 def render_values(calibration: Calibration) -> RenderableType:
     """Meaning of the values to enter, and those that the short answer does not list."""
-    found = assessment_of(calibration)
-    if not found.entries:
+    assessment = assessment_of(calibration)
+    if not assessment.entries:
         return Group(Text("None: no offset was identified."), Text(EXPANDED))
-    complete = found.decision.verdict != "reject" and calibration.only_offsets
+    complete = assessment.decision.verdict != "reject" and calibration.only_offsets
     table = _entry_table(calibration, identified=not calibration.only_offsets)
-    notes = [_example(calibration, found.entries[0])]
-    notes += [f.text for f in found.of_kind("controller not stated")]
+    notes = [_example(calibration, assessment.entries[0])]
+    notes += [f.text for f in assessment.of_kind("controller not stated")]
     notes.append(EXPANDED)
     if not calibration.only_offsets:
         notes.append(
@@ -37,12 +37,12 @@ def short_entry_table(calibration: Calibration) -> Table:
 
 
 def _entry_table(calibration: Calibration, *, identified: bool) -> Table:
-    found = assessment_of(calibration)
-    enter = "estimate" if found.of_kind("no change needed") else "enter"
-    stated = any(e.active is not None for e in found.entries)
+    assessment = assessment_of(calibration)
+    enter = "estimate" if assessment.of_kind("no change needed") else "enter"
+    stated = any(e.active is not None for e in assessment.entries)
     columns = ["now", enter] if stated else ["add" if enter == "enter" else enter]
     table = table_of("drive", *columns, "±", *(["identified"] if identified else []), "unit")
-    for e in found.entries:
+    for e in assessment.entries:
         factor = e.edge_factor
         now = [] if e.active is None else [signed(e.active * factor)]
         estimate = [signed(e.identified * factor)] if identified else []

@@ -25,6 +25,7 @@ from orthocal.assessment.wording import um as um
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.io.html import items, paragraph, table
 from orthocal.text import printable
+from orthocal.units import format_fixed
 
 MANY_ROWS = 60
 """Readings above which only the worst are listed, unless all are asked for."""
@@ -209,8 +210,11 @@ def typeset(value: float, decimals: int = 3) -> str:
         value: The number.
         decimals: Number of decimals.
     """
-    rounded = round(value, decimals)
-    text = signed(rounded, decimals) if rounded else plain(0.0, decimals)
+    return true_minus(format_fixed(value, decimals, sign=round(value, decimals) != 0.0))
+
+
+def true_minus(text: str) -> str:
+    """A number with a true minus."""
     return text.replace("-", "−")
 
 

@@ -13,7 +13,7 @@ from orthocal.measurement.motion.motion import Guidance
 from orthocal.measurement.recording import Recording, Row
 from orthocal.session.session import Session, Setup
 from orthocal.text import printable
-from orthocal.units import DRIVE_UNITS, MM, to_mm
+from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm
 
 GLUE = "\u00a0"
 """Space at which no line ends."""
@@ -46,13 +46,8 @@ def wrap(text: str, width: int, *, indent: str = "", first: str | None = None) -
 
 def show_mm(value: float) -> str:
     """A reading in mm with all its decimals, two at least."""
-    whole, _, decimals = f"{to_mm(value) + 0.0:.6f}".partition(".")
-    return f"{whole}.{decimals.rstrip('0').ljust(2, '0')}"
-
-
-def _decimal(value: float, decimals: int = 3) -> str:
-    """A number whose zero has no sign."""
-    return f"{round(float(value), decimals) + 0.0:.{decimals}f}"
+    integer, _, decimals = f"{to_mm(value) + 0.0:.6f}".partition(".")
+    return f"{integer}.{decimals.rstrip('0').ljust(2, '0')}"
 
 
 def describe_session(recording: Recording, *, width: int) -> str:
@@ -116,7 +111,7 @@ def describe_setup(
 
 def _stand(guidance: Guidance, setup: str) -> str:
     aligned = guidance.aligned_at[setup]
-    at = ", ".join(f"{_decimal(v / MM, 1)}" for v in guidance.touched(setup, aligned))
+    at = ", ".join(f"{format_fixed(v / MM, 1)}" for v in guidance.touched(setup, aligned))
     side = name_direction(guidance.contacts[setup][1].direction)
     return (
         f"Stand: on the {side} side, so that the tip touches at ({at}) mm in {aligned}. Push the "
@@ -162,11 +157,11 @@ def _coordinates(session: Session, guidance: Guidance, posture: str, name: str, 
     parts = []
     for drive, value in zip(session.robot.drives, guidance.joints[posture], strict=True):
         unit, size = DRIVE_UNITS[drive.unit]
-        parts.append(f"{drive.name} {_decimal(value / size)} {unit}".replace(" ", GLUE))
+        parts.append(f"{drive.name} {format_fixed(value / size, 3)} {unit}".replace(" ", GLUE))
     lines = [wrap(f"{name}joints {', '.join(parts)}", width, indent="  ")]
     if posture in guidance.tool:
         values = zip("xyz", guidance.tool[posture], strict=True)
-        tool = ", ".join(f"{axis}{GLUE}{_decimal(v / MM)}" for axis, v in values)
+        tool = ", ".join(f"{axis}{GLUE}{format_fixed(v / MM, 3)}" for axis, v in values)
         lines.append(wrap(f"{name}tool {tool}{GLUE}mm", width, indent="  "))
     return "\n".join(lines)
 
@@ -188,7 +183,7 @@ def describe_prediction(mean: float, std: float, *, width: int) -> str:
     """
     if math.isinf(std):
         return ""
-    text = f"The other readings predict {_decimal(mean / MM)} ± {mm(2.0 * std)} mm."
+    text = f"The other readings predict {format_fixed(mean / MM, 3)} ± {mm(2.0 * std)} mm."
     return wrap(text, width, indent="  ")
 
 

@@ -249,17 +249,17 @@ def _bootstrap(table: StudyTable, all_rows: bool) -> StudyReport:
 
 
 def _bootstrap_answer(s: BootstrapSummary) -> str:
-    known = [p for p in s.parameters if p.predicted > 0.0 and math.isfinite(p.std)]
-    if not known:
+    scattered = [p for p in s.parameters if p.predicted > 0.0 and math.isfinite(p.std)]
+    if not scattered:
         return "The estimates do not scatter."
-    ratios = np.array([p.std / p.predicted for p in known])
+    ratios = np.array([p.std / p.predicted for p in scattered])
     text = (
         f"Scatter of the estimates: {float(np.median(ratios)):.2f} times the standard deviation "
         f"that the covariance predicts from noise ({ratios.min():.2f} to {ratios.max():.2f} times, "
         f"{counted(s.draws, 'draw')})."
     )
     if s.fewest_cycles is not None:
-        uncertainty = 1.0 / math.sqrt(2.0 * (s.fewest_cycles - 1) * len(known))
+        uncertainty = 1.0 / math.sqrt(2.0 * (s.fewest_cycles - 1) * len(scattered))
         text += (
             f" With {s.fewest_cycles} cycles the standard error of this ratio is about "
             f"{100.0 * uncertainty:.0f} %."

@@ -131,10 +131,10 @@ def _interval(low: float, high: float, factor: float) -> str:
 
 def render_identifiability(calibration: Calibration, *, all_rows: bool = False) -> RenderableType:
     """Identifiable combinations of parameters, and inseparable parameters."""
-    found, base = calibration.identifiability, calibration.base
-    count = found.singular_values.size
+    spectrum, base = calibration.identifiability, calibration.base
+    count = spectrum.singular_values.size
     spare = calibration.spare_readings
-    threshold = f"{found.threshold / UM:.3g} µm per prior standard deviation"
+    threshold = f"{spectrum.threshold / UM:.3g} µm per prior standard deviation"
     if base:
         lines = [
             f"{count} base parameters: combinations of errors that the readings separate, with "
@@ -142,17 +142,17 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
         ]
     else:
         lines = [
-            f"Rank {found.rank} of {count}: combinations of parameters with singular values above "
-            f"the noise ({threshold}). Rank without noise: {found.structural_rank}."
+            f"Rank {spectrum.rank} of {count}: combinations of parameters with singular values "
+            f"above the noise ({threshold}). Rank without noise: {spectrum.structural_rank}."
         ]
     lines.append(
-        f"{counted(found.n_readings, 'independent reading')}: {found.n_readings - spare} determine "
-        f"the parameters, {spare or 'none'} check the model."
+        f"{counted(spectrum.n_readings, 'independent reading')}: {spectrum.n_readings - spare} "
+        f"determine the parameters, {spare or 'none'} check the model."
     )
-    if found.rank:
-        o = found.observability
+    if spectrum.rank:
+        o = spectrum.observability
         lines.append(
-            f"Condition number {found.condition:.3g}. Observability indices, per prior standard "
+            f"Condition number {spectrum.condition:.3g}. Observability indices, per prior standard "
             f"deviation: O1 {o['O1'] / MM:.3g} mm, O2 {o['O2']:.3g}, O3 {o['O3'] / MM:.3g} mm, "
             f"O4 {o['O4'] / MM:.3g} mm, O5 {o['O5'] / MM:.3g} mm. Compare them only between plans "
             "of the same rank."
@@ -167,7 +167,7 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
         lines.append(below.text)
         if len(names) > FEW_NAMES:
             lines[-1] += f" They are {', '.join(names)}." if all_rows else " --all lists them."
-    sums = [c for c in found.base if len(c.terms) > 1]
+    sums = [c for c in spectrum.base if len(c.terms) > 1]
     if base:
         most = None if all_rows else MOST_TERMS
         lines += [f"{c.terms[0][0]} represents {c.shorten(most)}" for c in sums]

@@ -186,7 +186,7 @@ def test_front_page_states_zero_travel_and_approach(page):
     assert (
         "towards larger numbers of x_slide, smaller numbers of y_slide, smaller numbers of z_slide"
     ) in text
-    assert "Do not touch bezel, stand or arm of the gauge after" in text
+    assert "After you have set the gauge zero, do not touch the bezel" in text
     assert "into it: controller: {offsets_mm: [0, 0, 0]}." in text
     assert words(page.findall(".//code")[-1]) == "orthocal calibrate ."
     assert "`" not in text
