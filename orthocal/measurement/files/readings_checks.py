@@ -40,7 +40,7 @@ class RawReading:
 
     @property
     def has_conditions(self) -> bool:
-        """Whether a condition is stated."""
+        """True if a condition is stated."""
         return bool(self.approach or self.temperature or self.time)
 
 
@@ -51,30 +51,24 @@ def check_readings(
     file: Path,
     unread: set[int] | None = None,
 ) -> tuple[Reading, ...]:
-    """Readings of a table, each with the row it is from.
+    """Readings of a table, checked against their session and against each other.
 
     Args:
         rows: The rows.
         plan: The session, for its setups, postures and gauges.
-        file: Where the rows are from, for messages.
-        unread: Where it is given cells may be empty, their readings are 0, and it is told which.
+        file: File of the rows, for messages.
+        unread: Filled with the indices of empty cells, whose readings are 0; None to refuse them.
 
     Raises:
         SessionError: Naming file and line.
     """
     rows = iter(rows)
-    readings: list[Reading] = []
-    seen: dict[tuple[Any, ...], int] = {}
-    zones: dict[bool, int] = {}
-    raw: dict[tuple[str, int], int] = {}
-    joined: dict[tuple[str, int], dict[str, str]] = {}
+    checked = CheckedReadings(file)
     for row in rows:
-        where = row.where
-        _check_names(row, plan)
-        cycle = parse_cycle(row.cycle, where)
+        reading = parse_reading(row, plan)
         if not row.reading:
             if unread is None:
-                if not readings and not any(r.reading for r in rows):
+                if not checked.readings and not any(r.reading for r in rows):
                     raise SessionError(
                         "nothing was read yet; `orthocal record` takes the readings",
                         where=str(file),
@@ -82,38 +76,115 @@ def check_readings(
                 raise SessionError(
                     "reading_mm is empty; expected what the gauge showed, or no row where nothing "
                     "was read (`orthocal record` takes it, or drops the row)",
+                    where=row.where,
+                )
+            unread.add(len(checked.readings))
+        checked.add(row, reading)
+    if not checked.readings:
+        raise SessionError("holds no readings", where=str(file))
+    return tuple(checked.readings)
+
+
+def parse_reading(row: RawReading, plan: Session) -> Reading:
+    """Reading of a row, checked against its session; 0 for an empty cell.
+
+    Raises:
+        SessionError: Naming file and line.
+    """
+    _check_names(row, plan)
+    cycle = parse_cycle(row.cycle, row.where)
+    value = parse_number(row.reading or "0", where=row.where, name="reading_mm", error=SessionError)
+    conditions = read_conditions(row, plan.robot)
+    check_range(value, plan.gauges[plan.setups[row.setup].gauge], bool(row.minus), row.where)
+    return Reading(
+        row.setup,
+        row.posture,
+        row.minus or None,
+        cycle,
+        value * MM,
+        row.line,
+        conditions=conditions,
+    )
+
+
+class CheckedReadings:
+    """Readings of a session that neither repeat nor contradict each other.
+
+    Args:
+        file: File of the rows, for messages.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.readings: list[Reading] = []
+        self._file = file
+        self._first_lines: dict[tuple[Any, ...], int] = {}
+        self._zone_lines: dict[bool, int] = {}
+        self._absolute: set[tuple[str, int]] = set()
+        self._differences: dict[tuple[str, int], dict[str, str]] = {}
+
+    def add(self, row: RawReading, reading: Reading) -> None:
+        """Add a reading, if it agrees with those before it.
+
+        Raises:
+            SessionError: Naming file and line.
+        """
+        key = (*reading.place, reading.cycle)
+        if key in self._first_lines:
+            raise SessionError(
+                f"repeats {reading.label} of cycle {reading.cycle}, first in line "
+                f"{self._first_lines[key]}; number repeated measurements in the column 'cycle'",
+                where=row.where,
+            )
+        self._first_lines[key] = row.line
+        self._check_zone(row, reading.conditions)
+        if len(self.readings) >= MOST_READINGS:
+            raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(self._file))
+        self._check_form(reading, row.where)
+        self.readings.append(reading)
+
+    def _check_zone(self, row: RawReading, conditions: Conditions | None) -> None:
+        """Refuse times with and without time zone in one session."""
+        if conditions is None or conditions.time is None:
+            return
+        zoned = conditions.time.tzinfo is not None
+        self._zone_lines.setdefault(zoned, row.line)
+        if len(self._zone_lines) > 1:
+            raise SessionError(
+                f"time is '{row.time}'; expected all times of a session with a time zone, or all "
+                f"without one, as in line {self._zone_lines[not zoned]}",
+                where=row.where,
+            )
+
+    def _check_form(self, reading: Reading, where: str) -> None:
+        """Refuse readings that determine each other within one cycle of one setup."""
+        group = (reading.setup, reading.cycle)
+        if reading.minus is None:
+            self._absolute.add(group)
+        else:
+            leaders = self._differences.setdefault(group, {})
+            first, second = (_find_leader(leaders, n) for n in (reading.posture, reading.minus))
+            if first == second:
+                raise SessionError(
+                    f"{reading.label} follows from the other differences of setup "
+                    f"{reading.setup} in cycle {reading.cycle}; leave it out, or give it its own "
+                    "cycle if it was measured apart",
                     where=where,
                 )
-            unread.add(len(readings))
-        text = row.reading or "0"
-        value = parse_number(text, where=where, name="reading_mm", error=SessionError)
-        conditions = read_conditions(row, plan.robot)
-        reading = Reading(
-            row.setup,
-            row.posture,
-            row.minus or None,
-            cycle,
-            value * MM,
-            row.line,
-            conditions=conditions,
-        )
-        key = (*reading.place, cycle)
-        if key in seen:
+            leaders[first] = second
+        if group in self._absolute and group in self._differences:
             raise SessionError(
-                f"repeats {reading.label} of cycle {cycle}, first in line {seen[key]}; "
-                "number repeated measurements in the column 'cycle'",
+                f"setup {reading.setup} has both readings and differences in cycle "
+                f"{reading.cycle}; give the readings only",
                 where=where,
             )
-        seen[key] = row.line
-        _check_zone(row, conditions, zones)
-        if len(readings) >= MOST_READINGS:
-            raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(file))
-        check_range(value, plan.gauges[plan.setups[row.setup].gauge], bool(row.minus), where)
-        _check_form(reading, raw, joined, where)
-        readings.append(reading)
-    if not readings:
-        raise SessionError("holds no readings", where=str(file))
-    return tuple(readings)
+
+
+def _find_leader(leaders: dict[str, str], name: str) -> str:
+    """Representative of the postures that differences connect with a posture."""
+    while (above := leaders.get(name, name)) != name:
+        leaders[name] = leaders.get(above, above)  # halves the path
+        name = above
+    return name
 
 
 def _check_names(row: RawReading, plan: Session) -> None:
@@ -130,26 +201,6 @@ def _check_names(row: RawReading, plan: Session) -> None:
             )
     if row.minus == row.posture:
         raise SessionError(f"takes posture '{row.posture}' off itself", where=row.where)
-
-
-def _check_zone(row: RawReading, conditions: Conditions | None, zones: dict[bool, int]) -> None:
-    """Refuse times with and without time zone in one session.
-
-    Args:
-        row: The row.
-        conditions: Its conditions.
-        zones: Line of the first time with and without zone; filled here.
-    """
-    if conditions is None or conditions.time is None:
-        return
-    zoned = conditions.time.tzinfo is not None
-    zones.setdefault(zoned, row.line)
-    if len(zones) > 1:
-        raise SessionError(
-            f"time is '{row.time}'; expected all times of a session with a time zone, or all "
-            f"without one, as in line {zones[not zoned]}",
-            where=row.where,
-        )
 
 
 def read_conditions(row: RawReading, robot: Robot) -> Conditions | None:
@@ -276,41 +327,5 @@ def check_range(value_mm: float, gauge: Gauge, difference: bool, where: str) -> 
         raise SessionError(
             f"reading_mm is {value_mm:g}; the gauge's range allows {kind} from "
             f"{lowest:g} to {highest:g}",
-            where=where,
-        )
-
-
-def _check_form(
-    reading: Reading,
-    raw: dict[tuple[str, int], int],
-    joined: dict[tuple[str, int], dict[str, str]],
-    where: str,
-) -> None:
-    """Refuse readings that say the same thing twice within one cycle of one setup."""
-    group = (reading.setup, reading.cycle)
-    if reading.minus is None:
-        raw.setdefault(group, reading.line or 0)
-    else:
-        leader = joined.setdefault(group, {})
-
-        def find(name: str) -> str:
-            while (above := leader.get(name, name)) != name:
-                leader[name] = leader.get(above, above)  # half the way next time
-                name = above
-            return name
-
-        first, second = find(reading.posture), find(reading.minus)
-        if first == second:
-            raise SessionError(
-                f"{reading.label} follows from the other differences of setup "
-                f"{reading.setup} in cycle {reading.cycle}; leave it out, or give it its own "
-                "cycle if it was measured apart",
-                where=where,
-            )
-        leader[first] = second
-    if group in raw and group in joined:
-        raise SessionError(
-            f"setup {reading.setup} has both readings and differences in cycle {reading.cycle}; "
-            "give the readings only",
             where=where,
         )

@@ -184,11 +184,20 @@ def readings_table(
         }
         for r, value in zip(rows, values, strict=True)
     ]
-    columns = used_columns(cells)
-    if blank:
-        cells = [{**row, **dict.fromkeys(MEASURED, "")} for row in cells]
-    lines = [",".join(columns), *(",".join(row[c] for c in columns) for row in cells)]
-    return "\n".join(lines) + "\n"
+    return format_cells(cells, blank=blank)
+
+
+def format_cells(rows: Sequence[Mapping[str, str]], *, blank: bool = False) -> str:
+    """Text of a readings.csv without the optional columns that no row needs.
+
+    Args:
+        rows: Cells by column.
+        blank: Leave the cells of measured conditions empty.
+    """
+    columns = used_columns(rows)
+    empty = MEASURED if blank else ()
+    lines = [columns, *(["" if c in empty else row[c] for c in columns] for row in rows)]
+    return "".join(",".join(line) + "\n" for line in lines)
 
 
 def condition_cells(conditions: Conditions | None) -> dict[str, str]:

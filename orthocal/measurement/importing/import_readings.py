@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from decimal import Decimal
 from pathlib import Path
-from typing import cast, get_args
+from typing import Literal, cast, get_args
 
 from orthocal.arguments import require_kind
 from orthocal.errors import SessionError
@@ -15,14 +14,15 @@ from orthocal.io.files import content_withheld_outside, exists, read_file, write
 from orthocal.io.tables.numerals import Sign
 from orthocal.io.tables.table import Table, read_table
 from orthocal.measurement.files.readings_checks import (
+    CheckedReadings,
     RawReading,
     check_readings,
-    parse_cycle,
+    parse_reading,
     parse_time,
 )
 from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.session_file import check_contacts, load_unread
-from orthocal.measurement.files.write_session import used_columns
+from orthocal.measurement.files.write_session import format_cells
 from orthocal.measurement.importing.headings import (
     EXPECTED,
     UNITS,
@@ -33,6 +33,7 @@ from orthocal.measurement.importing.headings import (
     parse_role,
 )
 from orthocal.measurement.importing.long_table import LongTable, make_long_table
+from orthocal.session.session import Conditions, Reading
 from orthocal.text import shorten
 
 Key = tuple[str, str, str, int]
@@ -141,16 +142,17 @@ def import_readings(
         separator_known=options.separator is not None,
         fill=options.fill,
     )
-    check_readings(long_table.rows, plan, file=path)
+    new = zip(long_table.rows, check_readings(long_table.rows, plan, file=path), strict=True)
     with content_withheld_outside((plan.path or Path(session)).parent, readings_path):
-        existing = _read_existing(readings_path, path, long_table, overwrite)
-        if existing:
-            check_readings(existing, plan, file=readings_path, unread=set())
-    rows, counts = _merge(existing, long_table.rows, overwrite)
-    text = _format_readings(rows)
-    written = read_rows(readings_path, text.encode())
-    readings = check_readings(written, plan, file=readings_path, unread=set())
-    check_contacts(replace(plan, readings=readings))
+        existing = [
+            (row, parse_reading(row, plan))
+            for row in _read_existing(readings_path, path, long_table, overwrite)
+        ]
+    merged, counts = _merge(existing, list(new), overwrite)
+    checked = CheckedReadings(readings_path)
+    for row, reading in merged:
+        checked.add(row, reading)
+    check_contacts(replace(plan, readings=tuple(checked.readings)))
     return TableImport(
         options=options,
         table=content,
@@ -158,12 +160,12 @@ def import_readings(
         long_table=long_table,
         session=plan.path or Path(session),
         readings_path=readings_path,
-        text=text,
+        text=_format_readings([row for row, _ in merged]),
         filled=counts["filled"],
         replaced=counts["replaced"],
         unchanged=counts["unchanged"],
         added=counts["added"],
-        empty=sum(not r.reading for r in rows),
+        empty=sum(not row.reading for row, _ in merged),
     )
 
 
@@ -225,13 +227,17 @@ def _read_existing(
     return sorted(rows, key=lambda row: row.line)
 
 
-def _key(row: RawReading) -> Key:
-    return row.setup, row.posture, row.minus, parse_cycle(row.cycle, row.where)
+_Row = tuple[RawReading, Reading]
+"""A row as text, and its reading."""
+
+
+def _key(reading: Reading) -> Key:
+    return reading.setup, reading.posture, reading.minus or "", reading.cycle
 
 
 def _merge(
-    existing: Sequence[RawReading], new: Sequence[RawReading], overwrite: bool
-) -> tuple[list[RawReading], Counter[str]]:
+    existing: Sequence[_Row], new: Sequence[_Row], overwrite: bool
+) -> tuple[list[_Row], Counter[str]]:
     """Merge new readings into the existing rows; further readings follow at the end.
 
     Returns:
@@ -240,65 +246,75 @@ def _merge(
     Raises:
         SessionError: If a reading or a condition differs, unless it may be overwritten.
     """
-    pending: dict[Key, list[RawReading]] = {}
+    pending: dict[Key, list[_Row]] = {}
     for row in new:
-        pending.setdefault(_key(row), []).append(row)
-    places = Counter(_key(row) for row in existing)
-    rows: list[RawReading] = []
+        pending.setdefault(_key(row[1]), []).append(row)
+    places = Counter(_key(reading) for _, reading in existing)
+    rows: list[_Row] = []
     counts: Counter[str] = Counter()
-    differing: list[tuple[RawReading, RawReading]] = []
+    differing: list[_Row] = []
     for row in existing:
-        match = _match(row, pending.get(_key(row), []), places[_key(row)] == 1)
+        key = _key(row[1])
+        match = _match(row[0], pending.get(key, []), places[key] == 1)
         if match is None:
             rows.append(row)
             continue
-        pending[_key(row)].remove(match)
-        stated = {name: getattr(match, name) or getattr(row, name) for name in CONDITIONS}
-        if _differs(row, match):
-            change = "replaced"
-            differing.append((row, match))
-        else:
-            more = any(stated[name] and not getattr(row, name) for name in CONDITIONS)
-            change = "filled" if more or not row.reading else "unchanged"
+        pending[key].remove(match)
+        change = _change(row, match)
         counts[change] += 1
-        rows.append(row if change == "unchanged" else replace(row, reading=match.reading, **stated))
+        if change == "replaced" and not differing:
+            differing = [row, match]
+        rows.append(row if change == "unchanged" else _update(row, match))
     if differing and not overwrite:
-        row, match = differing[0]
-        more_rows = f" ({len(differing) - 1} more differ)" if len(differing) > 1 else ""
+        (first, _), (other, _) = differing
+        more = counts["replaced"] - 1
         raise SessionError(
-            f"{row.setup} {row.posture} of cycle {row.cycle or 1} is {_describe(row)}, but "
-            f"{_describe(match)} in {match.where}{more_rows}; --replace overwrites existing "
-            "readings",
-            where=row.where,
+            f"{first.setup} {first.posture} of cycle {first.cycle or 1} is {_describe(first)}, but "
+            f"{_describe(other)} in {other.where}{f' ({more} more differ)' if more else ''}; "
+            "--replace overwrites existing readings",
+            where=first.where,
         )
     added = [row for of_place in pending.values() for row in of_place]
     counts["added"] = len(added)
     return [*rows, *added], counts
 
 
-def _match(row: RawReading, among: Sequence[RawReading], alone: bool) -> RawReading | None:
+def _match(row: RawReading, among: Sequence[_Row], alone: bool) -> _Row | None:
     """The new reading of an existing row: that of its approach, or the only one without."""
     for other in among:
-        if other.approach == row.approach:
+        if other[0].approach == row.approach:
             return other
-    unstated = alone and len(among) == 1 and not (row.approach and among[0].approach)
+    unstated = alone and len(among) == 1 and not (row.approach and among[0][0].approach)
     return among[0] if unstated else None
 
 
-def _differs(row: RawReading, match: RawReading) -> bool:
-    """Whether an existing row has another reading or condition."""
-    if row.reading and Decimal(row.reading) != Decimal(match.reading):
-        return True
-    stated = zip(_stated_conditions(row), _stated_conditions(match), strict=True)
-    return any(one is not None and other is not None and one != other for one, other in stated)
+def _change(row: _Row, match: _Row) -> Literal["replaced", "filled", "unchanged"]:
+    """Effect of a new reading on an existing row."""
+    (text, old), (_, new) = row, match
+    before, after = ([getattr(r.conditions, name, None) for name in CONDITIONS] for r in (old, new))
+    pairs = list(zip(before, after, strict=True))
+    if (text.reading and old.value != new.value) or any(
+        one is not None and other is not None and one != other for one, other in pairs
+    ):
+        return "replaced"
+    filled = not text.reading or any(one is None and other is not None for one, other in pairs)
+    return "filled" if filled else "unchanged"
 
 
-def _stated_conditions(row: RawReading) -> tuple[object, ...]:
-    """Approach, temperature and time; None where not stated."""
+def _update(row: _Row, match: _Row) -> _Row:
+    """An existing row with the reading and the stated conditions of another."""
+    (text, old), (new_text, new) = row, match
+    texts = {name: getattr(new_text, name) or getattr(text, name) for name in CONDITIONS}
+    stated = {
+        name: value
+        for r in (old, new)
+        for name in CONDITIONS
+        if (value := getattr(r.conditions, name, None)) is not None
+    }
+    conditions = Conditions(**stated) if stated else None
     return (
-        row.approach or None,
-        Decimal(row.temperature) if row.temperature else None,
-        parse_time(row.time, row.where) if row.time else None,
+        replace(text, reading=new_text.reading, **texts),
+        replace(old, value=new.value, conditions=conditions),
     )
 
 
@@ -320,10 +336,8 @@ def _format_readings(rows: Sequence[RawReading]) -> str:
             "reading_mm": r.reading,
             "approach": r.approach,
             "temperature_C": r.temperature,
-            "time": r.time,
+            "time": r.time.replace(",", "."),  # ISO 8601 allows both in a fraction of a second
         }
         for r in rows
     ]
-    columns = used_columns(cells)
-    lines = [",".join(columns), *(",".join(row[c] for c in columns) for row in cells)]
-    return "\n".join(lines) + "\n"
+    return format_cells(cells)
