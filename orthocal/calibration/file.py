@@ -1,7 +1,7 @@
-"""calibration.json: written, read and checked, for it may come from a stranger or an editor.
+"""Reading, checking and writing of calibration.json.
 
-The record (`records.py`) is its schema. Beside it stand numbers that follow from the record, for
-those who read the file without orthocal; on loading each is held against what it follows from.
+The record (`records.py`) is the schema. The file also contains numbers derived from the record, for
+readers without orthocal. Loading recomputes and compares them.
 """
 
 from __future__ import annotations
@@ -16,12 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
-from orthocal.calibration.recorded_robot import (
-    load_recorded_robot,
-    require_offsets,
-    require_parameters,
-    require_rows,
-)
+from orthocal.calibration.recorded_robot import load_recorded_robot, require_consistent
 from orthocal.calibration.records import CalibrationRecord
 from orthocal.errors import CalibrationFileError, SolverError
 from orthocal.io.documents import read_json, validate, write_plain
@@ -36,19 +31,19 @@ Array = NDArray[np.float64]
 SCHEMA = "orthocal/calibration/7"
 
 FOLLOWS = 1e-9
-"""Relative difference up to which a number is what it follows from: both are sums of doubles."""
+"""Largest relative difference of a derived number from its recomputed value."""
 
 BESIDE = ("schema", "decision", "findings")
-"""What is no part of the record: its schema, and what `calibrate --json` prints beside it."""
+"""Keys outside the record: the schema, and further keys of `calibrate --json`."""
 
 MAKE_ONE = "`orthocal calibrate SESSION --out FOLDER` makes one"
 
 OTHER_KINDS = (".csv", ".html", ".urdf", ".yaml", ".yml")
-"""What the names of files of other kinds end with."""
+"""Suffixes of files of other kinds."""
 
 
 def load_calibration(path: str | Path) -> Calibration:
-    """Read a calibration.json, or the one in a folder.
+    """Read a calibration.json, or the one in a directory. It needs no other file.
 
     Raises:
         CalibrationFileError: Naming file and key, what was found and what was expected.
@@ -95,10 +90,10 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
 
 
 def require_loadable(calibration: Calibration) -> None:
-    """Refuse a result that could not be read again once it is written: it makes no sense.
+    """Refuse a result that could not be loaded from its file.
 
     Raises:
-        SolverError: Naming the number that cannot be.
+        SolverError: Naming the impossible number.
     """
     try:
         _read_document(
@@ -120,13 +115,13 @@ def _read_document(
     path: Path | None = None,
     robot: Robot | None = None,
 ) -> Calibration:
-    """A document as a calibration, each of its parts checked against the others.
+    """Calibration of a document, whose parts are checked against each other.
 
     Args:
-        data: The document; what does not belong to the record is taken out of it.
-        file: Where it is from, for messages.
-        path: The file, where it is from one.
-        robot: The robot that it is of; by default that which the document names.
+        data: The document; derived numbers are removed from it.
+        file: Name of the file, for messages.
+        path: The file, if the document was read from one.
+        robot: The calibrated robot; by default the embedded one.
 
     Raises:
         CalibrationFileError: Naming the key.
@@ -141,14 +136,12 @@ def _read_document(
     _check_unmodelled(record, file)
     _check_estimates(record, file)
     _check_singular_values(record.identifiability, file)
-    known = load_recorded_robot(record.robot_record, file=file) if robot is None else robot
-    prefix = "" if path is None else f"{path}: "
-    require_parameters(known, record.parameters, record.unmodelled.names, prefix=prefix)
-    require_rows(known, record.setups, record.postures, record.residuals, prefix=prefix)
-    require_offsets(known, record.session.controller_offsets, prefix=prefix)
+    if robot is None:
+        robot = load_recorded_robot(record.robot_record, file=file)
+    require_consistent(record, robot, file=file)
     calibration = Calibration(
         **{name: getattr(record, name) for name in CalibrationRecord.__slots__},
-        robot=known,
+        robot=robot,
         path=path,
     )
     for place, value in _derive(calibration):
@@ -158,11 +151,11 @@ def _read_document(
 
 
 _Place = tuple[str, int | None, str]
-"""Key of the document, index in it, name: of one number that follows; "" for the document."""
+"""Key in the document ("" for the document), index in a list, and name of a derived number."""
 
 
 def _derive(c: Calibration) -> Iterator[tuple[_Place, Any]]:
-    """Numbers that follow from a record, and where they stand."""
+    """Derived numbers of a record, with their places in the document."""
     yield ("", None, "sigma"), finite_or_none(c.sigma)
     yield ("", None, "dof"), finite_or_none(c.dof)
     for name in ("rms_before", "rms_after", "largest_before", "largest_after"):
@@ -178,43 +171,43 @@ _FOLLOWING = {
     "identifiability": ("condition", "observability"),
     "residuals": ("residual",),
 }
-"""Names of such numbers, and of what is not read, by their key."""
+"""Names of derived numbers and of keys that are not read, by the key that contains them."""
 
 
 def _take_derived(data: Any) -> dict[_Place, Any]:  # noqa: ANN401 - any document
-    """Metadata of the numbers that follow, removed from the document."""
-    found: dict[_Place, Any] = {}
+    """Derived numbers of a document, which are removed from it."""
+    derived: dict[_Place, Any] = {}
     for key, names in _FOLLOWING.items():
         part = data.get(key) if key and isinstance(data, dict) else data
         holders = enumerate(part) if isinstance(part, list) else [(None, part)]
         for i, holder in holders:
             if isinstance(holder, dict):
-                found |= {(key, i, n): holder.pop(n) for n in names if n in holder}
-    return found
+                derived |= {(key, i, n): holder.pop(n) for n in names if n in holder}
+    return derived
 
 
 def _check_derived(
     place: _Place,
-    found: Any,  # noqa: ANN401 - whatever stood there
+    stated: Any,  # noqa: ANN401 - any value of a document
     value: float | dict[str, float] | None,
     file: str,
 ) -> None:
-    """Refuse a number, or numbers by name, that are not what they follow from."""
+    """Refuse a stated number, or numbers by name, that differ from the recomputed ones."""
     if isinstance(value, dict):
-        inner = found if isinstance(found, dict) else {}
+        inner = stated if isinstance(stated, dict) else {}
         for name, number in value.items():
             where = (place[0], place[1], f"{place[2]}.{name}")
             _check_derived(where, inner.get(name), number, file)
         return
-    if found is None and value is None:
+    if stated is None and value is None:
         return
-    number = isinstance(found, int | float) and not isinstance(found, bool)
-    if number and value is not None and math.isclose(found, value, rel_tol=FOLLOWS, abs_tol=1e-15):
+    number = isinstance(stated, int | float) and not isinstance(stated, bool)
+    if number and value is not None and math.isclose(stated, value, rel_tol=FOLLOWS, abs_tol=1e-15):
         return
     key, index, name = place
     at = "" if not key else f"{key}." if index is None else f"{key}[{index}]."
     expected = "null" if value is None else f"{value:.9g}"
-    shown = "null" if found is None else shorten(str(found))
+    shown = "null" if stated is None else shorten(str(stated))
     raise CalibrationFileError(
         f"found {shown}; by what the file says otherwise it is {expected}",
         where=f"{file}: {at}{name}",
@@ -222,7 +215,7 @@ def _check_derived(
 
 
 def _check_estimates(record: CalibrationRecord, file: str) -> None:
-    """Refuse parameters and covariances that do not belong to each other."""
+    """Refuse parameters whose standard deviations contradict the covariances."""
     free = [(i, p) for i, p in enumerate(record.parameters) if p.free]
     names = [p.name for p in record.parameters]
     for i, name in enumerate(names):
@@ -244,7 +237,7 @@ def _check_estimates(record: CalibrationRecord, file: str) -> None:
 
 
 def _require_covariance(matrix: Array, count: int, where: str) -> None:
-    """Refuse numbers that are no covariance of the free parameters."""
+    """Refuse a matrix that is not a covariance of the free parameters."""
     if matrix.shape != (count, count):
         raise CalibrationFileError(
             f"expected {count} × {count} numbers, as free parameters", where=where
@@ -262,30 +255,30 @@ def _require_covariance(matrix: Array, count: int, where: str) -> None:
         )
 
 
-def _check_singular_values(found: Identifiability, file: str) -> None:
-    """Refuse singular values that are none, or that count though they are 0."""
-    values = found.singular_values
+def _check_singular_values(identifiability: Identifiability, file: str) -> None:
+    """Refuse negative or unsorted singular values, and a rank above their number."""
+    values, rank = identifiability.singular_values, identifiability.rank
     if not values.size or values.min() < 0.0 or (np.diff(values) > 0.0).any():
         raise CalibrationFileError(
             "expected positive numbers, the largest first",
             where=f"{file}: identifiability.singular_values",
         )
-    if found.rank > len(values) or (found.rank and values[found.rank - 1] <= 0.0):
+    if rank > len(values) or (rank and values[rank - 1] <= 0.0):
         raise CalibrationFileError(
-            f"found {found.rank}; only {(values > 0.0).sum()} singular values are above 0",
+            f"found {rank}; only {(values > 0.0).sum()} singular values are above 0",
             where=f"{file}: identifiability.rank",
         )
 
 
 def _check_unmodelled(record: CalibrationRecord, file: str) -> None:
-    found, n_free = record.unmodelled, len(record.model_covariance)
-    count = len(found.names)
-    if found.prior_stds.shape != (count,):
+    unmodelled, n_free = record.unmodelled, len(record.model_covariance)
+    count = len(unmodelled.names)
+    if unmodelled.prior_stds.shape != (count,):
         raise CalibrationFileError(
-            f"has {found.prior_stds.size} numbers; expected {count}, as names",
+            f"has {unmodelled.prior_stds.size} numbers; expected {count}, as names",
             where=f"{file}: unmodelled.prior_stds",
         )
-    if found.leakage.shape != (n_free, count):
+    if unmodelled.leakage.shape != (n_free, count):
         raise CalibrationFileError(
             f"expected {n_free} × {count} numbers, free parameters by names",
             where=f"{file}: unmodelled.leakage",

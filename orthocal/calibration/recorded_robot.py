@@ -10,21 +10,14 @@ import binascii
 import hashlib
 import logging
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
-from orthocal.calibration.records import (
-    CalibrationRecord,
-    ParameterEstimate,
-    PostureRecord,
-    RobotFile,
-    RobotRecord,
-    SetupRecord,
-)
+from orthocal.calibration.records import CalibrationRecord, RobotFile, RobotRecord
 from orthocal.effects.loading import load_robot, load_robot_content
 from orthocal.errors import CalibrationFileError, ParameterError, RobotError, SessionError
-from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.io.fields import finite_or_none
 from orthocal.measurement.files.readings_checks import check_conditions
 from orthocal.robot.files import LARGEST_MESHES, MESH_FORMATS, collect_files
@@ -104,10 +97,8 @@ def load_recorded_robot(record: RobotRecord, *, file: str) -> Robot:
             "used as it was calibrated.",
             *(printable(text) for text in (file, record.name, str(source))),
         )
-    try:
+    with _named(f"{file}: robot.tolerances"):
         return robot.with_tolerances(dict(record.tolerances))
-    except ParameterError as e:
-        raise CalibrationFileError(e.problem, where=f"{file}: robot.tolerances") from None
 
 
 def _read_content(file: RobotFile, where: str) -> bytes:
@@ -180,113 +171,90 @@ def require_calibrated_robot(calibration: CalibrationRecord, session: Session) -
         )
 
 
-def require_parameters(
-    robot: Robot,
-    parameters: Sequence[ParameterEstimate],
-    unmodelled: Sequence[str],
-    *,
-    prefix: str,
-) -> None:
-    """Refuse parameters that the robot does not have, or not in that unit.
+def require_consistent(record: CalibrationRecord, robot: Robot, *, file: str) -> None:
+    """Refuse a record with anything that its robot does not have, or rows of nothing.
 
     Args:
-        robot: The robot.
-        parameters: Estimates.
-        unmodelled: Names of errors that were not free.
-        prefix: The file, for messages.
+        record: The record.
+        robot: Its robot.
+        file: Name of the file, for messages.
 
     Raises:
         CalibrationFileError: Naming the key.
     """
-    for i, p in enumerate(parameters):
-        where = f"{prefix}parameters[{i}]"
-        try:
-            known = robot.parameters[p.name]
-        except ParameterError as e:
-            raise CalibrationFileError(e.problem, where=f"{where}.name") from None
-        if p.unit != known.unit:
-            raise CalibrationFileError(
-                f"found '{p.unit}'; {p.name} is in {known.unit}", where=f"{where}.unit"
-            )
-    for i, name in enumerate(unmodelled):
-        try:
-            robot.parameters[name]
-        except ParameterError as e:
-            raise CalibrationFileError(e.problem, where=f"{prefix}unmodelled.names[{i}]") from None
-
-
-def require_rows(
-    robot: Robot,
-    setups: Sequence[SetupRecord],
-    postures: Sequence[PostureRecord],
-    residuals: Sequence[ResidualRow],
-    *,
-    prefix: str,
-) -> None:
-    """Refuse setups and postures that the robot cannot have, and rows of what is not there.
-
-    Args:
-        robot: The robot.
-        setups: Of the session.
-        postures: Of the session.
-        residuals: Rows that name both.
-        prefix: The file, for messages.
-
-    Raises:
-        CalibrationFileError: Naming the key.
-    """
-    for i, setup in enumerate(setups):
-        try:
-            setup.sensor.require_fit(robot, where=f"{prefix}setups[{i}].reads")
-        except SessionError as e:
-            raise CalibrationFileError(e.problem, where=e.where) from None
-    for i, posture in enumerate(postures):
-        for key, values, count, kind in (
-            ("values", posture.values, len(robot.drives), "drive"),
-            ("drives", posture.drives, len(robot.drives), "drive"),
-            ("passive", posture.passive, robot.passive_index.size, "passive joint"),
-        ):
-            if len(values) != count:
-                raise CalibrationFileError(
-                    f"has {len(values)} numbers; expected {count}, one a {kind}",
-                    where=f"{prefix}postures[{i}].{key}",
-                )
-    for i, row in enumerate(residuals):
+    _require_parameters(record, robot, file)
+    _require_postures(record, robot, file)
+    _require_names(record, file)
+    for i, setup in enumerate(record.setups):
+        with _named(f"{file}: setups[{i}].reads"):
+            setup.sensor.require_fit(robot, where=f"{file}: setups[{i}].reads")
+    for i, row in enumerate(record.residuals):
         if row.conditions is not None:
-            where = f"{prefix}residuals[{i}].conditions"
-            try:
+            where = f"{file}: residuals[{i}].conditions"
+            with _named(where):
                 check_conditions(row.conditions, robot, row.minus is not None, where)
-            except SessionError as e:
-                raise CalibrationFileError(e.problem, where=e.where) from None
-    posture_names, setup_names = {p.name for p in postures}, {s.name for s in setups}
-    for i, setup in enumerate(setups):
-        if setup.aligned_at not in posture_names:
+
+
+@contextmanager
+def _named(where: str) -> Iterator[None]:
+    """Turn errors about the robot into errors of the file, by default at a key."""
+    try:
+        yield
+    except (ParameterError, SessionError) as e:
+        raise CalibrationFileError(e.problem, where=e.where or where) from None
+
+
+def _require_parameters(record: CalibrationRecord, robot: Robot, file: str) -> None:
+    for i, p in enumerate(record.parameters):
+        with _named(f"{file}: parameters[{i}].name"):
+            unit = robot.parameters[p.name].unit
+        if p.unit != unit:
             raise CalibrationFileError(
-                f"'{setup.aligned_at}' is not among the file's postures",
-                where=f"{prefix}setups[{i}].aligned_at",
+                f"found '{p.unit}'; {p.name} is in {unit}", where=f"{file}: parameters[{i}].unit"
             )
-    for i, row in enumerate(residuals):
-        for key, name, kind, among in (
-            ("setup", row.setup, "setups", setup_names),
-            ("posture", row.posture, "postures", posture_names),
-            ("minus", row.minus or row.posture, "postures", posture_names),
-        ):
-            if name not in among:
-                raise CalibrationFileError(
-                    f"'{name}' is not among the file's {kind}",
-                    where=f"{prefix}residuals[{i}].{key}",
-                )
+    for i, name in enumerate(record.unmodelled.names):
+        with _named(f"{file}: unmodelled.names[{i}]"):
+            robot.parameters[name]
 
 
-def require_offsets(robot: Robot, offsets: Sequence[float] | None, *, prefix: str) -> None:
-    """Refuse offsets of the controller that are not one a drive.
-
-    Raises:
-        CalibrationFileError: Naming the drives.
-    """
-    if offsets is not None and len(offsets) != len(robot.drives):
-        raise CalibrationFileError(
-            f"has {len(offsets)} numbers; expected {len(robot.drives)}, one a drive: "
-            f"{', '.join(d.name for d in robot.drives)}",
-            where=f"{prefix}session.controller_offsets",
+def _require_postures(record: CalibrationRecord, robot: Robot, file: str) -> None:
+    """Refuse postures and offsets with another number of coordinates than the robot has."""
+    drives, passive = len(robot.drives), robot.passive_index.size
+    counts = [
+        (f"postures[{i}].{key}", len(values), count, kind)
+        for i, p in enumerate(record.postures)
+        for key, values, count, kind in (
+            ("values", p.values, drives, "drive"),
+            ("drives", p.drives, drives, "drive"),
+            ("passive", p.passive, passive, "passive joint"),
         )
+    ]
+    if record.session.controller_offsets is not None:
+        names = f"drive: {', '.join(d.name for d in robot.drives)}"
+        offsets = len(record.session.controller_offsets)
+        counts.append(("session.controller_offsets", offsets, drives, names))
+    for key, found, count, kind in counts:
+        if found != count:
+            raise CalibrationFileError(
+                f"has {found} numbers; expected {count}, one a {kind}", where=f"{file}: {key}"
+            )
+
+
+def _require_names(record: CalibrationRecord, file: str) -> None:
+    """Refuse names of setups and postures that the file does not have."""
+    postures, setups = {p.name for p in record.postures}, {s.name for s in record.setups}
+    names = [
+        (f"setups[{i}].aligned_at", s.aligned_at, "postures", postures)
+        for i, s in enumerate(record.setups)
+    ]
+    for i, row in enumerate(record.residuals):
+        names += [
+            (f"residuals[{i}].setup", row.setup, "setups", setups),
+            (f"residuals[{i}].posture", row.posture, "postures", postures),
+            (f"residuals[{i}].minus", row.minus or row.posture, "postures", postures),
+        ]
+    for key, name, kind, existing in names:
+        if name not in existing:
+            raise CalibrationFileError(
+                f"'{name}' is not among the file's {kind}", where=f"{file}: {key}"
+            )
