@@ -1,10 +1,10 @@
-"""The record of a solved problem: what a calibration is, from its fit."""
+"""Building of a calibration from the fit of a problem."""
 
 from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
@@ -40,14 +40,13 @@ from orthocal.estimation.linear import Linearisation, linearise_at_reference
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.weighting import split_by_gauge
 from orthocal.io.fields import finite_or_none, read_only
-from orthocal.robot.parameters import Parameter
 from orthocal.session.session import Session
 from orthocal.statistics.chance import confidence_factor
 from orthocal.statistics.identifiability import (
     Identifiability,
     analyse_identifiability,
 )
-from orthocal.statistics.information import Information, marginalise
+from orthocal.statistics.information import marginalise
 from orthocal.statistics.zeros import project_out_zeros
 
 Array = NDArray[np.float64]
@@ -56,30 +55,28 @@ Array = NDArray[np.float64]
 def assemble_calibration(
     fit: Fit,
     *,
-    whole: CalibrationProblem | None = None,
+    full_problem: CalibrationProblem | None = None,
     intervals: Mapping[str, tuple[float, float]] | None = None,
     nominal: Array | None = None,
 ) -> Calibration:
-    """The record of a solved problem.
+    """Calibration of a solved problem.
 
     Args:
         fit: The solved problem.
-        whole: The problem with all parameters, where those that were solved for are its base
-            parameters.
+        full_problem: The problem with all parameters, if base parameters were solved for.
         intervals: Profile-likelihood intervals by name, [SI].
-        nominal: Free parameters of the machine that readings are held against, shape (n_free,),
-            [SI]; what the controller already corrects by default.
+        nominal: Free parameters of the machine whose predictions are the nominal readings, shape
+            (n_free,), [SI]; by default the offsets that are active in the controller.
 
     Raises:
         SolverError: If the result makes no sense.
     """
-    problem, noise, loss = fit.problem, fit.noise, fit.loss
-    session = problem.session
-    n = problem.n_machine
+    problem = fit.problem
+    session, n = problem.session, problem.n_machine
     covariance, noise_covariance = fit.covariance(), fit.noise_covariance()
-    # a base parameter is the whole combination: nothing of it is left out
+    # a base parameter stands for all errors of its combination
     others = find_other_errors(
-        fit, spoken_for=() if whole is None else whole.machine_selection.names
+        fit, spoken_for=() if full_problem is None else full_problem.machine_selection.names
     )
     unmodelled, taken_on = measure_unmodelled(fit, others)
     bias = np.append(np.sqrt(np.diag(unmodelled.bias_covariance)), taken_on)
@@ -90,41 +87,24 @@ def assemble_calibration(
         intervals=_widen(fit, unmodelled, intervals or {}),
     )
     diagnostics = diagnose_readings(fit)
-    residuals = _residual_rows(fit, diagnostics, nominal)
     calibration = Calibration(
         robot_record=record_robot(session),
         session=_session_record(session),
         model=problem.selection.label,
         prior=bool(problem.machine_selection.prior.any()),
-        solver=SolverRecord(
-            name=fit.program.options.solver,
-            status=fit.solution.status,
-            iterations=fit.iterations,
-            seconds_build=fit.seconds_build,
-            seconds_solve=fit.seconds_solve,
-            hessian=fit.solution.hessian,
-            loss=loss.kind,
-            loss_width=loss.width,
-        ),
+        solver=_solver_record(fit),
         parameters=(*estimates[:n], *_held_estimates(problem)),
         sensors=estimates[n:],
         model_covariance=read_only(covariance[:n, :n]),
         noise_covariance=read_only(noise_covariance[:n, :n]),
         unmodelled=unmodelled,
-        identifiability=_identifiability(fit, whole),
-        base=whole is not None,
-        noise=noise,
+        identifiability=_identifiability(fit, full_problem),
+        base=full_problem is not None,
+        noise=fit.noise,
         rows_are_differences=session.only_differences,
-        residuals=residuals,
+        residuals=_residual_rows(fit, diagnostics, nominal),
         critical=diagnostics.critical,
-        postures=tuple(
-            PostureRecord(
-                p.name,
-                p.form,
-                *(tuple(v.tolist()) for v in (p.values, p.drives, fit.solution.passive[i])),
-            )
-            for i, p in zip(problem.states.first_of_posture, session.postures.values(), strict=True)
-        ),
+        postures=_posture_records(fit),
         setups=_setup_records(fit),
         gauges=_gauge_records(fit),
         versions=_versions(),
@@ -134,35 +114,57 @@ def assemble_calibration(
     return calibration
 
 
-def _identifiability(fit: Fit, whole: CalibrationProblem | None) -> Identifiability:
-    """Identifiability of the free parameters; for base parameters with the sums they represent."""
+def _solver_record(fit: Fit) -> SolverRecord:
+    return SolverRecord(
+        name=fit.program.options.solver,
+        status=fit.solution.status,
+        iterations=fit.iterations,
+        seconds_build=fit.seconds_build,
+        seconds_solve=fit.seconds_solve,
+        hessian=fit.solution.hessian,
+        loss=fit.loss.kind,
+        loss_width=fit.loss.width,
+    )
 
-    def analyse(information: Information, parameters: Sequence[Parameter]) -> Identifiability:
+
+def _posture_records(fit: Fit) -> tuple[PostureRecord, ...]:
+    states, postures = fit.problem.states, fit.problem.session.postures.values()
+    return tuple(
+        PostureRecord(
+            p.name,
+            p.form,
+            *(tuple(v.tolist()) for v in (p.values, p.drives, fit.solution.passive[i])),
+        )
+        for i, p in zip(states.first_of_posture, postures, strict=True)
+    )
+
+
+def _identifiability(fit: Fit, full_problem: CalibrationProblem | None) -> Identifiability:
+    """Identifiability of the free parameters; for base parameters with their combinations."""
+
+    def analyse(linearisation: Linearisation) -> Identifiability:
+        machine = linearisation.problem.machine_selection.parameters
         return analyse_identifiability(
-            information,
-            parameters,
+            marginalise(linearisation.information, len(machine), sigma=fit.sigma),
+            machine,
             sigma=fit.noise.sigma,
             n_postures=len(fit.problem.session.postures),
             n_readings=fit.independent_readings,
         )
 
-    def of_machine(linearisation: Linearisation) -> Identifiability:
-        machine = linearisation.problem.machine_selection.parameters
-        information = marginalise(linearisation.information, len(machine), sigma=fit.sigma)
-        return analyse(information, machine)
-
-    own = of_machine(fit.linearisation)
-    if whole is None:
-        return own
-    # how well the base parameters are told; which they are follows from the whole
-    found = of_machine(linearise_at_reference(whole.with_noise(fit.problem.noise)))
-    return replace(found, singular_values=own.singular_values, rank=own.structural_rank)
+    solved = analyse(fit.linearisation)
+    if full_problem is None:
+        return solved
+    combinations = analyse(linearise_at_reference(full_problem.with_noise(fit.problem.noise)))
+    return replace(
+        combinations, singular_values=solved.singular_values, rank=solved.structural_rank
+    )
 
 
 def _widen(
     fit: Fit, unmodelled: Unmodelled, intervals: Mapping[str, tuple[float, float]]
 ) -> dict[str, tuple[float, float]]:
-    """Intervals of what the noise explains, with the errors of the machine that were left out."""
+    """Profile-likelihood intervals, widened by the errors of the machine that were not free."""
     spread = confidence_factor(np.inf) * np.sqrt(np.diag(unmodelled.bias_covariance))
     result = {}
     for name, ends in intervals.items():
@@ -187,8 +189,8 @@ def _estimates(
     """Estimates of the machine, then of the sensors; standard deviations in [SI]."""
     problem, solution = fit.problem, fit.solution
     selection = problem.selection
-    told = fit.machine_information.determined(sigma=fit.noise.sigma)
-    determined = np.append(told, np.zeros(problem.n_free - told.size, dtype=bool))
+    determined = fit.machine_information.determined(sigma=fit.noise.sigma)
+    determined = np.append(determined, np.zeros(problem.n_free - determined.size, dtype=bool))
     words: dict[int, Literal["lower", "upper"] | None] = {-1: "lower", 0: None, 1: "upper"}
     return tuple(
         ParameterEstimate(
@@ -266,7 +268,7 @@ def _session_record(session: Session) -> SessionRecord:
 def _residual_rows(
     fit: Fit, diagnostics: Diagnostics, nominal_theta: Array | None
 ) -> tuple[ResidualRow, ...]:
-    """Readings beside what three machines would show, each with its best gauge zeros."""
+    """Readings with the predictions of three machines, each with its best gauge zeros."""
     problem, o = fit.problem, fit.problem.observations
     measured, session, noise = problem.values, problem.session, problem.noise[o.plus]
 
@@ -275,11 +277,10 @@ def _residual_rows(
         return session.values - noise * o.rows(residual)
 
     n = problem.n_machine
-    own = nominal_theta is None
-    reference = problem.reference[:n] if nominal_theta is None else nominal_theta
-    # gauges stood as they did, whatever the machine is held to be
-    held = np.append(reference, fit.solution.theta[n:])
-    nominal = fitted(problem.predict(held, problem.reference_passive if own else None))
+    at_reference = nominal_theta is None
+    machine = problem.reference[:n] if nominal_theta is None else nominal_theta
+    theta = np.append(machine, fit.solution.theta[n:])  # the mounting of the gauges is the same
+    nominal = fitted(problem.predict(theta, problem.reference_passive if at_reference else None))
     try:
         closed = problem.close(fit.linear, start=fit.solution.passive)
         by_linear = fitted(problem.predict(fit.linear, closed))

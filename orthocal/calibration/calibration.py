@@ -1,6 +1,6 @@
-"""The result of a calibration: its record, and what follows from that.
+"""The result of a calibration: its record with derived quantities.
 
-It holds all that a report, a scene or an export needs: none of them asks for the session again.
+It contains everything that reports, scenes and exports need; none of them reads the session again.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Calibration(CalibrationRecord):
-    """A calibration: its record, the robot that it is of, and what follows from both."""
+    """A calibration: its record, its robot, and quantities derived from both."""
 
     robot: Robot
     """The nominal robot, with the tolerances that the session states."""
@@ -55,7 +55,7 @@ class Calibration(CalibrationRecord):
     def correlation(self) -> Array:
         """Correlation by noise and priors, shape (n_free, n_free); NaN at a bound.
 
-        Of the model's own parameters: it shows which of them the readings do not tell apart.
+        Parameters that the readings cannot separate have a correlation near ±1.
         """
         std = np.sqrt(np.diag(self.model_covariance))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -73,13 +73,13 @@ class Calibration(CalibrationRecord):
 
     @property
     def spare_readings(self) -> int:
-        """Independent readings that the parameters leave to check the model."""
-        found = self.identifiability
-        return found.n_readings - (len(self.free) if self.base else found.structural_rank)
+        """Independent readings in excess of the parameters: they check the model."""
+        rank = len(self.free) if self.base else self.identifiability.structural_rank
+        return self.identifiability.n_readings - rank
 
     @property
     def suspicious(self) -> tuple[ResidualRow, ...]:
-        """Rows that all the others contradict, the worst first."""
+        """Outliers among the rows, the worst first."""
         rows = [r for r in self.residuals if abs(r.studentised) > self.critical]
         return tuple(sorted(rows, key=lambda r: -abs(r.studentised)))
 
@@ -157,8 +157,8 @@ class Calibration(CalibrationRecord):
     @property
     def only_offsets(self) -> bool:
         """True if the identified machine has no errors but offsets."""
-        known = self.robot.parameters
-        return all(known.are_offsets(p.name) for p in self.parameters if p.free or p.value != 0.0)
+        are_offsets = self.robot.parameters.are_offsets
+        return all(are_offsets(p.name) for p in self.parameters if p.free or p.value != 0.0)
 
     @property
     def offset_weights(self) -> Array:

@@ -23,13 +23,10 @@ from orthocal.kinematics.loop_closure import as_rows
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.observation.observations import require_conditions
 from orthocal.session.session import Session
-from orthocal.statistics.identifiability import (
-    find_base_parameters,
-)
+from orthocal.statistics.identifiability import find_base_parameters
 from orthocal.statistics.noise import estimate_repeatability
 
 Array = NDArray[np.float64]
-
 
 MAX_BASE_ROUNDS = 8
 
@@ -47,9 +44,9 @@ def identify(
 
     Args:
         sessions: The session, or the path to one; or several, which are fitted together.
-        choice: Which errors are free, and what is known of them; or the name of a model. By default
-            what the session is for, or offsets.
-        loss: What a residual costs: `squares` (the default), `huber`, or one with its own width.
+        choice: Free errors and prior knowledge of them, or the name of a model; by default as the
+            session states.
+        loss: Loss of a residual: `squares` (the default), `huber`, or a Loss with another width.
         solver: `ipopt` on the whole program, the reference; `variable-projection`, the
             same optimum sooner; `linearised`, as the paper; or one with its own settings.
         profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
@@ -80,15 +77,12 @@ def identify(
         if start.shape != (1, n) or not np.isfinite(start).all():
             raise ValueError(f"expected {n} finite numbers to start from")
         start = np.append(start[0], np.zeros(problem.n_free - n))
-    whole = None
-    if chosen.base:
-        whole = problem
-        fit = _fit_base(whole, options=options, start=start)
-    else:
-        fit = fit_problem(problem, options=options, start=start)
+    full_problem = problem if chosen.base else None
+    solve = _fit_base if chosen.base else fit_problem
+    fit = solve(problem, options=options, start=start)
     profiled = _match_profiled(fit.problem, profile)
     intervals = {name: profile_interval(fit, name) for name in profiled}
-    return assemble_calibration(fit, whole=whole, intervals=intervals), session
+    return assemble_calibration(fit, full_problem=full_problem, intervals=intervals), session
 
 
 def _solver_options(
@@ -105,9 +99,9 @@ def _solver_options(
 def _fit_base(
     problem: CalibrationProblem, *, options: SolverOptions | None, start: ArrayLike | None
 ) -> Fit:
-    """Solve a problem in base parameters: what cannot be told apart is told as one.
+    """Solve a problem in base parameters, each the sum of inseparable parameters.
 
-    How many there are depends on the noise, and that on what they leave: until both agree.
+    Their number depends on the noise, which depends on the residuals: iterated until both agree.
     """
     information = linearise_at_reference(problem).information
     repeatability = estimate_repeatability(problem.values, problem.observations)
@@ -116,13 +110,13 @@ def _fit_base(
     for _ in range(MAX_BASE_ROUNDS):
         factor = information.factor[:, : problem.n_machine]
         machine = problem.machine_selection.parameters
-        found = find_base_parameters(factor, machine, threshold=sigma)
-        if not found:
+        combinations = find_base_parameters(factor, machine, threshold=sigma)
+        if not combinations:
             raise NotIdentifiableError(
-                "the readings tell none of the free parameters",
+                "the readings determine none of the free parameters",
                 parameters=problem.machine_selection.names,
             )
-        chosen = [c.terms[0][0] for c in found]
+        chosen = [c.terms[0][0] for c in combinations]
         if chosen == leads:
             break
         leads = chosen
@@ -135,9 +129,7 @@ def _fit_base(
 def _match_profiled(problem: CalibrationProblem, patterns: Sequence[str]) -> list[str]:
     if not patterns:
         return []
-    found = [n for n in problem.robot.parameters.select(patterns) if n in problem.free]
-    if not found:
-        raise ParameterError(
-            f"{', '.join(patterns)}: no free parameter to find the interval of",
-        )
-    return found
+    names = [n for n in problem.robot.parameters.select(patterns) if n in problem.free]
+    if not names:
+        raise ParameterError(f"{', '.join(patterns)}: no free parameter to find the interval of")
+    return names

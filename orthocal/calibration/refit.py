@@ -52,9 +52,9 @@ def repeat_fit(calibration: Calibration, session: Session) -> Fit:
 
 
 def restore_gauge_covariance(calibration: Calibration) -> Array:
-    """`find_gauge_covariance` of a calibration, from what its file keeps.
+    """`find_gauge_covariance` of a calibration, from its record.
 
-    Shape (n_free, n_free), [SI]; zeros where the noise is not known.
+    Shape (n_free, n_free), [SI]; zeros if the noise is unknown.
     """
     problem = _repeat_problem(calibration, restore_session(calibration))
     if not math.isfinite(calibration.noise.sigma):
@@ -88,12 +88,9 @@ def _repeat_problem(calibration: Calibration, session: Session) -> CalibrationPr
 
 
 def restore_session(calibration: Calibration) -> Session:
-    """The session that a calibration was made from, as its file keeps it.
+    """The session that a calibration was made from, rebuilt from its record.
 
-    `repeat_calibration(calibration, restore_session(calibration))` identifies the same again.
-
-    Raises:
-        RobotError, CalibrationFileError: If the robot cannot be loaded, or has changed.
+    `repeat_calibration(calibration, restore_session(calibration))` gives the same result again.
     """
     record, robot = calibration.session, calibration.robot
     offsets = record.controller_offsets

@@ -1,6 +1,6 @@
-"""A calibration as tables: lists of plain records, as pandas, polars and csv.DictWriter take them.
+"""A calibration as tables: lists of plain records for pandas, polars or csv.DictWriter.
 
-All is in SI; a parameter's record says its unit. What is not known is None.
+Values are in SI; a parameter's record states its unit. Unknown values are None.
 """
 
 from __future__ import annotations
