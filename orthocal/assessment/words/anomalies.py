@@ -155,7 +155,9 @@ def _numbers(result: Anomalies, anomaly: Anomaly) -> dict[str, float]:
 def _odds(result: Anomalies, anomaly: Anomaly) -> str:
     """Residuals before and after the correction, and the odds."""
     odds = math.exp(min(anomaly.log_evidence, math.log(LARGEST_ODDS)))
-    number = f"more than {LARGEST_ODDS:,.0f}" if odds > 0.999 * LARGEST_ODDS else f"{odds:,.0f}"
+    number = f"{float(f'{odds:.3g}'):,.0f}"
+    if odds > 0.999 * LARGEST_ODDS:
+        number = f"more than {LARGEST_ODDS:,.0f}"
     words = f"odds that something is wrong: {number} to 1."
     stuck = anomaly.explanation.kind == "stuck dial"
     if stuck or not math.isfinite(result.rms_before + result.rms_after):

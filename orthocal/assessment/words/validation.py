@@ -69,8 +69,7 @@ def as_predicted(achieved: float, expected: float, numbers: Mapping[str, float])
     return Finding(
         "as predicted",
         "note",
-        f"The deviations of the new readings are {mm(achieved)} mm RMS, as predicted "
-        f"({mm(expected)} mm).",
+        _agreement(achieved, expected),
         numbers=numbers,
     )
 
@@ -83,11 +82,17 @@ def further_change(
     return Finding(
         "further change",
         "note",
-        f"The deviations of the new readings are {mm(achieved)} mm RMS, as predicted "
-        f"({mm(expected)} mm). The new readings determine {what} better.",
+        f"{_agreement(achieved, expected)} The new readings determine {what} better.",
         AGAIN,
         numbers,
         named(*drives),
+    )
+
+
+def _agreement(achieved: float, expected: float) -> str:
+    return (
+        f"The deviations of the new readings are {mm(achieved)} mm RMS, consistent with the "
+        f"predicted {mm(expected)} mm."
     )
 
 
