@@ -1,4 +1,4 @@
-"""The entry of the command line: Ctrl-C ends it while it is still being loaded, too."""
+"""Entry point of the command line, which Ctrl-C ends even while it is being loaded."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import gc
 
 from orthocal.runtime.interrupts import ending_at_interrupt
 
-FEWEST_OBJECTS = 100_000
-"""New ones before garbage is looked for: loading libraries makes many, all of which stay."""
+GARBAGE_THRESHOLD = 100_000
+"""New objects before a garbage collection: loading libraries creates many permanent ones."""
 
 
 def main() -> None:
-    """Load the command line, and run it."""
-    gc.set_threshold(FEWEST_OBJECTS, *gc.get_threshold()[1:])
+    """Load and run the command line."""
+    gc.set_threshold(GARBAGE_THRESHOLD, *gc.get_threshold()[1:])
     with ending_at_interrupt():
         from orthocal.cli import main as run
     try:
         run()
     finally:
-        gc.freeze()  # of what goes with the process nothing is looked through for garbage first
+        gc.freeze()  # no collection when the process ends
 
 
 if __name__ == "__main__":

@@ -30,7 +30,8 @@ from orthocal.calibration.assessment_record import ToolErrorSummary
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
-from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace, require_commanded_tool
+from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
+from orthocal.robot.model import require_commanded_tool
 
 Array = NDArray[np.float64]
 

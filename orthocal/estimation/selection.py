@@ -130,7 +130,7 @@ def select_parameters(
             parameter = parameters[name]
             _refuse_length(entry[0] if isinstance(entry, tuple) else entry, parameter)
             if isinstance(entry, tuple):
-                spread = require_prior_std(entry[1], parameters.own[name])
+                spread = require_prior_std(entry[1], parameters.defaults[name])
                 own_prior[name] = (_finite(entry[0], name), spread)
                 chosen.add(name)
             else:
@@ -145,7 +145,7 @@ def select_parameters(
     for glob, value in (prior_stds or {}).items():
         with _named("tolerances"):
             for name in _match_free(parameters, glob, names):
-                stds[name] = require_prior_std(value, parameters.own[name])
+                stds[name] = require_prior_std(value, parameters.defaults[name])
     stds.update({n: s for n, (_, s) in own_prior.items()})
     lower = np.array([_lowest(parameters[n]) for n in names])
     upper = np.full(len(names), np.inf)

@@ -75,14 +75,14 @@ class Journal:
 
 @contextmanager
 def open_journal_file(
-    path: Path, *, busy: str, anew: bool = False, longest: int = LONGEST_LINE
+    path: Path, *, busy: str, discard: bool = False, longest: int = LONGEST_LINE
 ) -> Iterator[Journal]:
     """A locked journal; the file is created if necessary.
 
     Args:
         path: The file.
         busy: Message if another process has locked the file.
-        anew: Whether to discard its content.
+        discard: Discard the content of the file.
         longest: Largest length of a line, [bytes].
 
     Raises:
@@ -99,7 +99,7 @@ def open_journal_file(
         raise OutputError(f"cannot be written: {e.strerror}", where=str(path)) from None
     try:
         _lock(descriptor, path, busy)
-        if anew:
+        if discard:
             os.ftruncate(descriptor, 0)
         if created:
             sync_folder(path.parent)

@@ -16,22 +16,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.arguments import require_kind
-from orthocal.errors import ClosureError, RobotError
+from orthocal.errors import ClosureError
 from orthocal.kinematics.error_map import MachineGeometry
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.robot.closing import describe_opening
 from orthocal.robot.model import (
     Robot,
-    Tcp,
     closure_row_units,
     closure_turns,
+    coordinate_joints,
     coordinate_limits,
     coordinate_units,
+    require_commanded_tool,
+    require_tcp,
 )
 from orthocal.units import DRIVE_UNITS
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Evaluate = Callable[[Array, Array, MachineGeometry], tuple[Array, Array]]
 Failures = dict[int, ClosureError]
 """Index of a posture to the reason why it cannot be reached. In a batch of machines, posture k of
 machine s of K postures has the index s K + k."""
@@ -69,7 +73,7 @@ MAX_POINTS = 4096
 class System:
     """Equations r(x, p) = 0 of many postures, in metres: square, or with redundant rows."""
 
-    evaluate: Callable[[Array, Array, MachineGeometry], tuple[Array, Array]]
+    evaluate: Evaluate
     """(x, p, geometry) to residuals, (n, n_rows), and Jacobians by x, (n, n_rows, n_x)."""
     n_rows: int
     n_x: int
@@ -153,8 +157,8 @@ def solve_closures(
 ) -> Array:
     """Newton's method along the straight path from the reference posture, or a start, to targets.
 
-    The first trial covers the complete path. A posture that does not converge, or moves so far that
-    it may have changed its assembly mode, is approached in halved steps.
+    The first trial covers the complete path. Postures that do not converge, or may have changed
+    their assembly mode, are approached in halved steps.
 
     Args:
         system: The equations.
@@ -176,13 +180,12 @@ def solve_closures(
     labels = [f"posture {i + 1}" for i in range(count)] if names is None else names
     if len(labels) != count:
         raise ValueError(f"found {len(labels)} names for {count} rows")
-    shape = (machines, count, system.n_x)
     first = system.start if start is None else np.asarray(start, dtype=np.float64)
     if first.shape[-1:] != (system.n_x,):
         raise ValueError(f"found the shape {first.shape}; expected {system.n_x} start values a row")
-    begin = np.broadcast_to(first, shape)
-    result = np.empty(shape)
-    size = machines if machines == 1 else max(1, MAX_POINTS // max(count, 1))
+    begin = np.broadcast_to(first, (machines, count, system.n_x))
+    result = np.empty(begin.shape)
+    size = max(1, MAX_POINTS // max(count, 1))
     for i in range(0, machines, size):
         part = slice(i, min(i + size, machines))
         n = part.stop - i
@@ -528,7 +531,7 @@ class LoopClosure:
             ClosureError: If a point cannot be reached.
             RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
-        p, single = as_rows(points, len(self._require_tcp().coordinates), "coordinates")
+        p, single = as_rows(points, len(require_tcp(self.robot).coordinates), "coordinates")
         drives, _ = self.reach(p, theta=theta, names=names, failures=failures)
         return drives[0] if single else drives
 
@@ -588,7 +591,7 @@ class LoopClosure:
         Returns:
             Shape (K, 3) or (3,), [m]; a batch has S in front.
         """
-        frame = self._require_tcp().frame
+        frame = require_tcp(self.robot).frame
         d, single = self._as_commands(drives)
         geometry, batch = self._batch(theta, errors, d)
         machines, n = len(geometry.drive_errors), self.robot.passive_index.size
@@ -635,13 +638,6 @@ class LoopClosure:
         rows, single = as_rows(drives, n, "drive coordinates")
         return map_.command(rows), single
 
-    def _require_tcp(self) -> Tcp:
-        if self.robot.tcp is None:
-            raise RobotError(
-                "has no tool centre point; add orthocal.tcp", where=str(self.robot.yaml)
-            )
-        return self.robot.tcp
-
     @cached_property
     def _closing(self) -> System:
         robot, function = self.robot, self._functions.closure_by_passive
@@ -652,33 +648,13 @@ class LoopClosure:
             g, g_q = function(actuated, x, geometry.placements)
             return g, g_q
 
-        lower, upper = coordinate_limits(robot)
-        return System(
-            evaluate=evaluate,
-            n_rows=robot.closure_rows,
-            n_x=robot.passive_index.size,
-            start=robot.reference_passive,
-            origin=map_.command(robot.drive_zero),
-            units=coordinate_units(robot)[robot.passive_index],
-            lower=lower[robot.passive_index],
-            upper=upper[robot.passive_index],
-            names=_joint_names(robot, robot.passive_index),
-            row_units=closure_row_units(robot),
-            turns=closure_turns(robot),
-            length=robot.characteristic_length,
-        )
+        origin = map_.command(robot.drive_zero)
+        return _build_system(robot, evaluate, robot.passive_index, robot.reference_passive, origin)
 
     @cached_property
     def _inverting(self) -> System:
         robot = self.robot
-        tcp = self._require_tcp()
-        chosen = list(tcp.coordinates)
-        if len(chosen) != len(robot.drives):
-            raise RobotError(
-                f"orthocal.tcp.coordinates names {len(tcp.coordinates)} coordinates for "
-                f"{len(robot.drives)} drives; the inverse needs as many",
-                where=str(robot.yaml),
-            )
+        chosen = list(require_commanded_tool(robot))
         function, n_d = self._functions.closure_and_tool, len(robot.drives)
         map_ = self._functions.errors
 
@@ -694,23 +670,46 @@ class LoopClosure:
             return residuals, np.concatenate([by_drives, by_passive], axis=2)
 
         index = np.concatenate([robot.drive_index, robot.passive_index])
-        lower, upper = coordinate_limits(robot)
-        zero_passive = robot.reference_passive
-        origin = nominal_closure(robot).tcp(robot.drive_zero, zero_passive)[chosen]
-        return System(
-            evaluate=evaluate,
-            n_rows=robot.closure_rows + len(chosen),
-            n_x=index.size,
-            start=np.concatenate([robot.drive_zero, zero_passive]),
-            origin=origin,
-            units=coordinate_units(robot)[index],
-            lower=lower[index],
-            upper=upper[index],
-            names=_joint_names(robot, index),
-            row_units=np.append(closure_row_units(robot), np.ones(len(chosen))),
-            turns=np.append(closure_turns(robot), np.zeros(len(chosen), dtype=np.bool_)),
-            length=robot.characteristic_length,
-        )
+        origin = nominal_closure(robot).tcp(robot.drive_zero, robot.reference_passive)[chosen]
+        start = np.concatenate([robot.drive_zero, robot.reference_passive])
+        return _build_system(robot, evaluate, index, start, origin, n_tool=len(chosen))
+
+
+def _build_system(
+    robot: Robot,
+    evaluate: Evaluate,
+    index: Indices,
+    start: Array,
+    origin: Array,
+    *,
+    n_tool: int = 0,
+) -> System:
+    """System of closure rows, followed by rows of tool coordinates.
+
+    Args:
+        robot: The robot.
+        evaluate: As for `System`.
+        index: Joint coordinates that are x, shape (n_x,).
+        start: As for `System`.
+        origin: As for `System`.
+        n_tool: Number of tool coordinates.
+    """
+    lower, upper = coordinate_limits(robot)
+    joints = coordinate_joints(robot.model)
+    return System(
+        evaluate=evaluate,
+        n_rows=robot.closure_rows + n_tool,
+        n_x=index.size,
+        start=start,
+        origin=origin,
+        units=coordinate_units(robot)[index],
+        lower=lower[index],
+        upper=upper[index],
+        names=tuple(str(robot.model.names[joints[k]]) for k in index.tolist()),
+        row_units=np.append(closure_row_units(robot), np.ones(n_tool)),
+        turns=np.append(closure_turns(robot), np.zeros(n_tool, dtype=np.bool_)),
+        length=robot.characteristic_length,
+    )
 
 
 @cached_per_robot(maxsize=8)
@@ -737,15 +736,6 @@ def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str]) -> Fai
             )
             failures.setdefault(i, ClosureError(reason, posture=names[i]))
     return failures
-
-
-def _joint_names(robot: Robot, index: NDArray[np.int64]) -> tuple[str, ...]:
-    owner = {}
-    for i in range(1, robot.model.njoints):
-        joint = robot.model.joints[i]
-        for k in range(joint.nv):
-            owner[joint.idx_v + k] = robot.model.names[i]
-    return tuple(owner[int(i)] for i in index)
 
 
 def as_rows(values: ArrayLike, n: int, noun: str) -> tuple[Array, bool]:

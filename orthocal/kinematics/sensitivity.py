@@ -12,10 +12,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.errors import RobotError
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import robot_functions
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Robot, require_tcp
 
 Array = NDArray[np.float64]
 
@@ -35,8 +34,7 @@ class ToolSensitivity:
     def __init__(
         self, robot: Robot, *, free: Sequence[str], values: Mapping[str, float] | None = None
     ) -> None:
-        if robot.tcp is None:
-            raise RobotError("has no tool centre point; add orthocal.tcp", where=str(robot.yaml))
+        require_tcp(robot)
         at = dict(values or {})
         self.robot = robot
         self.free = tuple(free)

@@ -20,7 +20,7 @@ from orthocal.io.fields import read_only
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Robot, require_commanded_tool
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
@@ -317,24 +317,6 @@ def nominal_reach(robot: Robot) -> Callable[[Array], None]:
             raise ClosureError("is nearly singular", posture="a corner")
 
     return reach
-
-
-def require_commanded_tool(robot: Robot) -> tuple[int, ...]:
-    """World coordinates of the tool that the drives command.
-
-    Raises:
-        RobotError: If there are none.
-    """
-    if robot.tcp is None:
-        raise RobotError("has no tool centre point; add orthocal.tcp", where=str(robot.yaml))
-    count = len(robot.tcp.coordinates)
-    if count != len(robot.drives):
-        raise RobotError(
-            f"orthocal.tcp.coordinates names {count} coordinates for {len(robot.drives)} drives: "
-            "they do not command the tool",
-            where=str(robot.yaml),
-        )
-    return robot.tcp.coordinates
 
 
 def tool_at_zero(robot: Robot) -> Array:

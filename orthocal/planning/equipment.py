@@ -16,10 +16,10 @@ from orthocal.io.documents import read_yaml, validate
 from orthocal.io.fields import read_only
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.kinematics.workspace import require_commanded_tool, tool_at_zero
+from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.files.schema import GaugeKeys
 from orthocal.planning.expected_error import state_noise
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Robot, require_commanded_tool
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.mounting import USUAL, Mounting, MountingKeys
 from orthocal.sensors.rod_indicator import RodIndicator

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.errors import ClosureError, ParameterError
+from orthocal.errors import ClosureError, ParameterError, RobotError
 from orthocal.io.fields import read_only
 from orthocal.robot.closing import close_loops, describe_opening
 from orthocal.robot.frames import find_frame, place_frames
@@ -357,6 +357,38 @@ class Robot:
             constraints=build_constraints(model, self.closures),
             drive_gain=read_only(gain),
         )
+
+
+def require_tcp(robot: Robot) -> Tcp:
+    """Tool centre point of a robot.
+
+    Raises:
+        RobotError: If the robot has none.
+    """
+    if robot.tcp is None:
+        raise RobotError("has no tool centre point; add orthocal.tcp", where=str(robot.yaml))
+    return robot.tcp
+
+
+def require_commanded_tool(robot: Robot) -> tuple[int, ...]:
+    """World coordinates of the tool that the drives command, as many as drives.
+
+    Raises:
+        RobotError: If there are none.
+    """
+    coordinates = require_tcp(robot).coordinates
+    if len(coordinates) != len(robot.drives):
+        raise RobotError(
+            f"orthocal.tcp.coordinates names {len(coordinates)} coordinates for "
+            f"{len(robot.drives)} drives: they do not command the tool",
+            where=str(robot.yaml),
+        )
+    return coordinates
+
+
+def coordinate_joints(model: pin.Model) -> list[int]:
+    """Index of the joint of each joint coordinate, shape (nv,)."""
+    return [i for i in range(1, model.njoints) for _ in range(model.joints[i].nv)]
 
 
 def joint_axis(model: pin.Model, joint: int) -> Array:

@@ -110,7 +110,7 @@ class ParameterSet:
         self._parameters = {p.name: p for p in parameters}
         self._models = dict(models)
         self._find_redundant = find_redundant
-        self.own: ParameterSet = self
+        self.defaults: ParameterSet = self
         """Parameters with the tolerances of the robot's YAML."""
         self.stated: Mapping[str, float] = {}
         """Tolerances in place of those; see `with_tolerances`."""
@@ -236,7 +236,7 @@ class ParameterSet:
         return self.select(self.patterns(model))
 
     def with_tolerances(self, given: Mapping[str, float]) -> ParameterSet:
-        """Errors with some tolerances replaced.
+        """Parameters with some tolerances replaced.
 
         Args:
             given: Name or glob with its unit, such as `*.offset_mm`, to a limit of ±2 prior
@@ -244,24 +244,24 @@ class ParameterSet:
                 later ones win.
 
         Raises:
-            ParameterError: If a name or unit is unknown, or a number makes no sense.
+            ParameterError: If a name or unit is unknown, or a number is implausible.
         """
         stated = {k: v for k, v in self.stated.items() if k not in given} | dict(given)
         if not stated:
             return self
-        parameters = {p.name: p for p in self.own}
-        for glob, value in self.own.read_tolerances(stated).items():
-            for name in self.own.select([glob]):
-                size = require_prior_std(value, self.own[name])
+        parameters = {p.name: p for p in self.defaults}
+        for glob, value in self.defaults.read_tolerances(stated).items():
+            for name in self.defaults.select([glob]):
+                size = require_prior_std(value, self.defaults[name])
                 parameters[name] = replace(parameters[name], prior_std=size)
-        found = ParameterSet(
+        result = ParameterSet(
             self.elementary.values(),
             parameters.values(),
             self._models,
             find_redundant=lambda: self.redundant,
         )
-        found.own, found.stated = self.own, stated
-        return found
+        result.defaults, result.stated = self.defaults, stated
+        return result
 
     def read_quantity(self, key: str, value: float) -> tuple[str, float]:
         """Parameter name and SI value of a key with its unit, such as x_slide.offset_mm.
@@ -327,7 +327,7 @@ def require_prior_std(value: float, parameter: Parameter) -> float:
 
     Args:
         value: [unit of the parameter].
-        parameter: With the robot's own tolerance.
+        parameter: Parameter with the tolerance of the robot's YAML.
 
     Raises:
         ParameterError: Naming both.
@@ -392,13 +392,13 @@ def build_parameters(
         parameters[name] = _sum_errors(name, members, by_name)
     for key, value in overrides.items():
         glob, unit, factor = split_unit(key)
-        found = [name for name in parameters if fnmatchcase(name, glob)]
-        if not found:
+        names = [name for name in parameters if fnmatchcase(name, glob)]
+        if not names:
             raise ParameterError(
                 f"tolerances.overrides: '{glob}' matches no error parameter"
                 f"{_suggest(glob, parameters)}"
             )
-        for name in found:
+        for name in names:
             _check_unit(key, unit, parameters[name])
             parameters[name] = replace(parameters[name], prior_std=read_limit(value) * factor)
     result = ParameterSet(elementary, parameters.values(), models, find_redundant=find_redundant)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError
 from orthocal.robot.frames import hangs_on
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Robot, coordinate_joints
 from orthocal.robot.parameters import ElementaryError
 
 Array = NDArray[np.float64]
@@ -98,8 +98,7 @@ def _carried_masks(
     The motions are the six of each owner, then those of the passive coordinates.
     """
     model = robot.model
-    joint_of = {j.idx_v + k: i for i, j in enumerate(model.joints) if i for k in range(j.nv)}
-    joints = [joint_of[k] for k in robot.passive_index.tolist()]
+    joints = np.array(coordinate_joints(model))[robot.passive_index].tolist()
     ends = [robot.frame_id(n) for c in robot.closures for n in (c.frame_a, c.frame_b)]
     masks = {}
     for frame in {*observed, *ends}:

@@ -20,6 +20,7 @@ from orthocal.robot.model import (
     Robot,
     closure_row_units,
     closure_turns,
+    coordinate_joints,
     coordinate_limits,
     coordinate_units,
     joint_turns,
@@ -124,9 +125,8 @@ def _find_joints_outside_limits(robot: Robot, start: Array, free: Indices) -> li
     closings = (_close(robot, s, free, limited=False) for s in _starts(robot, start, free))
     x = next((c.coordinates for c in closings if c.closed), np.clip(start, lower, upper))
     outside = np.flatnonzero((x < lower - LIMIT_TOLERANCE) | (x > upper + LIMIT_TOLERANCE))
-    model = robot.model
-    names = {model.joints[i].idx_v: str(model.names[i]) for i in range(1, model.njoints)}
-    return [names[k] for k in outside.tolist() if k in names]
+    joints = coordinate_joints(robot.model)
+    return list(dict.fromkeys(str(robot.model.names[joints[k]]) for k in outside.tolist()))
 
 
 def _explain_open_loops(robot: Robot, best: Closing, drives_moved: bool, outside: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""Kinds of something by name: built in, registered, or from installed packages."""
+"""Registry of implementations by name: built in, registered, or from installed packages."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ Kind = TypeVar("Kind")
 
 
 class Registry(Generic[Kind]):
-    """Kinds by name; those of installed packages are loaded when they are needed.
+    """Kinds by name; those of installed packages are loaded on first use.
 
     Args:
-        group: Group of the entry points by which packages offer kinds; their names are the kinds.
-        noun: Name of what a kind is, for messages.
-        read: Kind of a name and the object that a package offers; raises what it likes for an
-            object that is none.
+        group: Group of the entry points of packages; an entry point has the name of its kind.
+        noun: Noun for a kind in messages, such as sensor.
+        read: Kind from a name and the object of an entry point; raises any error for an invalid
+            object.
         built_in: Kinds of orthocal.
     """
 
@@ -37,7 +37,7 @@ class Registry(Generic[Kind]):
         self._kinds[name] = kind
 
     def unregister(self, name: str) -> None:
-        """Forget a kind, if there is one of this name."""
+        """Remove a kind if it exists."""
         self._kinds.pop(name, None)
 
     @property
@@ -47,7 +47,7 @@ class Registry(Generic[Kind]):
         return tuple(dict.fromkeys([*self._kinds, *offered]))
 
     def find(self, name: object, *, where: str, error: type[OrthocalError]) -> Kind:
-        """The kind of a name.
+        """Find the kind of a name.
 
         Args:
             name: The name, from a document.
@@ -66,7 +66,7 @@ class Registry(Generic[Kind]):
         package = "" if point.dist is None else f" of package {point.dist.name}"
         try:
             return self._read(point.name, point.load())
-        except Exception as e:  # whatever foreign code raises is this one problem
+        except Exception as e:  # foreign code may raise anything
             raise error(
                 f"the {self._noun} '{name}'{package} cannot be loaded: {type(e).__name__}: {e}",
                 where=where,

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import TextIO
+from typing import Any, TextIO, cast
 
 from orthocal.errors import OutputError
 from orthocal.text import printable
@@ -17,41 +17,23 @@ class ReaderGoneError(Exception):
     """The reader of the standard output has closed it, as `head` does; this is not an error."""
 
 
-class _Guarded(io.TextIOBase):
-    """A standard stream that raises orthocal's errors.
+class _Guarded:
+    """Standard stream that raises orthocal's errors.
 
     Args:
         stream: The stream, or None if it was closed when the process started.
     """
 
     def __init__(self, stream: TextIO | None) -> None:
-        self._stream = stream
+        self._is_open = stream is not None
+        self._stream = open(os.devnull, "w", encoding="utf-8") if stream is None else stream
         self._failure: Exception | None = None
         """First failure; it is raised again if a library swallowed it."""
 
-    @property
-    def encoding(self) -> str:  # type: ignore[override] # a property there, too, but in C
-        """Encoding of the stream."""
-        return "utf-8" if self._stream is None else self._stream.encoding
-
-    @property
-    def errors(self) -> str:  # type: ignore[override] # likewise
-        """Error handler of the encoding."""
-        return "strict" if self._stream is None else self._stream.errors or "strict"
-
-    def isatty(self) -> bool:
-        """True for a terminal."""
-        return self._stream is not None and self._stream.isatty()
-
-    def fileno(self) -> int:
-        """Descriptor of the stream."""
-        if self._stream is None:
-            raise io.UnsupportedOperation("fileno")
-        return self._stream.fileno()
-
-    def writable(self) -> bool:
-        """True."""
-        return True
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - any attribute of a stream
+        if name == "buffer":  # bytes would bypass this object
+            raise AttributeError(name)
+        return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
         """Write a text.
@@ -60,7 +42,7 @@ class _Guarded(io.TextIOBase):
             ReaderGoneError: If the reader has closed the stream.
             OutputError: If the text cannot be written.
         """
-        if text and self._stream is None:
+        if text and not self._is_open:
             self._failure = _unwritable("it is closed")
         self._try(lambda stream: stream.write(text))
         return len(text)
@@ -71,7 +53,7 @@ class _Guarded(io.TextIOBase):
 
     def _try(self, act: Callable[[TextIO], object]) -> None:
         try:
-            if self._failure is None and self._stream is not None:
+            if self._failure is None:
                 act(self._stream)
         except BrokenPipeError:
             self._failure = ReaderGoneError()
@@ -85,7 +67,7 @@ class _Guarded(io.TextIOBase):
         """Discard buffered text, which Python would write when it ends."""
         with suppress(OSError, ValueError, io.UnsupportedOperation):
             nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self.fileno())
+            os.dup2(nowhere, self._stream.fileno())
             os.close(nowhere)
 
 
@@ -124,7 +106,8 @@ def guarded_streams() -> Iterator[None]:
     for stream in original:  # a terminal without ± prints a question mark
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    sys.stdout, sys.stderr = _Guarded(original[0]), _Silent(original[1])
+    sys.stdout = cast("TextIO", _Guarded(original[0]))
+    sys.stderr = cast("TextIO", _Silent(original[1]))
     try:
         yield
     finally:

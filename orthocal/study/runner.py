@@ -137,7 +137,7 @@ def open_results(
         yield results, results.__setitem__
         return
     busy = "is in use by another process; wait for it, or choose another directory"
-    with open_journal_file(path, busy=busy, anew=anew) as journal:
+    with open_journal_file(path, busy=busy, discard=anew) as journal:
         results = _read_results(journal, study)
 
         def store(task: int, columns: dict[str, list[Cell]]) -> None:

@@ -133,5 +133,5 @@ def test_later_ones_come_on_top(orthoglide):
     assert [parameters[f"{a}_slide.offset"].prior_std for a in "xyz"] == [1e-3, 2e-3, 2e-3]
     parameters = parameters.with_tolerances({"*.offset_mm": 1.0})
     assert {parameters[f"{a}_slide.offset"].prior_std for a in "xyz"} == {0.5e-3}
-    assert parameters.own is orthoglide.parameters
+    assert parameters.defaults is orthoglide.parameters
     assert parameters.redundant == orthoglide.parameters.redundant

@@ -1,1 +1,1 @@
-"""Tables as spreadsheets write them: bytes to cells, and what was understood on the way."""
+"""Tables of spreadsheet programs: cells of delimited text and of workbooks."""

@@ -1,4 +1,4 @@
-"""Cells and rows of a table, whatever file they come from."""
+"""Cells and rows of a table, from text files or workbooks."""
 
 from __future__ import annotations
 

@@ -269,7 +269,7 @@ def _provenance(calibration: Calibration) -> str:
 
 def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
     """Tolerances, known values and bounds that the user stated."""
-    usual = calibration.robot.parameters.own
+    usual = calibration.robot.parameters.defaults
     tolerances, known, bounds = [], [], []
     for p in calibration.parameters:
         f, unit = p.edge_factor, p.edge_unit
