@@ -27,9 +27,8 @@ from orthocal.calibration.records import (
     Versions,
 )
 from orthocal.errors import ClosureError
-from orthocal.estimation.diagnostics.cross_validation import predict_unseen
+from orthocal.estimation.diagnostics.deletion import Diagnostics, diagnose_readings, predict_unseen
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
-from orthocal.estimation.diagnostics.studentised import Diagnostics, diagnose_readings
 from orthocal.estimation.diagnostics.unmodelled import (
     Unmodelled,
     find_other_errors,

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
-from orthocal.estimation.fit import Fit, fit_problem
-from orthocal.estimation.gauges import find_gauge_covariance
+from orthocal.estimation.fit import Fit, find_gauge_covariance, fit_problem
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem

@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError, SolverError
-from orthocal.estimation.gauges import find_gauge_covariance
 from orthocal.estimation.linear import Linearisation, linearise_at_reference
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.choice import build_program
 from orthocal.estimation.solvers.program import Program, Solution
 from orthocal.estimation.weighting import (
     SMALLEST_SIGMA,
@@ -33,6 +31,7 @@ from orthocal.statistics.information import (
     decompose,
     marginalise,
     require_identifiable,
+    take_for_known,
 )
 from orthocal.statistics.noise import Noise, estimate_noise, estimate_repeatability
 from orthocal.statistics.zeros import project_out_zeros
@@ -389,3 +388,50 @@ def _noise(
         gauge_sigma=problem.session.gauge.sigma,
         resolution=problem.session.gauge.resolution,
     )
+
+
+def build_program(problem: CalibrationProblem, options: SolverOptions | None = None) -> Program:
+    """A problem prepared for the chosen solver; Ipopt by default."""
+    chosen = options or SolverOptions()
+    if chosen.solver == "variable-projection":
+        from orthocal.estimation.solvers.variable_projection import VariableProjection
+
+        return VariableProjection(problem, options=chosen)
+    if chosen.solver == "linearised":
+        from orthocal.estimation.solvers.linearised import LinearisedProgram
+
+        return LinearisedProgram(problem, options=chosen)
+    from orthocal.estimation.solvers.ipopt import NonlinearProgram
+
+    return NonlinearProgram(problem, options=chosen)
+
+
+def find_gauge_covariance(
+    problem: CalibrationProblem,
+    information: Information,
+    *,
+    sigma: float,
+    held: NDArray[np.bool_] | None = None,
+) -> Array:
+    """Part of the covariance of the machine's parameters that is due to mounting errors.
+
+    The covariance less that with known nuisance parameters. Other setups have other mounting
+    errors, so this part is independent between sessions.
+
+    Args:
+        problem: The problem.
+        information: Information about all its parameters.
+        sigma: Standard deviation of a reading, [m].
+        held: Mask of the parameters that a bound holds, shape (n_free,).
+
+    Returns:
+        Shape (n_machine, n_machine), [SI].
+    """
+    n, precision = problem.n_machine, problem.prior_precision
+    held = np.zeros(problem.n_free, dtype=np.bool_) if held is None else held
+    total = information.covariance(sigma=sigma, precision=precision, held=held)
+    without_mounting = take_for_known(information, n).covariance(
+        sigma=sigma, precision=precision[:n], held=held[:n]
+    )
+    scale = problem.theta_scale[:n]
+    return np.asarray((total[:n, :n] - without_mounting) * np.outer(scale, scale))

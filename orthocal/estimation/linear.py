@@ -221,19 +221,3 @@ def _require_numbers(problem: CalibrationProblem, prediction: Array, jacobian: A
         "it, or what moves it has no derivative there",
         where=f"{session.path or 'session'}: setups.{setup}",
     )
-
-
-def solve_linearised(problem: CalibrationProblem, *, sigma: float) -> Array:
-    """First-order solution of a problem about what the controller already corrects.
-
-    Args:
-        problem: The problem.
-        sigma: Standard deviation of one reading, [m]; matters only beside a prior.
-
-    Returns:
-        Free parameters, shape (n_free,), [SI].
-
-    Raises:
-        ClosureError: If the reference machine cannot reach a posture.
-    """
-    return linearise_at_reference(problem).solve(sigma=sigma)

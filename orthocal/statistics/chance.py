@@ -7,8 +7,6 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.statistics.distributions import chi_square_tail, f_tail, normal_quantile, t_quantile
-
 BY_CHANCE = 0.01
 """Probability below which residuals that are larger than noise are not put down to chance."""
 
@@ -66,3 +64,38 @@ def expanded_uncertainty(
     total, scatter = np.asarray(std, dtype=np.float64), np.asarray(std_scatter, dtype=np.float64)
     rest = np.sqrt(np.maximum(total**2 - scatter**2, 0.0))
     return np.asarray(np.hypot(coverage_factor(dof) * scatter, COVERAGE * rest))
+
+
+def normal_quantile(share: float) -> float:
+    """Below which a share of the standard normal distribution lies."""
+    from scipy import special
+
+    return float(special.ndtri(share))
+
+
+def chi_square_tail(dof: float, value: float) -> float:
+    """Probability that χ² with so many degrees of freedom is larger than a value."""
+    from scipy import special
+
+    return float(special.chdtrc(dof, value))
+
+
+def f_tail(dof: float, dof_below: float, value: float) -> float:
+    """Probability that F with so many degrees of freedom is larger than a value."""
+    from scipy import special
+
+    return float(special.fdtrc(dof, dof_below, value))
+
+
+def t_quantile(dof: float, share: float) -> float:
+    """Below which a share of Student's t with so many degrees of freedom lies."""
+    from scipy import special
+
+    return float(special.stdtrit(dof, share))
+
+
+def beta_share(a: float, b: float, x: float) -> float:
+    """The regularised incomplete beta function I_x(a, b)."""
+    from scipy import special
+
+    return float(special.betainc(a, b, x))

@@ -74,17 +74,6 @@ class Noise:
             return None
         return self._chance_in_residuals(gauge) > 1.0 - BY_CHANCE
 
-    def cycles_scatter_more(self, gauge: float | None) -> bool | None:
-        """Whether repeated readings differ by more than a standard deviation [m] explains.
-
-        Returns:
-            None where that is not stated, or nothing was repeated.
-        """
-        if gauge is None or self.cycles_dof == 0:
-            return None
-        chi_square = (self.cycles_sigma / gauge) ** 2 * self.cycles_dof
-        return chance_of_excess(chi_square, self.cycles_dof) < BY_CHANCE
-
     def is_finer_than(self, sigma: float, *, dof: float) -> bool | None:
         """Whether residuals are smaller than rounding of a standard deviation [m] leaves.
 

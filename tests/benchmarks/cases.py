@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal import load_plan, simulate_session
+from orthocal.estimation.fit import build_program
 from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.choice import build_program
 from orthocal.estimation.solvers.program import Program, Solution
 from orthocal.kinematics.backend import llvm
 from orthocal.measurement.joining import join_sessions

@@ -12,8 +12,8 @@ from orthocal.estimation.linear import (
     SIX_ROWS,
     TWELVE_ROWS,
     leg_parallelism_matrix,
+    linearise_at_reference,
     solve_equation_8,
-    solve_linearised,
     twelve_row_covariance,
 )
 from orthocal.estimation.problem import build_problem
@@ -97,7 +97,7 @@ def test_the_closed_loop_model_agrees_to_first_order_with_equation_8(experiment_
     slopes = problem.observations.rows(jacobian) / problem.theta_scale
     matrix = leg_parallelism_matrix(**GEOMETRY, rows=6)
     assert np.abs(slopes - matrix).max() < 1e-11
-    theta = solve_linearised(problem, sigma=1e-5)
+    theta = linearise_at_reference(problem).solve(sigma=1e-5)
     expected = solve_equation_8(matrix, experiment_2.values).offsets
     assert np.abs(theta - expected).max() < 1e-13
 
@@ -110,7 +110,7 @@ def test_twelve_generalised_rows_are_raw_readings_with_their_zeros(root):
     rng = np.random.default_rng(0)
     session = plan.with_values(1e-3 * rng.normal(size=len(plan.readings)))
     problem = build_problem(session, model="offsets")
-    theta = solve_linearised(problem, sigma=1e-5)
+    theta = linearise_at_reference(problem).solve(sigma=1e-5)
     means = {}
     for r in session.readings:
         means.setdefault((r.setup, r.posture), []).append(r.value)

@@ -11,11 +11,10 @@ from gauges import exact
 from orthocal import calibrate, load_plan, simulate_session
 from orthocal.calibration.refit import restore_session
 from orthocal.errors import SessionError
-from orthocal.estimation.fit import fit_problem
+from orthocal.estimation.fit import build_program, fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.estimation.solvers.choice import build_program
 from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
 

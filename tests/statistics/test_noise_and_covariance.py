@@ -227,22 +227,21 @@ def test_what_noise_explains_is_yes_no_or_unknown():
 
 
 @pytest.mark.parametrize(
-    ("noise", "gauge", "more", "less", "scatter"),
+    ("noise", "gauge", "more", "less"),
     [
-        (Noise(1.0, 9.0, "residuals", np.nan, 0, 1.0, 9.0), 1.0, False, False, None),
-        (Noise(3.0, 9.0, "residuals", np.nan, 0, 3.0, 9.0), 1.0, True, False, None),
-        (Noise(0.1, 9.0, "residuals", np.nan, 0, 0.1, 9.0), 1.0, False, True, None),
-        (Noise(3.0, 9.0, "residuals", np.nan, 0, 3.0, 9.0), None, None, None, None),
-        (Noise(3.0, 9.0, "residuals", 1.0, 12, 3.0, 9.0), 1.0, True, False, False),
-        (Noise(3.0, 12.0, "cycles", 3.0, 12, 3.0, 9.0), 1.0, False, False, True),
-        (Noise(1.0, np.inf, "gauge", np.nan, 0, np.nan, 0.0), 1.0, False, None, None),
-        (Noise(np.nan, 0.0, "unknown", np.nan, 0, np.nan, 0.0), None, None, None, None),
+        (Noise(1.0, 9.0, "residuals", np.nan, 0, 1.0, 9.0), 1.0, False, False),
+        (Noise(3.0, 9.0, "residuals", np.nan, 0, 3.0, 9.0), 1.0, True, False),
+        (Noise(0.1, 9.0, "residuals", np.nan, 0, 0.1, 9.0), 1.0, False, True),
+        (Noise(3.0, 9.0, "residuals", np.nan, 0, 3.0, 9.0), None, None, None),
+        (Noise(3.0, 9.0, "residuals", 1.0, 12, 3.0, 9.0), 1.0, True, False),
+        (Noise(3.0, 12.0, "cycles", 3.0, 12, 3.0, 9.0), 1.0, False, False),
+        (Noise(1.0, np.inf, "gauge", np.nan, 0, np.nan, 0.0), 1.0, False, None),
+        (Noise(np.nan, 0.0, "unknown", np.nan, 0, np.nan, 0.0), None, None, None),
     ],
 )
-def test_what_residuals_and_cycles_say_of_the_gauge(noise, gauge, more, less, scatter):
+def test_residuals_against_the_noise_of_the_gauge(noise, gauge, more, less):
     assert noise.leaves_more(gauge) is more
     assert noise.leaves_less(gauge) is less
-    assert noise.cycles_scatter_more(gauge) is scatter
 
 
 def test_what_is_kept_of_information_is_as_if_the_rest_were_estimated_too():

@@ -6,7 +6,6 @@ closures of every posture are constraints (see `nlp.py`).
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +20,13 @@ from orthocal.errors import OrthocalError, SolverError
 from orthocal.estimation.options import OptionValue, SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.solvers.nlp import ProgramFunctions
-from orthocal.estimation.solvers.program import LEFT_OUT, Solution, no_convergence
+from orthocal.estimation.solvers.program import (
+    LEFT_OUT,
+    Program,
+    Solution,
+    SolverInput,
+    no_convergence,
+)
 from orthocal.runtime.interrupts import noticed_interrupt
 
 Array = NDArray[np.float64]
@@ -79,7 +84,7 @@ class Expressions:
     """Posture to the residuals g of its loop closures, shape (closure_rows,), [m]."""
 
 
-class NonlinearProgram:
+class NonlinearProgram(Program):
     """A calibration problem as a nonlinear program, built once for any number of solutions.
 
     Args:
@@ -90,12 +95,13 @@ class NonlinearProgram:
         OrthocalError: If Ipopt does not accept one of `options.ipopt`.
     """
 
+    kind = "ipopt"
+
     def __init__(
         self, problem: CalibrationProblem, *, options: SolverOptions | None = None
     ) -> None:
         began = time.perf_counter()
-        self.problem = problem
-        self.options = options or SolverOptions()
+        super().__init__(problem, options=options)
         self._n_theta = problem.n_free
         self._n_zeros = problem.observations.n_zeros
         self._n_passive = problem.robot.passive_index.size
@@ -107,85 +113,56 @@ class NonlinearProgram:
         self.seconds_build = time.perf_counter() - began
 
     def with_problem(self, problem: CalibrationProblem) -> NonlinearProgram:
-        """The same program for a `with_values` of its problem; nothing is built again."""
-        other = copy.copy(self)
-        other.problem = problem
+        """The program for a `with_values` of its problem; nothing is built again."""
+        other = super().with_problem(problem)
         other.__dict__.pop("_exact", None)
         return other
 
-    def solve(
-        self,
-        *,
-        sigma: float,
-        values: ArrayLike | None = None,
-        start: ArrayLike | None = None,
-        start_passive: Array | None = None,
-        left_out: ArrayLike | None = None,
-        held: Mapping[int, float] | None = None,
-    ) -> Solution:
-        """Solve for given readings; arguments as for `Program.solve`.
+    def _solve(self, readings: SolverInput) -> Solution:
+        """Solve, if necessary with the exact Hessian and with a robust loss of decreasing width.
 
         Raises:
             SolverError: If Ipopt does not converge.
             ClosureError: If the machine cannot reach a posture with the start values.
             KeyboardInterrupt: At Ctrl-C, which CasADi would swallow.
         """
-        y = self.problem.values if values is None else np.asarray(values, dtype=np.float64)
-        begun = start, start_passive
-
-        def run(program: NonlinearProgram, widening: float = 1.0) -> Solution:
-            return program._solve(
-                start,
-                start_passive,
-                sigma=sigma,
-                values=y,
-                left_out=left_out,
-                held=held or {},
-                widening=widening,
-            )
-
         exact, robust = self.options.hessian == "exact", self.options.loss.robust
         try:
-            return run(self)
+            return self._run(readings)
         except SolverError:
             if self.problem.observations.size > MOST_EXACT or (exact and not robust):
                 raise
         program = self if exact else self._exact
         if not robust:
-            return run(program)
+            return program._run(readings)
+        step = readings
         try:
-            for widening in WIDENINGS:  # nearly squares first, then as wanted
-                solution = run(program, widening)
-                start, start_passive = solution.theta, solution.passive
+            for widening in WIDENINGS:  # nearly squares first, then the requested width
+                solution = program._run(step, widening)
+                step = replace(step, start=solution.theta, start_passive=solution.passive)
         except SolverError:
             if exact:
                 raise
-            start, start_passive = begun
-            return run(program)
+            return program._run(readings)
         return solution
 
-    def _solve(
-        self,
-        start: ArrayLike | None,
-        start_passive: Array | None,
-        *,
-        sigma: float,
-        values: Array,
-        left_out: ArrayLike | None,
-        held: Mapping[int, float],
-        widening: float,
-    ) -> Solution:
+    def _run(self, readings: SolverInput, widening: float = 1.0) -> Solution:
         """One run of Ipopt, with a multiple of the width of a robust loss."""
-        problem = self.problem
+        problem, sigma, held = self.problem, readings.sigma, readings.held
         lower, upper = (self._bounds(side, held) for side in ("lower", "upper"))
-        theta = np.array(problem.reference if start is None else start, dtype=np.float64)
         theta = np.clip(
-            theta,
+            readings.start,
             lower[: self._n_theta] * problem.theta_scale,
             upper[: self._n_theta] * problem.theta_scale,
         )
-        x0 = self.begin(theta, sigma=sigma, values=values, passive=start_passive, widening=widening)
-        p = self.pack(sigma=sigma, values=values, left_out=left_out, widening=widening)
+        x0 = self.begin(
+            theta,
+            sigma=sigma,
+            values=readings.values,
+            passive=readings.start_passive,
+            widening=widening,
+        )
+        p = self._pack(sigma, readings.values, readings.weights, widening)
         began = time.perf_counter()
         with noticed_interrupt():
             answer = self._solver(x0=x0, p=p, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
@@ -310,9 +287,12 @@ class NonlinearProgram:
         weights = np.ones(y.size)
         if left_out is not None:
             weights[np.asarray(left_out, dtype=np.int64)] = LEFT_OUT
+        return self._pack(sigma, y, weights, widening)
+
+    def _pack(self, sigma: float, values: Array, weights: Array, widening: float) -> Array:
         weighted, scale = _weighting(sigma)
         width = self.options.loss.width * widening * sigma / weighted
-        return np.concatenate([y, weights, self.problem.noise, [weighted, scale, width]])
+        return np.concatenate([values, weights, self.problem.noise, [weighted, scale, width]])
 
     def functions(self) -> dict[str, ca.Function]:
         """The program's functions of (x, p[, lam_f, lam_g]), for checks of their derivatives."""

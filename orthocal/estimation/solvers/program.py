@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import copy
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.estimation.options import Hessian, SolverOptions
+from orthocal.estimation.options import Hessian, SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 
 Array = NDArray[np.float64]
@@ -43,14 +45,45 @@ class Solution:
     """-1 for a parameter at its lower bound, 1 at its upper bound, else 0, shape (n_free,)."""
 
 
-class Program(Protocol):
-    """A problem prepared for a solver, for any number of solutions."""
+@dataclass(frozen=True, slots=True, eq=False)
+class SolverInput:
+    """One set of readings to solve for."""
 
-    problem: CalibrationProblem
-    options: SolverOptions
+    sigma: float
+    """Standard deviation of one reading, [m]."""
+    values: Array
+    """Readings as single ones, shape (n_entries,), [m of the first gauge]."""
+    weights: Array
+    """Weights of the entries, shape (n_entries,): 1, or `LEFT_OUT` for excluded ones."""
+    start: Array
+    """Free parameters to start from, shape (n_free,), [SI]."""
+    start_passive: Array | None
+    """Passive coordinates to start closing the loops from."""
+    held: Mapping[int, float]
+    """Index of a free parameter to the value it is held at, [SI]."""
 
-    def with_problem(self, problem: CalibrationProblem) -> Program:
-        """The same program for a `with_values` of its problem; nothing is built again."""
+
+class Program(ABC):
+    """A problem prepared for a solver, for any number of solutions.
+
+    Args:
+        problem: The problem.
+        options: Options of the solver.
+    """
+
+    kind: ClassVar[SolverKind]
+
+    def __init__(
+        self, problem: CalibrationProblem, *, options: SolverOptions | None = None
+    ) -> None:
+        self.problem = problem
+        self.options = options or SolverOptions(solver=self.kind)
+
+    def with_problem(self, problem: CalibrationProblem) -> Self:
+        """The program for a `with_values` of its problem; nothing is built again."""
+        other = copy.copy(self)
+        other.problem = problem
+        return other
 
     def solve(
         self,
@@ -62,14 +95,13 @@ class Program(Protocol):
         left_out: ArrayLike | None = None,
         held: Mapping[int, float] | None = None,
     ) -> Solution:
-        """Solve for given readings.
+        """Solve for one set of readings.
 
         Args:
             sigma: Standard deviation of one reading, [m].
             values: Readings as single ones, shape (n_entries,), [m of the first gauge]; the
                 session's by default.
-            start: Free parameters to start from, shape (n_free,), [SI]; by default the
-                reference.
+            start: Free parameters to start from, shape (n_free,), [SI]; the reference by default.
             start_passive: Passive coordinates to start closing the loops from.
             left_out: Indices of the entries to exclude.
             held: Index of a free parameter to the value it is held at, [SI].
@@ -78,6 +110,24 @@ class Program(Protocol):
             SolverError: If it does not converge.
             ClosureError: If the machine cannot reach a posture with the start values.
         """
+        problem = self.problem
+        weights = np.ones(problem.observations.size)
+        if left_out is not None:
+            weights[np.asarray(left_out, dtype=np.int64)] = LEFT_OUT
+        return self._solve(
+            SolverInput(
+                sigma=sigma,
+                values=np.asarray(problem.values if values is None else values, dtype=np.float64),
+                weights=weights,
+                start=np.array(problem.reference if start is None else start, dtype=np.float64),
+                start_passive=start_passive,
+                held=held or {},
+            )
+        )
+
+    @abstractmethod
+    def _solve(self, readings: SolverInput) -> Solution:
+        """Solve for one set of readings."""
 
 
 def no_convergence(options: SolverOptions) -> str:

@@ -6,16 +6,15 @@ Free gauge zeros have their optimal values. The remaining problem is small and d
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from orthocal.errors import SolverError
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.program import LEFT_OUT
+from orthocal.estimation.solvers.program import Solution, SolverInput
 from orthocal.observation.model import Linearisation
 
 Array = NDArray[np.float64]
@@ -53,50 +52,64 @@ class Task:
 
     problem: CalibrationProblem
     loss: Loss
-    values: Array
-    weights: Array
-    sigma: float
+    readings: SolverInput
     low: Array
     high: Array
     """Bounds of θ̂, shape (n_free,)."""
 
     @staticmethod
-    def of(
-        problem: CalibrationProblem,
-        loss: Loss,
-        *,
-        sigma: float,
-        values: ArrayLike | None,
-        left_out: ArrayLike | None,
-        held: Mapping[int, float] | None,
-    ) -> Task:
-        """Task of a solver; arguments as for `Program.solve`."""
+    def of(problem: CalibrationProblem, loss: Loss, readings: SolverInput) -> Task:
+        """Task of a solver."""
         lower, upper = problem.selection.lower.copy(), problem.selection.upper.copy()
-        for i, value in (held or {}).items():
+        for i, value in readings.held.items():
             lower[i] = upper[i] = value
-        weights = np.ones(problem.observations.size)
-        if left_out is not None:
-            weights[np.asarray(left_out, dtype=np.int64)] = LEFT_OUT
-        readings = problem.values if values is None else np.asarray(values, dtype=np.float64)
         scale = problem.theta_scale
-        return Task(problem, loss, readings, weights, sigma, lower / scale, upper / scale)
+        return Task(problem, loss, readings, lower / scale, upper / scale)
 
-    def start(self, theta: ArrayLike | None) -> Array:
-        """θ̂ to start from, within the bounds, shape (n_free,)."""
-        problem = self.problem
-        start = np.array(problem.reference if theta is None else theta, dtype=np.float64)
-        return np.clip(start / problem.theta_scale, self.low, self.high)
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of one reading, [m]."""
+        return self.readings.sigma
 
-    def held_by_bounds(
-        self, state: State, jacobian: Array, held: Mapping[int, float] | None
-    ) -> NDArray[np.int8]:
-        """-1 for a parameter held by its lower bound, 1 by its upper bound, shape (n_free,)."""
+    @property
+    def weights(self) -> Array:
+        """Weights of the entries, shape (n_entries,)."""
+        return self.readings.weights
+
+    def clip(self, theta: Array) -> Array:
+        """θ̂ within the bounds, shape (n_free,) of free parameters in SI."""
+        return np.clip(theta / self.problem.theta_scale, self.low, self.high)
+
+    def solution(
+        self, state: State, jacobian: Array, *, passive: Array, iterations: int, seconds: float
+    ) -> Solution:
+        """Solution of the task.
+
+        Args:
+            state: The optimum.
+            jacobian: dh/dθ̂ there, shape (n_entries, n_free), [σ per tolerance].
+            passive: Passive coordinates, shape (n_states, n_passive), [m, rad].
+            iterations: Number of iterations.
+            seconds: Time of the solution, [s].
+        """
         gradient = self.slope(state, jacobian)
-        result = np.zeros(state.theta.size, dtype=np.int8)
-        result[(state.theta <= self.low) & (gradient > 0.0)] = -1
-        result[(state.theta >= self.high) & (gradient < 0.0)] = 1
-        result[list(held or {})] = 0
-        return result
+        at_bound = np.zeros(state.theta.size, dtype=np.int8)
+        at_bound[(state.theta <= self.low) & (gradient > 0.0)] = -1
+        at_bound[(state.theta >= self.high) & (gradient < 0.0)] = 1
+        at_bound[list(self.readings.held)] = 0
+        return Solution(
+            theta=state.theta * self.problem.theta_scale,
+            zeros=state.zeros * self.sigma,
+            passive=passive,
+            objective=state.objective,
+            status="Solve_Succeeded",
+            iterations=iterations,
+            hessian="gauss-newton",
+            seconds_build=0.0,
+            seconds_solve=seconds,
+            closure=0.0,
+            at_bound=at_bound,
+        )
 
     def at(self, theta: Array, passive: Array | None) -> State:
         """The problem at some θ̂, shape (n_free,).
@@ -107,22 +120,28 @@ class Task:
         problem = self.problem
         si = theta * problem.theta_scale
         closed = problem.close(si, start=passive)
-        return self._state(theta, closed, (self.values - problem.predict(si, closed)) / self.sigma)
+        return self._state(
+            theta, closed, (self.readings.values - problem.predict(si, closed)) / self.sigma
+        )
 
-    def begin(self, theta: ArrayLike | None, passive: Array | None) -> tuple[State, Linearisation]:
-        """The problem at the start of a solver; arguments as for `Program.solve`.
+    def begin(self) -> tuple[State, Linearisation]:
+        """The problem at the start of a solver.
 
         Raises:
             ClosureError: If the machine cannot reach a posture there.
             SolverError: If a sensor has no reading there.
         """
-        problem, at = self.problem, self.start(theta)
-        if passive is None:
+        problem, at, passive = (
+            self.problem,
+            self.clip(self.readings.start),
+            self.readings.start_passive,
+        )
+        at_reference = np.array_equal(at * problem.theta_scale, problem.reference)
+        if passive is None and at_reference:
             passive = problem.reference_passive
-            if not np.array_equal(at * problem.theta_scale, problem.reference):
-                passive = problem.close(at * problem.theta_scale, start=passive)
         else:
-            passive = problem.close(at * problem.theta_scale, start=passive)
+            first = problem.reference_passive if passive is None else passive
+            passive = problem.close(at * problem.theta_scale, start=first)
         linear = self.linearise(at, passive)
         if not np.isfinite(linear.jacobian).all():
             raise SolverError(
@@ -140,7 +159,7 @@ class Task:
     def near(self, theta: Array, passive: Array, linear: Linearisation) -> State:
         """The problem at some θ̂, with loops closed to first order."""
         predicted = linear.reading + linear.opening
-        return self._state(theta, passive, (self.values - predicted) / self.sigma)
+        return self._state(theta, passive, (self.readings.values - predicted) / self.sigma)
 
     def moved(self, state: State, jacobian: Array, change: Array) -> State:
         """The problem to first order at another θ̂; arguments as for `step`."""

@@ -11,15 +11,13 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError, SolverError
-from orthocal.estimation.options import SolverOptions
-from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
-from orthocal.estimation.solvers.program import Solution, no_convergence
+from orthocal.estimation.problem import LENGTH_SCALE
+from orthocal.estimation.solvers.program import Program, Solution, SolverInput, no_convergence
 from orthocal.estimation.solvers.subproblem import State, Task
 from orthocal.observation.model import Linearisation
 
@@ -39,67 +37,28 @@ ROUNDING = 1e-12
 """Relative growth of the objective that counts as rounding."""
 
 
-class VariableProjection:
+class VariableProjection(Program):
     """A calibration problem reduced to its free parameters.
 
-    Args:
-        problem: The problem.
-        options: Iterations and loss; other options do not apply.
+    Its options are iterations and loss; other options do not apply.
     """
 
-    def __init__(
-        self, problem: CalibrationProblem, *, options: SolverOptions | None = None
-    ) -> None:
-        self.problem = problem
-        self.options = options or SolverOptions(solver="variable-projection")
+    kind = "variable-projection"
 
-    def with_problem(self, problem: CalibrationProblem) -> VariableProjection:
-        """The same solver for another problem; nothing is built."""
-        return VariableProjection(problem, options=self.options)
-
-    def solve(
-        self,
-        *,
-        sigma: float,
-        values: ArrayLike | None = None,
-        start: ArrayLike | None = None,
-        start_passive: Array | None = None,
-        left_out: ArrayLike | None = None,
-        held: Mapping[int, float] | None = None,
-    ) -> Solution:
-        """Solve for given readings; arguments as for `Program.solve`.
-
-        Raises:
-            SolverError: If it does not converge.
-            ClosureError: If the machine cannot reach a posture with the start values.
-        """
+    def _solve(self, readings: SolverInput) -> Solution:
         began = time.perf_counter()
-        task = Task.of(
-            self.problem,
-            self.options.loss,
-            sigma=sigma,
-            values=values,
-            left_out=left_out,
-            held=held,
-        )
-        begin = task.begin(start, start_passive)
+        task = Task.of(self.problem, self.options.loss, readings)
+        start = task.begin()
         try:
-            optimum = self._descend(task, begin, follow=True)
+            state, jacobian, iterations = self._descend(task, start, follow=True)
         except (ClosureError, SolverError):  # with open loops; now close them in every step
-            optimum = self._descend(task, task.begin(start, start_passive), follow=False)
-        state, jacobian, iterations = optimum
-        return Solution(
-            theta=state.theta * self.problem.theta_scale,
-            zeros=state.zeros * sigma,
+            state, jacobian, iterations = self._descend(task, task.begin(), follow=False)
+        return task.solution(
+            state,
+            jacobian,
             passive=state.passive,
-            objective=state.objective,
-            status="Solve_Succeeded",
             iterations=iterations,
-            hessian="gauss-newton",
-            seconds_build=0.0,
-            seconds_solve=time.perf_counter() - began,
-            closure=0.0,
-            at_bound=task.held_by_bounds(state, jacobian, held),
+            seconds=time.perf_counter() - began,
         )
 
     def _descend(

@@ -7,7 +7,7 @@ import pytest
 from gauges import exact
 
 from orthocal import calibrate, compare_models, load_session
-from orthocal.estimation.diagnostics.cross_validation import predict_unseen
+from orthocal.estimation.diagnostics.deletion import predict_unseen
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions

@@ -17,7 +17,7 @@ from orthocal import (
     simulate_session,
 )
 from orthocal.errors import SolverError
-from orthocal.estimation.diagnostics.studentised import diagnose_readings
+from orthocal.estimation.diagnostics.deletion import diagnose_readings
 from orthocal.estimation.fit import fit_problem, require_assembly
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import build_problem

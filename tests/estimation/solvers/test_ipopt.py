@@ -12,7 +12,7 @@ from tolerances import DERIVATIVE, SAME_OPTIMUM, TRUTH_BACK
 
 from orthocal import load_plan, load_session, simulate_session
 from orthocal.errors import OrthocalError, SolverError
-from orthocal.estimation.linear import solve_linearised
+from orthocal.estimation.linear import linearise_at_reference
 from orthocal.estimation.loss import SQUARES, Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, build_problem
@@ -132,7 +132,7 @@ def test_perfect_data_give_the_truth_back_from_any_start(perfect, seed, hessian)
 def test_both_hessians_reach_the_same_optimum(plan, model, loss):
     session = simulate_session(plan, TRUTH, seed=3).session
     problem = build_problem(session, model=model)
-    start = solve_linearised(problem, sigma=1e-5)  # whence fits start by themselves
+    start = linearise_at_reference(problem).solve(sigma=1e-5)  # whence fits start by themselves
     found = [
         NonlinearProgram(problem, options=SolverOptions(hessian=h, loss=loss)).solve(
             sigma=1e-5, start=start
@@ -178,7 +178,7 @@ def test_where_gauss_newton_does_not_converge_the_exact_hessian_does(root, exper
         load_session(root / f"examples/table1/experiment-{experiment}"), model="full"
     )
     program, sigma = NonlinearProgram(problem, options=SolverOptions(loss=HUBER)), 2e-5
-    solution = program.solve(sigma=sigma, start=solve_linearised(problem, sigma=sigma))
+    solution = program.solve(sigma=sigma, start=linearise_at_reference(problem).solve(sigma=sigma))
     assert solution.hessian == "exact"
     prediction, jacobian = problem.linearise(solution.theta, solution.passive)
     residual = problem.values - prediction - solution.zeros[problem.observations.zero]

@@ -12,6 +12,7 @@ from gauges import exact
 from orthocal import calibrate, load_calibration, load_session
 from orthocal.calibration.file import calibration_json
 from orthocal.errors import OrthocalError, SolverError
+from orthocal.estimation.fit import build_program
 from orthocal.estimation.linear import (
     SIX_ROWS,
     leg_parallelism_matrix,
@@ -21,7 +22,6 @@ from orthocal.estimation.linear import (
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.choice import build_program
 from orthocal.estimation.solvers.linearised import LinearisedProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 

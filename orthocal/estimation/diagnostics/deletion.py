@@ -1,13 +1,19 @@
-"""Single readings held against all others: studentised residuals and what each one moves.
+"""Deletion diagnostics: a reading or a setup against the prediction from all the others.
 
-A reading that is left out is the same as one with an unknown error of its own. With
-y ~ (X θ, σ² S), X with a column for every gauge zero and the prior as P,
+Deleting a reading is equivalent to adding an unknown error to it. With y ~ (X θ, σ² S), X with a
+column for every gauge zero and the prior as P,
 
     M = S⁻¹ − S⁻¹ X A⁻¹ Xᵀ S⁻¹,  A = Xᵀ S⁻¹ X + σ² P
 
-that error is estimated as γᵢ = (M y)ᵢ/Mᵢᵢ with variance σ²/Mᵢᵢ, and leaving the reading out
-changes the estimate by −A⁻¹ Xᵀ S⁻¹ eᵢ γᵢ (Cook and Weisberg, Residuals and Influence, 1982, 2.2).
-Differences of one setup and cycle share postures: S is theirs, a block a group.
+this error is estimated as γᵢ = (M y)ᵢ/Mᵢᵢ with variance σ²/Mᵢᵢ, and deleting the reading changes
+the estimate by −A⁻¹ Xᵀ S⁻¹ eᵢ γᵢ (Cook and Weisberg, Residuals and Influence, 1982, 2.2).
+Differences of one setup and cycle share postures: S has a block for each group.
+
+Deleting a setup s changes the estimate, to first order about the solution, by
+
+    δ = −A₋ₛ⁻¹ Fₛᵀ rₛ/σ²,  A₋ₛ = FᵀF/σ² + P − FₛᵀFₛ/σ²
+
+with F the Jacobian and r the residuals, zeros eliminated. The setup is then missed by rₛ − Fₛ δ.
 """
 
 from __future__ import annotations
@@ -17,11 +23,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.estimation.fit import Fit
+from orthocal.errors import NotIdentifiableError
+from orthocal.estimation.fit import Fit, require_determined
 from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.observation.observations import Observations
 from orthocal.statistics.chance import confidence_factor
-from orthocal.statistics.information import Information
+from orthocal.statistics.information import Information, decompose
 from orthocal.statistics.zeros import project_out_zeros
 
 Array = NDArray[np.float64]
@@ -160,3 +167,40 @@ def _spread_without(fit: Fit, share: Array) -> tuple[Array, float]:
     # to first order a reading that is far out can take more than there is
     total = noise.sigma**2 * noise.dof
     return np.sqrt(np.maximum(total - share, LEAST_REST * total) / dof), dof
+
+
+def predict_unseen(fit: Fit) -> Array:
+    """Errors of predicting the rows of every setup from all other setups.
+
+    Returns:
+        Measured less predicted, each with its best gauge zeros, shape (n_rows,), [m]; NaN where
+        the other setups do not determine the parameters.
+    """
+    problem, o = fit.problem, fit.problem.observations
+    errors = np.full(o.plus.size, np.nan)
+    setups = np.unique(o.setup)
+    if setups.size < 2:
+        return errors
+    root = np.sqrt(fit.weights)[:, None]
+    factor = root * project_out_zeros(fit.jacobian, o, weights=fit.weights)
+    pull = root[:, 0] * fit.residual / fit.sigma**2
+    free = ~fit.held
+    precision = np.diag(problem.prior_precision)[np.ix_(free, free)]
+    for setup in setups:
+        out = o.setup == setup
+        if not problem.prior_precision.all():
+            # at the reference: at the solution what is not seen looks faintly seen
+            left = np.where(out[:, None], 0.0, fit.linearisation.slopes)
+            try:
+                require_determined(problem, decompose(left, o))
+            except NotIdentifiableError:
+                continue  # stays unknown
+        others = factor[~out][:, free] / fit.sigma
+        change = np.zeros(problem.n_free)
+        change[free] = -np.linalg.solve(
+            others.T @ others + precision, factor[out][:, free].T @ pull[out]
+        )
+        missed = project_out_zeros(fit.residual - fit.jacobian @ change, o)
+        rows = out[o.plus]
+        errors[rows] = o.rows(missed)[rows]
+    return errors
