@@ -186,7 +186,7 @@ def _predict_unseen(fit: Fit, linearisation: Linearisation, method: Method) -> A
         out = o.setup == setup
         try:
             if not problem.prior_precision.all():
-                left = np.where(out[:, None], 0.0, linearisation.slopes)
+                left = np.where(out[:, None], 0.0, linearisation.jacobian)
                 require_determined(problem, decompose(left, o))
             if method == "exact":
                 theta = fit.program.solve(

@@ -75,7 +75,7 @@ def assemble_calibration(
     covariance, noise_covariance = fit.covariance(), fit.noise_covariance()
     # a base parameter stands for all errors of its combination
     others = find_other_errors(
-        fit, spoken_for=() if full_problem is None else full_problem.machine_selection.names
+        fit, represented=() if full_problem is None else full_problem.machine_selection.names
     )
     unmodelled, taken_on = measure_unmodelled(fit, others)
     bias = np.append(np.sqrt(np.diag(unmodelled.bias_covariance)), taken_on)

@@ -1,4 +1,4 @@
-"""What a calibration may change, as its user says it: numbers carry their unit in their name."""
+"""Choice of the free parameters by the user; numbers carry their unit in their key."""
 
 from __future__ import annotations
 
@@ -16,23 +16,24 @@ from orthocal.units import read_limit
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Which errors of the machine are free, and what is known of them beforehand.
+    """Free errors of the machine, their priors, known values and bounds.
 
-    A number that has a unit stands under a name that ends with it, as on the command line:
-    {"x_leg.length_mm": 0.12}; the units are _mm, _um, _m, _mrad, _deg, _rad and _ppm.
+    Keys of numbers end with the unit, as on the command line: {"x_leg.length_mm": 0.12}; the units
+    are _mm, _um, _m, _mrad, _deg, _rad and _ppm.
 
     Args:
-        model: A model of the robot's YAML: `offsets`, `lengths`, `full` or one's own; by default
-            what the session states, otherwise the complete model.
-        free: Names or globs that are free too, or instead where no model is named; '!' takes out.
-        prior: Whether parameters have priors; by default not where only offsets are free.
+        model: A model of the robot's YAML: `offsets`, `lengths`, `full` or another; by default
+            the one that the session states, otherwise the complete model.
+        free: Names or globs of further free parameters, or of all if no model is named; '!'
+            excludes.
+        prior: Use priors; by default True, unless only offsets are free.
         known: Name with its unit to a known value, which is then held, or to a value and its
             tolerance, a limit of ±2 standard deviations, which then act as prior.
         tolerances: Name or glob with its unit to another tolerance than the robot's, a limit of
             ±2 prior standard deviations.
         bounds: Name or glob with its unit to lowest and highest value, ±inf for open.
-        base: Identify base parameters instead, without any prior: of what the readings cannot
-            tell apart one parameter stays, and stands for the whole combination.
+        base: Identify base parameters without priors: of each indistinguishable combination one
+            parameter remains free and represents the combination.
 
     Raises:
         TypeError: If an argument is of another kind.
@@ -57,7 +58,7 @@ class Choice:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The choice as plain data."""
+        """Plain data of the choice."""
 
         def plain(values: Mapping[str, Known]) -> dict[str, Any]:
             return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
@@ -78,11 +79,11 @@ class Choice:
         Raises:
             ParameterError: If a name, unit, glob or model is unknown, or a number makes no sense.
         """
-        own = [key for key, value in self.known.items() if isinstance(value, tuple)]
-        if self.base and (self.prior or own):
+        with_std = [key for key, value in self.known.items() if isinstance(value, tuple)]
+        if self.base and (self.prior or with_std):
             raise ParameterError(
                 "base parameters are identified without any prior"
-                + (f"; give {', '.join(own)} as known without ±" if own else "")
+                + (f"; give {', '.join(with_std)} as known without ±" if with_std else "")
             )
         return select_parameters(
             parameters,
@@ -96,23 +97,23 @@ class Choice:
 
 
 def choose(
-    given: Choice | str | None, session: Session | None, *, usual: str | None = None
+    choice: Choice | str | None, session: Session | None, *, usual: str | None = None
 ) -> Choice:
-    """What is to be identified: as is said, else what a session is for, else as usual.
+    """Choice of the user, otherwise of the session, otherwise the usual model.
 
     Args:
-        given: What is said: a choice, or the name of a model.
-        session: That is measured, or joined of several that were.
+        choice: A choice, or the name of a model.
+        session: The measured session, or several joined ones.
         usual: The model if nothing is stated; by default the complete one.
 
     Raises:
-        ParameterError: If sessions are for different models, and nothing is said.
+        ParameterError: If nothing is chosen and the sessions state different models.
         TypeError: If an argument is of another kind.
     """
-    require_kind(given, (Choice, str, type(None)), expected="a Choice, or the name of a model")
-    choice = given if isinstance(given, Choice) else Choice(given)
-    if choice.model is not None or choice.free:
-        return choice
+    require_kind(choice, (Choice, str, type(None)), expected="a Choice, or the name of a model")
+    chosen = choice if isinstance(choice, Choice) else Choice(choice)
+    if chosen.model is not None or chosen.free:
+        return chosen
     sessions = () if session is None else session.parts or (session,)
     purposes = {s.purpose: s for s in sessions if s.purpose is not None}
     if len(purposes) > 1:
@@ -121,7 +122,7 @@ def choose(
     if usual is None and session is not None:
         usual = complete_model(session.robot.parameters)
     purpose = next(iter(purposes), Purpose(usual))
-    return replace(choice, model=purpose.model, free=purpose.free)
+    return replace(chosen, model=purpose.model, free=purpose.free)
 
 
 def _in_words(purpose: Purpose) -> str:
@@ -145,10 +146,10 @@ def _known(known: Mapping[str, Known], parameters: ParameterSet) -> dict[str, Kn
 
 
 def _bounds(
-    given: Mapping[str, tuple[float, float]], parameters: ParameterSet
+    bounds: Mapping[str, tuple[float, float]], parameters: ParameterSet
 ) -> dict[str, tuple[float, float]]:
     result = {}
-    for key, (low, high) in given.items():
+    for key, (low, high) in bounds.items():
         try:
             glob, factor = parameters.read_glob(key)
         except ParameterError as e:

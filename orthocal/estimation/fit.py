@@ -1,4 +1,4 @@
-"""One problem solved: linearised start, noise, exact solution, and what the readings say there."""
+"""Fit of a problem: linearised start, noise, exact solution, information at the solution."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ from orthocal.statistics.zeros import project_out_zeros
 Array = NDArray[np.float64]
 
 SIGMA_SETTLED = 0.03
-"""Relative change of sigma below which it needs no further solution: beside a prior it moves no
+"""Relative change of sigma below which no further solution is needed: with a prior it changes no
 parameter by more than a twentieth of its standard deviation."""
 
 MAX_SIGMA_ROUNDS = 8
 
 SMALL_DOF = 20.0
-"""Residuals that are few, for a first sigma."""
+"""Residual degrees of freedom below which the first sigma is the stated one."""
 
-OUT_OF_QUESTION = 10.0
-"""Times a stated sigma that residuals of a linearised problem never are by what bends in it."""
+MAX_LINEARISATION_RATIO = 10.0
+"""Residuals of the linearised problem over the stated sigma that nonlinearity never reaches."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,13 +58,13 @@ class Fit:
     problem: CalibrationProblem
     program: Program
     seconds_build: float
-    """Building all functions and the program, once, [s]."""
+    """Time to build the functions and the program, [s]."""
     seconds_solve: float
-    """All solutions until sigma had settled, [s]."""
+    """Time of all solutions until sigma converged, [s]."""
     iterations: int
-    """Of the solver, in all of them."""
+    """Iterations of the solver in all solutions."""
     linearisation: Linearisation
-    """About what the controller already corrects."""
+    """Linearisation about the active offsets of the controller."""
     linear: Array
     """Linearised solution, shape (n_free,), [SI]."""
     solution: Solution
@@ -74,13 +74,13 @@ class Fit:
     jacobian: Array
     """dh/dθ̂ at the solution, shape (n_entries, n_free), [m per prior std]."""
     information: Information
-    """Of that Jacobian."""
+    """Information of that Jacobian."""
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of a reading by which the solution was weighted, [m].
+        """Standard deviation of a reading in the weights of the solution, [m].
 
-        With several gauges, that of the first.
+        With several gauges, it belongs to the first.
         """
         if math.isfinite(self.noise.sigma):
             return max(self.noise.sigma, SMALLEST_SIGMA)
@@ -88,7 +88,7 @@ class Fit:
 
     @property
     def loss(self) -> Loss:
-        """What a residual cost."""
+        """Cost of a residual."""
         return self.program.options.loss
 
     @property
@@ -98,24 +98,24 @@ class Fit:
 
     @property
     def weights(self) -> Array:
-        """How much of a square each entry counted, shape (n_entries,): 1 without a robust loss."""
+        """Weights of the squared residuals, shape (n_entries,): 1 without a robust loss."""
         return self.loss.weight(self.residual / self.sigma)
 
     @property
     def machine_information(self) -> Information:
-        """What the readings say of the machine, sensors known to their priors."""
+        """Information about the machine, nuisance parameters marginalised over their priors."""
         return marginalise(self.information, self.problem.n_machine, sigma=self.sigma)
 
     @property
     def independent_readings(self) -> int:
-        """Independent readings: repeated ones once, less gauge zeros."""
+        """Number of independent readings: repeated ones once, minus gauge zeros."""
         o = self.problem.observations
         _, repeated = estimate_repeatability(self.problem.values, o)
         return o.size - o.n_free_zeros - repeated
 
     @property
     def held(self) -> NDArray[np.bool_]:
-        """Parameters that a bound holds, shape (n_free,)."""
+        """Mask of the parameters at a bound, shape (n_free,)."""
         return np.asarray(self.solution.at_bound != 0)
 
     def covariance(self) -> Array:
@@ -130,7 +130,7 @@ class Fit:
         return self._scaled(self.information.noise_covariance)
 
     def _scaled(self, covariance: Callable[..., Array]) -> Array:
-        """A covariance of the scaled parameters, with the weights of this fit, in SI units."""
+        """Covariance of the scaled parameters with the weights of this fit, in SI units."""
         scale = np.outer(self.problem.theta_scale, self.problem.theta_scale)
         if not math.isfinite(self.noise.sigma):
             return np.full_like(scale, np.nan)
@@ -140,7 +140,7 @@ class Fit:
             gain = self.loss.gain(self.residual / self.sigma, used=used)
             factors = (gain, self.loss.normal_square)
         return scale * covariance(
-            sigma=self.sigma,  # some, also for readings without any scatter
+            sigma=self.sigma,  # above 0, also for readings without scatter
             precision=self.problem.prior_precision,
             held=self.held,
             loss=factors,
@@ -148,7 +148,7 @@ class Fit:
 
     @property
     def gauge_covariance(self) -> Array:
-        """As of `find_gauge_covariance`."""
+        """Part of the covariance that is due to mounting errors; see `find_gauge_covariance`."""
         return find_gauge_covariance(
             self.problem, self.information, sigma=self.sigma, held=self.held
         )
@@ -161,14 +161,14 @@ def fit_problem(
     start: ArrayLike | None = None,
     program: Program | None = None,
 ) -> Fit:
-    """Solve a problem exactly, with sigma from the readings where they tell it.
+    """Solve a problem exactly, with sigma from the readings if they determine it.
 
     Args:
         problem: The problem.
-        options: Which solver, and how it is run.
+        options: Choice and options of the solver.
         start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
             solution.
-        program: Of the same problem with other readings, to be used again; `options` are its own.
+        program: Program of the same problem with other readings; it replaces `options`.
 
     Raises:
         NotIdentifiableError: If neither readings nor a prior determine a parameter.
@@ -197,11 +197,11 @@ def fit_problem(
         except ClosureError:
             if start is not None or passive is not None:
                 raise
-            solution = program.solve(sigma=sigma)  # the linearised machine cannot be assembled
+            solution = program.solve(sigma=sigma)  # the linearised machine cannot reach a posture
         except SolverError:
             if start is not None or passive is not None or not larger > sigma:
                 raise
-            # what the model leaves out may be too much for a sigma that leaves no room for it
+            # the unmodelled errors may be too large for the stated sigma
             sigma, first = larger, linearisation.solve(sigma=larger)
             solution = program.solve(sigma=sigma, start=first)
         seconds, iterations = seconds + solution.seconds_solve, iterations + solution.iterations
@@ -210,16 +210,16 @@ def fit_problem(
         residual = _residual(program, solution, prediction)
         held = solution.at_bound != 0
         noise = _noise(program, residual, information, sigma, repeatability, held=held)
-        found = max(noise.sigma, SMALLEST_SIGMA)
+        estimated = max(noise.sigma, SMALLEST_SIGMA)
         weights = problem.noise
         if len(groups) > 1:
             weights = _weigh(problem, groups, residual, jacobian, information, sigma, held)
         balanced = bool(np.abs(weights / problem.noise - 1.0).max() < SIGMA_SETTLED)
-        if balanced and (not _matters(program) or _settled(found, sigma)):
+        if balanced and (not _matters(program) or _settled(estimated, sigma)):
             break
         first, passive = solution.theta, solution.passive
         if balanced:
-            sigma = found
+            sigma = estimated
             continue
         problem = problem.with_noise(weights)
         program, linearisation = program.with_problem(problem), linearise_at_reference(problem)
@@ -250,9 +250,9 @@ def _weigh(
     sigma: float,
     held: NDArray[np.bool_],
 ) -> Array:
-    """Noise of each entry over the first gauge's, as the solution leaves it, (n_entries,)."""
+    """Noise of each entry relative to the first gauge, from the residuals, (n_entries,)."""
     covariance = information.covariance(sigma=sigma, precision=problem.prior_precision, held=held)
-    found = weigh_gauges(
+    std = weigh_gauges(
         groups,
         problem.observations,
         residual=residual * problem.noise,
@@ -260,26 +260,26 @@ def _weigh(
         values=problem.values * problem.noise,
         sigma=sigma * problem.noise,
     )
-    return np.asarray(found / found[groups[0].entries][0])
+    return np.asarray(std / std[groups[0].entries][0])
 
 
 def require_assembly(problem: CalibrationProblem, solution: Solution, *, robust: bool) -> None:
-    """Refuse a solution that is no machine: absurd readings can be met by absurd errors.
+    """Refuse a solution that cannot reach a posture: wrong readings can lead to impossible errors.
 
     Args:
         problem: The problem.
         solution: Its solution.
-        robust: Whether the loss was a robust one already.
+        robust: True if the loss was robust.
 
     Raises:
-        SolverError: Naming the posture that the machine found cannot reach.
+        SolverError: Naming the posture that the machine cannot reach.
     """
     try:
         problem.close(solution.theta, start=solution.passive)
     except ClosureError as e:
         hint = "" if robust else "; with the loss 'huber' it may be named"
         raise SolverError(
-            f"the errors that fit these readings best make no machine: {e}. Look for a reading "
+            f"the errors that fit these readings best are impossible: {e}. Look for a reading "
             f"with a wrong sign or in a wrong row{hint}",
             status=solution.status,
             iterations=solution.iterations,
@@ -287,46 +287,46 @@ def require_assembly(problem: CalibrationProblem, solution: Solution, *, robust:
 
 
 def _matters(program: Program) -> bool:
-    """Whether sigma matters to the estimate: beside a prior, or with a robust loss."""
+    """True if the estimate depends on sigma: with a prior or a robust loss."""
     return program.problem.prior or program.options.loss.robust
 
 
-def _settled(found: float, sigma: float) -> bool:
-    return not math.isfinite(found) or abs(found / sigma - 1.0) < SIGMA_SETTLED
+def _settled(estimated: float, sigma: float) -> bool:
+    return not math.isfinite(estimated) or abs(estimated / sigma - 1.0) < SIGMA_SETTLED
 
 
 def _linearised_sigma(
     program: Program, linearisation: Linearisation, repeatability: tuple[float, int]
 ) -> tuple[float, float]:
-    """Sigma as the linearised problem has it, [m]: mostly near enough for one exact solution.
+    """Sigma of the linearised problem, [m]: usually close enough for one exact solution.
 
-    Where few residuals are free beside the prior, and the gauge's sigma is stated, that, unless it
-    is out of the question: what bends in the problem would be taken for noise, which leaves larger
-    residuals, and so on.
+    With few residual degrees of freedom the stated sigma is used, unless the residuals exclude it:
+    otherwise nonlinearity would count as noise, which would allow larger residuals, and so on.
 
     Returns:
-        That, and the linearised problem's own, which is larger where that is the stated one.
+        Sigma to start with, and sigma from the residuals, which is larger if the first one is
+        stated.
     """
     problem = program.problem
     sigma = first_sigma(problem.session, repeatability)
     stated = sigma
-    keeps = problem.session.gauge.sigma is not None and _few_are_free(linearisation, sigma)
+    use_stated = problem.session.gauge.sigma is not None and _few_are_free(linearisation, sigma)
     for i in range(MAX_SIGMA_ROUNDS if _matters(program) else 0):
         change = (linearisation.solve(sigma=sigma) - problem.reference) / problem.theta_scale
-        residual = linearisation.residual - linearisation.slopes @ change
+        residual = linearisation.residual - linearisation.jacobian @ change
         if i == 0:
-            far = residual @ residual > residual.size * (OUT_OF_QUESTION * sigma) ** 2
-            keeps = keeps and not far
+            excluded = residual @ residual > residual.size * (MAX_LINEARISATION_RATIO * sigma) ** 2
+            use_stated = use_stated and not excluded
         noise = _noise(program, residual, linearisation.information, sigma, repeatability)
-        found = max(noise.sigma, SMALLEST_SIGMA)
-        if _settled(found, sigma):
+        estimated = max(noise.sigma, SMALLEST_SIGMA)
+        if _settled(estimated, sigma):
             break
-        sigma = found
-    return (stated, sigma) if keeps else (sigma, sigma)
+        sigma = estimated
+    return (stated, sigma) if use_stated else (sigma, sigma)
 
 
 def _few_are_free(linearisation: Linearisation, sigma: float) -> bool:
-    """Whether parameters that are held by a prior take up nearly all readings."""
+    """True if the parameters use nearly all degrees of freedom of the readings."""
     problem = linearisation.problem
     o = problem.observations
     used = linearisation.information.effective_parameters(
@@ -336,7 +336,7 @@ def _few_are_free(linearisation: Linearisation, sigma: float) -> bool:
 
 
 def first_sigma(session: Session, repeatability: tuple[float, int]) -> float:
-    """What a reading's standard deviation is taken to be before there is a solution, [m]."""
+    """Standard deviation of a reading before the first solution, [m]."""
     return stated_sigma(session.gauge, repeatability)
 
 
@@ -357,12 +357,12 @@ def require_determined(problem: CalibrationProblem, information: Information) ->
 
 
 def _residual(program: Program, solution: Solution, prediction: Array) -> Array:
-    """Residuals with the zeros that the loss gives: their mean for squares."""
+    """Residuals with the optimal gauge zeros."""
     problem, o = program.problem, program.problem.observations
-    left = problem.values - prediction
+    deviation = problem.values - prediction
     if program.options.loss.robust:
-        return np.asarray(left - solution.zeros[o.zero])
-    return project_out_zeros(left, o)
+        return np.asarray(deviation - solution.zeros[o.zero])
+    return project_out_zeros(deviation, o)
 
 
 def _noise(
@@ -381,7 +381,7 @@ def _noise(
     )
     dof = problem.observations.size - problem.observations.n_free_zeros - used
     return estimate_noise(
-        # cycles with a wrong reading among them would say that all scatter
+        # a wrong reading in repeated cycles would increase the noise of all
         repeatability=(math.nan, 0) if loss.robust and dof > 1.0 else repeatability,
         residual_square=loss.robust_square(residual, dof=dof, start=sigma),
         residual_dof=dof,

@@ -148,36 +148,36 @@ def solve_equation_8(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linearisation:
-    """A problem to first order about what the controller already corrects."""
+    """A problem to first order about the active offsets of the controller."""
 
     problem: CalibrationProblem
     residual: Array
-    """y − h there, less the mean of those with the same gauge zero, shape (n_entries,), [m]."""
-    slopes: Array
-    """dh/dθ̂ there, zeros eliminated likewise, shape (n_entries, n_free), [m per prior std]."""
+    """y − h, gauge zeros eliminated, shape (n_entries,), [m]."""
+    jacobian: Array
+    """dh/dθ̂, gauge zeros eliminated, shape (n_entries, n_free), [m per prior std]."""
     information: Information
 
     def solve(self, *, sigma: float, use: NDArray[np.bool_] | None = None) -> Array:
         """First-order solution: generalised least squares with the problem's prior and bounds.
 
         Args:
-            sigma: Standard deviation of one reading, [m]; matters only beside a prior.
-            use: Which entries to use, shape (n_entries,): whole groups with a common zero.
+            sigma: Standard deviation of one reading, [m]; used only with a prior.
+            use: Mask of the entries to use, shape (n_entries,): complete groups with a common zero.
 
         Returns:
             Free parameters, shape (n_free,), [SI].
         """
         problem = self.problem
-        chosen = slice(None) if use is None else use
-        slopes, residual = self.slopes[chosen], self.residual[chosen]
-        if len(slopes) > 2 * problem.n_free:  # the same normal equations from far fewer rows
-            stacked = np.asarray(np.linalg.qr(np.column_stack([slopes, residual]), mode="r"))
-            slopes, residual = stacked[:, :-1], stacked[:, -1]
+        rows = slice(None) if use is None else use
+        jacobian, residual = self.jacobian[rows], self.residual[rows]
+        if len(jacobian) > 2 * problem.n_free:  # the same normal equations from far fewer rows
+            stacked = np.asarray(np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"))
+            jacobian, residual = stacked[:, :-1], stacked[:, -1]
         reference = problem.reference / problem.theta_scale
         weight = np.sqrt(problem.prior_precision)
         if problem.prior:
             expected = problem.prior_mean / problem.theta_scale
-            slopes = np.vstack([slopes / sigma, np.diag(weight)])
+            jacobian = np.vstack([jacobian / sigma, np.diag(weight)])
             residual = np.concatenate([residual / sigma, weight * (expected - reference)])
         selection = problem.selection
         lower, upper = selection.lower, selection.upper
@@ -185,18 +185,18 @@ class Linearisation:
             from scipy.optimize import lsq_linear
 
             limits = [b / problem.theta_scale - reference for b in (lower, upper)]
-            step = lsq_linear(slopes, residual, bounds=limits, method="bvls").x
+            step = lsq_linear(jacobian, residual, bounds=limits, method="bvls").x
         else:
-            step = np.linalg.lstsq(slopes, residual, rcond=RANK_THRESHOLD)[0]
+            step = np.linalg.lstsq(jacobian, residual, rcond=RANK_THRESHOLD)[0]
         return np.asarray((reference + step) * problem.theta_scale)
 
 
 def linearise_at_reference(problem: CalibrationProblem) -> Linearisation:
-    """A problem to first order about what the controller already corrects.
+    """Linearise a problem about the active offsets of the controller.
 
     Raises:
         ClosureError: If the reference machine cannot reach a posture.
-        SessionError: If a sensor shows nothing in one.
+        SessionError: If a sensor has no reading in one.
     """
     prediction, jacobian = problem.linearise(problem.reference, problem.reference_passive)
     _require_numbers(problem, prediction, jacobian)
@@ -209,7 +209,7 @@ def linearise_at_reference(problem: CalibrationProblem) -> Linearisation:
 
 
 def _require_numbers(problem: CalibrationProblem, prediction: Array, jacobian: Array) -> None:
-    """Refuse readings that are no numbers: a tip touches nothing, or a sensor is wrong."""
+    """Refuse predictions that are not finite: a tip touches nothing, or a sensor is wrong."""
     bad = np.flatnonzero(~(np.isfinite(prediction) & np.isfinite(jacobian).all(axis=1)))
     if not bad.size:
         return

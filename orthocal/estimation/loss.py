@@ -1,12 +1,12 @@
-"""How residuals count: their squares, or less than that far out.
+"""Loss functions: squares, or Huber's loss for outliers.
 
 A residual r, in standard deviations, costs ρ(r). Beside squares, ρ = r²/2, there is a smooth form
 of Huber's loss (Hartley and Zisserman, Multiple View Geometry, 2004, A6.8)
 
     ρ(r) = k² (√(1 + (r/k)²) − 1)
 
-which is r²/2 for small residuals and k |r| for large ones, so that a single wrong reading cannot
-pull the estimate as far as it likes.
+which is r²/2 for small residuals and k |r| for large ones, so that the influence of a single wrong
+reading is bounded.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ SETTLED = 1e-11
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """What a residual costs."""
+    """Cost of a residual."""
 
     kind: LossKind = "squares"
     width: float = HUBER_WIDTH
-    """k, [standard deviations]; of no account for squares."""
+    """k, [standard deviations]; not used for squares."""
 
     def __post_init__(self) -> None:
         if self.kind not in ("squares", "huber"):
@@ -50,7 +50,7 @@ class Loss:
 
     @property
     def robust(self) -> bool:
-        """Whether large residuals count less than their squares."""
+        """True if large residuals count less than their squares."""
         return self.kind == "huber"
 
     def cost(self, r: ca.SX, width: ca.SX) -> ca.SX:
@@ -69,7 +69,7 @@ class Loss:
         return (1.0 + (r / width) ** 2) ** -1.5 if self.robust else ca.SX(1.0)
 
     def secant(self, r: ca.SX, width: ca.SX) -> ca.SX:
-        """ρ'(r)/r: how much of a square a residual counts."""
+        """ρ'(r)/r, the weight of a squared residual."""
         return 1.0 / ca.sqrt(1.0 + (r / width) ** 2) if self.robust else ca.SX(1.0)
 
     def value(self, r: Array) -> Array:
@@ -83,21 +83,21 @@ class Loss:
         return r / np.sqrt(1.0 + (r / self.width) ** 2) if self.robust else r
 
     def weight(self, r: Array) -> Array:
-        """ρ'(r)/r: how much of a square a residual counts, 1 at 0, shape as r."""
+        """ρ'(r)/r, the weight of a squared residual, 1 at 0, shape as r."""
         return 1.0 / np.sqrt(1.0 + (r / self.width) ** 2) if self.robust else np.ones_like(r)
 
     def bend(self, r: Array) -> Array:
-        """ρ''(r): how steeply its influence grows, 1 at 0, shape as r."""
+        """ρ''(r), 1 at 0, shape as r."""
         return np.asarray((1.0 + (r / self.width) ** 2) ** -1.5) if self.robust else np.ones_like(r)
 
     def centres(self, values: Array, group: Indices, count: int, *, weights: Array) -> Array:
-        """What is best taken off the values of each group: their mean, for squares.
+        """Optimal centre of the values of each group: the mean for squares.
 
         Args:
             values: In standard deviations, shape (n,).
-            group: Of each value, shape (n,).
+            group: Index of the group of each value, shape (n,).
             count: Number of groups; none is empty.
-            weights: How often each value counts, shape (n,).
+            weights: Weights of the values, shape (n,).
 
         Returns:
             c with Σ w ρ(v − c) least, shape (count,).
@@ -113,32 +113,35 @@ class Loss:
         low, high = np.full(count, np.inf), np.full(count, -np.inf)
         np.minimum.at(low, group, values)
         np.maximum.at(high, group, values)
-        steepest = np.full(count, np.inf)
+        last_gradient = np.full(count, np.inf)
         for _ in range(MOST_STEPS if self.robust else 0):
             residual = values - result[group]
-            pull = sums(self.influence(residual))
-            low, high = np.where(pull > 0.0, result, low), np.where(pull < 0.0, result, high)
-            # by ρ'' as long as that brings it nearer; else half of where it can be
-            nearer = np.abs(pull) < 0.5 * steepest
-            steepest = np.abs(pull)
-            newton = result + pull / np.maximum(sums(self.bend(residual)), 1e-300)
-            inside = nearer & (newton >= low) & (newton <= high)
-            found = np.where(inside, newton, 0.5 * (low + high))
-            found = np.where(pull == 0.0, result, found)
-            step, result = np.abs(found - result).max(initial=0.0), found
+            gradient = sums(self.influence(residual))
+            low, high = (
+                np.where(gradient > 0.0, result, low),
+                np.where(gradient < 0.0, result, high),
+            )
+            # Newton's step while the gradient decreases fast enough, otherwise bisection
+            decreasing = np.abs(gradient) < 0.5 * last_gradient
+            last_gradient = np.abs(gradient)
+            newton = result + gradient / np.maximum(sums(self.bend(residual)), 1e-300)
+            inside = decreasing & (newton >= low) & (newton <= high)
+            trial = np.where(inside, newton, 0.5 * (low + high))
+            trial = np.where(gradient == 0.0, result, trial)
+            step, result = np.abs(trial - result).max(initial=0.0), trial
             if step < SETTLED:
                 break
         return result
 
     def gain(self, r: Array, *, used: float) -> float:
-        """Mean of ρ''(r): how steeply the estimate answers to the readings; 1 for squares.
+        """Mean of ρ''(r), the sensitivity of the estimate to the readings; 1 for squares.
 
         Divided by Huber's correction for few residuals, 1 + (p/n) var ρ''/(mean ρ'')² (Robust
         Statistics, 1981, section 7.6).
 
         Args:
             r: Residuals, [standard deviations], shape (n,).
-            used: p, parameters and zeros that the residuals were fitted with.
+            used: p, number of fitted parameters and zeros.
         """
         if not self.robust or not r.size:
             return 1.0
@@ -152,7 +155,7 @@ class Loss:
         return _normal_square(self.width) if self.robust else 1.0
 
     def robust_square(self, residual: Array, *, dof: float, start: float) -> float:
-        """Σ r² that residuals would have without those that are far out, [unit of r²].
+        """Σ r² without the effect of outliers, [unit of r²].
 
         The scale s with Σ ρ'(r/s)² = dof E ρ'(z)² (Huber's proposal 2), times dof.
 
@@ -165,8 +168,8 @@ class Loss:
             return float(residual @ residual)
         scale = start
         for _ in range(200):
-            found = float(np.sum(self.influence(residual / scale) ** 2)) / dof
-            new = scale * math.sqrt(found / self.normal_square)
+            mean_square = float(np.sum(self.influence(residual / scale) ** 2)) / dof
+            new = scale * math.sqrt(mean_square / self.normal_square)
             if new == 0.0 or abs(new / scale - 1.0) < 1e-10:
                 return new**2 * dof
             scale = new

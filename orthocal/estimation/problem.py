@@ -73,7 +73,7 @@ class CalibrationProblem:
         self.passive_scale = LENGTH_SCALE / coordinate_units(self.robot)[self.robot.passive_index]
 
     def with_values(self, values: ArrayLike) -> CalibrationProblem:
-        """The same problem for other readings of the same rows; nothing is built again.
+        """Problem for other readings of the same rows; nothing is built again.
 
         Args:
             values: Readings of the session's rows, shape (n_rows,), [m].
@@ -84,10 +84,10 @@ class CalibrationProblem:
         return other
 
     def with_noise(self, noise: Array) -> CalibrationProblem:
-        """The same problem with other standard deviations; nothing is built again.
+        """Problem with other standard deviations; nothing is built again.
 
         Args:
-            noise: As a multiple of the first gauge's, shape (n_entries,).
+            noise: Standard deviations relative to the first gauge, shape (n_entries,).
         """
         other = copy.copy(self)
         other.noise = noise
@@ -106,17 +106,17 @@ class CalibrationProblem:
 
     @property
     def prior(self) -> bool:
-        """Whether any parameter has a prior."""
+        """True if any parameter has a prior."""
         return bool(self.prior_precision.any())
 
     @property
     def n_states(self) -> int:
-        """Number of loop closures: of postures, or of postures under different conditions."""
+        """Number of loop closures: postures, or postures under different conditions."""
         return self.states.posture.size
 
     @cached_property
     def reference(self) -> Array:
-        """Parameters that the controller already corrects, shape (n_free,), [SI].
+        """Active offsets of the controller as parameters, shape (n_free,), [SI].
 
         The point of linearisation and the default start: nominal where the controller has no
         offsets.

@@ -1,4 +1,4 @@
-"""What a calibration may change, and what it takes for known: models, globs, tolerances, bounds."""
+"""Selection of the free parameters: models, globs, priors, known values, bounds."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ Array = NDArray[np.float64]
 Known = float | tuple[float, float]
 
 COMPLETE_MODELS = ("full", "complete")
-"""Names under which a robot has its complete model, the first of them that it has."""
+"""Names of complete models, in order of preference."""
 
 
 def complete_model(parameters: ParameterSet) -> str:
-    """Name of a robot's complete model; its largest if it names none so."""
+    """Name of a robot's complete model; the largest model if none has such a name."""
     for name in COMPLETE_MODELS:
         if name in parameters.models:
             return name
@@ -33,23 +33,23 @@ def complete_model(parameters: ParameterSet) -> str:
 
 
 LARGEST_KNOWN = 100.0
-"""Tolerances beyond which a known value is taken for a length or an angle instead of an error."""
+"""Known value over tolerance above which it is a length or an angle instead of an error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Selection:
-    """The free parameters of a problem, with what is known of each beforehand."""
+    """Free parameters of a problem, with priors and bounds."""
 
     label: str
-    """Model, and what was added to it or taken from it."""
+    """Model and the patterns added to it."""
     parameters: tuple[Parameter, ...]
-    """The free ones, with the priors that hold here."""
+    """Free parameters, with the priors of this selection."""
     prior: NDArray[np.bool_]
-    """Whether a parameter has a prior, shape (n_free,)."""
+    """Mask of the parameters with a prior, shape (n_free,)."""
     mean: Array
     """Mean of each prior, shape (n_free,), [SI]."""
     lower: Array
-    """Lower bounds, -inf where there are none, shape (n_free,), [SI]."""
+    """Lower bounds, -inf for none, shape (n_free,), [SI]."""
     upper: Array
     """Upper bounds, shape (n_free,), [SI]."""
     fixed: Mapping[str, float]
@@ -66,7 +66,7 @@ class Selection:
         return np.array([p.prior_std for p in self.parameters])
 
     def with_known(self, parameters: Sequence[Parameter]) -> Selection:
-        """The same with further parameters, each with a prior of its own."""
+        """Selection with further parameters that have priors."""
         n = len(parameters)
         return replace(
             self,
@@ -78,7 +78,7 @@ class Selection:
         )
 
     def keep(self, names: Sequence[str]) -> Selection:
-        """The same with only some of the parameters free, none with a prior; the others are 0."""
+        """Selection of some of the parameters, without priors; the others are 0."""
         index = [self.names.index(name) for name in names]
         return replace(
             self,
@@ -100,22 +100,22 @@ def select_parameters(
     prior_stds: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> Selection:
-    """Choose what is free.
+    """Select the free parameters of a robot.
 
     Args:
-        parameters: Of the robot.
+        parameters: Parameters of the robot.
         model: A model of the robot's YAML; the complete one if neither a model nor `free` is
             given.
-        free: Names or globs that are free too, after the model's; '!' takes out again.
-        prior: Whether parameters have priors; by default not where only offsets are free.
+        free: Names or globs of further free parameters; '!' excludes.
+        prior: Use priors; by default True, unless only offsets are free.
         known: Name to a known value, which is then held, or to a value and its standard
             deviation, which then act as prior of a free parameter, [SI].
         prior_stds: Name or glob to another prior standard deviation than the robot's, [SI].
         bounds: Name or glob to lowest and highest value, ±inf for open, [SI].
 
     Raises:
-        ParameterError: If a name, glob or model is unknown, nothing is left free, two of the
-            parameters are partly the same error, or a number makes no sense.
+        ParameterError: If a name, glob or model is unknown, no parameter is free, two
+            parameters contain the same elementary error, or a number is invalid.
     """
     base = complete_model(parameters) if model is None and not free else model
     patterns: list[str] = []
@@ -124,14 +124,14 @@ def select_parameters(
     with _named("free"):
         chosen = set(parameters.select([*patterns, *free]))
     held: dict[str, float] = {}
-    own_prior: dict[str, tuple[float, float]] = {}
+    priors: dict[str, tuple[float, float]] = {}
     for name, entry in (known or {}).items():
         with _named("known"):
             parameter = parameters[name]
             _refuse_length(entry[0] if isinstance(entry, tuple) else entry, parameter)
             if isinstance(entry, tuple):
                 spread = require_prior_std(entry[1], parameters.defaults[name])
-                own_prior[name] = (_finite(entry[0], name), spread)
+                priors[name] = (_finite(entry[0], name), spread)
                 chosen.add(name)
             else:
                 held[name] = _finite(entry, name)
@@ -146,7 +146,7 @@ def select_parameters(
         with _named("tolerances"):
             for name in _match_free(parameters, glob, names):
                 stds[name] = require_prior_std(value, parameters.defaults[name])
-    stds.update({n: s for n, (_, s) in own_prior.items()})
+    stds.update({n: s for n, (_, s) in priors.items()})
     lower = np.array([_lowest(parameters[n]) for n in names])
     upper = np.full(len(names), np.inf)
     for glob, (low, high) in (bounds or {}).items():
@@ -156,13 +156,13 @@ def select_parameters(
             for name in _match_free(parameters, glob, names):
                 i = names.index(name)
                 lower[i], upper[i] = max(low, lower[i]), high
-    only_offsets = all(parameters.are_offsets(n) for n in names if n not in own_prior)
+    only_offsets = all(parameters.are_offsets(n) for n in names if n not in priors)
     everywhere = not only_offsets if prior is None else prior
     return Selection(
         label=_label(base, free),
         parameters=tuple(replace(parameters[n], prior_std=stds[n]) for n in names),
-        prior=np.array([everywhere or n in own_prior for n in names]),
-        mean=read_only([own_prior.get(n, (0.0, 0.0))[0] for n in names]),
+        prior=np.array([everywhere or n in priors for n in names]),
+        mean=read_only([priors.get(n, (0.0, 0.0))[0] for n in names]),
         lower=read_only(lower),
         upper=read_only(upper),
         fixed=held,
@@ -172,7 +172,8 @@ def select_parameters(
 def read_known(texts: Sequence[str], parameters: ParameterSet, *, where: str) -> dict[str, Known]:
     """Known values from texts such as x_leg.length_mm=0.12 or x_leg.length_mm=0.12±0.02.
 
-    As `Choice` takes them: a key with its unit to a number, or to two.
+    Returns:
+        Key with its unit to a value, or to a value and its standard deviation, as in `Choice`.
 
     Raises:
         ParameterError: If a text does not fit.
@@ -180,24 +181,24 @@ def read_known(texts: Sequence[str], parameters: ParameterSet, *, where: str) ->
     result: dict[str, Known] = {}
     names: set[str] = set()
     for text in texts:
-        key, number = _split(text, "NAME=VALUE or NAME=VALUE±TOLERANCE", where)
-        value, sign, spread = number.replace("+/-", "±").replace("+-", "±").partition("±")
+        key, text_of_value = _split(text, "NAME=VALUE or NAME=VALUE±TOLERANCE", where)
+        value, sign, spread = text_of_value.replace("+/-", "±").replace("+-", "±").partition("±")
         try:
-            own = _number(value, where, key)
-            name, _ = parameters.read_quantity(key, own)
+            number = _number(value, where, key)
+            name, _ = parameters.read_quantity(key, number)
         except ParameterError as e:
             raise ParameterError(e.problem, where=e.where or where) from None
         if name in names:
             raise ParameterError(f"'{name}' is given twice", where=where)
         names.add(name)
-        result[key] = (own, _number(spread, where, key)) if sign else own
+        result[key] = (number, _number(spread, where, key)) if sign else number
     return result
 
 
 def read_tolerances(
     texts: Sequence[str], parameters: ParameterSet, *, where: str
 ) -> dict[str, float]:
-    """Tolerances from texts such as *.offset_mm=2, as `Choice` takes them.
+    """Tolerances from texts such as *.offset_mm=2, as in `Choice`.
 
     Raises:
         ParameterError: If a text does not fit.
@@ -213,9 +214,9 @@ def read_tolerances(
 def read_bounds(
     texts: Sequence[str], parameters: ParameterSet, *, where: str
 ) -> dict[str, tuple[float, float]]:
-    """Bounds from texts such as x_slide.offset_mm=-2:2, as `Choice` takes them.
+    """Bounds from texts such as x_slide.offset_mm=-2:2, as in `Choice`.
 
-    Either side may be left open.
+    Either side may be empty.
 
     Raises:
         ParameterError: If a text does not fit.
@@ -249,7 +250,7 @@ def _number(text: str, where: str, name: str) -> float:
 
 
 def _check_glob(key: str, parameters: ParameterSet, where: str) -> None:
-    """Refuse a key without its unit, or with another than what it matches."""
+    """Refuse a key without a unit, or with a wrong one."""
     try:
         parameters.read_glob(key)
     except ParameterError as e:
@@ -258,33 +259,33 @@ def _check_glob(key: str, parameters: ParameterSet, where: str) -> None:
 
 def _match_free(parameters: ParameterSet, glob: str, free: Sequence[str]) -> list[str]:
     """Free parameters that a glob matches, all in one unit."""
-    found = [n for n in parameters.select([glob]) if n in free]
-    if not found:
+    matches = [n for n in parameters.select([glob]) if n in free]
+    if not matches:
         raise ParameterError(f"'{glob}' matches no free parameter")
-    units: set[Unit] = {parameters[n].unit for n in found}
+    units: set[Unit] = {parameters[n].unit for n in matches}
     if len(units) > 1:
         *others, last = sorted("ppm" if u == "1" else u for u in units)
         raise ParameterError(f"'{glob}' matches parameters in {', '.join(others)} and {last}")
-    return found
+    return matches
 
 
 def _refuse_overlap(parameters: ParameterSet, names: Sequence[str]) -> None:
-    """Two parameters that add to the same elementary error are not two."""
+    """Refuse two parameters that contain the same elementary error."""
     owner: dict[str, str] = {}
     for name in names:
         for term, _ in parameters[name].terms:
             if term in owner:
-                whole = max(name, owner[term], key=lambda n: len(parameters[n].terms))
-                terms = ", ".join(t for t, _ in parameters[whole].terms)
+                larger = max(name, owner[term], key=lambda n: len(parameters[n].terms))
+                terms = ", ".join(t for t, _ in parameters[larger].terms)
                 raise ParameterError(
-                    f"'{owner[term]}' and '{name}' are partly the same error: {whole} is made of "
-                    f"{terms}; take one of them out, such as '!{term}'"
+                    f"'{owner[term]}' and '{name}' are partly the same error: {larger} is made of "
+                    f"{terms}; exclude one of them, such as '!{term}'"
                 )
             owner[term] = name
 
 
 def _lowest(parameter: Parameter) -> float:
-    """Lower bound of a parameter for which none is stated."""
+    """Default lower bound of a parameter."""
     return 0.0 if parameter.positive else -math.inf
 
 
@@ -298,7 +299,7 @@ def _refuse_length(value: float, parameter: Parameter) -> None:
         limit = show_limit(parameter.prior_std) * factor
         raise ParameterError(
             f"'{parameter.name}' is {value * factor:g} {unit}; expected the deviation from nominal "
-            f"(its tolerance is {limit:g} {unit}), not the whole length"
+            f"(its tolerance is {limit:g} {unit}), not the length itself"
         )
 
 
@@ -310,7 +311,7 @@ def _finite(value: float, name: str) -> float:
 
 @contextmanager
 def _named(choice: str) -> Iterator[None]:
-    """Say which of the choices an error is about."""
+    """Add the name of the argument to an error."""
     try:
         yield
     except ParameterError as e:

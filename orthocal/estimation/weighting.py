@@ -1,9 +1,8 @@
-"""How much the readings of several gauges count beside each other: by their noise.
+"""Weights of the readings of several gauges by their noise.
 
-The noise of each gauge is found as that of a single one: from its repeated cycles, else from what
-is left of its own readings (Förstner, Ein Verfahren zur Schätzung von Varianz- und
-Kovarianzkomponenten, 1979: the squares left of a group, over its readings less what the parameters
-took of them), and never below what is stated of it.
+The noise of each gauge is estimated from its repeated cycles, otherwise from its residuals
+(variance components, Förstner, Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten,
+1979: squared residuals over the redundancy of the group). It is never below the stated noise.
 """
 
 from __future__ import annotations
@@ -22,19 +21,19 @@ from orthocal.statistics.zeros import project_out_zeros
 
 Array = NDArray[np.float64]
 
-SIGMA_WITHOUT_WORD = 10e-6
-"""Standard deviation of a reading assumed at first where nothing tells it, [m]."""
+DEFAULT_SIGMA = 10e-6
+"""Standard deviation of a reading assumed at first if none is stated, [m]."""
 
 SMALLEST_SIGMA = 1e-9
 """Standard deviation of a reading below which readings count as perfect, [m]."""
 
 LEAST_DOF = 3.0
-"""Degrees of freedom below which what is left of a gauge's readings does not tell its noise."""
+"""Degrees of freedom below which residuals do not determine the noise of a gauge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaugeReadings:
-    """The entries that one gauge shows."""
+    """Entries of one gauge."""
 
     name: str
     gauge: Gauge
@@ -43,7 +42,7 @@ class GaugeReadings:
 
 
 def split_by_gauge(session: Session, observations: Observations) -> tuple[GaugeReadings, ...]:
-    """Entries by the gauges that are read, the session's first gauge first."""
+    """Entries by gauge, the session's first gauge first."""
     names = [s.gauge for s in session.setups.values()]
     of_entry = np.array([list(session.gauges).index(n) for n in names])[observations.setup]
     return tuple(
@@ -54,16 +53,16 @@ def split_by_gauge(session: Session, observations: Observations) -> tuple[GaugeR
 
 
 def stated_sigma(gauge: Gauge, repeatability: tuple[float, int]) -> float:
-    """What a reading's standard deviation is taken to be before there is a solution, [m]."""
+    """Standard deviation of a reading before the first solution, [m]."""
     cycles_sigma, cycles_dof = repeatability
     floor = noise_floor(gauge.sigma, gauge.resolution)
     if cycles_dof > 0:
         return max(cycles_sigma, floor, SMALLEST_SIGMA)
-    return max(gauge.sigma or SIGMA_WITHOUT_WORD, floor)
+    return max(gauge.sigma or DEFAULT_SIGMA, floor)
 
 
 def first_noise(session: Session, observations: Observations) -> Array:
-    """Noise of each entry before there is a solution, over the first gauge's, (n_entries,)."""
+    """Noise of each entry relative to the first gauge, before the first solution, (n_entries,)."""
     groups = split_by_gauge(session, observations)
     result = np.ones(observations.size)
     if len(groups) < 2:
@@ -84,16 +83,16 @@ def weigh_gauges(
     values: Array,
     sigma: Array,
 ) -> Array:
-    """Standard deviation of each entry's readings as its gauge's own readings tell it, [m].
+    """Standard deviation of each entry from the residuals of its gauge, shape (n_entries,), [m].
 
     Args:
         groups: The gauges.
         observations: Which setup, posture and zero each entry has.
-        residual: Zeros taken off, shape (n_entries,), [m].
-        leverage: What the parameters took of each entry, shape (n_entries,).
+        residual: Residuals, gauge zeros eliminated, shape (n_entries,), [m].
+        leverage: Leverage of each entry, shape (n_entries,).
         values: Readings as single ones, shape (n_entries,), [m].
-        sigma: By which they were weighted, shape (n_entries,), [m]: what holds where a gauge's
-            own readings are too few.
+        sigma: Standard deviations in the present weights, shape (n_entries,), [m]; kept for gauges
+            with too few readings.
     """
     result = np.array(sigma)
     for g in groups:
@@ -122,12 +121,12 @@ def _repeatability(values: Array, o: Observations, group: GaugeReadings) -> tupl
 def leverages(
     jacobian: Array, observations: Observations, covariance: Array, sigma: float
 ) -> Array:
-    """What the parameters take of each entry, shape (n_entries,); their sum is how many they are.
+    """Leverage of each entry, shape (n_entries,); the sum is the effective number of parameters.
 
     Args:
         jacobian: dh/dθ̂, shape (n_entries, n_free), [m per prior std].
         observations: Which zero each entry has.
-        covariance: Of θ̂, shape (n_free, n_free).
+        covariance: Covariance of θ̂, shape (n_free, n_free).
         sigma: Standard deviation of a reading, [m].
     """
     centred = project_out_zeros(jacobian, observations)

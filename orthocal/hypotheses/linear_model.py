@@ -15,7 +15,7 @@ from orthocal.errors import ClosureError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
-from orthocal.estimation.weighting import SIGMA_WITHOUT_WORD, first_noise
+from orthocal.estimation.weighting import DEFAULT_SIGMA, first_noise
 from orthocal.hypotheses.hypothesis import MachineShift, Patterns, Sparse, Tails
 from orthocal.hypotheses.likelihood import Likelihood, Products, build_likelihood
 from orthocal.session.session import Session
@@ -98,7 +98,7 @@ class LinearModel:
         self.problem = problem.with_noise(first_noise(session, problem.observations))
         o = self.problem.observations
         self.stated = session.gauge.sigma is not None
-        floor = noise_floor(session.gauge.sigma or SIGMA_WITHOUT_WORD, session.gauge.resolution)
+        floor = noise_floor(session.gauge.sigma or DEFAULT_SIGMA, session.gauge.resolution)
         self.sigma = max(floor, LEAST_SIGMA)
         """Standard deviation of a reading of the first gauge, in whose metres all entries are."""
         self.dof = o.size - o.n_zeros

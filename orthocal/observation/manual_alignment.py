@@ -29,19 +29,19 @@ Array = NDArray[np.float64]
 class ManualAlignment:
     """Nuisance parameters of aligned gauges as functions of the machine's errors."""
 
-    slopes: Array
+    sensitivity: Array
     """S, derivative by all elementary errors, shape (n_nuisance, n_errors), [SI]."""
     start: Array
     """Value without errors, −S θ_active, shape (n_nuisance,), [SI]."""
 
     def __call__(self, errors: Array) -> Array:
         """Nuisance parameters, shape (..., n_nuisance) of errors (..., n_errors), [SI]."""
-        return np.asarray(errors @ self.slopes.T + self.start)
+        return np.asarray(errors @ self.sensitivity.T + self.start)
 
     @property
     def aligned(self) -> NDArray[np.bool_]:
         """Mask of the nuisance parameters that are aligned by eye, shape (n_nuisance,)."""
-        return np.asarray(self.slopes.any(axis=1))
+        return np.asarray(self.sensitivity.any(axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +67,7 @@ def list_alignments(session: Session, nuisance: NuisanceParameters) -> list[Alig
         if not nuisance.of_setup[i]:  # it has no readings
             continue
         virtual = setup.sensor.aligned_to(session.robot)
-        # those of effects follow, and are not aligned
+        # parameters of effects follow, and are not aligned
         for index, parameter in zip(
             nuisance.of_setup[i], setup.sensor.nuisance_parameters, strict=False
         ):

@@ -181,7 +181,7 @@ class ObservationModel:
             ClosureError: If the nominal machine cannot reach a posture of alignment.
         """
         errors = self.functions.errors
-        slopes = np.zeros((len(self.nuisance.parameters), len(errors.names)))
+        sensitivity = np.zeros((len(self.nuisance.parameters), len(errors.names)))
         start = np.zeros(len(self.nuisance.parameters))
         alignments = list_alignments(self.session, self.nuisance)
         if alignments:
@@ -189,9 +189,9 @@ class ObservationModel:
             by_errors = nominal_sensitivity(virtual_session(self.session, alignments))
             offsets = errors.columns([f"{d.name}.offset" for d in self.session.robot.drives])
             active = np.array([a.active for a in alignments])
-            slopes[index] = by_errors
+            sensitivity[index] = by_errors
             start[index] = -((by_errors @ offsets) * active).sum(axis=1)
-        return ManualAlignment(slopes, start)
+        return ManualAlignment(sensitivity, start)
 
     def parametrise(self, columns: Array, nuisance_scale: Array) -> FreeParameters:
         """Free parameters for `linearise`; arguments as the fields of `FreeParameters`."""
@@ -262,7 +262,7 @@ class ObservationModel:
             LinAlgError: If a posture is singular.
         """
         at, q, nu = self._batch(errors, passive, nuisance, aligned=aligned)
-        alignment = self.alignment.slopes if aligned else np.zeros((nu.shape[1], at.shape[1]))
+        alignment = self.alignment.sensitivity if aligned else np.zeros((nu.shape[1], at.shape[1]))
         divisor = np.ones(self.observations.size) if noise is None else noise
         return Linearisation(
             self,
@@ -498,7 +498,7 @@ class Linearisation:
         return replace(result, by_twists=tuple(by_twists))
 
     def _machine_rows(self, block: _Block, closures: _Closures, readings: _Readings) -> Array:
-        """Dh by the machine's parameters with the loops closed, shape (S, k m, n_machine)."""
+        """∂h by the machine's parameters with the loops closed, shape (S, k m, n_machine)."""
         (k, m), n_sets, used = block.entries.shape, len(readings.value), self._pattern.used
         pull = -(readings.by_passive.reshape(n_sets, k, m, -1) @ closures.inverse)
         by_drive_errors = readings.by_drive_errors.reshape(n_sets, k, m, -1)
@@ -507,9 +507,9 @@ class Linearisation:
         if used.size:
             twists = np.zeros((n_sets, k * m, used.size))
             for where, columns, nonzeros in readings.by_twists:
-                kept = np.flatnonzero(self._pattern.place[columns] >= 0)
-                at = self._pattern.place[columns[kept]]
-                twists[:, where[:, None], at] = nonzeros[:, :, kept]
+                moved = np.flatnonzero(self._pattern.place[columns] >= 0)
+                at = self._pattern.place[columns[moved]]
+                twists[:, where[:, None], at] = nonzeros[:, :, moved]
             dense = self._pattern.dense(closures.by_twists, pull.shape[-1])
             twists += (pull @ dense).reshape(n_sets, k * m, -1)
             rows += self._twists[block.variant](twists)

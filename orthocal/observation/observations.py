@@ -75,7 +75,7 @@ class Observations:
     plus: Indices
     """Entry of each row of the session, shape (n_rows,)."""
     minus: Indices
-    """Entry taken off, or -1, shape (n_rows,)."""
+    """Entry to subtract, or -1, shape (n_rows,)."""
     state: Indices
     """Index of the loop closure, shape (n,)."""
     place: Indices
@@ -122,10 +122,10 @@ class Observations:
 
     def rows(self, entries: Array) -> Array:
         """Rows of the session from values of the entries, shape (n_rows, ...)."""
-        taken = np.where(
+        subtracted = np.where(
             (self.minus >= 0).reshape(-1, *(1,) * (entries.ndim - 1)), entries[self.minus], 0.0
         )
-        return np.asarray(entries[self.plus] - taken)
+        return np.asarray(entries[self.plus] - subtracted)
 
     def values(self, rows: Array) -> Array:
         """Values of the entries from rows of the session, shape (n,) of (n_rows,), [m].
@@ -133,26 +133,26 @@ class Observations:
         Where rows are differences, the first posture of each group is given the value 0.
         """
         result = np.zeros(self.size)
-        known = np.zeros(self.size, dtype=bool)
+        done = np.zeros(self.size, dtype=bool)
         raw = self.minus < 0
         result[self.plus[raw]] = rows[raw]
-        known[self.plus[raw]] = True
+        done[self.plus[raw]] = True
         pending = list(np.flatnonzero(~raw))
         while pending:
-            left = []
+            postponed = []
             for row in pending:
                 p, m = self.plus[row], self.minus[row]
-                if known[p]:
+                if done[p]:
                     result[m] = result[p] - rows[row]
-                elif known[m]:
+                elif done[m]:
                     result[p] = result[m] + rows[row]
                 else:
-                    left.append(row)
+                    postponed.append(row)
                     continue
-                known[p] = known[m] = True
-            if len(left) == len(pending):  # nothing touches a known one: begin a new group
-                known[self.minus[left[0]]] = True
-            pending = left
+                done[p] = done[m] = True
+            if len(postponed) == len(pending):  # start a new group
+                done[self.minus[postponed[0]]] = True
+            pending = postponed
         return result
 
 
@@ -193,7 +193,7 @@ def build_observations(session: Session) -> Observations:
     states, state = _find_states(session, table[:, 1], values)
     places = np.hstack([table[:, :2], values["approach"]])
     zero_setup, zero_real = tuple(k[0] for k in zeros), tuple(len(k) == 1 for k in zeros)
-    known = [len(k) == 1 and session.setups[k[0]].zero == "known" for k in zeros]
+    absolute = [len(k) == 1 and session.setups[k[0]].zero == "known" for k in zeros]
     return Observations(
         setup=table[:, 0],
         posture=table[:, 1],
@@ -201,7 +201,7 @@ def build_observations(session: Session) -> Observations:
         n_zeros=len(zeros),
         zero_setup=zero_setup,
         zero_real=zero_real,
-        zero_known=np.array(known, dtype=np.bool_),
+        zero_known=np.array(absolute, dtype=np.bool_),
         plus=np.array(plus, dtype=np.int64),
         minus=np.array(minus, dtype=np.int64),
         state=state,

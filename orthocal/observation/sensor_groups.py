@@ -57,16 +57,16 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
         if setup.name not in read:
             of_setup.append(())
             continue
-        own = [
+        of_sensor = [
             Parameter(f"{_owner(u, setup, session)}.{u.name}", u.unit, u.prior_std, ())
             for u in setup.sensor.nuisance_parameters
         ]
-        own += [
+        of_sensor += [
             Parameter(f"setup.{setup.name}.{e.name}", e.unit, e.prior_std, (), e.positive)
             for effect in reading_effects(session.robot)
             for e in effect.setup_errors
         ]
-        for parameter in own:
+        for parameter in of_sensor:
             parameters.setdefault(parameter.name, parameter)
             indices.append(list(parameters).index(parameter.name))
         of_setup.append(tuple(indices))

@@ -55,9 +55,9 @@ def draw_errors(
 
     Args:
         robot: The robot.
-        patterns: Names or globs of the parameters to draw; '!' takes out. Of a sum and the errors
-            that it is made of only these are drawn.
-        seed: Of the random numbers.
+        patterns: Names or globs of the parameters to draw; '!' excludes. Of a sum and its terms
+            only the terms are drawn.
+        seed: Seed of the random numbers.
         tolerances: Name or glob with its unit, such as `*.offset_mm`, to another tolerance than
             the robot's, a limit of ±2 standard deviations.
 
@@ -70,15 +70,15 @@ def draw_errors(
     rng = np.random.default_rng(seed)
     parameters = robot.parameters
     chosen = parameters.select(patterns)
-    # a sum beside the errors that it is made of would be drawn twice
+    # a sum and its terms would be drawn twice
     chosen = tuple(
         n
         for n in chosen
         if len(parameters[n].terms) == 1 or not {t for t, _ in parameters[n].terms} & set(chosen)
     )
-    given = parameters.read_tolerances(tolerances or {})
-    own = {n: value for g, value in given.items() for n in parameters.select([g])}
-    drawn = {n: float(rng.normal() * own.get(n, parameters[n].prior_std)) for n in chosen}
+    changed = parameters.read_tolerances(tolerances or {})
+    std = {n: value for g, value in changed.items() for n in parameters.select([g])}
+    drawn = {n: float(rng.normal() * std.get(n, parameters[n].prior_std)) for n in chosen}
     return {n: abs(v) if parameters[n].positive else v for n, v in drawn.items()}
 
 
@@ -93,14 +93,14 @@ def simulate_session(
     """Readings of a plan (or of another session's rows) on a machine with given errors.
 
     Args:
-        plan: What is read where.
+        plan: Setups, postures and rows.
         errors: Parameter name to value, [SI]; absent ones are 0.
-        seed: Of noise and gauge zeros.
+        seed: Seed of noise and gauge zeros.
         sigma: Standard deviation of a reading, [m]; the plan's gauge by default.
         exact: No noise, no rounding to the gauge's resolution; dials show 0 where they begin.
 
     Raises:
-        SessionError: If the noise is not known, or a reading does not exist or leaves the gauge's
+        SessionError: If the noise is not stated, or a reading does not exist or leaves the gauge's
             range.
         ClosureError: If the machine cannot reach a posture.
     """
@@ -111,13 +111,13 @@ def simulate_session(
         raise ValueError(f"sigma: found {sigma!r}; expected a number of at least 0")
     rng = np.random.default_rng(seed)
     observations = build_observations(plan)
-    unknown = nuisance_parameters(plan).parameters
-    drawn = np.zeros(len(unknown))
-    if unknown and not exact:
+    nuisance = nuisance_parameters(plan).parameters
+    drawn = np.zeros(len(nuisance))
+    if nuisance and not exact:
         # a separate generator: the noise does not depend on the nuisance parameters
-        normal = np.random.default_rng((seed, 1)).normal(size=len(unknown))
-        drawn = normal * [p.prior_std for p in unknown]
-        drawn = np.where([p.positive for p in unknown], np.abs(drawn), drawn)
+        normal = np.random.default_rng((seed, 1)).normal(size=len(nuisance))
+        drawn = normal * [p.prior_std for p in nuisance]
+        drawn = np.where([p.positive for p in nuisance], np.abs(drawn), drawn)
     entries = predict_readings(plan, errors, observations=observations, nuisance=drawn)
     entries, zeros = show_readings(plan, observations, entries, rng=rng, sigma=sigma, exact=exact)
     rows = observations.rows(entries)
@@ -125,7 +125,7 @@ def simulate_session(
         if not math.isfinite(value):
             raise SessionError(
                 f"the simulated reading {reading.label} does not exist: on this machine the tip "
-                "passes what it should touch; take smaller errors, or another seed"
+                "misses the rod; use smaller errors or another seed"
             )
         gauge_name, limits = plan.setups[reading.setup].gauge, limits_of(plan, reading)
         if limits is not None and not limits[0] <= value <= limits[1]:
@@ -146,8 +146,8 @@ def simulate_session(
         readings_path=None,
         seed=seed,
     )
-    found = {p.name: float(v) for p, v in zip(unknown, drawn, strict=True)}
-    return SimulatedSession(session, dict(errors), zeros, found)
+    truth = {p.name: float(v) for p, v in zip(nuisance, drawn, strict=True)}
+    return SimulatedSession(session, dict(errors), zeros, truth)
 
 
 def show_readings(
@@ -162,7 +162,7 @@ def show_readings(
     """Dial readings of exact entries: with gauge zeros, noise and rounding.
 
     Args:
-        plan: What is read where.
+        plan: Setups, postures and rows.
         observations: The entries of the plan.
         entries: Exact readings, gauge zeros at 0, shape (n_entries,), [m].
         rng: Draws zeros and noise.
@@ -173,7 +173,7 @@ def show_readings(
         Shape (n_entries,), [m], and setup to the zero of its gauge, [m].
 
     Raises:
-        SessionError: If the noise is not known.
+        SessionError: If the noise is not stated.
     """
     gauges = [plan.gauges[s.gauge] for s in plan.setups.values()]
     deviation = np.array([_noise_of(plan, s.gauge, sigma, exact) for s in plan.setups.values()])
@@ -190,17 +190,17 @@ def show_readings(
         entries = entries + deviation[observations.setup] * rng.normal(size=observations.size)
         for i, gauge in enumerate(gauges):
             if gauge.resolution is not None:
-                own = observations.setup == i
-                entries[own] = np.round(entries[own] / gauge.resolution) * gauge.resolution
+                shown = observations.setup == i
+                entries[shown] = np.round(entries[shown] / gauge.resolution) * gauge.resolution
     return entries, zeros
 
 
 def limits_of(plan: Session, reading: Reading) -> tuple[float, float] | None:
     """Lowest and highest possible value of a reading, [m]; None without a stated range."""
-    found = plan.gauges[plan.setups[reading.setup].gauge].range
-    if found is None or reading.minus is None:
-        return found
-    return found[0] - found[1], found[1] - found[0]
+    limits = plan.gauges[plan.setups[reading.setup].gauge].range
+    if limits is None or reading.minus is None:
+        return limits
+    return limits[0] - limits[1], limits[1] - limits[0]
 
 
 def _noise_of(plan: Session, gauge: str, sigma: float | None, exact: bool) -> float:
@@ -208,7 +208,7 @@ def _noise_of(plan: Session, gauge: str, sigma: float | None, exact: bool) -> fl
     deviation = plan.gauges[gauge].sigma if sigma is None else sigma
     if deviation is None and not exact:
         raise SessionError(
-            "is missing: the noise to simulate is not known",
+            "is missing: the noise to simulate is not stated",
             where=_where(plan, gauge, "sigma_mm"),
         )
     return deviation or 0.0
@@ -251,24 +251,24 @@ def collect_errors(
     tolerances: Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> dict[str, float]:
-    """Errors drawn, then from a file, then given singly; later ones win.
+    """Errors drawn from priors, from a file and from single values; later ones win.
 
     Args:
         robot: The robot.
         file: As for `load_errors`.
         single: Texts such as x_slide.offset_mm=1.2.
-        draw: Model of the robot, or names and globs with commas between, to draw.
+        draw: Model of the robot, or names and globs separated by commas, to draw.
         tolerances: For drawing, as for `draw_errors`.
-        seed: Of the random numbers.
+        seed: Seed of the random numbers.
 
     Raises:
-        ParameterError: If a name, unit or number does not fit, or nothing is given.
+        ParameterError: If a name, unit or number does not fit, or there are no errors.
     """
     errors: dict[str, float] = {}
     if draw is not None:
         models = robot.parameters.models
-        own = draw in models
-        patterns = robot.parameters.patterns(draw) if own else tuple(draw.split(","))
+        is_model = draw in models
+        patterns = robot.parameters.patterns(draw) if is_model else tuple(draw.split(","))
         try:
             errors.update(draw_errors(robot, patterns, seed=seed, tolerances=tolerances))
         except ParameterError:
@@ -309,7 +309,7 @@ def read_errors(values: Mapping[str, float], robot: Robot, *, where: str) -> dic
 
 
 def truth_document(simulated: SimulatedSession) -> str:
-    """The text of a truth.yaml: the errors and zeros that a session was simulated from."""
+    """Text of a truth.yaml: errors, zeros and nuisance parameters of a simulated session."""
     parameters = simulated.session.robot.parameters
     errors = {}
     for name, value in simulated.errors.items():

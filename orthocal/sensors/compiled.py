@@ -217,14 +217,14 @@ def express_reading(
     sizes = [condition_size(robot, c) for c in names]
     n = constants.numel() - sum(sizes)
     values = ca.vertsplit(constants, np.cumsum([0, n, *sizes]).tolist())
-    known = dict(zip(names, values[1:], strict=True))
+    conditions = dict(zip(names, values[1:], strict=True))
     first = len(sensor.nuisance_parameters)
-    seen: dict[str, ca.SX] = {c: known[c] for c in sensor_conditions(sensor)}
-    view = View(frames, at_zero, values[0], nuisance[:first], seen)
+    of_sensor: dict[str, ca.SX] = {c: conditions[c] for c in sensor_conditions(sensor)}
+    view = View(frames, at_zero, values[0], nuisance[:first], of_sensor)
     reading = sensor.expression(view, robot)
     for effect in reading_effects(robot):
         errors = {e.name: nuisance[first + i] for i, e in enumerate(effect.setup_errors)}
-        reading = effect.reading(reading, errors, {c: known[c] for c in effect.conditions})
+        reading = effect.reading(reading, errors, {c: conditions[c] for c in effect.conditions})
         first += len(errors)
     return reading
 

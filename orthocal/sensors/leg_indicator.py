@@ -68,8 +68,8 @@ class SectionKeys(BaseModel):
         forms = ("coordinate_mm", "from_root_mm", "fraction")
         stated = [k for k in forms if getattr(self, k) is not None]
         if len(stated) != 1:
-            found = " and ".join(stated) if stated else "none"
-            raise ValueError(f"found {found}; expected one of {', '.join(forms)}")
+            text = " and ".join(stated) if stated else "none"
+            raise ValueError(f"found {text}; expected one of {', '.join(forms)}")
         return self
 
 

@@ -129,16 +129,16 @@ class RodIndicator:
         self._line.require_fit_within(OBLIQUITY_DEG[self.tip.form], robot, where=where)
         rods = robot.legs[self.leg].rods
         if self.rod not in rods:
-            known = f"; rods: {', '.join(rods)}" if rods else ": it has none in the robot's YAML"
+            hint = f"; rods: {', '.join(rods)}" if rods else ": it has none in the robot's YAML"
             raise SessionError(
-                f"'{self.rod}' is not a rod of leg {self.leg}{known}", where=f"{where}.touches"
+                f"'{self.rod}' is not a rod of leg {self.leg}{hint}", where=f"{where}.touches"
             )
         side = self._side(robot)
         if np.abs(np.cross(self.beside, side)).max() > NOT_ACROSS:
-            given = ", ".join(f"{v / MM:g}" for v in self.beside)
+            stated = ", ".join(f"{v / MM:g}" for v in self.beside)
             across = ", ".join(f"{v:.3g}" for v in side)
             raise SessionError(
-                f"found [{given}]; expected a multiple of ({across}), across leg and plunger",
+                f"found [{stated}]; expected a multiple of ({across}), across leg and plunger",
                 where=f"{where}.beside_mm",
             )
 
@@ -294,8 +294,8 @@ class RodIndicator:
             plane += float(axis @ robot.legs[self.leg].reference_root)
         along = rod.reference_tip - rod.reference_root
         share = (plane - axis @ rod.reference_root) / (axis @ along)
-        found = rod.reference_root + share * along
-        return np.asarray(found - (axis @ found) * axis + self.beside)
+        point = rod.reference_root + share * along
+        return np.asarray(point - (axis @ point) * axis + self.beside)
 
 
 def _touch(

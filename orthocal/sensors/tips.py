@@ -94,8 +94,8 @@ class TipKeys(BaseModel):
     @model_validator(mode="after")
     def _one_form(self) -> TipKeys:
         if (self.ball is None) == (self.blade is None):
-            found = "none" if self.ball is None else "ball and blade"
-            raise ValueError(f"found {found}; expected one of ball, blade")
+            text = "none" if self.ball is None else "ball and blade"
+            raise ValueError(f"found {text}; expected one of ball, blade")
         return self
 
 

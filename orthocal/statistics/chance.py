@@ -1,4 +1,4 @@
-"""What chance alone explains, and how wide an interval has to be."""
+"""Significance tests, coverage factors and quantiles by SciPy, imported at the first use."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 BY_CHANCE = 0.01
-"""Probability below which residuals that are larger than noise are not put down to chance."""
+"""Significance level of tests of residuals against noise."""
 
 COVERAGE = 2.0
 """Coverage factor k of an expanded uncertainty."""
 
 
 def chance_of_excess(chi_square: float, dof: float, *, cycles_dof: float = 0.0) -> float:
-    """Probability that noise alone leaves residuals as large, or larger.
+    """Probability that noise alone gives residuals as large, or larger.
 
     Args:
         chi_square: Σ r²/σ² of single readings, zeros eliminated.
         dof: Degrees of freedom of the residuals.
-        cycles_dof: Those of σ, where it is from repeated cycles: an F test of what the residuals
-            have beside the cycles' own scatter. 0 for a σ that was given: a χ² test.
+        cycles_dof: Degrees of freedom of σ from repeated cycles: an F test of the residuals beyond
+            the scatter of the cycles. 0 for a stated σ: a χ² test.
     """
     if cycles_dof == 0.0:
         return chi_square_tail(dof, chi_square)
-    rest, rest_dof = chi_square - cycles_dof, dof - cycles_dof
-    if rest_dof <= 0.5 or rest <= 0.0:
+    excess_square, excess_dof = chi_square - cycles_dof, dof - cycles_dof
+    if excess_dof <= 0.5 or excess_square <= 0.0:
         return 1.0
-    return f_tail(rest_dof, cycles_dof, rest / rest_dof)
+    return f_tail(excess_dof, cycles_dof, excess_square / excess_dof)
 
 
 def confidence_factor(dof: float, level: float = 0.95) -> float:
-    """Standard deviations on either side of an estimate that hold it with a probability."""
+    """Half width of a confidence interval, in standard deviations."""
     tail = 0.5 + level / 2.0
     if math.isinf(dof):
         return normal_quantile(tail)
@@ -57,45 +57,45 @@ def expanded_uncertainty(
     noise estimated with ν degrees of freedom.
 
     Args:
-        std: Standard deviations u, everything that is not known included.
-        std_scatter: The parts s of them that are due to the noise of the readings.
+        std: Standard deviations u from all contributions.
+        std_scatter: Parts s of them that are due to the noise of the readings.
         dof: Degrees of freedom ν of the noise.
     """
     total, scatter = np.asarray(std, dtype=np.float64), np.asarray(std_scatter, dtype=np.float64)
-    rest = np.sqrt(np.maximum(total**2 - scatter**2, 0.0))
-    return np.asarray(np.hypot(coverage_factor(dof) * scatter, COVERAGE * rest))
+    other = np.sqrt(np.maximum(total**2 - scatter**2, 0.0))
+    return np.asarray(np.hypot(coverage_factor(dof) * scatter, COVERAGE * other))
 
 
 def normal_quantile(share: float) -> float:
-    """Below which a share of the standard normal distribution lies."""
+    """Quantile of the standard normal distribution."""
     from scipy import special
 
     return float(special.ndtri(share))
 
 
 def chi_square_tail(dof: float, value: float) -> float:
-    """Probability that χ² with so many degrees of freedom is larger than a value."""
+    """Probability that χ² with `dof` degrees of freedom exceeds a value."""
     from scipy import special
 
     return float(special.chdtrc(dof, value))
 
 
 def f_tail(dof: float, dof_below: float, value: float) -> float:
-    """Probability that F with so many degrees of freedom is larger than a value."""
+    """Probability that F with `dof` and `dof_below` degrees of freedom exceeds a value."""
     from scipy import special
 
     return float(special.fdtrc(dof, dof_below, value))
 
 
 def t_quantile(dof: float, share: float) -> float:
-    """Below which a share of Student's t with so many degrees of freedom lies."""
+    """Quantile of Student's t with `dof` degrees of freedom."""
     from scipy import special
 
     return float(special.stdtrit(dof, share))
 
 
 def beta_share(a: float, b: float, x: float) -> float:
-    """The regularised incomplete beta function I_x(a, b)."""
+    """Regularised incomplete beta function I_x(a, b)."""
     from scipy import special
 
     return float(special.betainc(a, b, x))

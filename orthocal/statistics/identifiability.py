@@ -1,9 +1,8 @@
-"""Which parameters the readings tell, and which they cannot tell apart.
+"""Identifiability of parameters: rank, indistinguishable parameters, base parameters.
 
-All is read off the identification Jacobian with gauge zeros eliminated, each column scaled by its
-parameter's prior std: an entry says how far one prior std moves a reading. A direction counts as
-seen where one prior std along it moves all readings together by more than the noise of one: then
-the readings say more of it than the prior did.
+The analysis uses the identification Jacobian with gauge zeros eliminated, each column scaled by the
+prior std of its parameter. A direction is resolvable if one prior std along it changes all readings
+together by more than the noise of one: then the readings are more informative than the prior.
 """
 
 from __future__ import annotations
@@ -29,37 +28,37 @@ NEGLIGIBLE = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Combination:
-    """A sum of parameters that the readings tell only as a whole."""
+    """Linear combination of parameters that the readings determine only as a sum."""
 
     terms: Annotated[tuple[tuple[str, Number], ...], Field(min_length=1)]
     """Parameter and coefficient, the first 1, [unit of the first per unit of the parameter]."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The parameters."""
+        """Names of the parameters."""
         return tuple(name for name, _ in self.terms)
 
     @property
     def formula(self) -> str:
-        """As a sum: x_slide.offset + x_swivel.x − 0.31 x_slide.ry."""
+        """Formula of the sum: x_slide.offset + x_swivel.x − 0.31 x_slide.ry."""
         return self.shorten(None)
 
     def shorten(self, most: int | None) -> str:
-        """The sum with no more than so many terms, the largest coefficients first."""
-        rest = sorted(self.terms[1:], key=lambda t: -abs(t[1])) if most else self.terms[1:]
+        """Formula with at most `most` terms, the largest coefficients first."""
+        others = sorted(self.terms[1:], key=lambda t: -abs(t[1])) if most else self.terms[1:]
         text = self.terms[0][0]
-        for name, coefficient in rest if most is None else rest[: most - 1]:
+        for name, coefficient in others if most is None else others[: most - 1]:
             size = f"{abs(coefficient):.3g}"
             factor = "" if size == "1" else f"{size} "
             text += f" {'+' if coefficient > 0 else '−'} {factor}{name}"
-        left_out = 0 if most is None else len(self.terms) - most
-        if left_out <= 0:
+        omitted = 0 if most is None else len(self.terms) - most
+        if omitted <= 0:
             return text
-        return f"{text} and {left_out} more, of at most {abs(rest[(most or 1) - 1][1]):.2g} each"
+        return f"{text} and {omitted} more, of at most {abs(others[(most or 1) - 1][1]):.2g} each"
 
     @property
     def words(self) -> str:
-        """In words: a and b: only their sum."""
+        """Description in words, such as a and b: only their sum."""
         if len(self.terms) == 2 and f"{abs(self.terms[1][1]):.3g}" == "1":
             kind = "sum" if self.terms[1][1] > 0 else "difference"
             return f"{self.terms[0][0]} and {self.terms[1][0]}: only their {kind}"
@@ -78,30 +77,30 @@ Recorded = Annotated[
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identifiability:
-    """What the readings tell of the parameters, and what not."""
+    """Identifiability of the free parameters by the readings."""
 
     __pydantic_config__ = CLOSED
 
     singular_values: Vector
-    """Of the scaled identification Jacobian of the free parameters, descending, shape (n_free,),
-    [m per prior std]; of base parameters it is the reduced one, of their columns."""
+    """Singular values of the scaled identification Jacobian, descending, shape (n_free,), [m per
+    prior std]; with base parameters, of their columns."""
     threshold: Number
-    """Singular values above it count as seen, [m per prior std]."""
+    """Smallest singular value of a resolvable direction, [m per prior std]."""
     rank: Count
     """Number of singular values above the threshold."""
     structural_rank: Count
-    """What perfect readings would tell: with base parameters, of all that they stand for."""
+    """Rank with perfect readings; with base parameters, of all parameters that they represent."""
     n_postures: Annotated[Count, Field(ge=1)]
     n_readings: Count
-    """Independent readings: repeated ones once, less gauge zeros."""
+    """Independent readings: repeated ones once, minus gauge zeros."""
     unseen: Many[str]
-    """Parameters that move no reading by more than the threshold."""
+    """Parameters that change the readings by less than the threshold."""
     resolvable: Many[str]
-    """Parameters that the readings alone tell better than their priors."""
+    """Parameters with a standard deviation below the prior one from the readings alone."""
     alike: Many[Recorded]
-    """Parameters that move the readings alike, two or more: only their sum is told."""
+    """Groups of parameters with proportional effects: only their sum is resolvable."""
     base: Many[Recorded]
-    """Base parameters by QR decomposition with pivoting: what the readings tell, one each."""
+    """Base parameters by QR decomposition with pivoting."""
 
     @property
     def condition(self) -> float:
@@ -143,8 +142,8 @@ def analyse_identifiability(
     Args:
         information: The Jacobian, zeros eliminated.
         parameters: The free parameters, in its order.
-        sigma: Standard deviation of a reading, which is the threshold, [m]; 0 or NaN for what
-            perfect readings would tell.
+        sigma: Standard deviation of a reading, which is the threshold, [m]; 0 or NaN for perfect
+            readings.
         n_postures: Postures of the session.
         n_readings: Independent readings of the session.
     """
@@ -173,8 +172,8 @@ def find_base_parameters(
 ) -> tuple[Combination, ...]:
     """Base parameters by QR decomposition with column pivoting (Gautier 1991).
 
-    J P = Q [R₁ R₂], so that J θ̂ = Q R₁ (θ̂₁ + R₁⁻¹ R₂ θ̂₂): the readings tell as many sums as
-    columns count, each of one leading parameter and what cannot be told from it.
+    J P = Q [R₁ R₂], so that J θ̂ = Q R₁ (θ̂₁ + R₁⁻¹ R₂ θ̂₂): the readings determine one sum
+    for each counted column: a leading parameter and multiples of the others.
 
     Args:
         factor: The Jacobian, zeros eliminated, shape (n, n_free), [m per prior std].
@@ -186,7 +185,7 @@ def find_base_parameters(
         return ()
     sizes = np.linalg.svd(factor, compute_uv=False)
     if len(sizes) == factor.shape[1] and sizes[-1] > threshold * (1.0 + 1e-9):
-        return tuple(Combination(((p.name, 1.0),)) for p in parameters)  # each is told by itself
+        return tuple(Combination(((p.name, 1.0),)) for p in parameters)  # all are resolvable
     from scipy import linalg
 
     r, order = linalg.qr(factor, mode="r", pivoting=True)
@@ -211,19 +210,19 @@ def find_base_parameters(
 def _find_alike(
     factor: Array, parameters: Sequence[Parameter], threshold: float
 ) -> tuple[Combination, ...]:
-    """Columns that are multiples of one another within the threshold, gathered."""
+    """Groups of columns that are multiples of one another within the threshold."""
     sizes = np.linalg.norm(factor, axis=0)
     products = factor.T @ factor
-    left = [int(i) for i in np.argsort(-sizes, kind="stable") if sizes[i] > threshold]
-    found = []
-    while left:
-        lead, *rest = left
-        slope = products[lead, rest] / sizes[lead] ** 2
-        square = sizes[rest] ** 2 - slope**2 * sizes[lead] ** 2
+    pending = [int(i) for i in np.argsort(-sizes, kind="stable") if sizes[i] > threshold]
+    groups = []
+    while pending:
+        lead, *others = pending
+        slope = products[lead, others] / sizes[lead] ** 2
+        square = sizes[others] ** 2 - slope**2 * sizes[lead] ** 2
         # a difference of squares loses half of the digits
-        floor = (1e-7 * sizes[rest]) ** 2
-        same = square <= np.maximum(threshold**2, floor)
-        members = sorted([lead, *(i for i, ok in zip(rest, same, strict=True) if ok)])
+        floor = (1e-7 * sizes[others]) ** 2
+        proportional = square <= np.maximum(threshold**2, floor)
+        members = sorted([lead, *(i for i, ok in zip(others, proportional, strict=True) if ok)])
         if len(members) > 1:
             first = members[0]
             terms = []
@@ -231,6 +230,6 @@ def _find_alike(
                 scaled = products[lead, i] / products[lead, first]
                 ratio = scaled * parameters[first].prior_std / parameters[i].prior_std
                 terms.append((parameters[i].name, float(ratio)))
-            found.append((first, Combination(tuple(terms))))
-        left = [i for i, ok in zip(rest, same, strict=True) if not ok]
-    return tuple(c for _, c in sorted(found, key=lambda f: f[0]))
+            groups.append((first, Combination(tuple(terms))))
+        pending = [i for i, ok in zip(others, proportional, strict=True) if not ok]
+    return tuple(c for _, c in sorted(groups, key=lambda f: f[0]))

@@ -1,6 +1,6 @@
-"""What the readings say of the parameters, and how well: rank, covariance, what nothing determines.
+"""Information of readings about parameters: rank, covariance, null space.
 
-Everything is in scaled parameters θ̂ = θ/(prior std), with gauge zeros eliminated.
+All quantities are in scaled parameters θ̂ = θ/(prior std), with gauge zeros eliminated.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ RANK_THRESHOLD = 1e-10
 """Singular values below this part of the largest count as zero."""
 
 MOST_NAMED = 6
-"""Parameters that a message names one by one."""
+"""Largest number of parameters that a message lists."""
 
 MOST_LOST = 2
-"""Ways to change parameters unseen that a message names."""
+"""Largest number of null space directions that a message lists."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Information:
-    """What the readings say of the parameters: the identification Jacobian, zeros eliminated."""
+    """Identification Jacobian, zeros eliminated, with its singular value decomposition."""
 
     factor: Array
     """A matrix with the same product FᵀF as the Jacobian, shape (n, n_free), [m per prior std]."""
@@ -45,33 +45,36 @@ class Information:
 
     @property
     def identifiable(self) -> NDArray[np.bool_]:
-        """Whether the readings alone determine a parameter, shape (n_free,)."""
+        """Mask of the parameters that the readings alone determine, shape (n_free,)."""
         null = self.directions[self.rank :]
         return np.asarray(np.sqrt((null**2).sum(axis=0)) < 1e-6)
 
     def determined(self, *, sigma: float) -> NDArray[np.bool_]:
-        """Whether the readings alone tell a parameter better than its prior, shape (n_free,).
+        """Mask of the parameters with a standard deviation below the prior one without prior.
 
         Args:
-            sigma: Standard deviation of one reading, [m]; if not known, what is structurally
-                identifiable counts as told.
+            sigma: Standard deviation of one reading, [m]; NaN if unknown: then all structurally
+                identifiable parameters count.
+
+        Returns:
+            Shape (n_free,).
         """
         if not sigma > 0.0:
             return self.identifiable
-        told = self.singular_values > RANK_THRESHOLD * self.singular_values[0]
+        seen = self.singular_values > RANK_THRESHOLD * self.singular_values[0]
         variance = np.zeros_like(self.singular_values)
-        variance[told] = (sigma / self.singular_values[told]) ** 2
+        variance[seen] = (sigma / self.singular_values[seen]) ** 2
         return np.asarray(((self.directions**2).T @ variance < 1.0) & self.identifiable)
 
     def effective_parameters(
         self, *, sigma: float, precision: Array, held: NDArray[np.bool_] | None = None
     ) -> float:
-        """Parameters that the readings determine, n − tr(P cov): the rank without a prior.
+        """Effective number of parameters, n − tr(P cov): the rank without a prior.
 
         Args:
             sigma: Standard deviation of one reading, [m].
-            precision: Diagonal of P, what the prior knows: 1 or 0, shape (n_free,).
-            held: Parameters that are held where they are, by a bound.
+            precision: Diagonal of P: 1 or 0, shape (n_free,).
+            held: Mask of the parameters at a bound.
         """
         count = 0 if held is None else int(held.sum())
         if not precision.any():
@@ -95,7 +98,7 @@ class Information:
         Args:
             sigma: Standard deviation of one reading, [m].
             precision: Diagonal of P: 1 or 0, shape (n_free,).
-            held: Parameters that are held where they are, by a bound: no covariance.
+            held: Mask of the parameters at a bound, which have no covariance.
             loss: a, mean of ρ'', and b, mean square of ρ', of the residuals; 1 for squares.
         """
         free = np.ones(len(precision), dtype=bool) if held is None else ~held
@@ -124,7 +127,7 @@ class Information:
         Args:
             sigma: Standard deviation of one reading, [m].
             precision: Diagonal of P: 1 or 0, shape (n_free,).
-            held: Parameters that are held where they are, by a bound: no covariance.
+            held: Mask of the parameters at a bound, which have no covariance.
             loss: a, mean of ρ'', and b, mean square of ρ', of the residuals; 1 for squares.
         """
         gain, noise = loss
@@ -148,7 +151,7 @@ def _inverse_square(matrix: Array) -> Array:
 
 
 def posterior_covariance(factor: Array, *, sigma: float, precision: Array) -> Array:
-    """As `Information.covariance` of a factor that needs no decomposition, (n_free, n_free).
+    """Covariance as of `Information.covariance`, without a decomposition, (n_free, n_free).
 
     Args:
         factor: A Jacobian, zeros eliminated, shape (n, n_free), [m per prior std].
@@ -160,11 +163,11 @@ def posterior_covariance(factor: Array, *, sigma: float, precision: Array) -> Ar
 
 
 def marginalise(information: Information, kept: int, *, sigma: float) -> Information:
-    """What readings say of the first parameters, the others known from their priors at least.
+    """Information about the first parameters, the others marginalised over their priors.
 
     Args:
-        information: Of all parameters.
-        kept: How many are kept.
+        information: Information about all parameters.
+        kept: Number of the first parameters.
         sigma: Standard deviation of a reading, [m].
     """
     count = information.factor.shape[1] - kept
@@ -172,13 +175,13 @@ def marginalise(information: Information, kept: int, *, sigma: float) -> Informa
         return information
     rows = np.vstack([information.factor / sigma, np.zeros((count, kept + count))])
     rows[-count:, kept:] = np.eye(count)
-    taken, _ = np.linalg.qr(rows[:, kept:])
-    left = rows[:, :kept] - taken @ (taken.T @ rows[:, :kept])
-    return _information(sigma * left)
+    basis, _ = np.linalg.qr(rows[:, kept:])
+    remaining = rows[:, :kept] - basis @ (basis.T @ rows[:, :kept])
+    return _information(sigma * remaining)
 
 
 def take_for_known(information: Information, kept: int) -> Information:
-    """What readings say of the first parameters, so many, all others known exactly."""
+    """Information about the first parameters, all others known exactly."""
     return _information(information.factor[:, :kept])
 
 
@@ -187,7 +190,7 @@ def decompose(jacobian: Array, observations: Observations) -> Information:
 
     Args:
         jacobian: dh/dθ̂, shape (n_entries, n_free), [m per prior std].
-        observations: Which zero each entry has.
+        observations: Zeros of the entries.
     """
     return _information(project_out_zeros(jacobian, observations))
 
@@ -211,9 +214,9 @@ def require_identifiable(
     """Refuse parameters that neither readings nor a prior determine.
 
     Args:
-        information: Of the readings.
-        names: Of the parameters that are asked for, the first ones.
-        precision: What the prior knows of each of all: 1 or 0, shape (n_free,).
+        information: Information of the readings.
+        names: Names of the first parameters, which are checked.
+        precision: Diagonal of the prior's precision: 1 or 0, shape (n_free,).
         where: File, for messages.
 
     Raises:
@@ -232,7 +235,7 @@ def require_identifiable(
         more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
         raise NotIdentifiableError(
             f"the readings do not determine {named}{more}: {information.rank} of {len(names)} free "
-            f"parameters can be told from them. {_advise_lost(information, names, null)} Or use "
+            f"parameters are identifiable. {_advise_lost(information, names, null)} Or use "
             "tolerances as a prior (--prior), or identify base parameters (--base)",
             parameters=lost,
             where=where,
@@ -240,21 +243,21 @@ def require_identifiable(
 
 
 def _advise_lost(information: Information, names: tuple[str, ...], null: Array) -> str:
-    """Which directions no reading sees, and what would help."""
+    """Advice on the null space of the readings."""
     sizes = np.linalg.norm(information.factor, axis=0)
     unread = sizes <= RANK_THRESHOLD * max(float(sizes.max(initial=0.0)), 1e-300)
     words = []
     if unread.any():
         listed = [n for n, out in zip(names, unread, strict=True) if out]
-        rest = f" and {len(listed) - MOST_NAMED} more" if len(listed) > MOST_NAMED else ""
+        more = f" and {len(listed) - MOST_NAMED} more" if len(listed) > MOST_NAMED else ""
         words.append(
-            f"No reading depends on {', '.join(listed[:MOST_NAMED])}{rest}: read the legs that are "
+            f"No reading depends on {', '.join(listed[:MOST_NAMED])}{more}: read the legs that are "
             "missing, in postures along their own axes."
         )
-    # each row of the reduced echelon form is one way to change the others that nothing sees
-    rest_null = _reduce(null[:, ~unread])
+    # each row of the reduced echelon form is one unobservable change of the others
+    null_rows = _reduce(null[:, ~unread])
     seen = [n for n, out in zip(names, unread, strict=True) if not out]
-    for row in rest_null[:MOST_LOST]:
+    for row in null_rows[:MOST_LOST]:
         order = np.argsort(-np.round(np.abs(row), 9), kind="stable")
         terms = [i for i in order if abs(row[i]) > 1e-6]
         ways = ", ".join(
@@ -262,33 +265,33 @@ def _advise_lost(information: Information, names: tuple[str, ...], null: Array) 
             for i in terms[:MOST_NAMED]
         )
         others = f" and {len(terms) - MOST_NAMED} more" if len(terms) > MOST_NAMED else ""
-        words.append(f"No reading sees a change of these together: {ways}{others}.")
+        words.append(f"No reading depends on this combined change: {ways}{others}.")
     return " ".join(words)
 
 
 def _reduce(rows: Array) -> Array:
-    """Reduced echelon form of what rows span: the same for any rows that span it.
+    """Reduced echelon form of the space that rows span.
 
-    The pivots are the largest columns; of those that are alike, the first.
+    The pivots are the largest columns; of equal ones, the first.
     """
     _, values, basis = np.linalg.svd(rows, full_matrices=False)
     basis = basis[values > 1e-6]
-    left, pivots = np.array(basis), []
+    remaining, pivots = np.array(basis), []
     for _ in range(len(basis)):
-        sizes = np.linalg.norm(left, axis=0)
+        sizes = np.linalg.norm(remaining, axis=0)
         pivots.append(int(np.argmax(sizes >= (1.0 - 1e-6) * sizes.max())))
-        along = left[:, pivots[-1]] / sizes[pivots[-1]]
-        left -= np.outer(along, along @ left)
+        along = remaining[:, pivots[-1]] / sizes[pivots[-1]]
+        remaining -= np.outer(along, along @ remaining)
     return np.asarray(np.linalg.solve(basis[:, pivots], basis))
 
 
 def whiten(values: Array, spread: Array, *, sigma: float) -> Array:
-    """V^(-1/2) times values, V = σ² I + S Sᵀ.
+    """Whitened values V^(-1/2) y, V = σ² I + S Sᵀ.
 
     Args:
         values: Shape (n,) or (n, k).
-        spread: S, a root of what is common to several of them, shape (n, m).
-        sigma: Standard deviation of each by itself, [as the values].
+        spread: S, root of the common covariance, shape (n, m).
+        sigma: Independent standard deviation of each value, [as the values].
     """
     directions, sizes, _ = np.linalg.svd(spread, full_matrices=False)
     shrunk = 1.0 - 1.0 / np.sqrt(1.0 + (sizes / sigma) ** 2)

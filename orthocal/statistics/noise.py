@@ -1,6 +1,6 @@
-"""How much readings scatter, where that is known from, and what it explains.
+"""Noise of the readings: its estimate, its source, and tests of residuals against it.
 
-Whether noise explains something is answered by yes, no, or None where nothing tells.
+Tests return True or False, or None if the noise is unknown.
 """
 
 from __future__ import annotations
@@ -20,65 +20,65 @@ from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
 Array = NDArray[np.float64]
 
 FEW_DOF = 5.0
-"""Below this residuals overrule what is stated of a gauge only where chance does not explain them:
-beside a prior a larger sigma leaves larger residuals, and would be its own proof."""
+"""Degrees of freedom below which residuals replace the stated noise only if they are significant:
+with a prior, a larger sigma leads to larger residuals and would confirm itself."""
 
 LEAST_DOF = 0.5
-"""Degrees of freedom below which residuals say nothing of the noise."""
+"""Degrees of freedom below which residuals do not determine the noise."""
 
 NoiseSource = Literal["cycles", "residuals", "gauge", "unknown"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """Standard deviation of one reading of the indicator, and where it is from."""
+    """Standard deviation of one reading of the indicator, and its source."""
 
     __pydantic_config__ = CLOSED
 
     sigma: SizeOrNaN
-    """[m]; NaN if nothing tells; a difference of two readings has √2 of it."""
+    """Standard deviation of a reading, [m]; NaN if unknown. A difference of two has √2 of it."""
     dof: SizeOrInf
-    """Degrees of freedom; infinite for a sigma that was given."""
+    """Degrees of freedom; infinite for a stated sigma."""
     source: NoiseSource
     cycles_sigma: SizeOrNaN
-    """From repeated cycles, [m]; NaN without."""
+    """Standard deviation from repeated cycles, [m]; NaN without cycles."""
     cycles_dof: Count
     residual_sigma: SizeOrNaN
     """√(Σ r²/(m − n)), [m]; NaN without degrees of freedom."""
     residual_dof: Size
 
     def leaves_more(self, gauge: float | None) -> bool | None:
-        """Whether residuals are larger than noise explains, so that the model is in error.
+        """Test for residuals larger than noise, which means a model discrepancy.
 
         Args:
-            gauge: Standard deviation of a reading as stated, [m]; None where it is not.
+            gauge: Stated standard deviation of a reading, [m]; None if not stated.
 
         Returns:
-            None where nothing but the residuals tells the noise.
+            None if the noise is known from the residuals only.
         """
         if self.source in ("cycles", "gauge"):
             return False
         if self.source == "residuals" and self.cycles_dof > 0:
-            return True  # else sigma would be theirs
+            return True  # otherwise sigma would come from the cycles
         if self.source == "unknown" or gauge is None:
             return None
         return self._chance_in_residuals(gauge) < BY_CHANCE
 
     def leaves_less(self, gauge: float | None) -> bool | None:
-        """Whether residuals are smaller than a gauge of a standard deviation [m] would leave.
+        """Test for residuals smaller than the noise of a gauge with standard deviation [m].
 
         Returns:
-            None where that is not stated, or no residuals are free to tell it.
+            None if it is not stated, or there are no residual degrees of freedom.
         """
         if gauge is None or not self.residual_dof > 0.0 or math.isnan(self.residual_sigma):
             return None
         return self._chance_in_residuals(gauge) > 1.0 - BY_CHANCE
 
     def is_finer_than(self, sigma: float, *, dof: float) -> bool | None:
-        """Whether residuals are smaller than rounding of a standard deviation [m] leaves.
+        """Test for residuals smaller than rounding.
 
         Args:
-            sigma: What rounding leaves of a reading.
+            sigma: Standard deviation of rounding, [m].
             dof: Degrees of freedom of the residuals; repeated readings may have been rounded alike.
         """
         if dof < 1.0 or not self.residual_dof > LEAST_DOF or math.isnan(self.residual_sigma):
@@ -92,22 +92,22 @@ class Noise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownNoise:
-    """Noise of a reading that no model has a part in."""
+    """Noise of a reading that is independent of the model."""
 
     sigma: float
-    """[m]; NaN if nothing tells it."""
+    """Standard deviation of a reading, [m]; NaN if unknown."""
     source: Literal["cycles", "gauge", "unknown"]
     dof: float
 
     def is_exceeded(self, chi_square: float, dof: float) -> bool | None:
-        """Whether residuals are larger than this noise explains.
+        """Test for residuals larger than this noise.
 
         Args:
             chi_square: Σ r²/σ² of single readings, zeros eliminated, by this σ.
             dof: Degrees of freedom of the residuals.
 
         Returns:
-            None where nothing tells the noise, or no residuals are free to tell it.
+            None if the noise is unknown, or there are no residual degrees of freedom.
         """
         if not math.isfinite(self.sigma) or dof < LEAST_DOF:
             return None
@@ -119,11 +119,11 @@ def estimate_repeatability(values: Array, observations: Observations) -> tuple[f
     """Standard deviation of repeated readings of the same setup in the same posture.
 
     Within a setup the readings are fitted by one value for each posture and approach and one zero
-    for each group; their residuals are noise whatever the machine is like.
+    for each group; their residuals are noise, independent of the machine.
 
     Args:
         values: Readings as single ones, shape (n_entries,), [m].
-        observations: Setup, place and zero of each.
+        observations: Setup, place and zero of each entry.
 
     Returns:
         Standard deviation [m] (NaN without repetition) and degrees of freedom.
@@ -140,17 +140,17 @@ def estimate_repeatability(values: Array, observations: Observations) -> tuple[f
         design[rows, at_posture] = 1.0
         design[rows, len(postures) + at_zero] = 1.0
         solution, _, rank, _ = np.linalg.lstsq(design, values[entries], rcond=1e-9)
-        left = values[entries] - design @ solution
-        total += float(left @ left)
+        residual = values[entries] - design @ solution
+        total += float(residual @ residual)
         dof += len(entries) - int(rank)
     return (float(np.sqrt(total / dof)) if dof else float("nan")), dof
 
 
 def noise_floor(gauge_sigma: float | None, resolution: float | None) -> float:
-    """Standard deviation of a reading that no scatter can argue away, [m].
+    """Lower limit of the standard deviation of a reading, [m].
 
-    What is stated of the gauge, and what rounding to its resolution adds, 1/√12 of it: readings
-    that happen to be alike, or are few, say nothing against either.
+    The stated noise of the gauge, plus rounding, 1/√12 of its resolution. A small scatter of few
+    readings does not disprove either.
     """
     return math.hypot(gauge_sigma or 0.0, (resolution or 0.0) / math.sqrt(12.0))
 
@@ -163,18 +163,18 @@ def estimate_noise(
     gauge_sigma: float | None,
     resolution: float | None = None,
 ) -> Noise:
-    """Standard deviation of a reading: from repeated cycles, else from residuals, else the gauge's.
+    """Noise of a reading: from repeated cycles, otherwise from residuals, otherwise as stated.
 
-    Residuals win over cycles where an F test finds them too large for the cycles: then the model
-    is in error, and the spread of the cycles would flatter every standard deviation. What is stated
-    of the gauge is a floor (`noise_floor`): with less it is the gauge's own that counts.
+    Residuals replace cycles if an F test finds them too large: then the model has errors, and the
+    scatter of the cycles would give too small standard deviations. The stated noise of the gauge is
+    a lower limit (`noise_floor`).
 
     Args:
         repeatability: From `estimate_repeatability`.
         residual_square: Σ r² of single readings, zeros eliminated, [m²].
-        residual_dof: Readings less zeros less (effective) parameters.
+        residual_dof: Readings minus zeros minus effective parameters.
         gauge_sigma: The session's `sigma_mm`, [m].
-        resolution: Of the gauge, [m].
+        resolution: Resolution of the gauge, [m].
     """
     cycles_sigma, cycles_dof = repeatability
     floor = noise_floor(gauge_sigma, resolution)
@@ -183,15 +183,15 @@ def estimate_noise(
     residual_sigma = math.sqrt(residual_square / residual_dof) if enough else math.nan
     source: NoiseSource
     if cycles_dof > 0:
-        known, known_dof = (cycles_sigma, cycles_dof) if cycles_sigma > floor else (floor, 0)
+        base, base_dof = (cycles_sigma, cycles_dof) if cycles_sigma > floor else (floor, 0)
         misfit = False
-        if enough and known > 0.0:
-            chi_square = residual_square / known**2
-            misfit = chance_of_excess(chi_square, residual_dof, cycles_dof=known_dof) < BY_CHANCE
+        if enough and base > 0.0:
+            chi_square = residual_square / base**2
+            misfit = chance_of_excess(chi_square, residual_dof, cycles_dof=base_dof) < BY_CHANCE
         source = "residuals" if misfit else "cycles"
     elif enough:
-        few = residual_dof < FEW_DOF and floor > 0.0 and gauge_sigma is not None
-        by_chance = few and not _exceeds(residual_square, residual_dof, floor)
+        provisional = residual_dof < FEW_DOF and floor > 0.0 and gauge_sigma is not None
+        by_chance = provisional and not _exceeds(residual_square, residual_dof, floor)
         source = "gauge" if by_chance else "residuals"
     else:
         source = "gauge" if gauge_sigma is not None else "unknown"
@@ -209,5 +209,5 @@ def estimate_noise(
 
 
 def _exceeds(square: float, dof: float, sigma: float) -> bool:
-    """Whether residuals are larger than a standard deviation [m] explains."""
+    """Test for residuals larger than noise with standard deviation [m]."""
     return chance_of_excess(square / sigma**2, dof) < BY_CHANCE

@@ -1,7 +1,7 @@
-"""Gauge zeros, eliminated exactly.
+"""Exact elimination of gauge zeros.
 
-A zero that several readings share takes their mean, so what is left of readings and Jacobians is
-their deviation from the mean of their zero.
+The optimal zero of several readings is their mean, so readings and Jacobians become deviations from
+the mean over their zero.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ def project_out_zeros(
 ) -> Array:
     """Values minus the mean of those with the same free gauge zero, shape (n_entries, ...).
 
-    Values with a known zero stay as they are.
+    Values with a known zero do not change.
 
     Args:
         values: Shape (n_entries, ...).
-        observations: Which zero each entry has.
-        weights: Of the entries in the means, shape (n_entries,); 1 by default.
+        observations: Zeros of the entries.
+        weights: Weights of the entries in the means, shape (n_entries,); 1 by default.
     """
     flat = values.reshape(len(values), -1)
-    own = np.ones(len(values)) if weights is None else weights
-    totals = observations.sum_by_zero(flat, own)
-    counts = np.bincount(observations.zero, own, minlength=observations.n_zeros)
+    weight = np.ones(len(values)) if weights is None else weights
+    totals = observations.sum_by_zero(flat, weight)
+    counts = np.bincount(observations.zero, weight, minlength=observations.n_zeros)
     means = totals / np.where(counts > 0.0, counts, 1.0)[:, None]
     means[observations.zero_known] = 0.0
     return np.asarray((flat - means[observations.zero]).reshape(values.shape))

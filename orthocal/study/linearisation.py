@@ -203,7 +203,7 @@ class _Prepared:
         for k, theta in enumerate(iterates):
             add(f"steps_{k + 2}", theta)
         add("exact", exact)
-        linear = errors / problem.theta_scale @ self.linearisation.slopes.T
+        linear = errors / problem.theta_scale @ self.linearisation.jacobian.T
         spread = _largest_difference(centred - linear, problem) / MM
         reason = np.where(assembled, NO_CONTACT, NOT_ASSEMBLED)
         return {
@@ -279,7 +279,7 @@ class _Prepared:
                 whiten = np.linalg.inv(np.linalg.cholesky(covariance))
             gain = np.linalg.pinv(whiten @ matrix) @ whiten @ differences
             result[name] = sigma * float(np.sqrt((gain**2).sum(axis=1).max()))
-        jacobian = self.linearisation.slopes / self.problem.theta_scale
+        jacobian = self.linearisation.jacobian / self.problem.theta_scale
         variances = np.linalg.inv(jacobian.T @ jacobian).diagonal()
         general = sigma * float(np.sqrt(variances.max()))
         return {**result, **dict.fromkeys(METHODS[3:], general)}

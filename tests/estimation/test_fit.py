@@ -44,7 +44,7 @@ def test_a_bound_holds_a_parameter_and_the_others_make_up_for_it(session):
     low = np.array([-1e-3, -np.inf, -np.inf]) / 5e-3
     high = np.array([0.9e-3, np.inf, np.inf]) / 5e-3
     bounds = (low, high)
-    expected = lsq_linear(linear.slopes, linear.residual, bounds=bounds, tol=1e-15).x * 5e-3
+    expected = lsq_linear(linear.jacobian, linear.residual, bounds=bounds, tol=1e-15).x * 5e-3
     assert np.abs(fit.solution.theta - expected).max() < LINEAR
     assert fit.linear == pytest.approx(expected, abs=1e-9)
 

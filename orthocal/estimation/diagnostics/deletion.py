@@ -33,85 +33,84 @@ from orthocal.statistics.zeros import project_out_zeros
 
 Array = NDArray[np.float64]
 
-BLIND = 1e-9
-"""Part of a row's own weight below which no other row says anything of it."""
+MIN_REDUNDANCY = 1e-9
+"""Redundancy of a row, relative to its weight, below which no other row predicts it."""
 
-LEAST_REST = 1e-6
-"""Part of the sum of squares that is left at least when a row is taken out."""
+MIN_REMAINING_SQUARE = 1e-6
+"""Part of the sum of squares that remains at least when a row is deleted."""
 
-SUSPICION = 0.01
-"""Probability that any of the readings of a session that is sound is called suspicious."""
+OUTLIER_PROBABILITY = 0.01
+"""Probability that a session without wrong readings has an outlier."""
 
 LARGEST_CRITICAL = 1e6
-"""Studentised residuals that are never reached; a threshold beyond is none."""
+"""Studentised residual above which a threshold counts as infinite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Diagnostics:
-    """Every row of the readings held against all the others."""
+    """Deletion diagnostics of every row."""
 
     studentised: Array
-    """Error of a row as all others see it, in its standard deviations, shape (n_rows,). The noise
-    is estimated without the row where it is from residuals at all; NaN where no other row says
-    anything of it."""
+    """Studentised deleted residual, shape (n_rows,). Noise from residuals is estimated without the
+    row. NaN if no other row predicts it."""
     deleted: Array
-    """That error, [m]: measured less what the others predict."""
+    """Deleted residual, [m]: measured minus predicted from the others."""
     influence: Array
-    """Largest change of an error of the machine when the row is left out, in its standard
+    """Largest change of an error of the machine when the row is deleted, in its standard
     deviations."""
     influenced: NDArray[np.int64]
-    """Which parameter that is."""
+    """Index of that parameter."""
     critical: float
-    """Studentised residuals beyond this are suspicious."""
+    """Studentised residual above which a row is an outlier."""
 
     @property
     def suspicious(self) -> NDArray[np.int64]:
-        """Rows that are suspicious, the worst first."""
+        """Outliers, the largest first."""
         size = np.nan_to_num(np.abs(self.studentised))
         rows = np.flatnonzero(size > self.critical)
         return np.asarray(rows[np.argsort(-size[rows])])
 
 
 def diagnose_readings(fit: Fit) -> Diagnostics:
-    """Hold every reading against all the others, to first order about the solution."""
+    """Deletion diagnostics of every reading, to first order about the solution."""
     problem, o = fit.problem, fit.problem.observations
     count, sigma = o.plus.size, fit.noise.sigma
     if not (np.isfinite(sigma) and sigma >= SMALLEST_SIGMA):
-        nothing, zeros = np.full(count, np.nan), np.zeros(count)
-        return Diagnostics(nothing, nothing, zeros, zeros.astype(np.int64), np.inf)
+        undefined, zeros = np.full(count, np.nan), np.zeros(count)
+        return Diagnostics(undefined, undefined, zeros, zeros.astype(np.int64), np.inf)
     inverse = _weighted_information(fit).covariance(
         sigma=sigma, precision=problem.prior_precision, held=fit.held
     )
-    slopes, residual, weights = o.rows(fit.jacobian), o.rows(fit.residual), fit.weights[o.plus]
-    sensitivity, projected, own = np.empty_like(slopes), np.empty(count), np.empty(count)
+    jacobian, residual, weights = o.rows(fit.jacobian), o.rows(fit.residual), fit.weights[o.plus]
+    sensitivity, projected, diagonal = np.empty_like(jacobian), np.empty(count), np.empty(count)
     for zero in range(o.n_zeros):
         group = np.flatnonzero(o.zero[o.plus] == zero)
         precision = _inverse_covariance(o, group)
         if precision is None:
             w = weights[group]
-            mean = (w @ slopes[group]) / w.sum()
-            sensitivity[group] = slopes[group] - mean
-            # in its own weight: what a robust loss has taken from a reading is not held against it
-            projected[group], own[group] = residual[group], 1.0 - w / w.sum()
+            mean = (w @ jacobian[group]) / w.sum()
+            sensitivity[group] = jacobian[group] - mean
+            # the weight of a robust loss is not part of the residual
+            projected[group], diagonal[group] = residual[group], 1.0 - w / w.sum()
         else:
-            sensitivity[group] = precision @ slopes[group]
-            projected[group], own[group] = precision @ residual[group], np.diag(precision)
+            sensitivity[group] = precision @ jacobian[group]
+            projected[group], diagonal[group] = precision @ residual[group], np.diag(precision)
             weights[group] = 1.0
-    moved = sensitivity @ inverse / sigma**2
-    left = own - weights * (moved * sensitivity).sum(axis=1)
-    left[left < BLIND * own] = np.nan
+    gain = sensitivity @ inverse / sigma**2
+    redundancy = diagonal - weights * (gain * sensitivity).sum(axis=1)
+    redundancy[redundancy < MIN_REDUNDANCY * diagonal] = np.nan
     with np.errstate(divide="ignore", invalid="ignore"):
-        deleted = projected / left
-        share = projected**2 / left
+        deleted = projected / redundancy
+        share = projected**2 / redundancy
     spread, dof = _spread_without(fit, share)
     n = problem.n_machine
     std = np.sqrt(np.diag(inverse))[:n]
     with np.errstate(divide="ignore", invalid="ignore"):
-        shifts = np.abs(moved[:, :n] * (weights * deleted)[:, None])
+        shifts = np.abs(gain[:, :n] * (weights * deleted)[:, None])
         shifts /= np.where(std > 0.0, std, np.inf)
     influenced = np.nan_to_num(shifts).argmax(axis=1)
     return Diagnostics(
-        studentised=deleted * np.sqrt(left) / spread,
+        studentised=deleted * np.sqrt(redundancy) / spread,
         deleted=deleted,
         influence=np.nan_to_num(shifts[np.arange(count), influenced]),
         influenced=influenced,
@@ -120,16 +119,16 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
 
 
 def _critical(dof: float, count: int) -> float:
-    """Studentised residual beyond which one of so many readings is suspicious; infinite for none.
+    """Studentised residual above which one of `count` readings is an outlier; infinite for none.
 
-    With hardly any degrees of freedom Student's distribution has no end: 1e28 is none either.
+    With very few degrees of freedom the quantile of Student's distribution is about 1e28.
     """
-    found = confidence_factor(dof, 1.0 - SUSPICION / count)
-    return found if found < LARGEST_CRITICAL else np.inf
+    factor = confidence_factor(dof, 1.0 - OUTLIER_PROBABILITY / count)
+    return factor if factor < LARGEST_CRITICAL else np.inf
 
 
 def _weighted_information(fit: Fit) -> Information:
-    """What the readings say in the weights that a robust loss has left them."""
+    """Information of the readings with the weights of a robust loss."""
     if not fit.loss.robust:
         return fit.information
     o, weights = fit.problem.observations, fit.weights
@@ -144,7 +143,7 @@ def _weighted_information(fit: Fit) -> Information:
 def _inverse_covariance(o: Observations, group: NDArray[np.int64]) -> Array | None:
     """Inverse covariance of differences that share postures, for readings of variance 1.
 
-    None for readings as shown, which share nothing but their gauge zero.
+    None for single readings, which share only their gauge zero.
     """
     if o.minus[group[0]] < 0:
         return None
@@ -157,23 +156,23 @@ def _inverse_covariance(o: Observations, group: NDArray[np.int64]) -> Array | No
 
 
 def _spread_without(fit: Fit, share: Array) -> tuple[Array, float]:
-    """Standard deviation of a reading as estimated without each row, and degrees of freedom."""
+    """Standard deviation of a reading without each row, and its degrees of freedom."""
     noise = fit.noise
     if noise.source != "residuals" or fit.loss.robust:
         return np.full(share.size, noise.sigma), noise.dof
     dof = noise.dof - 1.0
     if dof <= 0.0:
         return np.full(share.size, np.nan), 0.0
-    # to first order a reading that is far out can take more than there is
+    # to first order the share of an outlier can exceed the total
     total = noise.sigma**2 * noise.dof
-    return np.sqrt(np.maximum(total - share, LEAST_REST * total) / dof), dof
+    return np.sqrt(np.maximum(total - share, MIN_REMAINING_SQUARE * total) / dof), dof
 
 
 def predict_unseen(fit: Fit) -> Array:
     """Errors of predicting the rows of every setup from all other setups.
 
     Returns:
-        Measured less predicted, each with its best gauge zeros, shape (n_rows,), [m]; NaN where
+        Measured minus predicted, each with its best gauge zeros, shape (n_rows,), [m]; NaN where
         the other setups do not determine the parameters.
     """
     problem, o = fit.problem, fit.problem.observations
@@ -187,20 +186,20 @@ def predict_unseen(fit: Fit) -> Array:
     free = ~fit.held
     precision = np.diag(problem.prior_precision)[np.ix_(free, free)]
     for setup in setups:
-        out = o.setup == setup
+        deleted = o.setup == setup
         if not problem.prior_precision.all():
-            # at the reference: at the solution what is not seen looks faintly seen
-            left = np.where(out[:, None], 0.0, fit.linearisation.slopes)
+            # at the reference: at the solution unobservable directions look slightly observable
+            jacobian = np.where(deleted[:, None], 0.0, fit.linearisation.jacobian)
             try:
-                require_determined(problem, decompose(left, o))
+                require_determined(problem, decompose(jacobian, o))
             except NotIdentifiableError:
                 continue  # stays unknown
-        others = factor[~out][:, free] / fit.sigma
+        others = factor[~deleted][:, free] / fit.sigma
         change = np.zeros(problem.n_free)
         change[free] = -np.linalg.solve(
-            others.T @ others + precision, factor[out][:, free].T @ pull[out]
+            others.T @ others + precision, factor[deleted][:, free].T @ pull[deleted]
         )
         missed = project_out_zeros(fit.residual - fit.jacobian @ change, o)
-        rows = out[o.plus]
+        rows = deleted[o.plus]
         errors[rows] = o.rows(missed)[rows]
     return errors

@@ -1,4 +1,4 @@
-"""Rows of a session beside what the machine would show: nominal, linearised, calibrated."""
+"""Rows of a session with nominal, linearised and calibrated predictions."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ class ResidualRow:
     measured: Number
     """[m]."""
     nominal: Number
-    """What the machine would show as the controller knows it, with the best gauge zero, [m]."""
+    """Prediction with the active offsets and the best gauge zero, [m]."""
     linear: NumberOrNaN
-    """The same for the linearised estimate, [m]."""
+    """Prediction of the linearised estimate, [m]."""
     predicted: Number
-    """The same for the calibrated machine, [m]."""
+    """Prediction of the calibrated machine, [m]."""
     line: Count | None
     """Line in the CSV."""
     file: str | None
-    """The CSV, where it is not that of the session."""
+    """The CSV, if it is not the one of the session."""
     studentised: NumberOrNaN
-    """Error of the row as all others see it, in its standard deviations; NaN if they do not."""
+    """Studentised deleted residual; NaN if no other row predicts it."""
     influence: Number
     """Largest change of a parameter without this row, in its standard deviations."""
     influenced: str
@@ -49,12 +49,12 @@ class ResidualRow:
 
     @property
     def deviation(self) -> float:
-        """Measured less nominal, [m]: the residual before calibration."""
+        """Measured minus nominal, [m]: the residual before calibration."""
         return self.measured - self.nominal
 
     @property
     def residual(self) -> float:
-        """Measured less predicted, [m]: the residual after calibration."""
+        """Measured minus predicted, [m]: the residual after calibration."""
         return self.measured - self.predicted
 
     @property
@@ -77,6 +77,6 @@ def rows_by_setup(rows: Iterable[ResidualRow]) -> dict[str, list[ResidualRow]]:
 
 
 def root_mean_square(values: Iterable[float]) -> float:
-    """Of what is known; NaN if nothing is."""
-    known = [v for v in values if math.isfinite(v)]
-    return math.sqrt(sum(v * v for v in known) / len(known)) if known else math.nan
+    """RMS of the finite values; NaN if there are none."""
+    finite = [v for v in values if math.isfinite(v)]
+    return math.sqrt(sum(v * v for v in finite) / len(finite)) if finite else math.nan

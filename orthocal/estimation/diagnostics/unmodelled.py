@@ -1,11 +1,11 @@
-"""What a machine's other errors do to an estimate that leaves them out.
+"""Effect of unmodelled errors of the machine on an estimate.
 
-Offsets that are fitted to a machine whose legs and axes are off as well take on some of those
-errors. To first order the estimate moves by L θᵤ for unmodelled errors θᵤ,
+Offsets fitted to a machine whose legs and axes have errors absorb some of these errors. To first
+order the estimate changes by L θᵤ for unmodelled errors θᵤ,
 
     L = A⁻¹ Jᵀ Jᵤ/σ²,  A = Jᵀ J/σ² + P
 
-and with θᵤ drawn from the priors this is known as a spread. It belongs into every honest ±.
+so that the priors of θᵤ give a covariance that belongs to every stated uncertainty.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from orthocal.statistics.zeros import project_out_zeros
 Array = NDArray[np.float64]
 
 WHOLE_MODEL = "full"
-"""The robot's own model of its errors: what it leaves out of joint placements a machine has not."""
+"""Model that lists the errors of joint placements that a machine has."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unmodelled:
-    """Errors that an estimate leaves out, with their priors."""
+    """Unmodelled errors and their effect on an estimate."""
 
     __pydantic_config__ = CLOSED
 
@@ -43,79 +43,79 @@ class Unmodelled:
     prior_stds: Sizes
     """One standard deviation of each, shape (n_unmodelled,), [SI]."""
     leakage: Matrix
-    """L: what the free parameters take on, shape (n_free, n_unmodelled), [SI per SI]."""
+    """L: change of the free parameters, shape (n_free, n_unmodelled), [SI per SI]."""
     residual_rms: Number
-    """What they alone would leave of the readings' rows after the fit, r.m.s., [m]."""
+    """Residuals of the rows due to unmodelled errors alone, RMS, [m]."""
     residual_dof: Number
-    """Independent parts of that: its square scatters as that of so many (Satterthwaite, 1946)."""
+    """Effective degrees of freedom of these residuals (Satterthwaite, 1946)."""
 
     @property
     def bias_covariance(self) -> Array:
-        """Covariance of what the free parameters take on, shape (n_free, n_free), [SI]."""
+        """Covariance of the parameters due to unmodelled errors, shape (n_free, n_free), [SI]."""
         spread = self.leakage * self.prior_stds
         return np.asarray(spread @ spread.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OtherErrors:
-    """Errors that a machine has and a fit left out, and how they move the readings."""
+    """Errors of the machine that a fit does not model, and their Jacobian."""
 
     names: tuple[str, ...]
     prior_stds: Array
     """One standard deviation of each, shape (n_others,), [SI]."""
-    slopes: Array
-    """∂h of one prior std of each, gauge zeros eliminated, shape (n_entries, n_others), [m]."""
+    jacobian: Array
+    """∂h by one standard deviation of each, zeros eliminated, shape (n_entries, n_others), [m]."""
 
 
 @cached_per_robot(maxsize=8)
 def machine_errors(robot: Robot) -> tuple[str, ...]:
-    """Names of all errors that a machine is taken to have, in the robot's order.
+    """Names of all errors that a machine has, in the robot's order.
 
-    All that change something; and of joint placements only those of its model `full`, where a
-    robot lists them itself: what it leaves out there a machine has not.
+    These are all errors with an effect. If the robot lists a model `full`, errors of joint
+    placements that are not in this model are excluded.
     """
     parameters = robot.parameters
     try:
-        whole = set(parameters.select_model(WHOLE_MODEL))
+        names = set(parameters.select_model(WHOLE_MODEL))
     except ParameterError:
-        whole = set()
-    whole |= {
+        names = set()
+    names |= {
         e.name
         for e in (parameters.elementary[n] for n in parameters.complete)
         if e.kind == "scale" or e.of_frame
     }
-    return tuple(name for name in parameters.names if name in whole)
+    return tuple(name for name in parameters.names if name in names)
 
 
-def find_other_errors(fit: Fit, *, spoken_for: Collection[str] = ()) -> OtherErrors:
-    """The errors of the machine that a fit left out.
+def find_other_errors(fit: Fit, *, represented: Collection[str] = ()) -> OtherErrors:
+    """Errors of the machine that a fit does not model.
 
     Args:
         fit: The fit.
-        spoken_for: Names of parameters that its own stand for, too.
+        represented: Further parameters that the fit represents, as base parameters do.
     """
     problem = fit.problem
     parameters = problem.robot.parameters
-    # of a sum the first error is what it is told by: the others still differ from it
-    own = problem.machine_selection.names
-    taken = {parameters[n].terms[0][0] for n in (*own, *problem.fixed, *spoken_for)}
+    # a sum is represented by its first error: the others still differ from it
+    free = problem.machine_selection.names
+    modelled = {parameters[n].terms[0][0] for n in (*free, *problem.fixed, *represented)}
     names = [
         n
         for n in machine_errors(problem.robot)
-        if n not in spoken_for and not taken & {term for term, _ in parameters[n].terms}
+        if n not in represented and not modelled & {term for term, _ in parameters[n].terms}
     ]
     o = problem.observations
     if not names:
         return OtherErrors((), read_only([]), read_only(np.zeros((o.size, 0))))
     prior_stds = read_only([parameters[n].prior_std for n in names])
-    return OtherErrors(tuple(names), prior_stds, read_only(error_slopes(fit, names)))
+    return OtherErrors(tuple(names), prior_stds, read_only(error_jacobian(fit, names)))
 
 
-def error_slopes(fit: Fit, names: Sequence[str]) -> Array:
-    """How errors of the machine move the readings at the solution of a fit that has them not free.
+def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
+    """Jacobian of the readings by errors that are not free, at the solution of a fit.
 
     Returns:
-        ∂h of one prior std of each, gauge zeros eliminated, shape (n_entries, n_names), [m].
+        ∂h by one standard deviation of each, zeros eliminated, shape (n_entries, n_names), [m].
     """
     problem = fit.problem
     chosen = tuple(problem.robot.parameters[n] for n in names)
@@ -136,7 +136,7 @@ def error_slopes(fit: Fit, names: Sequence[str]) -> Array:
 
 
 def measure_unmodelled(fit: Fit, others: OtherErrors) -> tuple[Unmodelled, Array]:
-    """What errors of the machine that were not free do to an estimate.
+    """Effect of errors that were not free on an estimate.
 
     Returns:
         Effect on the machine's parameters; and standard deviations of the effect on the nuisance
@@ -148,25 +148,25 @@ def measure_unmodelled(fit: Fit, others: OtherErrors) -> tuple[Unmodelled, Array
         none = Unmodelled((), read_only([]), read_only(np.zeros((n, 0))), 0.0, 0.0)
         return none, np.zeros(problem.n_free - n)
     o, sigma = problem.observations, max(fit.sigma, SMALLEST_SIGMA)
-    slopes = project_out_zeros(fit.jacobian, o)
+    jacobian = project_out_zeros(fit.jacobian, o)
     inverse = fit.information.covariance(
         sigma=sigma, precision=problem.prior_precision, held=fit.held
     )
-    scaled = inverse @ (slopes.T @ others.slopes) / sigma**2
-    left = o.rows(others.slopes - slopes @ scaled)
-    taken = scaled * problem.theta_scale[:, None]
-    found = Unmodelled(
+    scaled = inverse @ (jacobian.T @ others.jacobian) / sigma**2
+    residual = o.rows(others.jacobian - jacobian @ scaled)
+    change = scaled * problem.theta_scale[:, None]
+    effect = Unmodelled(
         names=others.names,
         prior_stds=others.prior_stds,
-        leakage=read_only((taken / others.prior_stds)[:n]),
-        residual_rms=float(np.sqrt((left**2).sum() / len(left))),
-        residual_dof=_independent_parts(left),
+        leakage=read_only((change / others.prior_stds)[:n]),
+        residual_rms=float(np.sqrt((residual**2).sum() / len(residual))),
+        residual_dof=_independent_parts(residual),
     )
-    return found, np.asarray(np.linalg.norm(taken[n:], axis=1))
+    return effect, np.asarray(np.linalg.norm(change[n:], axis=1))
 
 
-def _independent_parts(spread: Array) -> float:
-    """ν with which |S t|², t standard normal, scatters as χ² does: (tr SᵀS)²/tr (SᵀS)²."""
-    square = spread.T @ spread
+def _independent_parts(matrix: Array) -> float:
+    """Degrees of freedom ν of |S t|², t standard normal: (tr SᵀS)²/tr (SᵀS)²."""
+    square = matrix.T @ matrix
     total = float(np.trace(square)) ** 2
     return total / float((square**2).sum()) if total > 0.0 else 0.0

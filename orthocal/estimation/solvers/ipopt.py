@@ -300,7 +300,7 @@ class NonlinearProgram(Program):
 
     @cached_property
     def _exact(self) -> NonlinearProgram:
-        """The same with the exact Hessian: slower, but it converges in more cases."""
+        """Program with the exact Hessian: slower, but it converges in more cases."""
         return NonlinearProgram(self.problem, options=replace(self.options, hessian="exact"))
 
     def _start_ipopt(self) -> ca.Function:

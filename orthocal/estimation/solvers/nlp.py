@@ -177,14 +177,14 @@ class ProgramFunctions:
         gradient.add(one.theta_index, np.zeros_like(one.theta_index), by_theta)
         gradient.add(local, np.zeros_like(local), ca.vec(by_local))
 
-        summed, rest = functions["hessian"].map(count, masks, [True, False])(*arguments)
+        summed, separate = functions["hessian"].map(count, masks, [True, False])(*arguments)
         rows, columns = _triangle(n_t)
         hessian.add(one.theta_index[rows], one.theta_index[columns], lam_f * summed)
         rows, columns = _rest_of_triangle(variables.shape[1], n_t)
         rows, columns = variables[:, rows], variables[:, columns]
         # nuisance parameters that setups share may have any order
         upper = np.minimum(rows, columns), np.maximum(rows, columns)
-        hessian.add(*upper, lam_f * ca.vec(rest))
+        hessian.add(*upper, lam_f * ca.vec(separate))
         return total
 
     def _local_variables(self, one: ReadingExpressions) -> Indices:
@@ -267,7 +267,7 @@ class ProgramFunctions:
         return cached_function(problem.robot, f"program {digest}", build)
 
     def _reading_functions(self, one: ReadingExpressions) -> dict[str, ca.Function]:
-        """Value, objective, gradient (θ̂; others) and Hessian (θ̂ with θ̂; others) of a reading."""
+        """Cached functions of a reading: value, objective, gradient and Hessian."""
         sensor = self.problem.model.groups[one.group].reading.name
         built: dict[str, ca.Function] = {}
 
@@ -417,7 +417,7 @@ class ProgramFunctions:
         rows = np.arange(self._aligned.size)
         matrix = np.zeros((rows.size, int(self._value_of.max()) + 1))
         alignment = problem.model.alignment
-        matrix[:, :n] = (alignment.slopes @ problem.columns)[index] / scale[:, None]
+        matrix[:, :n] = (alignment.sensitivity @ problem.columns)[index] / scale[:, None]
         matrix[rows, self._aligned] = 1.0
         matrix[rows, self._value_of[self._aligned]] = -1.0
         start = alignment(problem.closure.errors())[index] / scale
@@ -446,8 +446,8 @@ class ProgramFunctions:
             *arguments, ca.reshape(lam_g, n_g, k)
         )
         hessian.add(rows[summed_part], columns[summed_part], summed)
-        rest = variables[:, rows[~summed_part]], variables[:, columns[~summed_part]]
-        hessian.add(*rest, ca.vec(local))
+        places = variables[:, rows[~summed_part]], variables[:, columns[~summed_part]]
+        hessian.add(*places, ca.vec(local))
 
 
 def _triangle(n: int) -> tuple[Indices, Indices]:
@@ -459,5 +459,5 @@ def _triangle(n: int) -> tuple[Indices, Indices]:
 def _rest_of_triangle(n: int, n_first: int) -> tuple[Indices, Indices]:
     """The upper triangle of n variables without that of the first ones."""
     rows, columns = _triangle(n)
-    rest = columns >= n_first
-    return rows[rest], columns[rest]
+    others = columns >= n_first
+    return rows[others], columns[others]

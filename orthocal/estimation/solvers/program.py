@@ -31,7 +31,7 @@ class Solution:
     passive: Array
     """Passive coordinates, shape (n_states, n_passive), [m, rad]."""
     objective: float
-    """Σ ρ((y − h − z)/σ) plus the contribution of the prior."""
+    """Objective: Σ ρ((y − h − z)/σ) plus the contribution of the prior."""
     status: str
     """Status as Ipopt names it."""
     iterations: int

@@ -92,7 +92,7 @@ class Task:
             iterations: Number of iterations.
             seconds: Time of the solution, [s].
         """
-        gradient = self.slope(state, jacobian)
+        gradient = self.gradient(state, jacobian)
         at_bound = np.zeros(state.theta.size, dtype=np.int8)
         at_bound[(state.theta <= self.low) & (gradient > 0.0)] = -1
         at_bound[(state.theta >= self.high) & (gradient < 0.0)] = 1
@@ -195,10 +195,10 @@ class Task:
         """Newton step with weights of the entries, within the bounds, shape (n_free,)."""
         square = self._square(jacobian, weights)
         square[np.diag_indices_from(square)] += self.problem.prior_precision
-        return self._solve(square, -self.slope(at, jacobian), at.theta)
+        return self._solve(square, -self.gradient(at, jacobian), at.theta)
 
-    def slope(self, state: State, jacobian: Array) -> Array:
-        """Derivative of the objective by θ̂, shape (n_free,)."""
+    def gradient(self, state: State, jacobian: Array) -> Array:
+        """Gradient of the objective by θ̂, shape (n_free,)."""
         residual = state.deviation - state.zeros[self.problem.observations.zero]
         prior = self.problem.prior_precision * self._off(state.theta)
         return np.asarray(prior - jacobian.T @ (self.weights * self.loss.influence(residual)))
@@ -207,12 +207,12 @@ class Task:
         o, off = self.problem.observations, self._off(theta)
         zeros = self.loss.centres(deviation, o.zero, o.n_zeros, weights=self.weights)
         zeros[o.zero_known] = 0.0
-        own = 0.5 * float(off @ (self.problem.prior_precision * off))
+        prior = 0.5 * float(off @ (self.problem.prior_precision * off))
         cost = float(self.weights @ self.loss.value(deviation - zeros[o.zero]))
-        return State(theta, passive, deviation, zeros, cost + own)
+        return State(theta, passive, deviation, zeros, cost + prior)
 
     def _solve(self, square: Array, gradient: Array, theta: Array) -> Array:
-        """The s that minimises ½ sᵀ A s − bᵀ s within the bounds, shape (n_free,).
+        """Step s that minimises ½ sᵀ A s − bᵀ s within the bounds, shape (n_free,).
 
         Parameters with a bound come last in the triangular factor, so that its last rows are a
         problem in them alone; the others follow.
@@ -264,16 +264,16 @@ class Task:
             rows, groups = order[starts[first] : ends[last - 1]], starts[first:last] - starts[first]
             counts = ends[first:last] - starts[first:last]
             part, weight = jacobian[rows], weights[rows]
-            known = o.zero_known[zero[order[starts[first:last]]]]
+            at_zero = o.zero_known[zero[order[starts[first:last]]]]
             if (weight != 1.0).any():
                 means = np.add.reduceat(part * weight[:, None], groups, axis=0)
                 means /= np.add.reduceat(weight, groups)[:, None]
-                means[known] = 0.0
+                means[at_zero] = 0.0
                 part -= np.repeat(means, counts, axis=0)
                 part *= np.sqrt(weight)[:, None]
             else:
                 means = np.add.reduceat(part, groups, axis=0) / counts[:, None]
-                means[known] = 0.0
+                means[at_zero] = 0.0
                 part -= np.repeat(means, counts, axis=0)
             result += part.T @ part
             first = last
@@ -281,7 +281,7 @@ class Task:
 
 
 def _solve_triangular(factor: Array, target: Array, *, transposed: bool = False) -> Array:
-    """The s with R s = t, or Rᵀ s = t, R upper triangular, shape (n,)."""
+    """Solution s of R s = t, or Rᵀ s = t, R upper triangular, shape (n,)."""
     if len(factor) <= FEW:
         return np.asarray(np.linalg.solve(factor.T if transposed else factor, target))
     from scipy import linalg
@@ -290,10 +290,10 @@ def _solve_triangular(factor: Array, target: Array, *, transposed: bool = False)
 
 
 def _bounded(factor: Array, target: Array, low: Array, high: Array) -> Array:
-    """The s that minimises ‖R s − t‖ within bounds, R upper triangular, shape (n,)."""
-    free = _solve_triangular(factor, target)
-    if ((free >= low) & (free <= high)).all():
-        return np.asarray(free)
+    """Vector s that minimises ‖R s − t‖ within bounds, R upper triangular, shape (n,)."""
+    open_solution = _solve_triangular(factor, target)
+    if ((open_solution >= low) & (open_solution <= high)).all():
+        return np.asarray(open_solution)
     from scipy.optimize import lsq_linear
 
     movable = high > low

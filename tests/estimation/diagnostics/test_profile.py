@@ -87,7 +87,7 @@ def test_without_noise_or_a_free_parameter_there_is_none(experiment_2):
     session = replace(experiment_2, readings=rows).with_gauge(
         replace(experiment_2.gauge, sigma=None)
     )
-    with pytest.raises(NotIdentifiableError, match="nothing tells the noise"):
+    with pytest.raises(NotIdentifiableError, match="the noise is unknown"):
         calibrate(session, profile=["x_slide.offset"])
     with pytest.raises(ParameterError, match="no free parameter to find the interval of"):
         calibrate(experiment_2, profile=["x_leg.length"])

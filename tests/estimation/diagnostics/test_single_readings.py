@@ -195,7 +195,7 @@ def test_readings_of_a_wrong_setup_are_said_to_be_of_one(root):
 def test_errors_that_make_no_machine_are_refused(readings):
     fit = fit_problem(build_problem(readings, model="offsets"))
     absurd = replace(fit.solution, theta=np.array([0.3, 0.0, 0.0]))
-    with pytest.raises(SolverError, match="make no machine: posture 'zero' cannot be reached"):
+    with pytest.raises(SolverError, match="are impossible: posture 'zero' cannot be reached"):
         require_assembly(fit.problem, absurd, robust=False)
     with pytest.raises(SolverError) as caught:
         require_assembly(fit.problem, absurd, robust=True)
