@@ -87,7 +87,7 @@ class Task:
 
         Args:
             state: The optimum.
-            jacobian: dh/dθ̂ there, shape (n_entries, n_free), [σ per tolerance].
+            jacobian: dh/dθ̂ there, shape (n_entries, n_free), [σ per prior std].
             passive: Passive coordinates, shape (n_states, n_passive), [m, rad].
             iterations: Number of iterations.
             seconds: Time of the solution, [s].
