@@ -243,7 +243,7 @@ def test_boxes_of_the_legend_show_and_hide(browser, page):
     with visit(browser, page.as_uri(), size=SIZES[1]) as found:
         found.wait_until_drawn()
         before = found.canvas()
-        found.page.click("#legend label:has-text('Machine where it really is')")
+        found.page.click("#legend label:has-text('Calibrated machine')")
         found.wait_for("!viewer.scene_tree.find(['Machine, calibrated']).object.visible")
         assert (found.canvas() != before).any()
         assert any("zx" in r[4] and "→" in r[4] for r in boxes(found.page)[2:])

@@ -175,7 +175,7 @@ def test_machine_without_deviation_needs_no_ghost(root):
     scene = draw_scene(calibrate(session))
     assert not links(scene, drawing.GHOST)
     assert scene.exaggeration == 1.0
-    assert "where the controller assumes it" in " ".join(scene.facts)
+    assert "does not deviate" in " ".join(scene.facts)
     assert "No gauge shows a deviation" in scene.headline
 
 
@@ -506,7 +506,7 @@ def test_headline_of_the_tool_states_error_and_uncertainty(calibration):
     known = measure_uncertainty(found.jacobian, covariance, found.workspace, found.targets)
     known = known.sizes.aligned.largest
     assert known > 1.2 * found.after.sizes.aligned.largest
-    assert f"With all corrected: {known * 1e6:.0f} µm RMS or less" in scene.headline
+    assert f"With all errors corrected: up to {known * 1e6:.0f} µm RMS" in scene.headline
     (told,) = (e.text for e in scene.legend if e.nodes == (tool_errors.TOOL_UNCERTAINTY,))
     assert f"errors at {calibration.tolerance_scale:.1f} × tolerances" in told
 

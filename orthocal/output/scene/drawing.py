@@ -1,7 +1,7 @@
 """Scenes of a robot, a session and a calibration.
 
-The scene of a calibration shows two machines: the calibrated one solid, where it really is, and the
-nominal one as a pale ghost, where the controller assumes it. The deviation between them is enlarged
+The scene of a calibration shows two machines: the calibrated one solid, and the nominal one, which
+the controller assumes, as a pale ghost. The deviation between them is enlarged
 by a factor that the scene states. Arrows at the gauges show the deviations of the readings before
 and after the calibration, enlarged by a factor of their own.
 """
@@ -229,9 +229,9 @@ def _draw_calibration(
     stops, left_out = plan_stops(measured, posture)
     machines = _place_machines(calibration, measured, stops, drawing, exaggeration)
     timeline, real = machines.timeline, machines.drawn
-    drawing.draw_machine(SOLID, "Machine where it really is", timeline, real)
+    drawing.draw_machine(SOLID, "Calibrated machine", timeline, real)
     if machines.largest > NOTHING:
-        text = "Machine where the controller assumes it"
+        text = "Nominal machine, as the controller assumes"
         drawing.draw_machine(GHOST, text, timeline, machines.nominal, ghost_of=real)
     drawing.draw_leg_lines(timeline, real)
     drawing.look_at(real, machines.nominal)
@@ -291,7 +291,7 @@ def _place_machines(
 def _state_deviation(machines: _Machines) -> str:
     """Size and scale of the deviation of the machine."""
     if machines.largest <= NOTHING:
-        return "The machine is where the controller assumes it."
+        return "The calibrated machine does not deviate from the nominal one."
     scale = "true scale"
     if machines.exaggeration != 1.0:
         scale = f"deviation × {machines.exaggeration:g}"

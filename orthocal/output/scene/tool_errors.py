@@ -77,10 +77,10 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     if after is not None:
         _draw_ellipsoids(scene, targets, after.aligned_covariance[chosen])
         wider = f", errors at {excess:.1f} × tolerances" if excess > 1.0 else ""
-        text = f"Tool error, all corrected: up to {um(spread)} µm RMS{wider} ({scale})"
+        text = f"Tool uncertainty, all errors corrected: up to {um(spread)} µm RMS{wider} ({scale})"
         colour = css(UNCERTAINTY_COLOUR)
         scene.explain(LegendEntry(text, (TOOL_UNCERTAINTY,), colour, "ball", shown))
-        headline += f" With all corrected: {um(spread)} µm RMS or less."
+        headline += f" With all errors corrected: up to {um(spread)} µm RMS."
     return headline
 
 
