@@ -9,7 +9,7 @@ from dataclasses import replace
 from numpy.typing import ArrayLike
 
 from orthocal.arguments import require_kind
-from orthocal.assessment.calibrated_tool import find_tool
+from orthocal.assessment.calibrated_tool import CalibratedTool, find_tool
 from orthocal.assessment.controller_entries import compute_entries
 from orthocal.assessment.fit_findings import find_fit_findings
 from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
@@ -117,8 +117,9 @@ def assess(
     measured = session or restore_session(calibration)
     if judgement is None:
         judgement = judge_session(measured)
-    tool, unreached = _tool(calibration, judgement)
-    entries = compute_entries(calibration, find_tool(calibration))
+    placed = find_tool(calibration)
+    entries = compute_entries(calibration, placed)
+    tool, unreached = _tool(calibration, judgement, placed, entries)
     notes = [
         *find_fit_findings(calibration),
         *_entry_findings(calibration, entries, tool),
@@ -159,11 +160,14 @@ def check_session(session: Session, judgement: Judgement | None = None) -> Asses
 
 
 def _tool(
-    calibration: Calibration, judgement: Judgement
+    calibration: Calibration,
+    judgement: Judgement,
+    placed: CalibratedTool | None,
+    entries: Sequence[ControllerEntry],
 ) -> tuple[ToolErrorSummary | None, list[Finding]]:
     """The expected tool error, or why it is unknown."""
     try:
-        accuracy = assess_placed(calibration, require_tool(calibration))
+        accuracy = assess_placed(calibration, require_tool(calibration, placed), entries)
     except (ClosureError, RobotError) as e:
         return None, [words.out_of_reach(str(e))]
     return summarise_tool(calibration, accuracy, scale=judgement.tolerance_scale), []

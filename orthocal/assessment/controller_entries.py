@@ -45,11 +45,13 @@ def find_entries(calibration: Calibration) -> tuple[ControllerEntry, ...]:
     return compute_entries(calibration, find_tool(calibration))
 
 
-def entered_offsets(calibration: Calibration) -> Array:
+def entered_offsets(
+    calibration: Calibration, entries: Sequence[ControllerEntry] | None = None
+) -> Array:
     """Offsets in the controller once they were entered, shape (n_drives,), [m, rad]."""
     offsets = calibration.active_offsets
     names = [d.name for d in calibration.robot.drives]
-    for entry in find_entries(calibration):
+    for entry in find_entries(calibration) if entries is None else entries:
         offsets[names.index(entry.drive)] = entry.enter
     return offsets
 

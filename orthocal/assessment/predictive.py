@@ -25,7 +25,7 @@ from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.fit import Fit
 from orthocal.measurement.joining import name_within
 from orthocal.session.session import known_approach
-from orthocal.statistics.chance import beta_share, chi_square_tail, f_tail
+from orthocal.statistics.distributions import beta_share, chi_square_tail, f_tail
 from orthocal.statistics.information import whiten
 from orthocal.statistics.zeros import project_out_zeros
 

@@ -26,7 +26,7 @@ from orthocal.assessment.calibrated_tool import (
     place_tool,
 )
 from orthocal.assessment.controller_entries import entered_offsets
-from orthocal.calibration.assessment_record import ToolErrorSummary
+from orthocal.calibration.assessment_record import ControllerEntry, ToolErrorSummary
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
@@ -194,18 +194,18 @@ def assess_tool(
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     if workspace is None:
-        return assess_placed(calibration, require_tool(calibration))
-    return _assess(calibration, place_tool(calibration, workspace, names=names), names)
+        return assess_placed(calibration, require_tool(calibration, find_tool(calibration)))
+    placed = place_tool(calibration, workspace, names=names)
+    return assess_placed(calibration, placed, names=names)
 
 
-def require_tool(calibration: Calibration) -> CalibratedTool:
-    """The tool over its workspace.
+def require_tool(calibration: Calibration, tool: CalibratedTool | None) -> CalibratedTool:
+    """The tool over its workspace, which exists.
 
     Raises:
         RobotError: If the robot has no tool centre point, or its drives do not command it.
         ClosureError: If its tool hardly moves at all.
     """
-    tool = find_tool(calibration)
     require_commanded_tool(calibration.robot)
     if tool is None:
         raise ClosureError(
@@ -216,14 +216,14 @@ def require_tool(calibration: Calibration) -> CalibratedTool:
     return tool
 
 
-def assess_placed(calibration: Calibration, tool: CalibratedTool) -> ToolAccuracy:
-    """`assess_tool` over points whose tool is known."""
-    return _assess(calibration, tool, None)
-
-
-def _assess(
-    calibration: Calibration, tool: CalibratedTool, names: Sequence[str] | None
+def assess_placed(
+    calibration: Calibration,
+    tool: CalibratedTool,
+    entries: Sequence[ControllerEntry] | None = None,
+    *,
+    names: Sequence[str] | None = None,
 ) -> ToolAccuracy:
+    """`assess_tool` over points whose tool is known, with offsets to enter that may be known."""
     unmodelled = calibration.unmodelled
     prior_stds = np.r_[[p.prior_std for p in calibration.free], unmodelled.prior_stds]
     jacobian = tool.jacobian[:, :, : len(prior_stds)]
@@ -231,7 +231,7 @@ def _assess(
     after = None
     if np.isfinite(calibration.model_covariance).all():
         after = measure_uncertainty(jacobian, error_covariance(calibration), space, where)
-    left = tool.deviation(entered_offsets(calibration), names=names)
+    left = tool.deviation(entered_offsets(calibration, entries), names=names)
     return ToolAccuracy(
         workspace=space,
         targets=where,

@@ -9,7 +9,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.session.session import Session
@@ -17,7 +16,10 @@ from orthocal.session.session import Session
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Sparse: TypeAlias = Any
-"""A scipy.sparse.csr_array; SciPy has no type stubs."""
+"""A scipy.sparse.csr_array, which has no type stubs; an ordinary array for few columns."""
+
+MOST_DENSE = 64
+"""Number of columns up to which matrices are ordinary arrays: SciPy is imported for more only."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,11 +75,12 @@ class Patterns:
         """All patterns written out, shape (h, n_rows)."""
         if self.tails is None:
             return self.rows
-        return sparse.csr_array(self.rows + self.tails.to_sparse(self.rows.shape[1]))
+        return self.rows + self.tails.to_sparse(self.rows.shape[1])
 
     def one(self, index: int) -> Array:
         """One pattern, dense, shape (n_rows,), [m]."""
-        return np.asarray(self.select(slice(index, index + 1)).to_sparse().toarray()[0])
+        dense: Array = to_dense(self.select(slice(index, index + 1)).to_sparse())[0]
+        return dense
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,8 +194,25 @@ def sparse_rows(rows: Sequence[Indices], values: Sequence[Array], count: int) ->
     sizes = np.array([len(r) for r in rows], dtype=np.int64)
     columns = np.concatenate([*rows, np.empty(0, dtype=np.int64)]).astype(np.int64)
     data = np.concatenate([*values, np.empty(0)]).astype(np.float64)
-    indptr = np.concatenate([[0], np.cumsum(sizes)])
-    return sparse.csr_array((data, columns, indptr), shape=(len(rows), count))
+    if count <= MOST_DENSE:
+        dense = np.zeros((len(rows), count))
+        np.add.at(dense, (np.repeat(np.arange(len(rows)), sizes), columns), data)
+        return dense
+    from scipy.sparse import csr_array
+
+    return csr_array((data, columns, np.concatenate([[0], np.cumsum(sizes)])), (len(rows), count))
+
+
+def to_dense(matrix: Sparse) -> Array:
+    """Ordinary array of a matrix."""
+    return np.asarray(matrix if isinstance(matrix, np.ndarray) else matrix.toarray())
+
+
+def row_products(one: Sparse, other: Sparse) -> Array:
+    """Inner products of two matrices of one kind, row by row."""
+    if isinstance(one, np.ndarray):
+        return np.asarray(np.vecdot(one, other))
+    return np.asarray(one.multiply(other).sum(axis=1)).ravel()
 
 
 def marks(rows: Sequence[Indices], count: int) -> Patterns:

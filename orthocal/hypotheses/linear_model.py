@@ -9,14 +9,20 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from orthocal.errors import ClosureError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
 from orthocal.estimation.weighting import DEFAULT_SIGMA, first_noise
-from orthocal.hypotheses.hypothesis import MachineShift, Patterns, Sparse, Tails
+from orthocal.hypotheses.hypothesis import (
+    MOST_DENSE,
+    MachineShift,
+    Patterns,
+    Sparse,
+    Tails,
+    row_products,
+)
 from orthocal.hypotheses.likelihood import Likelihood, Products, build_likelihood
 from orthocal.session.session import Session
 from orthocal.statistics.noise import noise_floor
@@ -104,10 +110,7 @@ class LinearModel:
         self.dof = o.size - o.n_zeros
         self.labels, self.session_of_entry = label_sessions(session, o.setup)
         self._counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
-        ones = np.ones(o.size)
-        self._incidence = sparse.csr_array(
-            (ones, (np.arange(o.size), o.zero)), shape=(o.size, o.n_zeros)
-        )
+        self._incidence = self.problem.zero_incidence
 
     @property
     def offsets(self) -> dict[str, int]:
@@ -134,13 +137,19 @@ class LinearModel:
     def to_entries(self) -> Sparse:
         """Entries per row of the session, in the first gauge's metres, (n_rows, n_entries)."""
         o = self.problem.observations
-        rows = np.arange(o.plus.size)
-        if (o.minus < 0).all():
-            return sparse.csr_array(
-                (1.0 / self.problem.noise[o.plus], (rows, o.plus)), shape=(rows.size, o.size)
+        n = o.plus.size
+        if n > MOST_DENSE and self._has_single_zeros:
+            from scipy.sparse import csr_array
+
+            return csr_array(
+                (1.0 / self.problem.noise[o.plus], (np.arange(n), o.plus)), (n, o.size)
             )
-        blocks = [o.values(row) / self.problem.noise for row in np.eye(rows.size)]
-        return sparse.csr_array(np.array(blocks))
+        blocks = np.array([o.values(row) / self.problem.noise for row in np.eye(n)])
+        if n <= MOST_DENSE:
+            return blocks
+        from scipy.sparse import csr_array
+
+        return csr_array(blocks)
 
     def entries(self, rows: Array) -> Array:
         """Entries of rows, zeros projected out, shape (h, n_entries), [m].
@@ -280,12 +289,11 @@ class LinearModel:
             The products; and the inner products with the deviation, shape (h,), [m²].
         """
         directions = about.likelihood.directions
-        if patterns.tails is not None and not self._has_single_zeros:
-            patterns = Patterns(patterns.to_sparse())
-        entries = sparse.csr_array(patterns.rows @ self.to_entries)
-        sums = np.asarray((entries @ self._incidence).toarray())
+        patterns = self._write_out(patterns)
+        entries = patterns.rows @ self.to_entries
+        sums = np.asarray(entries @ self._incidence)
         along = np.asarray(entries @ directions.T)
-        square = np.asarray(entries.multiply(entries).sum(axis=1)).ravel()
+        square = row_products(entries, entries)
         cross = np.asarray(entries @ deviation)
         if patterns.tails is not None:
             tails, o = patterns.tails, self.problem.observations
@@ -311,21 +319,25 @@ class LinearModel:
             patterns: Over the rows, shape (h, n_rows).
             others: The same number, without tails.
         """
-        if patterns.tails is not None and not self._has_single_zeros:
-            patterns = Patterns(patterns.to_sparse())
+        patterns = self._write_out(patterns)
         one, other = patterns.rows @ self.to_entries, others.rows @ self.to_entries
-        result = np.asarray(one.multiply(other).sum(axis=1)).ravel()
-        sums = (one @ self._incidence).toarray()
+        result = row_products(one, other)
+        sums = np.asarray(one @ self._incidence)
         if patterns.tails is not None:
             tails, o = patterns.tails, self.problem.observations
-            result = result + self._overlap(tails, sparse.csr_array(other))
+            result = result + self._overlap(tails, other)
             for own, rows, base in tails.by_segment():
                 at = o.plus[rows]
                 total = np.cumsum((base / self.problem.noise[at])[::-1])[::-1]
                 sums[own, o.zero[at[0]]] += total[tails.start[own]]
-        return np.asarray(
-            result - (sums * (other @ self._incidence).toarray()) @ (1 / self._counts)
-        )
+        return np.asarray(result - (sums * (other @ self._incidence)) @ (1 / self._counts))
+
+    def _write_out(self, patterns: Patterns) -> Patterns:
+        """Patterns without tails, where cumulative sums do not apply or gain little."""
+        few = isinstance(patterns.rows, np.ndarray)
+        if patterns.tails is None or (self._has_single_zeros and not few):
+            return patterns
+        return Patterns(patterns.to_sparse())
 
     def _overlap(self, tails: Tails, entries: Sparse) -> Array:
         """Inner products of tails with sparse vectors over the entries, pair by pair."""

@@ -25,7 +25,7 @@ from orthocal.hypotheses.families.sessions import MOST_DRIVES, changes_between_s
 from orthocal.hypotheses.families.single_reading import wrong_readings
 from orthocal.hypotheses.families.swapped_rows import swapped_rows
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
-from orthocal.hypotheses.hypothesis import Family, Rows, marks
+from orthocal.hypotheses.hypothesis import Family, Rows, marks, to_dense
 from orthocal.hypotheses.hypothesis_set import (
     HypothesisSet,
     Term,
@@ -447,7 +447,7 @@ class _Search:
         single = max(float(e.max(initial=-np.inf)) for _, e in scored)
         rows = [
             np.vstack(
-                [np.zeros((0, self.values.size)), *(p.to_sparse().toarray() for p in part if p)]
+                [np.zeros((0, self.values.size)), *(to_dense(p.to_sparse()) for p in part if p)]
             )
             for part in ([f.edits for f in edits], [f.effects for f in effects])
         ]
@@ -541,8 +541,7 @@ def _indicators(rows: NDArray[np.int64], count: int) -> Array:
 
 
 def _marks(groups: Sequence[NDArray[np.int64]], count: int) -> Array:
-    written: Array = marks(groups, count).rows.toarray()
-    return written
+    return to_dense(marks(groups, count).rows)
 
 
 def _rms(model: LinearModel, state: HypothesisSet) -> float:

@@ -1,4 +1,4 @@
-"""Significance tests, coverage factors and quantiles by SciPy, imported at the first use."""
+"""Significance tests and coverage factors."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from orthocal.statistics.distributions import chi_square_tail, f_tail, normal_quantile, t_quantile
 
 BY_CHANCE = 0.01
 """Significance level of tests of residuals against noise."""
@@ -64,38 +66,3 @@ def expanded_uncertainty(
     total, scatter = np.asarray(std, dtype=np.float64), np.asarray(std_scatter, dtype=np.float64)
     other = np.sqrt(np.maximum(total**2 - scatter**2, 0.0))
     return np.asarray(np.hypot(coverage_factor(dof) * scatter, COVERAGE * other))
-
-
-def normal_quantile(share: float) -> float:
-    """Quantile of the standard normal distribution."""
-    from scipy import special
-
-    return float(special.ndtri(share))
-
-
-def chi_square_tail(dof: float, value: float) -> float:
-    """Probability that χ² with `dof` degrees of freedom exceeds a value."""
-    from scipy import special
-
-    return float(special.chdtrc(dof, value))
-
-
-def f_tail(dof: float, dof_below: float, value: float) -> float:
-    """Probability that F with `dof` and `dof_below` degrees of freedom exceeds a value."""
-    from scipy import special
-
-    return float(special.fdtrc(dof, dof_below, value))
-
-
-def t_quantile(dof: float, share: float) -> float:
-    """Quantile of Student's t with `dof` degrees of freedom."""
-    from scipy import special
-
-    return float(special.stdtrit(dof, share))
-
-
-def beta_share(a: float, b: float, x: float) -> float:
-    """Regularised incomplete beta function I_x(a, b)."""
-    from scipy import special
-
-    return float(special.betainc(a, b, x))

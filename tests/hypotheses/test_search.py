@@ -24,7 +24,7 @@ from orthocal.hypotheses.anomaly import AnomalyKind
 from orthocal.hypotheses.families.single_reading import wrong_readings
 from orthocal.hypotheses.families.swapped_rows import swapped_rows
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
-from orthocal.hypotheses.hypothesis import Rows
+from orthocal.hypotheses.hypothesis import Rows, to_dense
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.hypotheses.search import find_anomalies
 
@@ -77,7 +77,7 @@ def test_an_edit_undoes_the_mistake(sheet, name):
         float(np.abs(made.values + change - sheet.values).max())
         for family in families
         if family.edits is not None
-        for change in family.edits.to_sparse().toarray()
+        for change in to_dense(family.edits.to_sparse())
     )
     assert best < 1e-9
 
@@ -238,7 +238,7 @@ def test_tails_by_cumulative_sums_equal_those_written_out(cycles):
             written = Patterns(patterns.to_sparse())
             found, cross = model.products(patterns, about, deviation)
             expected, expected_cross = model.products(written, about, deviation)
-            dense = model.entries(written.rows.toarray())
+            dense = model.entries(to_dense(written.rows))
             assert found.along == pytest.approx(expected.along, abs=1e-12)
             assert found.along == pytest.approx(dense @ about.likelihood.directions.T, abs=1e-12)
             assert found.square == pytest.approx(expected.square, rel=1e-9, abs=1e-14)
@@ -249,7 +249,7 @@ def test_tails_by_cumulative_sums_equal_those_written_out(cycles):
         if family.edits is not None and family.effects is not None:
             inner = model.inner(family.edits, family.effects)
             one, other = (
-                model.entries(p.to_sparse().toarray()) for p in (family.edits, family.effects)
+                model.entries(to_dense(p.to_sparse())) for p in (family.edits, family.effects)
             )
             assert inner == pytest.approx((one * other).sum(axis=1), rel=1e-9, abs=1e-12)
     assert tested > 100

@@ -20,7 +20,7 @@ from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchProgram
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
-from orthocal.statistics.chance import chi_square_tail
+from orthocal.statistics.distributions import chi_square_tail
 from orthocal.statistics.zeros import project_out_zeros
 
 
