@@ -11,9 +11,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import copy
+import faulthandler
 import functools
 import io
-import itertools
 import json
 import os
 import random
@@ -24,12 +24,14 @@ import subprocess
 import sys
 import tempfile
 import time
+import traceback
 import unicodedata
 import warnings
 import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -39,7 +41,43 @@ import openpyxl
 import yaml
 from lxml import etree
 
+from orthocal import (
+    Dimensions,
+    calibrate,
+    draw_scene,
+    load_calibration,
+    load_plan,
+    load_robot,
+    load_session,
+    make_robot,
+    simulate_session,
+    summarize,
+    write_session,
+)
+from orthocal.assessment.controller_entries import entered_offsets, find_entries
+from orthocal.assessment.tool_tables import (
+    accuracy_rows,
+    forward_blocks,
+    forward_rows,
+    inverse_rows,
+)
+from orthocal.builder.build import remake_robot
+from orthocal.builder.machine_file import read_machine
 from orthocal.calibration.file import calibration_document, write_calibration
+from orthocal.cli.correct import _lines
+from orthocal.errors import OrthocalError
+from orthocal.export.correction_field import CorrectionField
+from orthocal.gcode.interpreter import Interpreter
+from orthocal.gcode.program import ProgramCorrector
+from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.measurement.files.coordinate_tables import read_points, stream_joints
+from orthocal.measurement.importing.import_readings import TableOptions, import_readings
+from orthocal.measurement.recording import open_recording
+from orthocal.observation.simulate import load_errors, truth_document
+from orthocal.output.text.accuracy import format_points
+from orthocal.output.text.import_report import format_import, format_import_json
+from orthocal.planning.equipment import Equipment, load_dial
+from orthocal.study.runner import open_results
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if os.environ.get("ORTHOCAL_FUZZ_WORKER"):
@@ -140,11 +178,6 @@ KINDS = {
 
 def lay_out(folder: Path) -> None:
     """Good files of every kind."""
-    from orthocal import Dimensions, calibrate, load_session, make_robot
-    from orthocal.measurement.files.session_file import load_plan
-    from orthocal.measurement.files.write_session import write_session
-    from orthocal.observation.simulate import simulate_session
-
     shutil.copytree(ROOT / "tests/robots/biglide", folder / "machine")
     for suffix in ("yaml", "urdf"):
         (folder / f"machine/biglide.{suffix}").rename(folder / f"machine/machine.{suffix}")
@@ -171,9 +204,6 @@ def lay_out(folder: Path) -> None:
 
 def lay_out_journals(folder: Path) -> None:
     """A recording and a study that were killed, the recording before its CSV was written."""
-    from orthocal.measurement.recording import open_recording
-    from orthocal.study.runner import open_results
-
     recorded = folder / "recorded"
     recorded.mkdir()
     text = SESSION.replace("robot: machine", "robot: ../machine")
@@ -341,33 +371,11 @@ def change_xml(rng: random.Random, data: bytes) -> bytes:
 
 
 WORDS = (
-    *("G0", "G1", "G2", "G3", "G20", "G21", "G90", "G91", "G90.1", "G91.1", "G18", "G4 P1", "G80"),
-    *("G54", "G55", "G59.3", "G61", "M0", "M2", "M30", "M6 T1", "%", "F0", "F1e3", "F0.0001", "N1"),
-    *("X0", "Y0", "X-40", "Y40", "X1000", "Y-1e3", "I0", "J0", "I-5", "R0", "R-5", "P2", "P10000"),
-    *(
-        "X" + "0" * 300,
-        "Y0." + "1" * 300,
-        "Z1",
-        "A1",
-        "G38.2",
-        "G92",
-        "#1=2",
-        "o1 sub",
-        "/",
-        "(",
-        ")",
-    ),
-    *(
-        "(" + "c" * 260 + ")",
-        ";" + "\xe9" * 400,
-        " " * 1200,
-        "\t",
-        "\r",
-        "G-0",
-        "M3.0",
-        "G1.0",
-        "X+.5",
-    ),
+    *"G0 G1 G2 G3 G20 G21 G90 G91 G90.1 G91.1 G18 G80 G54 G55 G59.3 G61 M0 M2 M30 % N1".split(),
+    *"F0 F1e3 F0.0001 X0 Y0 X-40 Y40 X1000 Y-1e3 I0 J0 I-5 R0 R-5 P2 P10000 Z1 A1 G38.2".split(),
+    *"G92 #1=2 / ( ) G-0 M3.0 G1.0 X+.5".split(),
+    *("G4 P1", "M6 T1", "o1 sub", "\t", "\r", " " * 1200, "X" + "0" * 300, "Y0." + "1" * 300),
+    *("(" + "c" * 260 + ")", ";" + "\xe9" * 400),
 )
 """What stands in programs, or nearly."""
 
@@ -445,20 +453,9 @@ def change_workbook(rng: random.Random, data: bytes) -> bytes:
 
 
 CELLS = (
-    *("A1", "XFD1", "A1048576", "ZZZ9999999", "A1:XFD1048576", "A0", "s", "n", "d", "b", "e"),
-    *(
-        "str",
-        "inlineStr",
-        "2026-05-01",
-        "1e309",
-        "-0",
-        "sheet1.xml",
-        "hidden",
-        "0.0%",
-        "14",
-        "9999",
-    ),
-)
+    "A1 XFD1 A1048576 ZZZ9999999 A1:XFD1048576 A0 s n d b e str inlineStr 2026-05-01 1e309 -0 "
+    "sheet1.xml hidden 0.0% 14 9999"
+).split()
 """What stands in the XML of workbooks."""
 
 
@@ -530,123 +527,43 @@ def make_case(seed: int, index: int, good: dict[str, bytes]) -> tuple[str, bytes
     return kind, mutate(rng, kind, good[kind]), rng
 
 
-# ---- what is done with a file
+# ---- what is done with a file; slow things where `deep`
 
 
-def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None:
-    """Do with a file what the command line does; slow things with a probability of `thorough`."""
-    from orthocal import calibrate, load_calibration, load_robot, load_session, summarize
-    from orthocal.assessment.controller_entries import find_entries
-    from orthocal.assessment.tool_tables import (
-        accuracy_rows,
-        forward_blocks,
-        forward_rows,
-        inverse_rows,
-    )
-    from orthocal.kinematics.loop_closure import nominal_closure
-    from orthocal.measurement.files.coordinate_tables import read_points, stream_joints
-    from orthocal.measurement.files.session_file import load_plan
-    from orthocal.measurement.files.write_session import write_session
-    from orthocal.measurement.importing.import_readings import TableOptions, import_readings
-    from orthocal.measurement.recording import open_recording
-    from orthocal.observation.simulate import load_errors, simulate_session, truth_document
-    from orthocal.output.scene.drawing import draw_scene
-    from orthocal.output.text.accuracy import format_points
-    from orthocal.output.text.import_report import format_import, format_import_json
-    from orthocal.planning.equipment import Equipment, load_dial
-    from orthocal.study.runner import open_results
-
-    deep = rng.random() < thorough
-    if kind in ("session", "readings"):
-        session = load_session(folder)
-        if deep:
-            calibration = calibrate(session, rng.choice((None, "full")))
-            path = write_calibration(calibration, folder / "out.json")
-            found = load_calibration(path)
-            assert calibration_document(found) == calibration_document(calibration)
-            summarize(found, details=True)
-            if rng.random() < 0.05:
-                draw_scene(found).to_html()
-    elif kind == "plan":
-        plan = load_plan(folder / "plan.yaml")
-        if deep:
-            simulated = simulate_session(plan, {"x_slide.offset": 3e-4})
-            truth = {"truth.yaml": truth_document(simulated)}
-            load_session(write_session(simulated.session, folder / "out", extra=truth))
-            load_errors(folder / "out/truth.yaml", plan.robot)
-    elif kind in ("robot", "urdf"):
-        robot = load_robot(folder / "machine")
-        if deep:
-            nominal_closure(robot).close(robot.drive_zero)
-            draw_scene(robot).to_html()
-    elif kind in ("table", "workbook"):
-        found = import_readings(
-            folder / KINDS[kind],
-            folder,
-            TableOptions(unit=rng.choice((None, "mm")), fill=rng.random() < 0.2),
-            overwrite=True,
-        )
-        format_import(found)
-        json.loads(format_import_json(found, written=False))
-        (folder / "readings.csv").write_text(found.text, encoding="utf-8")
-        load_plan(folder)
-    elif kind == "program":
-        use_program(folder, deep=deep)
-    elif kind == "machine":
-        use_machine(folder / "made", deep=deep)
-    elif kind == "dial":
-        load_dial(folder / "dial.yaml", Equipment())
-    elif kind == "journal":
-        with restored(folder / "recorded"), open_recording(folder / "recorded") as recording:
-            assert recording.rows
-    elif kind == "study":
-        with open_results(folder / "study.jsonl", STUDY) as (stored, _):
-            assert set(stored) <= set(range(4))
-    elif kind == "calibration":
-        calibration = load_calibration(folder)
-        find_entries(calibration)
-        if deep:
-            write_calibration(calibration, folder / "out.json")
-            assert calibration_document(
-                load_calibration(folder / "out.json")
-            ) == calibration_document(calibration)
-            summarize(calibration, details=True)
-            list(forward_rows(calibration, [[0.2, 0.2]]))
-            list(inverse_rows(calibration, [[0.0, 0.0]]))
-            for chunk in accuracy_rows(calibration, [[0.0, 0.0]]):
-                format_points(chunk.values)
-            if rng.random() < 0.1:
-                draw_scene(calibration).to_html()
-    else:
-        calibration = load_calibration(folder)
-        if kind == "errors":
-            errors = load_errors(folder / "errors.yaml", calibration.robot)
-            if deep:
-                simulate_session(load_plan(folder / "plan.yaml"), errors)
-        elif kind == "joints":
-            path = folder / "joints.csv"
-            blocks = list(stream_joints(path, calibration.robot, name=str(path)))
-            if deep:
-                list(forward_blocks(calibration, blocks))
-        else:
-            names, rows = read_points(folder / "points.csv", calibration.robot)
-            if deep:
-                list(inverse_rows(calibration, rows, names=names))
-                list(accuracy_rows(calibration, rows, names=names))
+def use_session(folder: Path, rng: random.Random, deep: bool) -> None:
+    session = load_session(folder)
+    if deep:
+        calibration = calibrate(session, rng.choice((None, "full")))
+        found = load_calibration(write_calibration(calibration, folder / "out.json"))
+        assert calibration_document(found) == calibration_document(calibration)
+        summarize(found, details=True)
+        if rng.random() < 0.05:
+            draw_scene(found).to_html()
 
 
-@contextlib.contextmanager
-def restored(folder: Path) -> Iterator[None]:
-    """A folder whose files are put back as they were."""
-    before = {path: path.read_bytes() for path in folder.iterdir()}
-    try:
-        yield
-    finally:
-        for path in folder.iterdir():
-            if path not in before:
-                path.unlink()
-        for path, content in before.items():
-            path.write_bytes(content)
+def use_plan(folder: Path, rng: random.Random, deep: bool) -> None:
+    plan = load_plan(folder / "plan.yaml")
+    if deep:
+        simulated = simulate_session(plan, {"x_slide.offset": 3e-4})
+        truth = {"truth.yaml": truth_document(simulated)}
+        load_session(write_session(simulated.session, folder / "out", extra=truth))
+        load_errors(folder / "out/truth.yaml", plan.robot)
+
+
+def use_robot(folder: Path, rng: random.Random, deep: bool) -> None:
+    robot = load_robot(folder / "machine")
+    if deep:
+        nominal_closure(robot).close(robot.drive_zero)
+        draw_scene(robot).to_html()
+
+
+def use_table(folder: Path, rng: random.Random, deep: bool, *, kind: str = "table") -> None:
+    options = TableOptions(unit=rng.choice((None, "mm")), fill=rng.random() < 0.2)
+    found = import_readings(folder / KINDS[kind], folder, options, overwrite=True)
+    format_import(found)
+    json.loads(format_import_json(found, written=False))
+    (folder / "readings.csv").write_text(found.text, encoding="utf-8")
+    load_plan(folder)
 
 
 class Shifted:
@@ -661,48 +578,118 @@ class Shifted:
 
 @functools.cache
 def correction_of(file: Path) -> Any:
-    from orthocal import load_calibration
-    from orthocal.assessment.controller_entries import entered_offsets
-    from orthocal.export.correction_field import CorrectionField
-
     calibration = load_calibration(file)
     return CorrectionField(calibration, entered_offsets(calibration), within=1e-5)
 
 
-def use_program(folder: Path, *, deep: bool) -> None:
+def use_program(folder: Path, rng: random.Random, deep: bool) -> None:
     """Correct a program; what comes out has lines that are read, and is a program of G0 and G1."""
-    from orthocal.cli.correct import _lines
-    from orthocal.gcode.interpreter import Interpreter
-    from orthocal.gcode.program import ProgramCorrector
 
     def correct(lines: Any, by: Any) -> str:
         interpreter = Interpreter("p", axes=(0, 1), offsets={"G54": (0.0, 0.0, 0.0)})
-        corrector = ProgramCorrector(interpreter, by, within=1e-4)
-        return "".join(corrector.run(lines))
+        return "".join(ProgramCorrector(interpreter, by, within=1e-4).run(lines))
 
     by = correction_of(folder / "calibration.json") if deep else Shifted()
     text = correct(_lines(folder / "part.ngc", "part.ngc"), by)
-    lines = text.encode("utf-8", "surrogateescape").split(b"\n")
-    assert max(map(len, lines)) <= 252
+    assert max(map(len, text.encode("utf-8", "surrogateescape").split(b"\n"))) <= 252
     again = [f"{line}\n" for line in text.removesuffix("\n").split("\n")]
     assert correct(again, Shifted()).count("\n") >= text.count("\n")
 
 
-def use_machine(folder: Path, *, deep: bool) -> None:
+def use_machine(folder: Path, rng: random.Random, deep: bool) -> None:
     """Make a machine again from its sizes."""
-    from orthocal.builder.build import remake_robot
-    from orthocal.builder.machine_file import read_machine
-
-    read_machine(folder / "machine.yaml")
+    read_machine(folder / "made/machine.yaml")
     if deep:
-        with restored(folder):
-            remake_robot(folder)
+        with restored(folder / "made"):
+            remake_robot(folder / "made")
 
 
-def tell(line: str) -> None:
-    """Print a line at once: whoever watches wants to know where this ended."""
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()
+def use_journal(folder: Path, rng: random.Random, deep: bool) -> None:
+    with restored(folder / "recorded"), open_recording(folder / "recorded") as recording:
+        assert recording.rows
+
+
+def use_study(folder: Path, rng: random.Random, deep: bool) -> None:
+    with open_results(folder / "study.jsonl", STUDY) as (stored, _):
+        assert set(stored) <= set(range(4))
+
+
+def use_calibration(folder: Path, rng: random.Random, deep: bool) -> None:
+    calibration = load_calibration(folder)
+    find_entries(calibration)
+    if deep:
+        again = load_calibration(write_calibration(calibration, folder / "out.json"))
+        assert calibration_document(again) == calibration_document(calibration)
+        summarize(calibration, details=True)
+        list(forward_rows(calibration, [[0.2, 0.2]]))
+        list(inverse_rows(calibration, [[0.0, 0.0]]))
+        for chunk in accuracy_rows(calibration, [[0.0, 0.0]]):
+            format_points(chunk.values)
+        if rng.random() < 0.1:
+            draw_scene(calibration).to_html()
+
+
+def use_errors(folder: Path, rng: random.Random, deep: bool) -> None:
+    errors = load_errors(folder / "errors.yaml", load_calibration(folder).robot)
+    if deep:
+        simulate_session(load_plan(folder / "plan.yaml"), errors)
+
+
+def use_joints(folder: Path, rng: random.Random, deep: bool) -> None:
+    calibration, path = load_calibration(folder), folder / "joints.csv"
+    blocks = list(stream_joints(path, calibration.robot, name=str(path)))
+    if deep:
+        list(forward_blocks(calibration, blocks))
+
+
+def use_points(folder: Path, rng: random.Random, deep: bool) -> None:
+    calibration = load_calibration(folder)
+    names, rows = read_points(folder / "points.csv", calibration.robot)
+    if deep:
+        list(inverse_rows(calibration, rows, names=names))
+        list(accuracy_rows(calibration, rows, names=names))
+
+
+USES: dict[str, Callable[[Path, random.Random, bool], object]] = {
+    "session": use_session,
+    "plan": use_plan,
+    "readings": use_session,
+    "robot": use_robot,
+    "urdf": use_robot,
+    "calibration": use_calibration,
+    "errors": use_errors,
+    "joints": use_joints,
+    "points": use_points,
+    "table": use_table,
+    "workbook": functools.partial(use_table, kind="workbook"),
+    "program": use_program,
+    "machine": use_machine,
+    "dial": lambda folder, rng, deep: load_dial(folder / "dial.yaml", Equipment()),
+    "journal": use_journal,
+    "study": use_study,
+}
+"""What the command line does with a file of each kind."""
+
+
+def use(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> None:
+    """Do with a file what the command line does; slow things with a probability of `thorough`."""
+    USES[kind](folder, rng, rng.random() < thorough)
+
+
+@contextlib.contextmanager
+def restored(folder: Path) -> Iterator[None]:
+    """A folder whose files are put back as they were."""
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    try:
+        yield
+    finally:
+        for path in set(folder.iterdir()) - set(before):
+            path.unlink()
+        for path, content in before.items():
+            path.write_bytes(content)
+
+
+# ---- workers
 
 
 def largest_memory() -> float:
@@ -715,10 +702,28 @@ def largest_memory() -> float:
     return int(line.split()[1]) / 1024
 
 
-def work(good_folder: Path, seed: int, first: int, last: int, *, thorough: float) -> None:
-    """Run cases; a line for each on stdout: what began, and how it ended."""
-    from orthocal.errors import OrthocalError
+def find_outcome(kind: str, folder: Path, rng: random.Random, *, thorough: float) -> str:
+    """What became of a case: 'loads', 'refused', or what must not be."""
+    before, outcome = time.process_time(), "loads"
+    try:
+        use(kind, folder, rng, thorough=thorough)
+    except OrthocalError as e:
+        steers = any(unicodedata.category(c) in STEERING for c in str(e))
+        outcome = "unprintable" if steers else "refused"
+    except BaseException as e:
+        *_, (frame, line) = traceback.walk_tb(e.__traceback__)
+        at = f"{frame.f_code.co_filename}:{line}"
+        outcome = f"{type(e).__name__} {at} {e}"[:300].replace("\n", " ")
+    took, memory = time.process_time() - before, largest_memory()
+    if took > LONGEST:
+        outcome = f"slow: {took:.1f} s, {outcome}"
+    if memory > LARGEST:
+        outcome = f"large: {memory:.0f} MiB, {outcome}"
+    return outcome
 
+
+def work(good_folder: Path, seed: int, first: int, last: int, *, thorough: float) -> None:
+    """Run cases, with a line on stdout for each; what hangs ends this process."""
     resource.setrlimit(resource.RLIMIT_AS, (6 * 2**30, 6 * 2**30))
     good = {kind: (good_folder / file).read_bytes() for kind, file in KINDS.items()}
     with tempfile.TemporaryDirectory() as name:
@@ -727,39 +732,21 @@ def work(good_folder: Path, seed: int, first: int, last: int, *, thorough: float
         for kind in ("calibration", "urdf", "workbook"):  # what is imported at first takes its time
             use(kind, folder, random.Random(0), thorough=1.0)
         for index in range(first, last):
+            faulthandler.dump_traceback_later(HANGS, exit=True)
             kind, data, rng = make_case(seed, index, good)
-            tell(f"begin {index}")
             (folder / KINDS[kind]).write_bytes(data)
-            before, outcome = time.process_time(), "loads"
-            try:
-                use(kind, folder, rng, thorough=thorough)
-            except OrthocalError as e:
-                steers = any(unicodedata.category(c) in STEERING for c in str(e))
-                outcome = "unprintable" if steers else "refused"
-            except BaseException as e:
-                place = e.__traceback__
-                while place is not None and place.tb_next is not None:
-                    place = place.tb_next
-                at = (
-                    ""
-                    if place is None
-                    else f"{place.tb_frame.f_code.co_filename}:{place.tb_lineno}"
-                )
-                outcome = f"{type(e).__name__} {at} {e}"[:300].replace("\n", " ")
-            took = time.process_time() - before
-            memory = largest_memory()
-            if took > LONGEST:
-                outcome = f"slow: {took:.1f} s, {outcome}"
-            if memory > LARGEST:
-                outcome = f"large: {memory:.0f} MiB, {outcome}"
+            outcome = find_outcome(kind, folder, rng, thorough=thorough)
             (folder / KINDS[kind]).write_bytes(good[kind])
             (folder / KINDS["readings"]).write_bytes(good["readings"])
-            tell(f"end {index} {kind} {outcome}".encode("ascii", "replace").decode())
-            if memory > LARGEST:
+            tell(f"{index} {kind} {outcome}".encode("ascii", "replace").decode())
+            if largest_memory() > LARGEST:
                 return  # what follows would be blamed for it
 
 
-# ---- many workers
+def tell(line: str) -> None:
+    """Print a line at once: whoever watches wants to know where this ended."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
 
 
 @dataclass
@@ -781,74 +768,46 @@ def run(
     report: Callable[[str], object] = lambda _: None,
 ) -> Findings:
     """Run cases 0 to count in workers, which are begun anew where one dies."""
-    good = {kind: (good_folder / file).read_bytes() for kind, file in KINDS.items()}
     findings = Findings(Counter(), [])
+
+    def watch(first: int, last: int) -> None:
+        for index, kind, outcome in run_cases(good_folder, seed, first, last, thorough):
+            good = outcome in ("loads", "refused")
+            findings.outcomes[kind, outcome if good else "BAD"] += 1
+            if not good:
+                findings.bad.append((index, kind, outcome))
+                report(f"{index} {kind} {outcome}")
+
     edges = [count * i // jobs for i in range(jobs + 1)]
-    workers = [_Worker(good_folder, seed, a, b, thorough) for a, b in itertools.pairwise(edges)]
-    while any(not w.done for w in workers):
-        for w in workers:
-            for index, kind, outcome in w.poll(good):
-                findings.outcomes[kind, outcome if outcome in ("loads", "refused") else "BAD"] += 1
-                if outcome not in ("loads", "refused"):
-                    findings.bad.append((index, kind, outcome))
-                    report(f"{index} {kind} {outcome}")
-        time.sleep(0.05)
+    with ThreadPoolExecutor(jobs) as pool:
+        list(pool.map(watch, edges[:-1], edges[1:]))
     return findings
 
 
-class _Worker:
-    def __init__(self, folder: Path, seed: int, first: int, last: int, thorough: float) -> None:
-        self.folder, self.seed, self.next, self.last = folder, seed, first, last
-        self.thorough = thorough
-        self.done = first >= last
-        self._output = Path(tempfile.mkstemp(prefix="orthocal-fuzz-")[1])
-        if not self.done:
-            self._start()
-
-    def _start(self) -> None:
-        self._read = 0
-        self._output.write_bytes(b"")
-        self._alive = time.monotonic()
-        command = [sys.executable, __file__, "--worker", str(self.folder), "--seed", str(self.seed)]
-        command += ["--first", str(self.next), "--count", str(self.last)]
-        command += ["--thorough", str(self.thorough)]
-        path = os.pathsep.join([os.environ.get("ORTHOCAL_FUZZ_PATH", ""), str(ROOT)])
-        environment = {**os.environ, "PYTHONPATH": path, "ORTHOCAL_FUZZ_WORKER": "1"}
-        with self._output.open("wb") as stream:
-            self._process = subprocess.Popen(
-                command, stdout=stream, stderr=subprocess.DEVNULL, env=environment
-            )
-
-    def poll(self, good: dict[str, bytes]) -> list[tuple[int, str, str]]:
-        """Cases that have ended since; begins anew after one that killed its worker."""
-        if self.done:
-            return []
-        ended = self._process.poll() is not None
-        text = self._output.read_bytes()[self._read :].decode()
-        lines = text[: text.rfind("\n") + 1].splitlines()
-        self._read += len(text[: text.rfind("\n") + 1].encode())
-        found = []
-        for line in lines:
-            self._alive = time.monotonic()
-            word, index, *rest = line.split(" ", 3)
-            if word == "end":
-                found.append((int(index), rest[0], rest[1]))
-                self.next = int(index) + 1
-        if not ended and time.monotonic() - self._alive > HANGS:
-            self._process.kill()
-            self._process.wait()
-            ended = True
-        if ended and self.next < self.last:
-            if self._process.returncode != 0:
-                kind, _, _ = make_case(self.seed, self.next, good)
-                found.append((self.next, kind, f"ended with {self._process.returncode}"))
-                self.next += 1
-            self._start()
-        self.done = self.next >= self.last
-        if self.done:
-            self._process.wait()
-            self._output.unlink(missing_ok=True)
-        return found
+def run_cases(
+    good_folder: Path, seed: int, first: int, last: int, thorough: float
+) -> Iterator[tuple[int, str, str]]:
+    """Index, kind and outcome of cases, one worker after the other."""
+    good = {kind: (good_folder / file).read_bytes() for kind, file in KINDS.items()}
+    path = os.pathsep.join([os.environ.get("ORTHOCAL_FUZZ_PATH", ""), str(ROOT)])
+    environment = {**os.environ, "PYTHONPATH": path, "ORTHOCAL_FUZZ_WORKER": "1"}
+    while first < last:
+        command = [sys.executable, __file__, "--worker", good_folder, "--seed", seed]
+        command += ["--first", first, "--count", last, "--thorough", thorough]
+        with subprocess.Popen(
+            list(map(str, command)),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=environment,
+            text=True,
+        ) as process:
+            for line in process.stdout or ():
+                index, kind, outcome = line.rstrip("\n").split(" ", 2)
+                yield int(index), kind, outcome
+                first = int(index) + 1
+        if first < last and process.returncode != 0:
+            yield first, make_case(seed, first, good)[0], f"ended with {process.returncode}"
+            first += 1
 
 
 def main() -> None:
@@ -862,25 +821,19 @@ def main() -> None:
     parser.add_argument("--thorough", type=float, default=1.0)
     parser.add_argument("--keep", type=Path, help="Folder for what was found.")
     given = parser.parse_args()
+    thorough, seed, count = given.thorough, given.seed, given.count
     if given.worker:
-        work(given.worker, given.seed, given.first, given.count, thorough=given.thorough)
+        work(given.worker, seed, given.first, count, thorough=thorough)
         return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         lay_out(folder)
-        good = {kind: (folder / file).read_bytes() for kind, file in KINDS.items()}
-        found = run(
-            folder,
-            seed=given.seed,
-            count=given.count,
-            jobs=given.jobs,
-            thorough=given.thorough,
-            report=tell,
-        )
+        found = run(folder, seed=seed, count=count, jobs=given.jobs, thorough=thorough, report=tell)
         if given.keep:
+            good = {kind: (folder / file).read_bytes() for kind, file in KINDS.items()}
             given.keep.mkdir(parents=True, exist_ok=True)
             for index, kind, _ in found.bad:
-                data = make_case(given.seed, index, good)[1]
+                data = make_case(seed, index, good)[1]
                 (given.keep / f"{index}-{Path(KINDS[kind]).name}").write_bytes(data)
     for key, number in sorted(found.outcomes.items()):
         tell(f"{' '.join(key)} {number}")
