@@ -203,12 +203,12 @@ def _entry_findings(
 
 
 def is_significant(calibration: Calibration, entry: ControllerEntry) -> bool:
-    """Whether a value to enter differs from the active one by more than its uncertainty."""
+    """True if a value to enter differs from the active one by more than its uncertainty."""
     return not abs(entry.change) <= expanded_uncertainty(calibration, entry)
 
 
 def _tool_changes(tool: ToolErrorSummary | None) -> bool:
-    """Whether the tool error changes by more than its uncertainty if the offsets are entered.
+    """True if the tool error changes by more than its uncertainty if the offsets are entered.
 
     Offsets that are correlated may do so although each of them changes insignificantly. Entering
     moves the tool by √(now² - entered²); a controller that corrects all errors leaves its

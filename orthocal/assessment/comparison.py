@@ -112,7 +112,7 @@ def compare_models(
         models: Models of the robot's YAML; all by default.
         tolerances: Name or glob with its unit, such as `*.offset_mm`, to another tolerance
             than the robot's.
-        repeat: Another session of the same rows, or several: whether what remains repeats.
+        repeat: Another session of the same rows, or several, to compare the residuals with.
         options: Which solver, and how it is run.
 
     Raises:
@@ -134,19 +134,12 @@ def compare_models(
     results, undetermined = [], []
     for model in dict.fromkeys(models or parameters.models):
         free = set(parameters.select_model(model))
-        own = {g: v for g, v in given.items() if free & set(parameters.select([g]))}
-        problem = build_problem(session, model=model, prior_stds=own)
-        try:
-            results.append(score_model(problem, noise=noise.sigma, options=options))
-        except NotIdentifiableError:
-            # larger models have a prior: a small one shall not be worse off for having none
-            held = build_problem(session, model=model, prior_stds=own, prior=True)
-            try:
-                results.append(
-                    score_model(held, noise=noise.sigma, by_choice=False, options=options)
-                )
-            except NotIdentifiableError as e:
-                undetermined.append(Undetermined(model, problem.n_machine, e.problem))
+        stds = {g: v for g, v in given.items() if free & set(parameters.select([g]))}
+        score = _score_with_prior(session, model, stds, noise.sigma, options)
+        if isinstance(score, Undetermined):
+            undetermined.append(score)
+        else:
+            results.append(score)
     results.sort(key=lambda r: r.n_free)
     recommendation, judgement = recommend_model(session, models), judge_session(session)
     compared = Comparison(
@@ -173,6 +166,28 @@ def compare_models(
         return compared
     again = repeat_calibration(best, others)
     return replace(compared, repetition=measure_repetition(best, again))
+
+
+def _score_with_prior(
+    session: Session,
+    model: str,
+    prior_stds: Mapping[str, float],
+    noise: float,
+    options: SolverOptions | None,
+) -> ModelResult | Undetermined:
+    """Score a model; with its tolerances as a prior if the readings alone do not determine it.
+
+    Larger models always have a prior, so a small one without would be at a disadvantage.
+    """
+    problem = build_problem(session, model=model, prior_stds=prior_stds)
+    try:
+        return score_model(problem, noise=noise, options=options)
+    except NotIdentifiableError:
+        held = build_problem(session, model=model, prior_stds=prior_stds, prior=True)
+    try:
+        return score_model(held, noise=noise, by_choice=False, options=options)
+    except NotIdentifiableError as e:
+        return Undetermined(model, problem.n_machine, e.problem)
 
 
 def _assess(comparison: Comparison) -> Assessment:
@@ -249,7 +264,9 @@ def _require_another(other: Session, sessions: Sequence[Session]) -> None:
                 where=where,
             )
         if other.sha256 and other.sha256 == session.sha256:
-            raise SessionError("is the same session: what remains repeats by itself", where=where)
+            raise SessionError(
+                "is the same session: its residuals repeat by definition", where=where
+            )
 
 
 def find_known_noise(session: Session) -> KnownNoise:

@@ -24,8 +24,8 @@ from orthocal.io.fields import read_only
 Array = NDArray[np.float64]
 
 DECIDED = 1e-2
-"""Part of what offsets do to the tool that they must do with shift and rotation taken out, for that
-to decide on them: below it they do little but shift and turn the workspace."""
+"""Ratio of the aligned to the absolute tool error of a direction of the offsets, below which the
+absolute error decides on it: such offsets little more than shift and turn the workspace."""
 
 MOST_STEPS = 12
 
@@ -134,7 +134,7 @@ class Entering:
 
 
 def choose_offsets(tool: CalibratedTool, start: Array, *, drives: Sequence[int]) -> Entering:
-    """Offsets that leave the least error at the tool, shift and rotation taken out.
+    """Offsets with the least tool error after alignment of the workpiece.
 
     Where that leaves them open, since they do little but shift and turn the whole region, the
     absolute error decides. Of a machine whose only errors are offsets these are they.
@@ -171,20 +171,21 @@ def choose_offsets(tool: CalibratedTool, start: Array, *, drives: Sequence[int])
 
 
 def _solve_in_order(first: Array, second: Array, first_rows: Array, second_rows: Array) -> Array:
-    """X with first X = first_rows by least squares, and where that hardly tells, by the second.
+    """Least-squares solution X of first X = first_rows, where ill-determined of the second system.
 
-    Directions of X are told apart by how much of what they do by `second` they do by `first`.
+    A direction of X is determined by `first` if its effect there is at least DECIDED times its
+    effect in `second`.
     """
     square = second.T @ second
     factor = np.linalg.cholesky(square)
     half = np.linalg.solve(factor, first.T)
     ratios, turned = np.linalg.eigh(half @ half.T)
     directions = np.linalg.solve(factor.T, turned)
-    told = ratios > DECIDED**2
-    kept = directions[:, told]
+    determined = ratios > DECIDED**2
+    kept = directions[:, determined]
     result = kept @ np.linalg.lstsq(first @ kept, first_rows, rcond=None)[0]
-    if not told.all():
-        rest = directions[:, ~told]
+    if not determined.all():
+        rest = directions[:, ~determined]
         result = (
             result
             + rest @ np.linalg.lstsq(second @ rest, second_rows - second @ result, rcond=None)[0]

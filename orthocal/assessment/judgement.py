@@ -163,7 +163,7 @@ def find_tolerance_scale(session: Session) -> float:
 def _parts(
     model: LinearModel, about: Linearisation, deviation: Array, noise: float
 ) -> tuple[Array, Array, float, int]:
-    """Independent parts of a deviation, offsets taken out.
+    """Independent parts of a deviation, offsets projected out.
 
     Returns:
         Parts over the standard deviation that noise and gauges leave, shape (n,); variances that

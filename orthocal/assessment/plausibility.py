@@ -46,7 +46,7 @@ COMPUTED = 1e-7
 """Scatter below which no dial showed the readings, [m]."""
 
 TINY = 2e-3
-"""Part of the largest distance of postures below which no two are meant to be apart."""
+"""Ratio to the largest distance of postures below which two are taken for a typing error."""
 
 MANY_PLACES = 500
 """Postures above which their distances are found by a tree."""
@@ -59,7 +59,7 @@ NO_CHANCE = 1e-6
 
 
 def find_implausible(session: Session) -> tuple[Finding, ...]:
-    """Findings about units, dimensions, steps and noise, the gravest first.
+    """Findings about units, dimensions, steps and noise.
 
     They depend on the readings and the robot alone, not on the model that is calibrated: residuals
     are those of a fit of offsets, which leaves more than any larger model does.
@@ -70,8 +70,7 @@ def find_implausible(session: Session) -> tuple[Finding, ...]:
         found += [_near(part), *find_finer(part)]
         if problem is not None and part.readings:
             found += _by_fit(part, problem)
-    order = {"reject": 0, "review": 1, "note": 2}
-    return tuple(sorted((f for f in found if f is not None), key=lambda f: order[f.severity]))
+    return tuple(f for f in found if f is not None)
 
 
 def find_scattered(session: Session) -> tuple[Finding, ...]:

@@ -23,7 +23,7 @@ class RemainingError:
     """A combination of parameters that is not well known, and what it does at the tool."""
 
     rms: float
-    """Over the workspace, shift and rotation taken out, [m]."""
+    """RMS over the workspace with shift and rotation removed, [m]."""
     parts: tuple[tuple[str, float], ...]
     """Parameters and by how many prior standard deviations each is off, the largest first."""
 

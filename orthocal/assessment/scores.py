@@ -79,7 +79,7 @@ class ModelResult:
     tool: ToolAccuracy | None
     """None for a robot without a tool centre point."""
     linearisation_cost: ErrorSize | None
-    """Distance at the tool between the two estimates, shift and rotation taken out."""
+    """Distance at the tool between the two estimates with shift and rotation removed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -61,12 +61,12 @@ class ErrorSize:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ErrorSizes:
-    """Size of a field of position errors, told three ways."""
+    """Size of a field of position errors: aligned, relative and absolute."""
 
     aligned: ErrorSize | None
-    """With shift and rotation taken out; None for points too few to have a size then."""
+    """With shift and rotation removed; None if there are too few points."""
     relative: ErrorSize
-    """With the common shift taken out."""
+    """With the common shift removed."""
     absolute: ErrorSize
 
     @property
@@ -82,7 +82,7 @@ class ToolUncertainty:
     covariance: Array
     """Of the position at each point, shape (K, 3, 3), [m²]."""
     aligned_covariance: Array
-    """The same with shift and rotation taken out."""
+    """Covariance at each point with shift and rotation removed, shape (K, 3, 3), [m²]."""
     sizes: ErrorSizes
 
 
@@ -107,7 +107,7 @@ class ToolAccuracy:
     """Uncertainty after the calibration; None if the noise is unknown."""
 
     def align(self, field: Array) -> Array:
-        """A field of position errors with shift and rotation taken out, shape (K, 3, ...)."""
+        """A field of position errors with shift and rotation removed, shape (K, 3, ...)."""
         if len(self.targets) < FEWEST_ALIGNED:
             return self.workspace.remove_shift(field)
         return self.workspace.remove_motion(field, self.targets)

@@ -107,7 +107,7 @@ class Validation:
 
     @property
     def nothing_to_change(self) -> bool:
-        """Whether a calibration from the new readings keeps the active offsets."""
+        """True if a calibration from the new readings keeps the active offsets."""
         return assessment_of(self.refit).keeps_offsets
 
     def to_json(self) -> str:

@@ -117,7 +117,7 @@ class Anomaly:
 
     @property
     def between_sessions(self) -> bool:
-        """Whether it is, or may be, a change between sessions."""
+        """True if it is, or may be, a change between sessions."""
         return any(e.sessions for e in (self.explanation, *self.alternatives))
 
 

@@ -30,7 +30,7 @@ class _Offsets(NamedTuple):
     start: Indices
     """Place from which on `base` applies, shape (h,)."""
     at: Indices
-    """Row with a correction of its own, shape (h,)."""
+    """Row with a separate correction, shape (h,)."""
     value: Array
     """That correction, shape (h,), [m]."""
     lost: Indices

@@ -1,4 +1,4 @@
-"""Swapped rows: two readings, postures, setups or legs in each other's place.
+"""Swapped rows: two readings, postures, setups or legs swapped.
 
 In sessions of more than `FAR_APART` rows two rows of a setup are considered only if they are
 neighbours, and a family of more than `MOST` pairs is not considered at all.
@@ -27,7 +27,7 @@ MOST = 60_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pair:
-    """Rows that may stand in each other's place."""
+    """Rows that may be swapped."""
 
     scope: Scope
     one: Indices
