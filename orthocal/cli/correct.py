@@ -51,6 +51,7 @@ def correct(
         float,
         Option(
             "--within",
+            metavar="UM",
             min=0.01,
             max=1000.0,
             help="Largest distance of the written path from the corrected path, µm.",
@@ -82,7 +83,8 @@ def correct(
     ] = None,
     tool: ToolTip = None,
     out: Annotated[
-        Path | None, Option(help="File for the corrected program; default: standard output.")
+        Path | None,
+        Option(metavar="FILE", help="File for the corrected program; default: standard output."),
     ] = None,
     anyway: Anyway = False,
 ) -> None:

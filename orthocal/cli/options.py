@@ -83,8 +83,9 @@ CalibrationPath = Annotated[
 Model = Annotated[
     str | None,
     Option(
-        help="Model to identify: full, offsets, lengths or another one of the robot; default: that "
-        "of the session, else full."
+        metavar="MODEL",
+        help="Errors to identify: full (the complete machine), offsets, lengths or another "
+        "model of the robot; default: that of the session, else full.",
     ),
 ]
 Free = Annotated[
@@ -107,20 +108,28 @@ Error = Annotated[
     Option(metavar="NAME=VALUE", help="Error of the machine, such as x_slide.offset_mm=1.2."),
 ]
 Errors = Annotated[
-    Path | None, Option(help="YAML file with errors of the machine, such as a truth.yaml.")
+    Path | None,
+    Option(metavar="FILE", help="YAML file with errors of the machine, such as a truth.yaml."),
 ]
 Gauge = Annotated[
     Path | None,
-    Option(help="dial.yaml with data of the gauge; default: ±5 mm, 10 µm, ball of 3 mm."),
+    Option(
+        metavar="FILE",
+        help="dial.yaml with range, resolution and tip of the gauge; default: ±5 mm, 10 µm, ball "
+        "of 3 mm diameter.",
+    ),
 ]
-Hours = Annotated[float | None, Option(help="Time available for measuring; default: 6 setups.")]
+Hours = Annotated[
+    float | None,
+    Option(metavar="HOURS", help="Time available for measuring; default: what 6 setups take."),
+]
 WorkspaceMm = Annotated[
     str | None,
     Option(
         "--workspace-mm",
         metavar="HALF|LOW:HIGH,...",
-        help="Workspace around the mechanical zero: half the side of a cube, or a range for each "
-        "coordinate.",
+        help="Workspace around the mechanical zero, mm: half the side of a cube, or a range "
+        "for each coordinate; default: that of the robot, else up to 60.",
     ),
 ]
 HalfSideMm = Annotated[
@@ -128,7 +137,7 @@ HalfSideMm = Annotated[
     Option(
         "--half-side-mm",
         metavar="MM",
-        help="Half the side of a cube around the mechanical zero, instead of the workspace.",
+        help="Half the side of a cube around the mechanical zero; default: the workspace.",
     ),
 ]
 ToolTip = Annotated[
@@ -139,15 +148,18 @@ ToolTip = Annotated[
         help="Tip of the tool in the frame of the tool centre point, mm; default: 0,0,0.",
     ),
 ]
-Seed = Annotated[int, Option(min=0, help="Seed of the random numbers.")]
+Seed = Annotated[int, Option(min=0, metavar="N", help="Seed of the random numbers.")]
 Workers = Annotated[
-    int | None, Option(min=1, max=1024, help="Number of processes; default: all cores.")
+    int | None,
+    Option(min=1, max=1024, metavar="N", help="Number of processes; default: all cores."),
 ]
 OutDirectory = Annotated[
-    Path, Option("--out", help="Directory for the results; created if necessary.")
+    Path,
+    Option("--out", metavar="DIRECTORY", help="Directory for the results; created if necessary."),
 ]
 OptionalOutDirectory = Annotated[
-    Path | None, Option("--out", help="Directory for the results; created if necessary.")
+    Path | None,
+    Option("--out", metavar="DIRECTORY", help="Directory for the results; created if necessary."),
 ]
 Json = Annotated[bool, Option("--json", help="Print the result as JSON.")]
 Details = Annotated[

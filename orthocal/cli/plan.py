@@ -52,13 +52,16 @@ def plan(
         ),
     ],
     model: Model = None,
-    setups: Annotated[int | None, Option(min=1, help="Number of setups; default: 6.")] = None,
+    setups: Annotated[
+        int | None, Option(min=1, metavar="N", help="Number of setups; default: 6.")
+    ] = None,
     readings: Annotated[
-        int | None, Option(min=2, help="Number of readings in all setups; default: 3 per setup.")
+        int | None,
+        Option(min=2, metavar="N", help="Number of readings in all setups; default: 3 per setup."),
     ] = None,
     hours: Hours = None,
     add: Annotated[
-        int | None, Option(min=1, help="Number of further setups for a session.")
+        int | None, Option(min=1, metavar="N", help="Number of further setups for a session.")
     ] = None,
     gauge: Gauge = None,
     touches: Annotated[
@@ -81,20 +84,33 @@ def plan(
         ),
     ] = None,
     along: Annotated[
-        int, Option(min=2, max=50, help="Number of positions along a leg's direction.")
+        int, Option(min=2, max=50, metavar="N", help="Number of positions along a leg's direction.")
     ] = 9,
     across_mm: Annotated[
-        float, Option(help="Displacement across that direction, to either side.")
+        float, Option(metavar="MM", help="Displacement across that direction, to either side.")
     ] = 20.0,
-    minutes_a_setup: Annotated[float, Option(help="Duration of a setup.")] = 10.0,
-    minutes_a_reading: Annotated[float, Option(help="Duration of a reading.")] = 0.5,
+    minutes_a_setup: Annotated[
+        float, Option(metavar="MINUTES", help="Duration of a setup.")
+    ] = 10.0,
+    minutes_a_reading: Annotated[
+        float, Option(metavar="MINUTES", help="Duration of a reading.")
+    ] = 0.5,
     workspace_mm: WorkspaceMm = None,
     criterion: Annotated[
-        str, Option(metavar="aligned|relative|absolute|worst|A|D|E", help="Criterion to minimise.")
+        str,
+        Option(
+            metavar="aligned|relative|absolute|worst|A|D|E",
+            help="Figure to minimise: RMS tool error after aligning the workpiece, "
+            "after shifting it, or absolute; worst tool error; or trace, determinant or "
+            "largest eigenvalue of the covariance.",
+        ),
     ] = "aligned",
     tolerance: Tolerances = None,
     starts: Annotated[
-        int | None, Option(min=1, max=100, help="Number of random starts of the search.")
+        int | None,
+        Option(
+            min=1, max=100, metavar="N", help="Number of starts of the search; default: 3 or more."
+        ),
     ] = None,
     seed: Seed = 0,
     workers: Workers = None,

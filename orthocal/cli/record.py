@@ -41,11 +41,11 @@ def record(
         ),
     ],
 ) -> None:
-    """Record readings one at a time: position of stand and machine, and warnings of mistakes.
+    """Record readings one at a time, with warnings of mistakes.
 
-    Every reading is on disk before the next one is asked for. An interrupted recording continues
-    at the first missing reading. From a pipe each line counts as typed. Warnings are those of
-    `check` for the readings so far.
+    The position of stand and machine is printed for each reading. Every reading is on disk before
+    the next one is asked for. An interrupted recording continues at the first missing reading.
+    From a pipe each line counts as typed. Warnings are those of `check` for the readings so far.
     """
     from orthocal.measurement.recording import open_recording
 

@@ -32,9 +32,6 @@ PANELS = {
 MODULES = {"import": "import_"}
 """Modules of commands with other names, because Python reserves those of the commands."""
 
-LINES = {"record": "Record readings one at a time, with warnings of mistakes."}
-"""Lines of help that replace the first line of a command's docstring."""
-
 
 def main() -> None:
     """Run the command line; no traceback ever reaches a user.
@@ -62,7 +59,7 @@ def make_program(called: str = "") -> typer.Typer:
     groups = {g.name: g for g in app.registered_groups}
     for name in chosen:
         info: CommandInfo | TyperInfo = commands.get(name) or groups[name]
-        info.rich_help_panel, info.short_help = panels[name], LINES.get(name)
+        info.rich_help_panel = panels[name]
     program = copy.copy(app)
     program.registered_commands = [commands[name] for name in chosen if name in commands]
     program.registered_groups = [groups[name] for name in chosen if name in groups]

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 @app.command()
 def sheet(
     session: PlanPath,
-    feed: Annotated[float, Option(help="Feed between postures, mm/min.")] = 600.0,
+    feed: Annotated[float, Option(metavar="MM/MIN", help="Feed between postures.")] = 600.0,
     approach_feed: Annotated[
-        float, Option(help="Feed over the last millimetres to a posture, mm/min.")
+        float, Option(metavar="MM/MIN", help="Feed over the last millimetres to a posture.")
     ] = 120.0,
     shift_mm: Annotated[
         str,

@@ -63,7 +63,9 @@ Subject = Annotated[
         help="An Orthoglide-type robot, measured by the paper's plan; or a session.",
     ),
 ]
-LegMm = Annotated[float | None, Option(help="Leg length of an Orthoglide of other dimensions, mm.")]
+LegMm = Annotated[
+    float | None, Option(metavar="MM", help="Leg length of an Orthoglide of other dimensions.")
+]
 
 
 @studies.command()
@@ -71,7 +73,9 @@ def accuracy(
     plan: PlanPath,
     model: Model = None,
     free: Free = None,
-    machines: Annotated[int, Option(min=2, max=1_000_000, help="Number of machines.")] = 1000,
+    machines: Annotated[
+        int, Option(min=2, max=1_000_000, metavar="N", help="Number of machines.")
+    ] = 1000,
     draw: Annotated[
         list[str] | None,
         Option(
@@ -134,10 +138,15 @@ def linearisation(
     free: Annotated[
         list[str] | None, Option(metavar="GLOBS", help="Errors that grow; default: offsets.")
     ] = None,
-    largest_mm: Annotated[float, Option(help="Largest size of the errors, mm or mrad.")] = 50.0,
-    sizes: Annotated[int, Option(min=1, max=10_000, help="Number of sizes, from 0.1 mm on.")] = 40,
+    largest_mm: Annotated[
+        float, Option(metavar="SIZE", help="Largest size of the errors, mm or mrad.")
+    ] = 50.0,
+    sizes: Annotated[
+        int, Option(min=1, max=10_000, metavar="N", help="Number of sizes, from 0.1 mm on.")
+    ] = 40,
     directions: Annotated[
-        int, Option(min=1, max=10_000, help="Number of random directions of the errors.")
+        int,
+        Option(min=1, max=10_000, metavar="N", help="Number of random directions of the errors."),
     ] = 25,
     along: Annotated[
         str | None, Option(metavar="A,B,...", help="One direction instead, such as 1,-0.6,0.3.")
@@ -145,20 +154,28 @@ def linearisation(
     max_mm: Annotated[
         float | None,
         Option(
-            help="Displacement of the paper's maximum postures; default: 60 mm, scaled with legs."
+            metavar="MM",
+            help="Displacement of the paper's maximum postures; default: 60 mm, scaled with legs.",
         ),
     ] = None,
     min_mm: Annotated[
         float | None,
-        Option(help="Displacement of its minimum postures; default: -100 mm, scaled with legs."),
+        Option(
+            metavar="MM",
+            help="Displacement of its minimum postures; default: -100 mm, scaled with legs.",
+        ),
     ] = None,
     leg_mm: LegMm = None,
     sigma_mm: Annotated[
         float | None,
-        Option(help="Standard deviation of a reading; default: 0.02, as in the paper."),
+        Option(
+            metavar="MM",
+            help="Standard deviation of a reading, mm; default: 0.02, as in the paper.",
+        ),
     ] = None,
     resolution_mm: Annotated[
-        float | None, Option(help="Resolution of a reading; default: 0.01, as in the paper.")
+        float | None,
+        Option(metavar="MM", help="Resolution of a reading, mm; default: 0.01, as in the paper."),
     ] = None,
     seed: Seed = 0,
     workers: Workers = None,
@@ -255,7 +272,9 @@ def bootstrap(
     by: Annotated[
         str, Option(metavar="residuals|cycles", help="Resample residuals or cycles of setups.")
     ] = "residuals",
-    draws: Annotated[int, Option(min=2, max=1_000_000, help="Number of draws.")] = 1000,
+    draws: Annotated[
+        int, Option(min=2, max=1_000_000, metavar="N", help="Number of draws.")
+    ] = 1000,
     tolerance: Tolerances = None,
     seed: Seed = 0,
     workers: Workers = None,

@@ -24,13 +24,14 @@ def view(
         ),
     ],
     posture: Annotated[
-        str | None, Option(help="Show this posture and its readings; default: all readings.")
+        str | None,
+        Option(metavar="NAME", help="Show this posture and its readings; default: all readings."),
     ] = None,
     exaggerate: Annotated[
         float | None,
         Option(
             metavar="FACTOR",
-            help="Factor that enlarges the deviation of the machine; 1 for true scale.",
+            help="Factor that enlarges the deviation of the machine; 1: true scale.",
         ),
     ] = None,
     show: Annotated[
@@ -38,16 +39,18 @@ def view(
         Option(metavar="readings|tool|all", help="Layers that a calibration shows at first."),
     ] = None,
     html: Annotated[
-        Path | None, Option(help="Write a page that needs neither network nor server.")
+        Path | None,
+        Option(metavar="FILE", help="Write a page that needs neither network nor server."),
     ] = None,
     png: Annotated[
-        Path | None, Option(help="Write a picture; needs an installed Chromium.")
+        Path | None, Option(metavar="FILE", help="Write a picture; needs an installed Chromium.")
     ] = None,
     size: Annotated[
         str, Option(metavar="WIDTHxHEIGHT", help="Size of the picture, in pixels.")
     ] = "1400x900",
     port: Annotated[
-        int | None, Option(min=1, max=65535, help="Port to listen on; default: a free one.")
+        int | None,
+        Option(min=1, max=65535, metavar="N", help="Port to listen on; default: a free one."),
     ] = None,
     browse: Annotated[bool, Option("--open", help="Open the page in a browser.")] = False,
 ) -> None:
