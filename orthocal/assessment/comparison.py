@@ -23,6 +23,7 @@ from orthocal.calibration.refit import repeat_calibration
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
+from orthocal.io.fields import finite_or_none
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.session.session import Session
 from orthocal.statistics.noise import KnownNoise, estimate_repeatability
@@ -77,7 +78,7 @@ class Comparison:
         document = {
             "schema": "orthocal/comparison/4",
             "title": self.title,
-            "noise": _number(self.noise.sigma),
+            "noise": finite_or_none(self.noise.sigma),
             "noise_source": self.noise.source,
             "independent_readings": self.independent,
             "models": [_result_document(r) for r in self.results],
@@ -90,7 +91,7 @@ class Comparison:
                 "model": self.recommendation.model,
                 "tolerance_scale": self.recommendation.tolerance_scale,
                 "log_evidence": {
-                    e.model: _number(e.log_evidence) for e in self.recommendation.evidence
+                    e.model: finite_or_none(e.log_evidence) for e in self.recommendation.evidence
                 },
             },
         }
@@ -280,21 +281,17 @@ def find_known_noise(session: Session) -> KnownNoise:
     return KnownNoise(math.nan, "unknown", 0.0)
 
 
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def _result_document(result: ModelResult) -> dict[str, Any]:
     def score(s: Score) -> dict[str, Any]:
         return {
             "estimates": dict(s.estimates),
-            "residuals": [_number(v) for v in s.residuals.tolist()],
-            "rms": _number(s.rms),
-            "chi_square": _number(s.chi_square),
+            "residuals": [finite_or_none(v) for v in s.residuals.tolist()],
+            "rms": finite_or_none(s.rms),
+            "chi_square": finite_or_none(s.chi_square),
             "dof": s.dof,
-            "aicc": _number(s.aicc),
-            "bic": _number(s.bic),
-            "unseen_rms": _number(s.unseen_rms),
+            "aicc": finite_or_none(s.aicc),
+            "bic": finite_or_none(s.bic),
+            "unseen_rms": finite_or_none(s.unseen_rms),
         }
 
     def size(s: ErrorSize | None) -> dict[str, float] | None:
@@ -311,7 +308,7 @@ def _result_document(result: ModelResult) -> dict[str, Any]:
         "effective_parameters": result.effective,
         "linearised": score(result.linearised),
         "exact": score(result.exact),
-        "standard_deviations": {p.name: _number(p.std) for p in result.calibration.free},
+        "standard_deviations": {p.name: finite_or_none(p.std) for p in result.calibration.free},
         "tool_uncertainty": size(None if after is None else after.sizes.aligned),
         "tool_uncertainty_relative": size(None if after is None else after.sizes.relative),
         "tool_uncertainty_absolute": size(None if after is None else after.sizes.absolute),

@@ -49,6 +49,7 @@ from orthocal.calibration.refit import repeat_fit, restore_session
 from orthocal.errors import SessionError
 from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomaly
 from orthocal.hypotheses.search import find_anomalies
+from orthocal.io.fields import finite_or_none
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.session.session import Session
 from orthocal.statistics.chance import BY_CHANCE
@@ -118,7 +119,7 @@ class Validation:
                 "drive": e.drive,
                 "unit": e.unit,
                 "change": e.change,
-                "expanded_uncertainty": _number(expanded_uncertainty(refit, e)),
+                "expanded_uncertainty": finite_or_none(expanded_uncertainty(refit, e)),
                 "significant": is_significant(refit, e),
             }
             for e in assessment_of(refit).entries
@@ -135,7 +136,7 @@ class Validation:
             "refit_rms": refit.rms_after,
             "refit_largest": refit.largest_after,
             "as_expected": self.as_expected,
-            "excess_probability": _number(self.excess_probability),
+            "excess_probability": finite_or_none(self.excess_probability),
             "nothing_to_change": self.nothing_to_change,
             "changes": changes,
             "mistake": None if self.mistake is None else _mistake_document(self.mistake),
@@ -143,10 +144,6 @@ class Validation:
             **self.repetition.to_document(),
         }
         return json.dumps(document, indent=1, allow_nan=False) + "\n"
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _mistake_document(mistake: Anomaly) -> dict[str, Any]:

@@ -6,7 +6,6 @@ by text, JSON, report, scene and exports.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -15,7 +14,7 @@ import numpy as np
 
 from orthocal.hypotheses.anomaly import AnomalyKind
 from orthocal.io.documents import Number, PositiveInSI
-from orthocal.io.fields import CLOSED, Many, NumberOrNaN, SizeOrNaN
+from orthocal.io.fields import CLOSED, Many, NumberOrNaN, SizeOrNaN, finite_or_none
 from orthocal.kinematics.workspace import describe_box
 from orthocal.units import InUnit, Unit
 
@@ -126,7 +125,7 @@ class Finding:
             "severity": self.severity,
             "text": self.text,
             "action": self.action,
-            "numbers": {k: v if math.isfinite(v) else None for k, v in self.numbers.items()},
+            "numbers": {k: finite_or_none(v) for k, v in self.numbers.items()},
             "places": [{k: getattr(p, k) for k in Place.__slots__} for p in self.places],
         }
 
