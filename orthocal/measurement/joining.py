@@ -20,7 +20,7 @@ Given = Session | str | Path
 
 
 def gather_sessions(given: Given | Sequence[Given]) -> list[Session]:
-    """What was given as one session or several, loaded where it is a path.
+    """List of one or several sessions; paths are loaded.
 
     Raises:
         SessionError: If a path is none of a session.
@@ -28,11 +28,9 @@ def gather_sessions(given: Given | Sequence[Given]) -> list[Session]:
     """
     several = [given] if isinstance(given, Session | str | Path) else given
     require_kind(several, (list, tuple), expected="a Session, the path to one, or a list of them")
-    found = []
     for one in several:
         require_kind(one, (Session, str, Path), expected="a Session, or the path to one")
-        found.append(one if isinstance(one, Session) else load_session(one))
-    return found
+    return [one if isinstance(one, Session) else load_session(one) for one in several]
 
 
 def join_sessions(sessions: Sequence[Session]) -> Session:
@@ -82,37 +80,37 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
 
 
 def _join_tolerances(sessions: Sequence[Session]) -> dict[str, float]:
-    """What sessions state of one machine's tolerances.
+    """Tolerances that sessions on one machine state.
 
     Raises:
         SessionError: If they do not agree.
     """
-    found: dict[str, float] = {}
+    tolerances: dict[str, float] = {}
     of: dict[str, Session] = {}
     for session in sessions:
         for key, value in session.robot.parameters.stated.items():
-            if found.setdefault(key, value) != value:
+            if tolerances.setdefault(key, value) != value:
                 raise SessionError(
-                    f"is {value:g}; it is {found[key]:g} in {of[key].path or 'another session'}, "
+                    f"is {value:g}; it is {tolerances[key]:g} in {of[key].path or 'another session'}, "
                     "and the machine is the same",
                     where=f"{session.path or 'session'}: calibration.tolerances.{key}",
                 )
             of.setdefault(key, session)
-    return found
+    return tolerances
 
 
 def split_sessions(session: Session) -> tuple[Session, ...]:
-    """A joined session's own ones, with what they are named in it; one that is none stays whole."""
+    """Parts of a joined session, with their names in it; another session is its only part."""
     if not session.joined:
         return (session,)
     label = [r.setup.partition("/")[0] for r in session.readings]
     return tuple(
         replace(
             session,
-            setups={k: v for k, v in session.setups.items() if k.partition("/")[0] == own},
-            readings=tuple(r for r, of in zip(session.readings, label, strict=True) if of == own),
+            setups={k: v for k, v in session.setups.items() if k.partition("/")[0] == part},
+            readings=tuple(r for r, of in zip(session.readings, label, strict=True) if of == part),
         )
-        for own in dict.fromkeys(label)
+        for part in dict.fromkeys(label)
     )
 
 
@@ -163,12 +161,11 @@ def _rename(session: Session, labels: Mapping[str, str]) -> Session:
     active, aligned_at = session.active_offsets, session.alignment_postures
 
     def setup(s: Setup) -> Setup:
-        own = active if s.active is None else s.active
         return replace(
             s,
             name=named(s.name),
             gauge=named(s.gauge),
-            active=own,
+            active=active if s.active is None else s.active,
             aligned_at=named(aligned_at[s.name]),
         )
 

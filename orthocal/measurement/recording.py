@@ -403,7 +403,7 @@ def _yaml_with_readings(file: Path, csv: Path, table: bytes) -> bytes:
 
 
 def _is_outdated(session: Session) -> bool:
-    """Whether the files of a session differ from those that were loaded."""
+    """True if the files of a session changed since they were loaded."""
     if session.path is None or session.readings_path is None:
         return True
     parts = (read_file(f, error=SessionError) for f in (session.path, session.readings_path))

@@ -203,12 +203,12 @@ class Session:
 
     @property
     def zero_drives(self) -> Array:
-        """Commanded drive coordinates of the mechanical zero while each setup stood.
+        """Commanded drive coordinates of the mechanical zero with the active offsets of each setup.
 
         Shape (n_setups, n_drives), [m, rad].
         """
-        own = [s.active for s in self.setups.values()]
-        active = [self.active_offsets if a is None else a for a in own]
+        stated = [s.active for s in self.setups.values()]
+        active = [self.active_offsets if a is None else a for a in stated]
         return np.asarray(self.robot.drive_zero - np.array(active))
 
     @property
@@ -225,15 +225,15 @@ class Session:
         for r in self.readings:
             read[r.setup].update(order[p] for p in (r.posture, r.minus) if p is not None)
         names, drives = list(order), np.array([p.drives for p in self.postures.values()])
-        found = {}
+        aligned_at = {}
         for setup, zero in zip(self.setups.values(), self.zero_drives, strict=True):
             if setup.aligned_at is not None:
-                found[setup.name] = setup.aligned_at
+                aligned_at[setup.name] = setup.aligned_at
                 continue
             among = np.array(sorted(read[setup.name]) or range(len(names)))
             distances = np.linalg.norm(drives[among] - zero, axis=1).round(ALIKE)
-            found[setup.name] = names[among[int(distances.argmin())]]
-        return found
+            aligned_at[setup.name] = names[among[int(distances.argmin())]]
+        return aligned_at
 
     @property
     def values(self) -> Array:
@@ -316,8 +316,6 @@ class Session:
         Args:
             values: Shape (n_readings,), [m].
         """
-        given = require_array(values, shape=(len(self.readings),), argument="values")
-        changed = tuple(
-            replace(r, value=float(v)) for r, v in zip(self.readings, given, strict=True)
-        )
+        new = require_array(values, shape=(len(self.readings),), argument="values")
+        changed = tuple(replace(r, value=float(v)) for r, v in zip(self.readings, new, strict=True))
         return replace(self, readings=changed, sha256="")

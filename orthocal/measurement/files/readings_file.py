@@ -41,12 +41,12 @@ def mm_text(value: Decimal) -> str:
     """A reading in mm as a readings.csv has it: exactly, with two decimals at least."""
     if not -30 < value.adjusted() < 30:
         return f"{value:e}"
-    whole, _, decimals = f"{value:f}".partition(".")
-    return f"{whole}.{decimals.rstrip('0').ljust(2, '0')}"
+    integer, _, decimals = f"{value:f}".partition(".")
+    return f"{integer}.{decimals.rstrip('0').ljust(2, '0')}"
 
 
 def is_house(header: Iterable[str]) -> bool:
-    """Whether headings are those of a readings.csv, letter by letter."""
+    """True for the exact headings of a readings.csv."""
     names = [composed(name.strip()) for name in header]
     return set(REQUIRED) <= set(names) <= {*REQUIRED, *OPTIONAL} and len(set(names)) == len(names)
 
@@ -65,15 +65,15 @@ def decide_sign(
     Raises:
         SessionError: Where two signs are possible.
     """
-    found = infer_decimal_sign(cells)
-    if found.sign is not None:
-        return found
-    if found.rival is not None and found.evidence is not None:
+    sign = infer_decimal_sign(cells)
+    if sign.sign is not None:
+        return sign
+    if sign.rival is not None and sign.evidence is not None:
         raise SessionError(
-            f"the reading '{shorten(found.rival.text)}' has a decimal point, and "
-            f"'{shorten(found.evidence.text)}' in line {found.evidence.line} a decimal comma; "
+            f"the reading '{shorten(sign.rival.text)}' has a decimal point, and "
+            f"'{shorten(sign.evidence.text)}' in line {sign.evidence.line} a decimal comma; "
             "use one decimal sign",
-            where=place(found.rival.line),
+            where=place(sign.rival.line),
         )
     open_cells = (c for c in cells if _is_open(c.text) and not (house and "," not in c.text))
     rival = next(open_cells, None)
@@ -88,7 +88,7 @@ def decide_sign(
 
 
 def _is_open(text: str) -> bool:
-    """Whether a numeral is two numbers."""
+    """True for a numeral that is a number with either decimal sign."""
     both = parse_numeral(text, "comma"), parse_numeral(text, "point")
     return None not in both and both[0] != both[1]
 
@@ -122,7 +122,7 @@ def read_rows(path: Path, content: bytes) -> Iterator[RawReading]:
 
 
 def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
-    """Rows below the house's own headings."""
+    """Rows below the headings of a readings.csv."""
 
     def rows() -> Iterator[tuple[int, dict[str, str]]]:
         return read_csv_rows(
@@ -156,14 +156,14 @@ ASK = "write it with a decimal point, or use `orthocal import --decimal comma|po
 
 
 def _plain_sign(cells: Sequence[Numeral], path: Path) -> Sign | None:
-    """The decimal sign below the house's own headings, where a point is a decimal point."""
+    """The decimal sign below the headings of a readings.csv, where a point is a decimal point."""
     if not any("," in cell.text for cell in cells) or infer_decimal_sign(cells).contradictory:
         return "point"
     return decide_sign(cells, house=True, ask=ASK, place=lambda line: f"{path}:{line}").sign
 
 
 def _house_number(text: str, sign: Sign | None) -> str:
-    """A number in the house form; what is none stays as it is, to be refused."""
+    """A number in the form of a readings.csv; other text is unchanged, to be refused later."""
     if sign == "comma":
         value = parse_numeral(text, sign)
         return text if value is None else mm_text(value)
@@ -184,8 +184,10 @@ def _clean_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
     first = table.header_line == 1 or stated_separator(decode(content, where="").text) is not None
     if table.above or not first:
         return None
-    strange = [i for i in columns.extra]
-    strange += [r.index for r in columns.readings if r.unit != "mm" or r.cycle is not None]
+    strange = [
+        *columns.extra,
+        *(r.index for r in columns.readings if r.unit != "mm" or r.cycle is not None),
+    ]
     if strange:
         name = " ".join(table.header[min(strange)].split())
         raise SessionError(
@@ -206,9 +208,9 @@ def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
         where = table.place(row.line)
         if len(row.cells) > width or row.width < width:
             names = SEPARATORS[table.separator or "comma"].join(table.header)
-            found = max(len(row.cells), row.width if row.width < width else 0)
+            count = max(len(row.cells), row.width if row.width < width else 0)
             raise SessionError(
-                f"has {found} fields; expected {width} ({shorten(names)})", where=where
+                f"has {count} fields; expected {width} ({shorten(names)})", where=where
             )
         text = {
             name: "" if index is None else composed(row.cell(index).text.strip())
@@ -264,8 +266,8 @@ def require_whole_cells(table: Table, columns: Columns, *, sure: bool = False) -
             )
         if certain:
             continue
-        for left, right in sorted(pairs):
-            a, b = row.cell(left).text.strip(), row.cell(right).text.strip()
+        for first, second in sorted(pairs):
+            a, b = row.cell(first).text.strip(), row.cell(second).text.strip()
             if _WHOLE.fullmatch(a) and _DIGITS.fullmatch(b):
                 raise SessionError(
                     f"'{shorten(a)},{shorten(b)}' may be two cells or one number with a decimal "

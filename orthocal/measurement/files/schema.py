@@ -1,4 +1,4 @@
-"""What a session.yaml may hold: keys and units as in the file."""
+"""Keys of a session.yaml, with their units."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ MOST_SETUPS = 1_000
 """Setups of a session; each has an unknown zero of its own."""
 
 MOST_READINGS = 50_000
-"""Readings of a session or a plan: four times the largest that was tried, by hand a month's work.
-A calibration takes 10 kB for each."""
+"""Largest number of readings of a session or a plan, four times the largest that was tested. A
+calibration needs 10 kB for each."""
 
 MOST_GAUGES = 100
 """Gauges of a session."""
@@ -78,15 +78,15 @@ class PostureKeys(_Keys):
 
     @model_validator(mode="after")
     def _one_form(self) -> PostureKeys:
-        given = [k for k in ("tcp_mm", "joints_mm", "joints_deg") if getattr(self, k) is not None]
-        if len(given) != 1:
-            found = " and ".join(given) if given else "none"
-            raise ValueError(f"found {found}; expected one of tcp_mm, joints_mm, joints_deg")
+        stated = [k for k in ("tcp_mm", "joints_mm", "joints_deg") if getattr(self, k) is not None]
+        if len(stated) != 1:
+            shown = " and ".join(stated) or "none"
+            raise ValueError(f"found {shown}; expected one of tcp_mm, joints_mm, joints_deg")
         return self
 
 
 class ControllerKeys(_Keys):
-    """What the controller already corrects: one number a drive of the kind, in their order."""
+    """Offsets active in the controller: one number per drive of the kind, in their order."""
 
     offsets_mm: Vector | None = None
     """Of prismatic drives."""
@@ -110,7 +110,7 @@ class ControllerKeys(_Keys):
 
 
 class CalibrationKeys(_Keys):
-    """What will be identified, and what is known of the machine's errors beforehand."""
+    """Model, free errors and tolerances of the calibration."""
 
     model: str | None = None
     """A model of the robot's YAML."""

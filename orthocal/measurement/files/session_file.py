@@ -6,19 +6,14 @@ They are checked against the robot and the nominal machine.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from orthocal.effects.loading import load_robot
-from orthocal.errors import ClosureError, ParameterError, RobotError, SessionError
+from orthocal.errors import ParameterError, RobotError, SessionError
 from orthocal.io.documents import read_yaml, validate
-from orthocal.io.fields import read_only
 from orthocal.io.files import (
     content_withheld_outside,
     exists,
@@ -26,31 +21,31 @@ from orthocal.io.files import (
     read_file,
     require_plain_name,
 )
-from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.files.readings_checks import check_readings
 from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
-from orthocal.measurement.files.session_robot import build_offsets, require_given_zero
+from orthocal.measurement.files.session_robot import (
+    build_offsets,
+    build_postures,
+    require_given_zero,
+)
 from orthocal.observation.contacts import locate_contacts
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import NuisanceParameter, Sensor, SetupKeys, default_zero
 from orthocal.sensors.registry import read_setup
-from orthocal.session.session import Gauge, Posture, Purpose, Reading, Session, Setup
-from orthocal.units import DRIVE_UNITS, MM, show_limit
-
-Array = NDArray[np.float64]
-
+from orthocal.session.session import Gauge, Purpose, Reading, Session, Setup
+from orthocal.units import MM, show_limit
 
 SESSION = "session.yaml"
 
 MOST_LOOKED_AT = 200
-"""Folders in which a session is looked for, where one was not found."""
+"""Largest number of subdirectories searched for sessions."""
 
 MOST_NAMED = 5
-"""Sessions of a folder that are named where it is none itself."""
+"""Largest number of sessions of subdirectories in a message."""
 
 OTHER_KINDS = (".csv", ".json", ".urdf")
-"""What the names of files of other kinds end with."""
+"""Suffixes of files of other kinds."""
 
 
 def load_session(path: str | Path) -> Session:
@@ -70,7 +65,7 @@ def load_session(path: str | Path) -> Session:
 def _load_session(
     file: Path, content: bytes, keys: SessionKeys, *, unread: set[int] | None = None
 ) -> Session:
-    """A session with readings; where `unread` is given cells may be empty, and it tells which."""
+    """A session with readings; `unread` collects the indices of empty cells."""
     plan, readings_path = _build_unread(file, keys)
     table = read_file(readings_path, error=SessionError)
     with content_withheld_outside(file.parent, readings_path):
@@ -162,19 +157,18 @@ def load_rows(path: str | Path) -> tuple[Session, frozenset[int]]:
 def read_purpose(
     keys: CalibrationKeys | None, robot: Robot, *, where: str
 ) -> tuple[Purpose | None, Robot]:
-    """What a session.yaml says under `calibration`.
+    """Purpose of a session, and its robot with the stated tolerances.
 
     Args:
-        keys: That.
+        keys: Keys under `calibration`.
         robot: The robot of the session.
         where: File and key, for messages.
 
     Returns:
-        What is to be identified, None where that is not said; and the robot with the tolerances
-        that are stated.
+        Model and free errors, None if neither is stated; and the robot.
 
     Raises:
-        SessionError: If a model, name, unit or number is none of the robot's.
+        SessionError: If the robot has no such model or name, or a unit or number is invalid.
     """
     if keys is None:
         return None, robot
@@ -219,43 +213,43 @@ def _read_keys(path: Path) -> tuple[Path, bytes, SessionKeys]:
     if file.suffix.lower() in OTHER_KINDS:
         raise SessionError("is no session.yaml", where=str(file))
     if file is not path and not exists(file):
-        raise SessionError(f"there is no such file{_what_is_there(path)}", where=str(file))
+        raise SessionError(f"there is no such file{_describe_content(path)}", where=str(file))
     content = read_file(file, error=SessionError)
     data = read_yaml(file, error=SessionError, content=content)
     return file, content, validate(SessionKeys, data, where=str(file), error=SessionError)
 
 
-def _what_is_there(folder: Path) -> str:
-    """What a folder without a session holds instead, as the end of a message."""
+def _describe_content(folder: Path) -> str:
+    """Calibration or sessions in a directory without a session, as the end of a message."""
     if exists(folder / "calibration.json"):
         return "; the folder holds a calibration: name the session that it was made from"
-    own = sorted(f.parent for f in islice(folder.glob(f"*/{SESSION}"), MOST_LOOKED_AT))
-    if not own:
+    sessions = sorted(f.parent for f in islice(folder.glob(f"*/{SESSION}"), MOST_LOOKED_AT))
+    if not sessions:
         return ""
-    more = ", ..." if len(own) > MOST_NAMED else ""
-    return f"; sessions in it: {', '.join(map(str, own[:MOST_NAMED]))}{more}"
+    more = ", ..." if len(sessions) > MOST_NAMED else ""
+    return f"; sessions in it: {', '.join(map(str, sessions[:MOST_NAMED]))}{more}"
 
 
 _Setups = Mapping[str, tuple[SetupKeys, Sensor]]
 
 
 def _read_setups(file: Path, keys: SessionKeys) -> _Setups:
-    """What the file says of each setup, and the sensor that stands there."""
+    """Keys and sensor of each setup."""
     gauges = keys.gauges or {"": keys.gauge or GaugeKeys()}
     only = next(iter(gauges.values())) if len(gauges) == 1 else GaugeKeys()
-    found = {}
+    setups = {}
     for name, data in keys.setups.items():
         named = data.get("gauge")
         gauge = gauges.get(named, only) if isinstance(named, str) else only
-        given = gauge.model_dump(include={"tip", "scale_tolerance"}, exclude_none=True)
-        found[name] = read_setup(
-            data, where=str(file), under=f"setups.{name}", error=SessionError, gauge=given
+        defaults = gauge.model_dump(include={"tip", "scale_tolerance"}, exclude_none=True)
+        setups[name] = read_setup(
+            data, where=str(file), under=f"setups.{name}", error=SessionError, gauge=defaults
         )
-    return found
+    return setups
 
 
 def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
-    """Everything of a session but its readings."""
+    """The session without its readings."""
     try:
         robot = load_robot(keys.robot, beside=file.parent)
     except RobotError as e:
@@ -285,7 +279,7 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         title=keys.title,
         source=keys.source,
         gauges=gauges,
-        postures=_build_postures(keys, robot, offsets, file),
+        postures=build_postures(keys, robot, offsets, file),
         setups=setups,
         readings=(),
         controller_offsets=offsets,
@@ -298,35 +292,35 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
 
 
 def _check_shared(setups: Mapping[str, Setup], file: str) -> None:
-    """Refuse setups that share what they cannot: at another place, or known otherwise."""
+    """Refuse setups that share a parameter at another place or with another tolerance."""
     first: dict[tuple[str, str], tuple[Setup, NuisanceParameter]] = {}
     for setup in setups.values():
-        for unknown in setup.sensor.nuisance_parameters:
-            owner = f"gauge {setup.gauge}" if unknown.of_gauge else unknown.shared_by
+        for parameter in setup.sensor.nuisance_parameters:
+            owner = f"gauge {setup.gauge}" if parameter.of_gauge else parameter.shared_by
             if owner is None:
                 continue
-            before, known = first.setdefault((owner, unknown.name), (setup, unknown))
-            if not unknown.of_gauge and before.sensor.place != setup.sensor.place:
+            before, other = first.setdefault((owner, parameter.name), (setup, parameter))
+            if not parameter.of_gauge and before.sensor.place != setup.sensor.place:
                 problem = f"stands at {' '.join(before.sensor.place)}"
-            elif known.prior_std != unknown.prior_std:
-                problem = f"states a tolerance of {show_limit(known.prior_std):g} {known.unit}"
+            elif other.prior_std != parameter.prior_std:
+                problem = f"states a tolerance of {show_limit(other.prior_std):g} {other.unit}"
             else:
                 continue
             raise SessionError(
-                f"shares the {unknown.name} of '{owner}' with '{before.name}', which {problem}",
+                f"shares the {parameter.name} of '{owner}' with '{before.name}', which {problem}",
                 where=f"{file}: setups.{setup.name}",
             )
 
 
 def _build_gauges(keys: SessionKeys) -> dict[str, Gauge]:
-    given = keys.gauges or {"": keys.gauge or GaugeKeys()}
+    gauges = keys.gauges or {"": keys.gauge or GaugeKeys()}
     return {
         name: Gauge(
             None if g.sigma_mm is None else g.sigma_mm * MM,
             None if g.resolution_mm is None else g.resolution_mm * MM,
             None if g.range_mm is None else (g.range_mm[0] * MM, g.range_mm[1] * MM),
         )
-        for name, g in given.items()
+        for name, g in gauges.items()
     }
 
 
@@ -361,85 +355,3 @@ def _check_planned_postures(file: Path, keys: SessionKeys, read: _Setups) -> Non
             if posture in seen:
                 raise SessionError(f"'{posture}' stands twice", where=where)
             seen.add(posture)
-
-
-def _check_count(values: Sequence[float], robot: Robot, where: str) -> None:
-    if len(values) != len(robot.drives):
-        names = ", ".join(d.name for d in robot.drives)
-        raise SessionError(
-            f"has {len(values)} numbers; expected {len(robot.drives)}, one a drive: {names}",
-            where=where,
-        )
-
-
-def _build_postures(
-    keys: SessionKeys, robot: Robot, offsets: Array | None, file: Path
-) -> dict[str, Posture]:
-    """Commanded drive coordinates of all postures, through the nominal inverse kinematics."""
-    closure = nominal_closure(robot)
-    active = np.zeros(len(robot.drives)) if offsets is None else offsets
-    stated = [] if keys.controller is None else keys.controller.stated
-    nominal: dict[str, Array] = {}
-    given: dict[str, tuple[Any, Array]] = {}
-    targets: dict[str, Array] = {}
-    for name, posture in keys.postures.items():
-        where = f"{file}: postures.{name}"
-        if posture.tcp_mm is not None:
-            if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
-                raise SessionError(
-                    f"{robot.name} cannot be commanded by its tool; give joints", where=where
-                )
-            if len(posture.tcp_mm) != len(robot.drives):
-                raise SessionError(
-                    f"has {len(posture.tcp_mm)} coordinates; expected {len(robot.drives)}",
-                    where=f"{where}.tcp_mm",
-                )
-            given[name] = ("tcp_mm", np.array(posture.tcp_mm) * MM)
-            targets[name] = given[name][1]
-            continue
-        form = "joints_mm" if posture.joints_mm is not None else "joints_deg"
-        values = posture.joints_mm or posture.joints_deg or []
-        _check_count(values, robot, f"{where}.{form}")
-        unit = "m" if form == "joints_mm" else "rad"
-        for drive in robot.drives:
-            if drive.unit != unit:
-                raise SessionError(
-                    f"drive {drive.name} is in {'mm' if drive.unit == 'm' else 'deg'}",
-                    where=f"{where}.{form}",
-                )
-        si = np.array(values) * MM if unit == "m" else np.deg2rad(values)
-        given[name] = (form, si)
-        nominal[name] = si
-    if targets:
-        try:
-            joints = closure.inverse(np.array(list(targets.values())), names=list(targets))
-        except ClosureError as e:
-            raise SessionError(e.reason, where=f"{file}: postures.{e.posture}") from None
-        nominal.update(zip(targets, joints, strict=True))
-    for name in keys.postures:
-        _check_travel(robot, nominal[name], where=f"{file}: postures.{name}")
-        where = f"{file}: controller.{' and '.join(stated)}: in posture '{name}'"
-        _check_travel(robot, nominal[name] - active, where=where, joiner=" ")
-    try:
-        closure.close(np.array([nominal[n] for n in keys.postures]), names=list(keys.postures))
-    except ClosureError as e:
-        raise SessionError(e.reason, where=f"{file}: postures.{e.posture}") from None
-    return {
-        name: Posture(
-            name, given[name][0], read_only(given[name][1]), read_only(nominal[name] - active)
-        )
-        for name in keys.postures
-    }
-
-
-def _check_travel(robot: Robot, drives: Array, *, where: str, joiner: str = ": ") -> None:
-    """Refuse drive coordinates beyond a drive's travel."""
-    for drive, value in zip(robot.drives, drives, strict=True):
-        if not drive.lower - 1e-9 <= value <= drive.upper + 1e-9:
-            unit, size = DRIVE_UNITS[drive.unit]
-            file, _, key = where.partition(": ")
-            problem = (
-                f"{key}{joiner}{drive.name} would be at {value / size:.2f} {unit}; it reaches "
-                f"from {drive.lower / size:g} to {drive.upper / size:g} {unit}"
-            )
-            raise SessionError(problem, where=file)

@@ -1,21 +1,26 @@
-"""What a session says of its robot, held against it: zero and controller."""
+"""Postures and controller offsets of a session, checked against its robot."""
 
 from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.errors import SessionError
+from orthocal.errors import ClosureError, SessionError
 from orthocal.io.fields import read_only
-from orthocal.measurement.files.schema import OFFSET_KEYS, ControllerKeys
+from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.measurement.files.schema import OFFSET_KEYS, ControllerKeys, PostureKeys, SessionKeys
 from orthocal.robot.model import Robot
-from orthocal.units import DRIVE_UNITS
+from orthocal.session.session import Posture, PostureForm
+from orthocal.units import DRIVE_UNITS, MM
 
 Array = NDArray[np.float64]
 
 
 def require_given_zero(robot: Robot, where: str) -> None:
-    """Refuse a robot whose zero is one of many: legs, sections and offsets count from it.
+    """Refuse a robot without a stated mechanical zero: legs, sections and offsets count from it.
 
     Args:
         robot: The robot.
@@ -24,18 +29,96 @@ def require_given_zero(robot: Robot, where: str) -> None:
     Raises:
         SessionError: With the zeros that were found, which may be adopted.
     """
-    found = [
+    zeros = [
         f"{d.name}.zero_{unit} ({d.zero / size:.6g} was found)"
         for d in robot.drives
         for unit, size in [DRIVE_UNITS[d.unit]]
         if d.zero_computed
     ]
-    if found:
+    if zeros:
         raise SessionError(
             f"'{robot.name}' cannot stand with its drives at 0, and its mechanical zero is not "
-            f"given; add to orthocal.drives in {robot.yaml}: {', '.join(found)}",
+            f"given; add to orthocal.drives in {robot.yaml}: {', '.join(zeros)}",
             where=where,
         )
+
+
+def build_postures(
+    keys: SessionKeys, robot: Robot, offsets: Array | None, file: Path
+) -> dict[str, Posture]:
+    """Postures with their commanded drive coordinates, by the nominal inverse kinematics.
+
+    Args:
+        keys: Keys of the session.yaml.
+        robot: The robot.
+        offsets: Active offsets, shape (n_drives,), [m, rad]; None if not stated.
+        file: The session.yaml, for messages.
+
+    Raises:
+        SessionError: If a posture has the wrong coordinates, or the machine cannot reach it.
+    """
+    closure = nominal_closure(robot)
+    active = np.zeros(len(robot.drives)) if offsets is None else offsets
+    stated = [] if keys.controller is None else keys.controller.stated
+    values = {n: _read_posture(p, robot, f"{file}: postures.{n}") for n, p in keys.postures.items()}
+    points = {name: point for name, (form, point) in values.items() if form == "tcp_mm"}
+    try:
+        commanded = {name: v for name, (_, v) in values.items()}
+        if points:
+            joints = closure.inverse(np.array(list(points.values())), names=list(points))
+            commanded |= dict(zip(points, joints, strict=True))
+        for name, drives in commanded.items():
+            _check_travel(robot, drives, f"postures.{name}: ", file)
+            key = f"controller.{' and '.join(stated)}: in posture '{name}' "
+            _check_travel(robot, drives - active, key, file)
+        closure.close(np.array(list(commanded.values())), names=list(commanded))
+    except ClosureError as e:
+        raise SessionError(e.reason, where=f"{file}: postures.{e.posture}") from None
+    return {
+        name: Posture(name, form, read_only(v), read_only(commanded[name] - active))
+        for name, (form, v) in values.items()
+    }
+
+
+def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureForm, Array]:
+    """Form and coordinates of a posture, [m, rad]."""
+    form = next(f for f in get_args(PostureForm) if getattr(keys, f) is not None)
+    values, count = getattr(keys, form), len(robot.drives)
+    if form == "tcp_mm":
+        if robot.tcp is None or len(robot.tcp.coordinates) != count:
+            raise SessionError(
+                f"{robot.name} cannot be commanded by its tool; give joints", where=where
+            )
+        if len(values) != count:
+            raise SessionError(
+                f"has {len(values)} coordinates; expected {count}", where=f"{where}.{form}"
+            )
+        return form, np.array(values) * MM
+    where = f"{where}.{form}"
+    if len(values) != count:
+        names = ", ".join(d.name for d in robot.drives)
+        raise SessionError(
+            f"has {len(values)} numbers; expected {count}, one a drive: {names}", where=where
+        )
+    unit = "m" if form == "joints_mm" else "rad"
+    for drive in robot.drives:
+        if drive.unit != unit:
+            raise SessionError(
+                f"drive {drive.name} is in {DRIVE_UNITS[drive.unit][0]}", where=where
+            )
+    return form, np.array(values) * MM if unit == "m" else np.deg2rad(values)
+
+
+def _check_travel(robot: Robot, drives: Array, key: str, file: Path) -> None:
+    """Refuse drive coordinates beyond a drive's travel."""
+    for drive, value in zip(robot.drives, drives, strict=True):
+        if not drive.lower - 1e-9 <= value <= drive.upper + 1e-9:
+            unit, size = DRIVE_UNITS[drive.unit]
+            raise SessionError(
+                f"{key}{drive.name} would be at {value / size:.2f} {unit}; it reaches from "
+                f"{drive.lower / size:g} to {drive.upper / size:g} {unit}",
+                where=str(file),
+            )
 
 
 def build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Array | None:

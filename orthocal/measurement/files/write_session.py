@@ -79,7 +79,7 @@ def _gauge_document(gauge: Gauge) -> dict[str, Any]:
 
 
 def _calibration_document(session: Session) -> dict[str, Any]:
-    """What it is measured for, and with which tolerances."""
+    """Purpose and stated tolerances of a session."""
     purpose = session.purpose or Purpose()
     entries = {
         "model": purpose.model,
@@ -219,5 +219,5 @@ def used_columns(rows: Sequence[Mapping[str, str]]) -> list[str]:
 
 def _trim(number: str) -> str:
     """A decimal number without trailing zeros beyond the second decimal."""
-    whole, _, decimals = number.partition(".")
-    return f"{whole}.{decimals.rstrip('0').ljust(2, '0')}"
+    integer, _, decimals = number.partition(".")
+    return f"{integer}.{decimals.rstrip('0').ljust(2, '0')}"

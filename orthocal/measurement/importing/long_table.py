@@ -130,8 +130,8 @@ def make_long_table(
         where = table.place(entry.line, entry.column.index)
         written = (entry.setup, entry.posture, entry.minus)
         meant = [
-            _session_name(name, known)
-            for name, known in zip(written, (setups, postures, postures), strict=True)
+            _session_name(name, of_session)
+            for name, of_session in zip(written, (setups, postures, postures), strict=True)
         ]
         setup, posture, minus = meant
         row = RawReading(
