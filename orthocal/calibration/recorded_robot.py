@@ -233,10 +233,10 @@ def _require_postures(record: CalibrationRecord, robot: Robot, file: str) -> Non
         names = f"drive: {', '.join(d.name for d in robot.drives)}"
         offsets = len(record.session.controller_offsets)
         counts.append(("session.controller_offsets", offsets, drives, names))
-    for key, found, count, kind in counts:
-        if found != count:
+    for key, length, count, kind in counts:
+        if length != count:
             raise CalibrationFileError(
-                f"has {found} numbers; expected {count}, one a {kind}", where=f"{file}: {key}"
+                f"has {length} numbers; expected {count}, one a {kind}", where=f"{file}: {key}"
             )
 
 

@@ -91,8 +91,8 @@ def _join_tolerances(sessions: Sequence[Session]) -> dict[str, float]:
         for key, value in session.robot.parameters.stated.items():
             if tolerances.setdefault(key, value) != value:
                 raise SessionError(
-                    f"is {value:g}; it is {tolerances[key]:g} in {of[key].path or 'another session'}, "
-                    "and the machine is the same",
+                    f"is {value:g}; it is {tolerances[key]:g} in "
+                    f"{of[key].path or 'another session'}, and the machine is the same",
                     where=f"{session.path or 'session'}: calibration.tolerances.{key}",
                 )
             of.setdefault(key, session)
