@@ -16,6 +16,7 @@ from tolerances import SAME_OPTIMUM
 from tool_coordinate import ToolCoordinate
 
 from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
+from orthocal.calibration import build_record
 from orthocal.calibration.file import calibration_json, write_calibration
 from orthocal.cli import make_program
 from orthocal.errors import OrthocalError, SessionError
@@ -34,6 +35,7 @@ from orthocal.sensors import registry
 from orthocal.sensors.compiled import compile_reading
 from orthocal.session.session import Conditions
 
+FAST = SolverOptions(solver="variable-projection")
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
 PLAN = """robot: orthoglide
@@ -88,7 +90,7 @@ def test_its_readings_are_those_of_the_tool(plan):
         assert np.abs(found[own] - expected).max() < 1e-12
 
 
-def test_what_is_not_known_of_it_is_identified_beside_the_machine(plan):
+def test_nuisance_parameters_are_identified_with_the_machine(plan):
     """Slopes of 2 and 3 in a thousand at 0.16 m of travel read to 2 µm: told to some 1e-5."""
     simulated = simulate_session(plan, TRUTH, seed=4)
     assert set(simulated.nuisance) == {"dial.d.slope", "setup.tz.slope"}
@@ -101,39 +103,44 @@ def test_what_is_not_known_of_it_is_identified_beside_the_machine(plan):
     assert [p.name for p in result.free] == list(TRUTH)
 
 
-def test_its_deviations_are_those_of_many_simulated_calibrations(plan):
-    """Offsets and slopes, both drawn: z scores of 60 fits, as calibrations have them."""
-    options, scores = SolverOptions(solver="variable-projection"), []
+def simulated_fits(plan, others=()):
+    """Truth and fit of 60 simulated sessions; errors named `others` are drawn."""
+    planned = build_problem(plan, model="offsets")
     for seed in range(60):
-        simulated = simulate_session(plan, TRUTH, seed=seed)
-        fit = fit_problem(build_problem(simulated.session, model="offsets"), options=options)
+        errors = {**(draw_errors(plan.robot, others, seed=seed) if others else {}), **TRUTH}
+        simulated = simulate_session(plan, errors, seed=seed)
+        problem = planned.with_values(simulated.session.values)
         truth = {**TRUTH, **simulated.nuisance}
-        names, std = fit.problem.free, np.sqrt(np.diag(fit.covariance()))
-        scores.append((fit.solution.theta - [truth[name] for name in names]) / std)
+        yield [truth[n] for n in problem.free], fit_problem(problem, options=FAST)
+
+
+def test_predicted_deviations_are_those_of_many_simulated_calibrations(plan):
+    """Offsets and slopes, both drawn: z scores of 60 fits, as calibrations have them."""
+    scores = []
+    for truth, fit in simulated_fits(plan):
+        std = np.sqrt(np.diag(fit.covariance()))
+        scores.append((fit.solution.theta - truth) / std)
     spread = np.sqrt(np.mean(np.square(scores), axis=0))
     assert spread == pytest.approx(1.0, abs=0.3)  # 3 standard deviations of a spread of 60
-    result = calibrate(simulated.session, solver=options)
+    result = calibrate(fit.problem.session, solver=FAST)
     estimates = (*result.free, *result.sensors)
-    assert [p.name for p in estimates] == list(names)
+    assert [p.name for p in estimates] == list(fit.problem.free)
     assert [p.value for p in estimates] == fit.solution.theta.tolist()
-    known = np.sqrt(np.diag(result.model_covariance))
-    assert known == pytest.approx(std[: len(known)], rel=1e-12)
+    machine = np.sqrt(np.diag(result.model_covariance))
+    assert machine == pytest.approx(std[: len(machine)], rel=1e-12)
 
 
-def test_all_that_is_not_known_of_it_holds_on_machines_with_all_errors(plan):
-    """60 of them: offsets and slopes by all that is not known, no more told than is so."""
+def test_standard_deviations_hold_on_machines_with_all_errors(plan):
+    """60 machines: offsets and slopes against standard deviations with unmodelled errors."""
     scores, others = [], [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
-    for seed in range(60):
-        errors = {**draw_errors(plan.robot, others, seed=seed), **TRUTH}
-        simulated = simulate_session(plan, errors, seed=seed)
-        result = calibrate(simulated.session, solver=SolverOptions(solver="variable-projection"))
-        truth = {**TRUTH, **simulated.nuisance}
+    for truth, fit in simulated_fits(plan, others):
+        result = build_record.assemble_calibration(fit)
         estimates = (*result.free, *result.sensors)
-        scores.append([(p.value - truth[p.name]) / p.std for p in estimates])
+        scores.append([(p.value - v) / p.std for p, v in zip(estimates, truth, strict=True)])
     spread = np.sqrt(np.mean(np.square(scores), axis=0))
     n = len(TRUTH)
     assert spread[:n] == pytest.approx(1.0, abs=0.3)  # 3 standard deviations of a spread of 60
-    # the noise that they are told by is that of the residuals, which have the other errors in them
+    # the noise of the slopes is that of the residuals, which contain the other errors
     assert (spread[n:] > 0.5).all()
     assert (spread[n:] < 1.3).all()
 
@@ -176,11 +183,11 @@ def test_it_is_written_and_read(plan, tmp_path):
     assert loaded.robot.name == "orthoglide"
 
 
-def test_it_is_told_reported_and_drawn(plan, tmp_path, capsys):
+def test_it_is_in_answer_report_and_scene(plan, tmp_path, capsys):
     path = write_session(simulate_session(plan, TRUTH, seed=1).session, tmp_path / "s")
     make_program()(["calibrate", str(path), "--out", str(tmp_path / "out")], standalone_mode=False)
-    told = capsys.readouterr().out
-    assert "legs x, y and tool" in told
+    answer = capsys.readouterr().out
+    assert "legs x, y and tool" in answer
     report = build_report(load_calibration(tmp_path / "out"))
     assert "dial.d.slope" in report
     make_program()(
