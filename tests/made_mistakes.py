@@ -316,7 +316,12 @@ def sized_mistakes(size: float) -> dict[str, Make]:
 
 
 def sound_session(plan, seed: int, *, entered: bool):
-    """A session of a machine with all errors at their tolerances.
+    """A session of a machine with all errors at their tolerances; see `sound_machine`."""
+    return sound_machine(plan, seed, entered=entered)[1]
+
+
+def sound_machine(plan, seed: int, *, entered: bool):
+    """Errors of a machine with all errors at their tolerances, and a session of it.
 
     Args:
         plan: What is read where.
@@ -335,7 +340,7 @@ def sound_session(plan, seed: int, *, entered: bool):
         else:
             errors.update({n: errors[n] * 0.4 for n in offsets})
         try:
-            return simulate_session(used, errors, seed=seed).session
+            return errors, simulate_session(used, errors, seed=seed).session
         except OrthocalError:
             continue
     raise AssertionError("no machine shows readings within the gauge's range")

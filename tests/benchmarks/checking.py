@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 from typer.testing import CliRunner
 
-from orthocal import load_plan
+from orthocal import check_session, load_plan
 from orthocal.cli import make_program
 from orthocal.hypotheses import search
 from orthocal.hypotheses.linear_model import LinearModel
@@ -66,12 +66,10 @@ def count_mistakes(example: str, sessions: int, sizes: tuple[float, ...]) -> dic
 
 
 def count_accused(example: str, sessions: int) -> int:
-    """Sound sessions of which a mistake is told."""
+    """Sound sessions that `check` asks to review or rejects."""
     plan = load_plan(ROOT / "examples" / example / "plan.yaml")
-    return sum(
-        bool(search.find_anomalies(sound_session(plan, seed, entered=seed % 2 == 1)).found)
-        for seed in range(sessions)
-    )
+    made = (sound_session(plan, seed, entered=seed % 2 == 1) for seed in range(sessions))
+    return sum(check_session(session).decision.verdict != "enter" for session in made)
 
 
 def plan_with(readings: int):
