@@ -114,7 +114,7 @@ def find_warnings(session: Session) -> tuple[Finding, ...]:
 
 
 def is_doubtful(session: Session, row: int, mean: float, std: float) -> bool:
-    """Whether a reading calls for `find_warnings` before its setup is complete.
+    """True if a reading calls for `find_warnings` before its setup is complete.
 
     Args:
         session: The readings so far.

@@ -85,18 +85,20 @@ def find_scattered(session: Session) -> tuple[Finding, ...]:
 def find_finer(session: Session) -> Iterator[Finding]:
     """Gauges of which at least half of the readings lie between the steps."""
     for name, gauge in session.gauges.items():
-        own = [i for i, r in enumerate(session.readings) if session.setups[r.setup].gauge == name]
-        finer = np.flatnonzero(are_finer(session.values[own], gauge))
-        if finer.size * 2 < len(own) or not finer.size:
+        rows_of_gauge = [
+            i for i, r in enumerate(session.readings) if session.setups[r.setup].gauge == name
+        ]
+        finer = np.flatnonzero(are_finer(session.values[rows_of_gauge], gauge))
+        if finer.size * 2 < len(rows_of_gauge) or not finer.size:
             continue
-        first = own[int(finer[0])]
+        first = rows_of_gauge[int(finer[0])]
         yield words.finer_than_gauge(
             finer.size,
-            len(own),
+            len(rows_of_gauge),
             gauge.resolution or 0.0,
             session.where(session.readings[first]),
             session.readings[first].value,
-            [place_of(session, own[int(i)]) for i in finer[:MOST_PLACES]],
+            [place_of(session, rows_of_gauge[int(i)]) for i in finer[:MOST_PLACES]],
         )
 
 

@@ -107,7 +107,7 @@ class Repetition:
 
     @property
     def repeats(self) -> bool | None:
-        """Whether the residuals are unmodelled errors, not noise; None if unknown."""
+        """True if the residuals are unmodelled errors, not noise; None if unknown."""
         if math.isnan(self.chance):
             return None
         return self.chance < CHANCE and self.correlation > 0.0

@@ -103,7 +103,7 @@ class Validation:
 
     @property
     def as_expected(self) -> bool | None:
-        """Whether the deviations are within the predictive distribution; None if unknown."""
+        """True if the deviations are within the predictive distribution; None if unknown."""
         return _is_expected(self.excess_probability)
 
     @property
@@ -112,7 +112,7 @@ class Validation:
         return assessment_of(self.refit).keeps_offsets
 
     def to_json(self) -> str:
-        """As JSON, SI units."""
+        """Document for JSON, SI units."""
         refit = self.refit
         changes = [
             {

@@ -132,12 +132,12 @@ def remake_robot(folder: Path, *, check: Callable[[Robot], object] | None = None
     """
     name = folder.resolve().name
     dimensions, counting = read_machine(folder / MACHINE)
-    own = folder / f"{name}.yaml"
-    if not exists(own):
+    yaml_file = folder / f"{name}.yaml"
+    if not exists(yaml_file):
         others = sorted(p.name for p in folder.glob("*.yaml") if p.name != MACHINE)
         there = f"; there is {', '.join(others[:3])}: was the directory renamed?" if others else ""
-        raise RobotError(f"there is no such file{there}", where=str(own))
-    description = read_file(own, error=RobotError).decode("utf-8", "replace")
+        raise RobotError(f"there is no such file{there}", where=str(yaml_file))
+    description = read_file(yaml_file, error=RobotError).decode("utf-8", "replace")
     files = describe_machine(dimensions, name=name, counting=counting, description=description)
     del files[MACHINE]
     with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
@@ -244,8 +244,8 @@ def _override(pattern: str, tolerances: Mapping[str, float], file: str) -> str:
     Raises:
         RobotError: If the YAML has no place for them.
     """
-    given = ", ".join(f"{json.dumps(name)}: {_number(v)}" for name, v in tolerances.items())
-    text, found = _TOLERANCES.subn(lambda m: f"{m[1]}, overrides: {{{given}}}}}", pattern)
+    stated = ", ".join(f"{json.dumps(name)}: {_number(v)}" for name, v in tolerances.items())
+    text, found = _TOLERANCES.subn(lambda m: f"{m[1]}, overrides: {{{stated}}}}}", pattern)
     if found != 1:
         raise RobotError(
             "has no line 'tolerances: {...}'; expected one for other tolerances", where=file

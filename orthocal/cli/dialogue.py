@@ -34,7 +34,7 @@ class Answers:
     counting: tuple[Counting, Counting, Counting]
 
     def with_dimensions(self, **changes: Any) -> Answers:  # noqa: ANN401 - dimensions, [m]
-        """The same answers with other dimensions."""
+        """Copy of the answers with other dimensions."""
         return replace(self, dimensions=replace(self.dimensions, **changes))
 
 

@@ -41,7 +41,7 @@ class GeometryErrors(Effect):
 
     robot: Robot
     errors: tuple[ElementaryError, ...]
-    """Errors of joints, then of the frames in use.
+    """Errors of joint placements, then of the frames in use.
 
     The component of a motor's placement along or about its own axis is left out: the offset is the
     same error.

@@ -128,7 +128,7 @@ class Effect:
         return {}
 
     def reading(self, reading: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
-        """What the gauge shows.
+        """Reading of the gauge.
 
         Args:
             reading: Reading after the preceding effects, [m]; that of the sensor for the first.

@@ -1,1 +1,1 @@
-"""What follows from the readings: linearised and exact identification, results, uncertainty."""
+"""Identification from readings: linearised and exact estimates, results, uncertainty."""

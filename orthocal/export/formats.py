@@ -141,7 +141,7 @@ def require_entering(calibration: Calibration) -> None:
 
 
 def warn_against_verdict(calibration: Calibration) -> str:
-    """What is written with a calibration whose verdict is review or reject; empty otherwise."""
+    """Warning written with a calibration whose verdict is review or reject; empty otherwise."""
     verdict = assessment_of(calibration).decision.verdict
     if verdict == "enter":
         return ""

@@ -43,8 +43,8 @@ class Tails:
     def by_segment(self) -> Iterator[tuple[Indices, Indices, Array]]:
         """Patterns of each segment that has any, with its rows and base vector."""
         used, begin = np.unique(self.segment, return_index=True)
-        for s, own in zip(used, np.split(np.arange(self.segment.size), begin[1:]), strict=True):
-            yield own, *self.segments[s]
+        for s, members in zip(used, np.split(np.arange(self.segment.size), begin[1:]), strict=True):
+            yield members, *self.segments[s]
 
     def to_sparse(self, count: int) -> Sparse:
         """Patterns as a sparse matrix, shape (h, count)."""

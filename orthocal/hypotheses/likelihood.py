@@ -108,9 +108,11 @@ class Likelihood:
 
         With errors at their tolerances and the stated noise.
         """
-        beside = np.maximum(effects.square - (effects.along**2).sum(axis=1), 0.0)
+        perpendicular = np.maximum(effects.square - (effects.along**2).sum(axis=1), 0.0)
         noise = self.sigma**2
-        return np.asarray(effects.along**2 @ (1.0 / (self.variances + noise)) + beside / noise)
+        return np.asarray(
+            effects.along**2 @ (1.0 / (self.variances + noise)) + perpendicular / noise
+        )
 
     def estimate_amount(self, deviation: Array, effect: Array) -> tuple[float, float]:
         """Amount of an effect without prior, errors at their tolerances, noise as stated.
@@ -127,8 +129,8 @@ class Likelihood:
         if not information > 0.0:
             return 0.0, np.inf
         along, noise = products.along, self.sigma**2
-        beside = effect @ deviation - along[0] @ along[1]
-        slope = along[0] @ (along[1] / (self.variances + noise)) + beside / noise
+        perpendicular = effect @ deviation - along[0] @ along[1]
+        slope = along[0] @ (along[1] / (self.variances + noise)) + perpendicular / noise
         return float(slope) / information, information**-0.5
 
     def score(
@@ -147,9 +149,9 @@ class Likelihood:
         logs = self._on_grid(deviations)
         if effects is not None and cross is not None:
             inverse, noise = 1.0 / self.variance, self.noise
-            beside = np.maximum(effects.square - (effects.along**2).sum(axis=1), 0.0)
+            perpendicular = np.maximum(effects.square - (effects.along**2).sum(axis=1), 0.0)
             remaining = cross - (effects.along * deviations.along).sum(axis=1)
-            information = effects.along**2 @ inverse + beside[:, None] / noise
+            information = effects.along**2 @ inverse + perpendicular[:, None] / noise
             slope = (effects.along * deviations.along) @ inverse + remaining[:, None] / noise
             logs = logs + self._gain(information, slope)
         return np.asarray(log_of_sum(logs + self.weights, axis=1))
@@ -164,8 +166,8 @@ class Likelihood:
     def _on_grid(self, deviations: Products) -> Array:
         """Logarithms for all pairs (e, s), shape (h, g)."""
         variance, noise = self.variance, self.noise
-        beside = np.maximum(deviations.square - (deviations.along**2).sum(axis=1), 0.0)
-        squares = deviations.along**2 @ (1.0 / variance) + beside[:, None] / noise
+        perpendicular = np.maximum(deviations.square - (deviations.along**2).sum(axis=1), 0.0)
+        squares = deviations.along**2 @ (1.0 / variance) + perpendicular[:, None] / noise
         logs = -0.5 * (squares + np.log(variance).sum(axis=0))
         return np.asarray(logs - 0.5 * max(self.dof - len(variance), 0) * np.log(noise))
 
@@ -197,8 +199,8 @@ class Likelihood:
         for taus in grid:
             precision = np.repeat(1.0 / (np.array(taus) * self.sigma) ** 2, sizes)
             full = gram + np.diag(np.append(precision, np.zeros(n_silent)))
-            found = np.linalg.solve(full, slope[..., None])[..., 0]
-            gain = 0.5 * ((slope * found).sum(axis=1) - np.linalg.slogdet(full)[1])
+            solution = np.linalg.solve(full, slope[..., None])[..., 0]
+            gain = 0.5 * ((slope * solution).sum(axis=1) - np.linalg.slogdet(full)[1])
             gains.append(gain + 0.5 * np.log(precision).sum())
         every = logs + log_of_sum(np.array(gains), axis=0) - np.log(len(grid))
         every = every + 0.5 * n_silent * np.log(2.0 * np.pi)
@@ -219,12 +221,14 @@ class Likelihood:
 
     def _gram(self, deviation: Array, vectors: Array) -> tuple[Array, Array]:
         """W V⁻¹ Wᵀ, shape (g, k, k), and W V⁻¹ d, shape (g, k), for all pairs (e, s)."""
-        inverse, rest = 1.0 / self.variance, 1.0 / self.noise
-        along, own = self.directions @ deviation, vectors @ self.directions.T
-        beside = vectors - own @ self.directions
-        gram = np.einsum("kr,rg,lr->gkl", own, inverse, own)
-        gram += rest[:, None, None] * (beside @ beside.T)
-        slope = ((own * along) @ inverse + np.outer(beside @ deviation, rest)).T
+        inverse, inverse_noise = 1.0 / self.variance, 1.0 / self.noise
+        along, components = self.directions @ deviation, vectors @ self.directions.T
+        perpendicular = vectors - components @ self.directions
+        gram = np.einsum("kr,rg,lr->gkl", components, inverse, components)
+        gram += inverse_noise[:, None, None] * (perpendicular @ perpendicular.T)
+        slope = (
+            (components * along) @ inverse + np.outer(perpendicular @ deviation, inverse_noise)
+        ).T
         return gram, np.asarray(slope)
 
 
@@ -253,24 +257,24 @@ def build_likelihood(
     n, p = jacobian.shape
     if n > 2 * p:  # principal directions of a tall matrix by its triangular factor
         q, triangle = np.linalg.qr(jacobian)
-        left, sizes, errors = np.linalg.svd(triangle, full_matrices=False)
-        kept = sizes > LEAST * max(float(sizes.max(initial=0.0)), sigma)
-        directions = (q @ left[:, kept]).T
+        left_vectors, sizes, errors = np.linalg.svd(triangle, full_matrices=False)
+        significant = sizes > LEAST * max(float(sizes.max(initial=0.0)), sigma)
+        directions = (q @ left_vectors[:, significant]).T
     else:
-        left, sizes, errors = np.linalg.svd(jacobian, full_matrices=False)
-        kept = sizes > LEAST * max(float(sizes.max(initial=0.0)), sigma)
-        directions = left[:, kept].T
+        left_vectors, sizes, errors = np.linalg.svd(jacobian, full_matrices=False)
+        significant = sizes > LEAST * max(float(sizes.max(initial=0.0)), sigma)
+        directions = left_vectors[:, significant].T
     scale = -0.5 * (np.log(TOLERANCE_SCALES) / TOLERANCE_SCALE_SPREAD) ** 2
     noise = noise_weights(stated=stated)
     weights = np.repeat(scale - log_of_sum(scale), NOISE_SCALES.size)
     likelihood = Likelihood(
         np.ascontiguousarray(directions),
-        sizes[kept] ** 2,
+        sizes[significant] ** 2,
         sigma,
         dof,
         weights + np.tile(noise, TOLERANCE_SCALES.size),
     )
-    return likelihood, errors[kept].T, sizes[kept]
+    return likelihood, errors[significant].T, sizes[significant]
 
 
 def noise_weights(*, stated: bool) -> Array:
@@ -282,8 +286,8 @@ def noise_weights(*, stated: bool) -> Array:
     noise = _log_normal(NOISE_SCALES, UNSTATED_SPREAD)
     if not stated:
         return noise
-    known = np.log1p(-WRONGLY_STATED) + _log_normal(NOISE_SCALES, NOISE_SCALE_SPREAD)
-    return np.asarray(np.logaddexp(known, np.log(WRONGLY_STATED) + noise))
+    stated_noise = np.log1p(-WRONGLY_STATED) + _log_normal(NOISE_SCALES, NOISE_SCALE_SPREAD)
+    return np.asarray(np.logaddexp(stated_noise, np.log(WRONGLY_STATED) + noise))
 
 
 def _log_normal(values: Array, spread: float) -> Array:

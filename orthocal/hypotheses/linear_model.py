@@ -123,7 +123,7 @@ class LinearModel:
     def active(self) -> Array:
         """Offsets stated as active in the controller, shape (n_sessions, n_drives), [m, rad]."""
         session = self.problem.session
-        own = [
+        indices = [
             session.active_offsets if s.active is None else s.active
             for s in session.setups.values()
         ]
@@ -131,7 +131,7 @@ class LinearModel:
         first = [
             int(setups[np.argmax(self.session_of_entry == k)]) for k in range(len(self.labels))
         ]
-        return np.array([own[i] for i in first])
+        return np.array([indices[i] for i in first])
 
     @cached_property
     def to_entries(self) -> Sparse:
@@ -196,8 +196,8 @@ class LinearModel:
             if len(machines) == 1:
                 expected, jacobian = prediction, slope
             else:
-                own = which[self.session_of_entry] == m
-                expected[own], jacobian[own] = prediction[own], slope[own]
+                entries = which[self.session_of_entry] == m
+                expected[entries], jacobian[entries] = prediction[entries], slope[entries]
         jacobian = project_out_zeros(jacobian, o)
         likelihood, vectors, sizes = build_likelihood(
             jacobian, sigma=self.sigma, dof=self.dof, stated=self.stated
@@ -298,17 +298,17 @@ class LinearModel:
         if patterns.tails is not None:
             tails, o = patterns.tails, self.problem.observations
             square += 2.0 * self._overlap(tails, entries)
-            for own, rows, base in tails.by_segment():
+            for members, rows, base in tails.by_segment():
                 at, zero = o.plus[rows], o.zero[o.plus[rows[0]]]
-                values, start = base / self.problem.noise[at], tails.start[own]
+                values, start = base / self.problem.noise[at], tails.start[members]
 
                 def tail(x: Array, start: Indices = start) -> Array:
                     return np.asarray(np.cumsum(x[::-1], axis=0)[::-1][start])
 
-                along[own] += tail(values[:, None] * directions[:, at].T)
-                square[own] += tail(values**2)
-                cross[own] += tail(values * deviation[at])
-                sums[own, zero] += tail(values)
+                along[members] += tail(values[:, None] * directions[:, at].T)
+                square[members] += tail(values**2)
+                cross[members] += tail(values * deviation[at])
+                sums[members, zero] += tail(values)
         square = square - (sums**2) @ (1.0 / self._counts)
         return Products(along, np.maximum(square, 0.0)), cross
 
@@ -326,10 +326,10 @@ class LinearModel:
         if patterns.tails is not None:
             tails, o = patterns.tails, self.problem.observations
             result = result + self._overlap(tails, other)
-            for own, rows, base in tails.by_segment():
+            for members, rows, base in tails.by_segment():
                 at = o.plus[rows]
                 total = np.cumsum((base / self.problem.noise[at])[::-1])[::-1]
-                sums[own, o.zero[at[0]]] += total[tails.start[own]]
+                sums[members, o.zero[at[0]]] += total[tails.start[members]]
         return np.asarray(result - (sums * (other @ self._incidence)) @ (1 / self._counts))
 
     def _write_out(self, patterns: Patterns) -> Patterns:
@@ -347,10 +347,10 @@ class LinearModel:
         base = np.zeros(o.size)
         start = np.repeat(tails.start, np.diff(entries.indptr))
         pattern = np.repeat(np.arange(result.size), np.diff(entries.indptr))
-        for own, rows, values in tails.by_segment():
+        for members, rows, values in tails.by_segment():
             at = o.plus[rows]
             position[at], base[at] = np.arange(rows.size), values / self.problem.noise[at]
-            chosen = slice(entries.indptr[own[0]], entries.indptr[own[-1] + 1])
+            chosen = slice(entries.indptr[members[0]], entries.indptr[members[-1] + 1])
             columns = entries.indices[chosen]
             shared = np.where(position[columns] >= start[chosen], base[columns], 0.0)
             shared = entries.data[chosen] * shared
@@ -368,8 +368,8 @@ class LinearModel:
         deviation = self.entries(rows[None])[0] - about.expected
         errors = about.errors_for(deviation)
         along = about.sizes * (about.errors.T @ errors)
-        left = (deviation - along @ about.likelihood.directions) * self.problem.noise
-        return float(np.sqrt(np.mean(self.problem.observations.rows(left) ** 2)))
+        residuals = (deviation - along @ about.likelihood.directions) * self.problem.noise
+        return float(np.sqrt(np.mean(self.problem.observations.rows(residuals) ** 2)))
 
 
 def label_sessions(session: Session, setup: Indices) -> tuple[tuple[str, ...], Indices]:

@@ -548,6 +548,6 @@ def _rms(model: LinearModel, state: HypothesisSet) -> float:
     """RMS of what remains of the corrected rows, [m]."""
     errors = state.about.errors_for(state.remaining)
     along = state.about.sizes * (state.about.errors.T @ errors)
-    left = state.remaining - along @ state.about.likelihood.directions
-    rows = model.problem.observations.rows(left * model.problem.noise)
+    residuals = state.remaining - along @ state.about.likelihood.directions
+    rows = model.problem.observations.rows(residuals * model.problem.noise)
     return float(np.sqrt(np.mean(rows**2)))

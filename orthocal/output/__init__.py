@@ -1,1 +1,1 @@
-"""What people look at and take away."""
+"""Text, JSON, reports, sheets and scenes."""

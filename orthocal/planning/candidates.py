@@ -257,7 +257,7 @@ def _difference_std(jacobian: Array, spread: Array) -> Array:
 
 
 def _find_reachable(session: Session, h: Array, unknown: Array) -> NDArray[np.bool_]:
-    """Whether a gauge with the middle of its range in one posture has another in its range."""
+    """True if a gauge with the middle of its range in one posture has another in its range."""
     if session.gauge.range is None:
         return np.ones((h.size, h.size), dtype=np.bool_)
     half = 0.5 * (session.gauge.range[1] - session.gauge.range[0])

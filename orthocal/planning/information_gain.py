@@ -133,13 +133,13 @@ class SetupGain:
         spread = self.spread[sets[:, :, None], sets[:, None, :]]
         spread += self.noise * np.eye(sets.shape[1])
         for a in self.aligned:
-            own = a.sensitivity[sets]
-            effect += own[:, :, None] * a.effect[first][:, None, :]
-            across = own[:, :, None] * a.spread[first[:, None], sets][:, None, :]
+            sensitivity = a.sensitivity[sets]
+            effect += sensitivity[:, :, None] * a.effect[first][:, None, :]
+            across = sensitivity[:, :, None] * a.spread[first[:, None], sets][:, None, :]
             spread += across + np.swapaxes(across, 1, 2)
             for other in self.aligned:
                 both = a.product(other)[first]
-                outer = own[:, :, None] * other.sensitivity[sets][:, None, :]
+                outer = sensitivity[:, :, None] * other.sensitivity[sets][:, None, :]
                 spread += both[:, None, None] * outer
         return np.asarray((effect * np.linalg.solve(spread, effect)).sum(axis=(1, 2)))
 
@@ -199,8 +199,8 @@ class SetupGain:
         spreads += 2.0 * self.noise
         for a in self.aligned:
             change = a.sensitivity - a.sensitivity[:, None]
-            for total, own in ((gains, a.effect @ self.effect.T), (spreads, a.spread)):
-                total += 2.0 * change * (own - own.diagonal()[:, None])
+            for total, pairs in ((gains, a.effect @ self.effect.T), (spreads, a.spread)):
+                total += 2.0 * change * (pairs - pairs.diagonal()[:, None])
             for other in self.aligned:
                 both = change * (other.sensitivity - other.sensitivity[:, None])
                 gains += both * np.vecdot(a.effect, other.effect)[:, None]
@@ -236,9 +236,9 @@ class SetupGain:
 
     def _covariance(self, rest: Array, rows: list[int]) -> Array:
         """V_SS + σ² I of readings, from their rows of V."""
-        own = rest[:, rows]
-        own[np.diag_indices(len(rows))] += self.noise
-        return own
+        variance = rest[:, rows]
+        variance[np.diag_indices(len(rows))] += self.noise
+        return variance
 
     def _single_gains(self, effect: Array, variance: Array) -> Array:
         scale = np.maximum(variance, 0.0)

@@ -196,7 +196,7 @@ def _evaluate(
 ) -> MeasuringPlan:
     """Plan with its expected errors, and those of others."""
     plan, measured, forecast = comparison.plan, comparison.measured, comparison.forecast
-    whole = plan if measured is None else join_sessions([measured, plan])
+    joined = plan if measured is None else join_sessions([measured, plan])
     setups, readings = len(planned.setups), sum(len(s.chosen) for s in planned.setups)
     minutes = comparison.equipment.minutes(setups, len(plan.readings))
     each = round(readings / setups)
@@ -206,15 +206,15 @@ def _evaluate(
                 lambda: compute_curve(search, each, setups, comparison.equipment),
                 comparison.list_alternatives,
                 comparison.list_usual_plans,
-                lambda: forecast.after(whole),
-                lambda: forecast.after(whole, entered=False),
-                lambda: forecast.about_nominal(whole),
+                lambda: forecast.after(joined),
+                lambda: forecast.after(joined, entered=False),
+                lambda: forecast.about_nominal(joined),
                 lambda: forecast.before if measured is None else forecast.after(measured),
             ),
             killed=KILLED,
         )
-    own = Stage(setups, readings, minutes, planned.error)
-    factor, rest = _scale(own, expected, nominal, criterion)
+    stage = Stage(setups, readings, minutes, planned.error)
+    factor, remainder = _scale(stage, expected, nominal, criterion)
     return MeasuringPlan(
         session=plan,
         forecast=forecast,
@@ -225,8 +225,8 @@ def _evaluate(
         first_round=first_round,
         compared=compared,
         helps=helps,
-        stage=scale_curve([own], factor, rest)[0],
-        curve=scale_curve(curve, factor, rest),
+        stage=scale_curve([stage], factor, remainder)[0],
+        curve=scale_curve(curve, factor, remainder),
         equipment=comparison.equipment,
         candidates=len(comparison.candidates.session.readings),
     )
@@ -246,7 +246,7 @@ def _reporter(say: Callable[[str], None], criterion: Criterion) -> Callable[[int
 
 
 def _scale(
-    own: Stage, expected: Expected, nominal: Expected, criterion: Criterion
+    stage: Stage, expected: Expected, nominal: Expected, criterion: Criterion
 ) -> tuple[float, float]:
     """Factor and additional error with which the search's error becomes the expected one.
 
@@ -261,8 +261,8 @@ def _scale(
         size = {"aligned": sizes.headline, "relative": sizes.relative, "absolute": sizes.absolute}
         return size[criterion].rms
 
-    rest = math.sqrt(max(rms(nominal) ** 2 - own.error**2, 0.0))
-    return rms(expected) / math.hypot(own.error, rest), rest
+    remainder = math.sqrt(max(rms(nominal) ** 2 - stage.error**2, 0.0))
+    return rms(expected) / math.hypot(stage.error, remainder), remainder
 
 
 def build_session(
@@ -280,15 +280,15 @@ def build_session(
     used: dict[str, Posture] = {}
     legs = list(source.robot.legs)
 
-    def place(own: PlannedSetup) -> tuple[int, str]:
-        name = candidates.setups[own.candidate].name
+    def place(setup: PlannedSetup) -> tuple[int, str]:
+        name = candidates.setups[setup.candidate].name
         leg = source.setups[name].sensor.place[1]
         return (legs.index(leg) if leg in legs else len(legs), name)
 
-    for own in sorted(planned, key=place):
-        candidate = candidates.setups[own.candidate]
+    for setup in sorted(planned, key=place):
+        candidate = candidates.setups[setup.candidate]
         name = _setup_name(candidate.name, {*used_names, *setups})
-        rows = [source.readings[i] for i in candidate.rows[list(own.chosen)]]
+        rows = [source.readings[i] for i in candidate.rows[list(setup.chosen)]]
         points = np.array([source.postures[r.posture].values for r in rows])
         setups[name] = replace(source.setups[candidate.name], name=name, aligned_at=rows[0].posture)
         readings += [replace(rows[i], setup=name) for i in order_postures(points)]
@@ -319,11 +319,11 @@ def order_postures(points: Array) -> list[int]:
     def length(order: list[int]) -> float:
         return float(sum(distance[a, b] for a, b in pairwise([*order, order[0]])))
 
-    order, rest = [0], set(range(1, len(points)))
-    while rest:
-        nearest = min(rest, key=lambda i: (distance[order[-1], i], i))
+    order, unvisited = [0], set(range(1, len(points)))
+    while unvisited:
+        nearest = min(unvisited, key=lambda i: (distance[order[-1], i], i))
         order.append(nearest)
-        rest.remove(nearest)
+        unvisited.remove(nearest)
     shorter = True
     while shorter:
         shorter = False
@@ -360,14 +360,16 @@ def _information(problem: CalibrationProblem, state: Sequence[str], measured: Se
     """Information of a session about the state, its other parameters marginalised."""
     _, jacobian = problem.linearise(problem.reference)
     jacobian = project_out_zeros(jacobian, problem.observations)
-    whole = jacobian.T @ jacobian / noise_of(measured) ** 2
-    rest = [i for i, name in enumerate(problem.free) if name not in state]
-    own = [problem.free.index(name) for name in state if name in problem.free]
+    information = jacobian.T @ jacobian / noise_of(measured) ** 2
+    others = [i for i, name in enumerate(problem.free) if name not in state]
+    state_columns = [problem.free.index(name) for name in state if name in problem.free]
     where = [i for i, name in enumerate(state) if name in problem.free]
-    inner = whole[np.ix_(rest, rest)] + np.diag(np.maximum(problem.prior_precision[rest], VAGUE))
-    cross = whole[np.ix_(own, rest)]
-    shared = whole[np.ix_(own, own)]
-    if rest:
+    inner = information[np.ix_(others, others)] + np.diag(
+        np.maximum(problem.prior_precision[others], VAGUE)
+    )
+    cross = information[np.ix_(state_columns, others)]
+    shared = information[np.ix_(state_columns, state_columns)]
+    if others:
         shared = shared - cross @ np.linalg.solve(inner, cross.T)
     result = np.zeros((len(state), len(state)))
     result[np.ix_(where, where)] = shared
@@ -428,7 +430,7 @@ def _quick_error(search: SetupSearch, seed: int, options: Sequence[list[int]], w
 
 
 def _simplify(candidates: Candidates, planned: PlannedSetups, search: SetupSearch) -> PlannedSetups:
-    """The same readings with tips nearer to the rods in the mechanical zero, at little cost."""
+    """Plan with tips nearer to the rods in the mechanical zero, at little cost."""
     session, setups = candidates.session, candidates.setups
 
     def distance(which: int) -> float:

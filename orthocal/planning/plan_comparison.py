@@ -72,7 +72,7 @@ class Comparison:
         return tuple(found)
 
     def list_alternatives(self) -> tuple[Alternative, ...]:
-        """The same readings with a finer dial, a blade, or one square block for each leg."""
+        """Plans with a finer dial, a blade, or one square block for each leg."""
         changes: list[tuple[str, Callable[[Session], Session]]] = [
             ("a dial of half the scatter and resolution", _with_finer_dial),
             ("each leg's gauges on one square block", _with_blocks),
@@ -143,7 +143,7 @@ class Comparison:
 
 
 def _is_in_range(setup: CandidateSetup, rows: Sequence[int]) -> bool:
-    """Whether the gauge has all readings in its range, with the first one in its middle."""
+    """True if the gauge has all readings in its range, with the first one in its middle."""
     at = np.searchsorted(setup.rows, rows)
     return bool(setup.reachable[at[:1], at].all())
 

@@ -213,9 +213,9 @@ class SetupSearch:
         for planned in setups:
             if len(planned.chosen) < FEWEST:
                 raise ValueError(f"found {len(planned.chosen)} readings; expected {FEWEST} or more")
-            own = self.candidates.setups[planned.candidate].only(planned.chosen).begun(0)
-            spread = own.covariance + self.candidates.sigma**2 * np.eye(len(own.rows))
-            total += own.jacobian.T @ np.linalg.solve(spread, own.jacobian)
+            setup = self.candidates.setups[planned.candidate].only(planned.chosen).begun(0)
+            spread = setup.covariance + self.candidates.sigma**2 * np.eye(len(setup.rows))
+            total += setup.jacobian.T @ np.linalg.solve(spread, setup.jacobian)
         return total
 
     def error_of(self, information: Array) -> float:
@@ -228,9 +228,9 @@ class SetupSearch:
         """First start without random numbers; in the others the first half of setups is random."""
         rng, drawn = np.random.default_rng(seed), [_Start(tuple(counts), ())]
         for _ in range(1, starts):
-            own = tuple(counts[i] for i in rng.permutation(len(counts)))
-            half = own[: (len(own) + 1) // 2]
-            drawn.append(_Start(own, tuple(self._draw_setup(n, rng) for n in half)))
+            shuffled = tuple(counts[i] for i in rng.permutation(len(counts)))
+            half = shuffled[: (len(shuffled) + 1) // 2]
+            drawn.append(_Start(shuffled, tuple(self._draw_setup(n, rng) for n in half)))
         return tuple(drawn)
 
     def _draw_setup(self, count: int, rng: np.random.Generator) -> PlannedSetup | None:
@@ -242,8 +242,8 @@ class SetupSearch:
             return None
         first = int(rng.choice(able))
         others = np.flatnonzero(reachable[first])
-        rest = rng.choice(others[others != first], size=count - 1, replace=False)
-        return PlannedSetup(which, (first, *(int(i) for i in rest)))
+        remainder = rng.choice(others[others != first], size=count - 1, replace=False)
+        return PlannedSetup(which, (first, *(int(i) for i in remainder)))
 
     def _find_best(self, information: Array, count: int) -> PlannedSetup:
         """Setup with the largest gain, given the information of others."""
@@ -312,9 +312,9 @@ class Gains:
         """Gain of a candidate setup, begun with one of its readings."""
         key = which, first if self.search.reduced[which].aligned else None, False
         if key not in self.computed:
-            own = self.search.reduced[which]
+            reduced = self.search.reduced[which]
             self.computed[key] = (
-                self._compute(own) if key[1] is None else self.setup(which).begun(key[1])
+                self._compute(reduced) if key[1] is None else self.setup(which).begun(key[1])
             )
         return self.computed[key]
 
@@ -323,12 +323,12 @@ class Gains:
 
         That takes half the time.
         """
-        own = self.search.reduced[which]
-        if not (own.aligned and self.averaged):
+        reduced = self.search.reduced[which]
+        if not (reduced.aligned and self.averaged):
             return self.setup(which)
         key = which, None, True
         if key not in self.computed:
-            self.computed[key] = self._compute(replace(own, aligned=()))
+            self.computed[key] = self._compute(replace(reduced, aligned=()))
         return self.computed[key]
 
     def _compute(self, setup: CandidateSetup) -> SetupGain:
@@ -348,14 +348,14 @@ class Gains:
         return math.sqrt(max(self.total - gain, 0.0))
 
     def exchange_first(self, planned: PlannedSetup) -> PlannedSetup:
-        """The same setup begun with another reading, of its own or not, if that gains more."""
+        """Setup that starts from another reading, chosen before or not, if that gains more."""
         setup, chosen = self.search.reduced[planned.candidate], planned.chosen
         if not setup.aligned:
             return planned
-        own = [(first, *(i for i in chosen if i != first)) for first in chosen]
+        begun_with = [(first, *(i for i in chosen if i != first)) for first in chosen]
         first = np.setdiff1d(np.arange(len(setup.rows)), chosen)
-        rest = np.broadcast_to(chosen[1:], (len(first), len(chosen) - 1))
-        sets = np.vstack([own, np.column_stack([first, rest])])
+        remainder = np.broadcast_to(chosen[1:], (len(first), len(chosen) - 1))
+        sets = np.vstack([begun_with, np.column_stack([first, remainder])])
         able = sets[setup.reachable[sets[:, :1], sets].all(axis=1)]
         best = int(self.setup(planned.candidate).gains(able).argmax())
         return PlannedSetup(planned.candidate, tuple(able[best].tolist()))
@@ -379,7 +379,7 @@ class Gains:
         return [planned for _, planned in sorted(completed, key=lambda c: -c[0])]
 
     def restart(self, planned: PlannedSetup) -> list[PlannedSetup]:
-        """The same setup with readings completed greedily from each of the best pairs."""
+        """Setup completed greedily from each of the best pairs of readings."""
         which, count = planned.candidate, len(planned.chosen)
         return [
             PlannedSetup(which, self.setup(which, pair[0]).complete(pair, count)[1])
@@ -387,7 +387,7 @@ class Gains:
         ]
 
     def exchange_readings(self, planned: PlannedSetup) -> PlannedSetup:
-        """The same setup with each reading in turn exchanged for the best beside its others."""
+        """Setup with each reading in turn exchanged for the best one beside the others."""
         setup, chosen = self.search.reduced[planned.candidate], list(planned.chosen)
         for _ in range(MOST_PASSES):
             before = list(chosen)

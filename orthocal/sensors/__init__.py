@@ -1,1 +1,1 @@
-"""What reads a machine: each sensor in a file of its own, known to all others by its protocol."""
+"""Sensors: a file each, known to all others by its protocol."""

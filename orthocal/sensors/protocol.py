@@ -163,7 +163,7 @@ class Sensor(Protocol):
 
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
-        """What of it is not known exactly, besides the zero of its setup."""
+        """Nuisance parameters of its mounting and scale, besides the zero of its setup."""
 
     def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
         """Nuisance parameters that the operator aligns by eye, mapped to the virtual sensor.

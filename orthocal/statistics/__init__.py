@@ -1,1 +1,1 @@
-"""Of arrays: noise, chance, what readings say of parameters. Knows no fit."""
+"""Statistics of arrays: noise, distributions, information and identifiability. Knows no fit."""

@@ -1,1 +1,1 @@
-"""Of a fit: single readings, prediction of the unseen, intervals, what is not modelled."""
+"""Diagnostics of a fit: single readings, cross-validation, intervals, unmodelled errors."""

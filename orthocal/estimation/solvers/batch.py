@@ -140,7 +140,7 @@ class BatchProgram:
 
 
 class _Shared:
-    """What all sets share: linearisation at the reference, prior, bounds and loss."""
+    """Input that all sets share: linearisation at the reference, prior, bounds and loss."""
 
     def __init__(self, problem: CalibrationProblem, options: SolverOptions, sigma: float) -> None:
         self.problem, self.loss, self.sigma = problem, options.loss, sigma

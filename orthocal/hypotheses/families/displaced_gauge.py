@@ -34,20 +34,20 @@ def displaced_gauges(rows: Rows) -> Iterator[Family]:
 
 def _displaced(rows: Rows) -> Family | None:
     segments = [
-        (own, np.ones(own.size))
-        for own in rows.setups.values()
-        if rows.single[own].all() and own.size >= FEWEST
+        (indices, np.ones(indices.size))
+        for indices in rows.setups.values()
+        if rows.single[indices].all() and indices.size >= FEWEST
     ]
     if not segments:
         return None
-    starts = [np.arange(2, own.size - 1) for own, _ in segments]
+    starts = [np.arange(2, indices.size - 1) for indices, _ in segments]
     segment = np.repeat(np.arange(len(segments)), [s.size for s in starts])
     start = np.concatenate(starts)
 
     def explain(h: int) -> Explanation:
-        own = segments[segment[h]][0]
-        setup = rows.session.readings[own[0]].setup
-        later = tuple(own[start[h] :].tolist())
+        indices = segments[segment[h]][0]
+        setup = rows.session.readings[indices[0]].setup
+        later = tuple(indices[start[h] :].tolist())
         return Explanation("displaced gauge", "setup", later, names=(setup,))
 
     none = sparse_rows([np.empty(0, dtype=np.int64)] * start.size, [], rows.count)
@@ -59,33 +59,33 @@ def _cycle_apart(rows: Rows) -> Family | None:
     """An inner cycle; before the second and the last one the gauge was displaced for good."""
     groups: list[Indices] = []
     keys: list[tuple[str, int]] = []
-    for (name, cycle), own in rows.cycles.items():
+    for (name, cycle), indices in rows.cycles.items():
         setup = rows.setups[name]
-        inner = own[0] != setup[0] and own[-1] != setup[-1]
-        if inner and own.size > 1 and rows.single[own].all():
-            groups.append(own)
+        inner = indices[0] != setup[0] and indices[-1] != setup[-1]
+        if inner and indices.size > 1 and rows.single[indices].all():
+            groups.append(indices)
             keys.append((name, cycle))
     if not groups:
         return None
 
     def explain(h: int) -> Explanation:
         name, cycle = keys[h]
-        own = tuple(groups[h].tolist())
-        return Explanation("displaced gauge", "cycle", own, names=(name,), cycle=cycle)
+        indices = tuple(groups[h].tolist())
+        return Explanation("displaced gauge", "cycle", indices, names=(name,), cycle=cycle)
 
     return Family(explain, len(groups), len(groups), effects=marks(groups, rows.count))
 
 
 def _drift(rows: Rows) -> Family | None:
     drifting = {
-        name: own
-        for name, own in rows.setups.items()
-        if own.size >= FEWEST and rows.single[own].all()
+        name: indices
+        for name, indices in rows.setups.items()
+        if indices.size >= FEWEST and rows.single[indices].all()
     }
     groups: list[tuple[tuple[str, ...], Indices]] = [
-        ((name,), own) for name, own in drifting.items()
+        ((name,), indices) for name, indices in drifting.items()
     ]
-    ramps = [np.linspace(0.0, 1.0, own.size) for own in drifting.values()]
+    ramps = [np.linspace(0.0, 1.0, indices.size) for indices in drifting.values()]
     if not groups:
         return None
     if len(groups) > 1:
@@ -93,23 +93,23 @@ def _drift(rows: Rows) -> Family | None:
         ramps.append(np.concatenate(ramps))
 
     def explain(h: int) -> Explanation:
-        setups, own = groups[h]
+        setups, indices = groups[h]
         scope: Scope = "setup" if len(setups) == 1 else "session"
-        return Explanation("drift", scope, tuple(own.tolist()), setups)
+        return Explanation("drift", scope, tuple(indices.tolist()), setups)
 
-    effects = Patterns(sparse_rows([own for _, own in groups], ramps, rows.count))
+    effects = Patterns(sparse_rows([indices for _, indices in groups], ramps, rows.count))
     return Family(explain, len(groups), len(groups), effects=effects)
 
 
 def _stuck(rows: Rows) -> Family | None:
     runs: list[Indices] = []
-    for own in rows.setups.values():
-        if not rows.single[own].all():
+    for indices in rows.setups.values():
+        if not rows.single[indices].all():
             continue
-        ends = np.flatnonzero(np.append(np.diff(rows.values[own]) != 0.0, True))
+        ends = np.flatnonzero(np.append(np.diff(rows.values[indices]) != 0.0, True))
         begins = np.append(0, ends[:-1] + 1)
         for k in np.flatnonzero(ends - begins >= FEWEST_STUCK - 1):
-            run = own[begins[k] : ends[k] + 1]
+            run = indices[begins[k] : ends[k] + 1]
             if len({rows.session.readings[i].posture for i in run}) > 1:
                 runs.append(run)
     if not runs:

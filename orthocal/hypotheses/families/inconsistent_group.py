@@ -34,32 +34,32 @@ def _setups(rows: Rows) -> Family | None:
         return None
     names: list[str] = []
     groups: list[list[Indices]] = []
-    for name, own in rows.setups.items():
+    for name, indices in rows.setups.items():
         amounts = [r for (setup, *_), r in rows.repeated.items() if setup == name]
-        if rows.single[own].all():  # the gauge zero is free
+        if rows.single[indices].all():  # the gauge zero is free
             amounts = amounts[1:]
         if 1 < len(amounts) <= MOST:
             names.append(name)
             groups.append(amounts)
 
     def explain(h: int) -> Explanation:
-        own = tuple(rows.setups[names[h]].tolist())
-        return Explanation("inconsistent setup", "setup", own, (names[h],))
+        indices = tuple(rows.setups[names[h]].tolist())
+        return Explanation("inconsistent setup", "setup", indices, (names[h],))
 
     return Family(explain, len(groups), len(groups), groups=groups)
 
 
 def _postures(rows: Rows) -> Family | None:
     by_label: dict[str, list[Indices]] = {}
-    for own in rows.repeated.values():
-        by_label.setdefault(rows.posture(int(own[0])), []).append(own)
+    for indices in rows.repeated.values():
+        by_label.setdefault(rows.posture(int(indices[0])), []).append(indices)
     if len(by_label) < 3:
         return None
     found = {k: v for k, v in by_label.items() if 1 < len(v) <= MOST}
     names, groups = list(found), list(found.values())
 
     def explain(h: int) -> Explanation:
-        own = tuple(np.concatenate(groups[h]).tolist())
-        return Explanation("inconsistent posture", "postures", own, names=(names[h],))
+        indices = tuple(np.concatenate(groups[h]).tolist())
+        return Explanation("inconsistent posture", "postures", indices, names=(names[h],))
 
     return Family(explain, len(groups), len(groups), groups=groups)

@@ -43,13 +43,17 @@ def row_offsets(rows: Rows) -> Iterator[Family]:
     If a step is missed, the last row is empty or holds what belongs into the first of the rows;
     if one is written twice, the last reading is lost. The lost reading is of unknown size.
     """
-    segments = [own for own in rows.setups.values() if own.size >= FEWEST]
+    segments = [indices for indices in rows.setups.values() if indices.size >= FEWEST]
     segments += [
-        own for (name, _), own in rows.cycles.items() if FEWEST <= own.size < rows.setups[name].size
+        indices
+        for (name, _), indices in rows.cycles.items()
+        if FEWEST <= indices.size < rows.setups[name].size
     ]
     if not segments:
         return
-    offsets = [_offsets(own, rows.values[own], m) for own in segments for m in (True, False)]
+    offsets = [
+        _offsets(indices, rows.values[indices], m) for indices in segments for m in (True, False)
+    ]
     sizes = [o.position.size for o in offsets]
     which = np.repeat(np.arange(len(offsets)), sizes)
     position, start, at, value, lost = (
@@ -57,13 +61,13 @@ def row_offsets(rows: Rows) -> Iterator[Family]:
     )
 
     def explain(h: int) -> Explanation:
-        own = offsets[which[h]].rows[position[h] :]
-        cycles = {rows.session.readings[i].cycle for i in own}
+        indices = offsets[which[h]].rows[position[h] :]
+        cycles = {rows.session.readings[i].cycle for i in indices}
         return Explanation(
             "row offset",
             "setup",
-            tuple(own.tolist()),
-            names=(rows.session.readings[own[0]].setup,),
+            tuple(indices.tolist()),
+            names=(rows.session.readings[indices[0]].setup,),
             cycle=cycles.pop() if len(cycles) == 1 else None,
             missing=int(which[h]) % 2 == 0,
         )
@@ -75,12 +79,12 @@ def row_offsets(rows: Rows) -> Iterator[Family]:
     yield Family(explain, count, count, edits, effects)
 
 
-def _offsets(own: Indices, values: Array, missing: bool) -> _Offsets:
+def _offsets(indices: Indices, values: Array, missing: bool) -> _Offsets:
     """Row offsets of one kind in some rows, one per row from which on it may begin."""
-    k = np.arange(0 if missing else 1, own.size - 1)
+    k = np.arange(0 if missing else 1, indices.size - 1)
     if missing:  # rows after k get the reading before, row k gets the last one
         base = np.append(0.0, values[:-1] - values[1:])
-        return _Offsets(own, base, k, k + 1, own[k], values[-1] - values[k], own[k])
+        return _Offsets(indices, base, k, k + 1, indices[k], values[-1] - values[k], indices[k])
     # rows from k on get the reading after, the last one is lost
     base = np.append(values[1:] - values[:-1], 0.0)
-    return _Offsets(own, base, k, k, own[k], np.zeros(k.size), np.full(k.size, own[-1]))
+    return _Offsets(indices, base, k, k, indices[k], np.zeros(k.size), np.full(k.size, indices[-1]))

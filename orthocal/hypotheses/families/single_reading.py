@@ -29,9 +29,9 @@ def wrong_readings(rows: Rows) -> Iterator[Family]:
     yield _multiplied(rows, single, DECIMAL_POINTS, "decimal point")
     yield _misread(rows, single)
     several = [
-        own
-        for (setup, *_), own in rows.repeated.items()
-        if len(own) > 1 and len(rows.setups[setup]) >= FEWEST_POSTURES * len(own)
+        indices
+        for (setup, *_), indices in rows.repeated.items()
+        if len(indices) > 1 and len(rows.setups[setup]) >= FEWEST_POSTURES * len(indices)
     ]
     if several:
         yield _outliers(rows, several)
@@ -40,12 +40,12 @@ def wrong_readings(rows: Rows) -> Iterator[Family]:
 
 
 def explain_rows(
-    rows: Rows, own: Indices, kind: AnomalyKind, *, factor: float | None = None
+    rows: Rows, indices: Indices, kind: AnomalyKind, *, factor: float | None = None
 ) -> Explanation:
     """Explanation that concerns one reading, or one posture in all cycles."""
-    scope: Scope = "reading" if len(own) == 1 else "posture"
-    names = (rows.posture(int(own[0])),)
-    return Explanation(kind, scope, tuple(own.tolist()), names=names, factor=factor)
+    scope: Scope = "reading" if len(indices) == 1 else "posture"
+    names = (rows.posture(int(indices[0])),)
+    return Explanation(kind, scope, tuple(indices.tolist()), names=names, factor=factor)
 
 
 def _outliers(rows: Rows, groups: Sequence[Indices]) -> Family:
@@ -61,29 +61,29 @@ def _outliers(rows: Rows, groups: Sequence[Indices]) -> Family:
 def _multiplied(
     rows: Rows, groups: Sequence[Indices], factors: Sequence[float], kind: AnomalyKind
 ) -> Family:
-    tried = [(factor, own) for factor in factors for own in groups]
-    change = [(factor - 1.0) * rows.values[own] for factor, own in tried]
+    tried = [(factor, indices) for factor in factors for indices in groups]
+    change = [(factor - 1.0) * rows.values[indices] for factor, indices in tried]
     return Family(
         lambda h: explain_rows(rows, tried[h][1], kind, factor=tried[h][0]),
         len(tried),
         len(tried),
-        Patterns(sparse_rows([own for _, own in tried], change, rows.count)),
-        log_volume=np.array([len(own) * np.log(abs(factor)) for factor, own in tried]),
+        Patterns(sparse_rows([indices for _, indices in tried], change, rows.count)),
+        log_volume=np.array([len(indices) * np.log(abs(factor)) for factor, indices in tried]),
     )
 
 
 def _misread(rows: Rows, groups: Sequence[Indices]) -> Family:
     steps = [sign * size for size in MISREAD for sign in (1.0, -1.0)]
-    tried = [(step, own) for step in steps for own in groups]
-    change = [np.full(len(own), step) for step, own in tried]
+    tried = [(step, indices) for step in steps for indices in groups]
+    change = [np.full(len(indices), step) for step, indices in tried]
 
     def explain(h: int) -> Explanation:
-        step, own = tried[h]
+        step, indices = tried[h]
         return Explanation(
             "misread dial",
             "reading",
-            tuple(own.tolist()),
-            names=(rows.posture(int(own[0])),),
+            tuple(indices.tolist()),
+            names=(rows.posture(int(indices[0])),),
             amount=-step,
         )
 
@@ -91,5 +91,5 @@ def _misread(rows: Rows, groups: Sequence[Indices]) -> Family:
         explain,
         len(tried),
         len(tried),
-        Patterns(sparse_rows([own for _, own in tried], change, rows.count)),
+        Patterns(sparse_rows([indices for _, indices in tried], change, rows.count)),
     )

@@ -75,8 +75,8 @@ def _of_setup(rows: Rows) -> list[_Pair]:
     near = rows.count > FAR_APART
     return [
         _rows(i, j)
-        for own in rows.cycles.values()
-        for i, j in (pairwise(own) if near else combinations(own, 2))
+        for indices in rows.cycles.values()
+        for i, j in (pairwise(indices) if near else combinations(indices, 2))
     ]
 
 
@@ -85,12 +85,12 @@ def _across_setups(rows: Rows) -> list[_Pair]:
     found: dict[tuple[str, int], list[int]] = {}
     for i, r in enumerate(rows.session.readings):
         found.setdefault((r.postures, r.cycle), []).append(i)
-    if sum(len(own) ** 2 for own in found.values()) > 2 * MOST:
+    if sum(len(indices) ** 2 for indices in found.values()) > 2 * MOST:
         return []
     return [
         _rows(i, j)
-        for own in found.values()
-        for i, j in combinations(own, 2)
+        for indices in found.values()
+        for i, j in combinations(indices, 2)
         if rows.session.readings[i].setup != rows.session.readings[j].setup
     ]
 
@@ -98,9 +98,9 @@ def _across_setups(rows: Rows) -> list[_Pair]:
 def _postures_of_setup(rows: Rows) -> list[_Pair]:
     """Two postures of a setup, in all cycles."""
     by_setup: dict[str, list[Indices]] = {}
-    for (setup, *_), own in rows.repeated.items():
-        if len(own) > 1:
-            by_setup.setdefault(setup, []).append(own)
+    for (setup, *_), indices in rows.repeated.items():
+        if len(indices) > 1:
+            by_setup.setdefault(setup, []).append(indices)
     if sum(len(groups) ** 2 for groups in by_setup.values()) > 2 * MOST:
         return []
     return [
@@ -157,8 +157,8 @@ def _legs(rows: Rows) -> list[_Pair]:
 def _backwards(rows: Rows) -> list[_Pair]:
     """The rows of a setup written from the last to the first."""
     found: list[_Pair] = []
-    for name, own in rows.setups.items():
-        half = own.size // 2
+    for name, indices in rows.setups.items():
+        half = indices.size // 2
         if half > 1:
-            found.append(_Pair("setup", own[:half], own[::-1][:half], (name,)))
+            found.append(_Pair("setup", indices[:half], indices[::-1][:half], (name,)))
     return found

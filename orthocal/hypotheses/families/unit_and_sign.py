@@ -75,9 +75,9 @@ def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
         pairs = combinations(names, 2)
         yield _reversed(rows, [_Group("setups", rows.of_setups(p), p) for p in pairs])
     groups += [
-        _Group("cycle", own, names=(name,), cycle=cycle)
-        for (name, cycle), own in rows.cycles.items()
-        if len(own) < len(rows.setups[name])
+        _Group("cycle", indices, names=(name,), cycle=cycle)
+        for (name, cycle), indices in rows.cycles.items()
+        if len(indices) < len(rows.setups[name])
     ]
     yield _scaled(rows, groups, "wrong unit", UNITS, sigma)
     yield _scaled(rows, groups, "decimal point", DECIMAL_POINTS, sigma)
@@ -90,7 +90,7 @@ def _groups(rows: Rows) -> list[_Group]:
         kind: Scope = "leg" if scope == "leg" else "gauge"
         found.append(_Group(kind, rows.of_setups(setups), setups, (name,)))
     if len(every) > 1:
-        found += [_Group("setup", own, (name,)) for name, own in rows.setups.items()]
+        found += [_Group("setup", indices, (name,)) for name, indices in rows.setups.items()]
     return found
 
 

@@ -226,7 +226,7 @@ def _across(gauge: GaugePosition) -> str:
 
 
 def _gauge_zero(gauge: Gauge, first: Stop) -> str:
-    """How to set the gauge zero."""
+    """Instruction for setting the gauge zero."""
     how = "Set the dial to the middle of its range."
     if gauge.range is not None:
         low, high = (v / MM for v in gauge.range)
