@@ -191,11 +191,11 @@ from pathlib import Path
 from orthocal import calibrate, load_session
 import orthocal.estimation.solvers.ipopt as nlp
 session = load_session(sys.argv[1])
-original = nlp.NonlinearProgram.pack
-def pack(self, **kwargs):
+original = nlp.NonlinearProgram._pack
+def pack(self, *args):
     signal.setitimer(signal.ITIMER_REAL, 0.001)  # once Ipopt runs
-    return original(self, **kwargs)
-nlp.NonlinearProgram.pack = pack
+    return original(self, *args)
+nlp.NonlinearProgram._pack = pack
 signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
 try:
     calibrate(session, "full")
