@@ -35,7 +35,7 @@ def test_main_job(root, workplace):
     done = subprocess.run(command, capture_output=True, text=True, cwd=workplace, check=False)
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr
-    for offset in ("-0.527", "+0.592", "-1.761"):  # DESIGN: exact offsets of Experiment 2
+    for offset in ("-0.527", "+0.592", "-1.761"):  # exact offsets of Experiment 2
         assert offset in done.stdout
     assert (workplace / "main/report.html").is_file()
 
