@@ -54,7 +54,9 @@ def run_lane(python: Path, *, resolution: str) -> None:
         tools = ["pytest>=8.0", "pytest-timeout>=2.3"]
         subprocess.run([*install, "--editable", ROOT, *tools], check=True)
         cache = {**os.environ, "ORTHOCAL_CACHE": str(Path(directory) / "cache")}
-        tests = [inside, "-m", "pytest", "-q", "-p", "no:cacheprovider", *TESTS]
+        # Python shows no user the deprecations within libraries
+        options = ["-q", "-p", "no:cacheprovider", "-W", "ignore::DeprecationWarning"]
+        tests = [inside, "-m", "pytest", *options, *TESTS]
         subprocess.run(tests, check=True, cwd=ROOT, env=cache)
     print(f"{python} with {resolution} versions: {time.monotonic() - began:.0f} s", flush=True)
 
