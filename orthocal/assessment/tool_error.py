@@ -108,9 +108,7 @@ class ToolAccuracy:
 
     def align(self, field: Array) -> Array:
         """A field of position errors with shift and rotation removed, shape (K, 3, ...)."""
-        if len(self.targets) < FEWEST_ALIGNED:
-            return self.workspace.remove_shift(field)
-        return self.workspace.remove_motion(field, self.targets)
+        return self.workspace.align(field, self.targets)
 
     def measure(self, deviations: Array) -> ErrorSizes:
         """Size of known position errors, shape (K, 3), [m]."""

@@ -126,6 +126,19 @@ class Workspace:
         """Position errors with the mean translation removed, shape (K, 3, ...)."""
         return np.asarray(field - np.tensordot(self.weights, field, axes=1))
 
+    def align(self, field: Array, positions: Array) -> Array:
+        """Position errors after aligning a workpiece: translation and rotation removed.
+
+        With few points only the translation is removed.
+
+        Args:
+            field: Position errors, shape (K, 3, ...), [m].
+            positions: Positions of the points in space, shape (K, 3), [m].
+        """
+        if len(positions) < FEWEST_ALIGNED:
+            return self.remove_shift(field)
+        return self.remove_motion(field, positions)
+
     def remove_motion(self, field: Array, positions: Array) -> Array:
         """Position errors with the best-fit translation and rotation removed.
 

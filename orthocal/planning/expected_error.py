@@ -28,7 +28,6 @@ from orthocal.estimation.weighting import split_by_gauge
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import (
-    FEWEST_ALIGNED,
     Workspace,
     find_workspace,
 )
@@ -138,9 +137,7 @@ class ToolForecast:
 
     def align(self, field: Array) -> Array:
         """Tool errors with translation and rotation removed, shape (K, 3, ...)."""
-        if len(self.positions) < FEWEST_ALIGNED:
-            return self.workspace.remove_shift(field)
-        return self.workspace.remove_motion(field, self.positions)
+        return self.workspace.align(field, self.positions)
 
     def problem(self, session: Session) -> CalibrationProblem:
         """Calibration problem of a session's readings."""

@@ -24,7 +24,6 @@ from orthocal.estimation.selection import Selection
 from orthocal.estimation.solvers.batch import BatchProgram
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import (
-    FEWEST_ALIGNED,
     Workspace,
     cube_limits,
     find_workspace,
@@ -123,7 +122,7 @@ class AccuracyStudy(Study):
             _set_reason(status, good[~converged], NOT_CONVERGED)
         before, after = p.tool_errors(measured.errors, theta, status)
         theta[status != CALIBRATED] = np.nan
-        aligned = p.align(after)
+        aligned = p.workspace.align(after, p.positions)
         weights = p.workspace.weights
 
         def rms(field: Array) -> list[float]:
@@ -137,7 +136,7 @@ class AccuracyStudy(Study):
         return {
             "machine": list(numbers),
             "status": list(status),
-            "before_um": rms(p.align(before)),
+            "before_um": rms(p.workspace.align(before, p.positions)),
             "tool_um": rms(aligned),
             "tool_shift_out_um": rms(p.workspace.remove_shift(after)),
             "tool_absolute_um": rms(after),
@@ -274,12 +273,6 @@ class _Prepared:
         """
         columns = self.problem.functions.errors.columns(self.problem.machine_selection.names)
         return np.asarray(errors @ (columns / (columns**2).sum(axis=0)))
-
-    def align(self, field: Array) -> Array:
-        """Tool errors, shape (K, 3, n), with translation and rotation removed."""
-        if len(self.positions) < FEWEST_ALIGNED:
-            return self.workspace.remove_shift(field)
-        return self.workspace.remove_motion(field, self.positions)
 
 
 @dataclass(frozen=True, eq=False)

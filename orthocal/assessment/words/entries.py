@@ -105,7 +105,7 @@ def describe_tool_error(tool: ToolErrorSummary, *, keep: bool = False) -> str:
     where = f"workspace {tool.region}, workpiece aligned on the machine"
     if keep:
         (now,) = lengths(tool.now)
-        return f"Expected tool error as it is: {now} RMS, {where}."
+        return f"Expected tool error with the present offsets: {now} RMS, {where}."
     entered, now = lengths(tool.entered, tool.now)
     return f"Expected tool error: {entered} RMS (now {now}), {where}."
 
