@@ -74,7 +74,9 @@ def test_mutated_documents(load):
         ("? [1]\n: 2", "a key is a list or a mapping"),
         ("a: !!python/object:os.system 1", "tag"),
         ('a: "\\x07"', "control character"),
-        *((f"a: {'[' * n}{']' * n}", "nested more than 20 deep") for n in (21, 5000, 100_000)),
+        (f"a: {'[' * 21}{']' * 21}", "nested more than 20 deep"),
+        # the scanner of libyaml may stop before the events do
+        *((f"a: {'[' * n}{']' * n}", "nest") for n in (5000, 100_000)),
         ("title: [" + "1," * 250_000 + "]", "holds more than 50000 keys and values"),
         *(
             (f"a: {form.format('9' * digits)}", "does not fit its tag !!")
