@@ -157,7 +157,7 @@ class Workspace:
         basis = motions.reshape(-1, 6) / np.array([1.0] * 3 + [size] * 3)
         root = np.sqrt(np.repeat(self.weights, 3))[:, None]
         flat = field.reshape(3 * len(field), -1)
-        motion = np.linalg.lstsq(root * basis, root * flat, rcond=1e-9)[0]
+        motion = np.linalg.pinv(root * basis, rcond=1e-9) @ (root * flat)
         return np.asarray((flat - basis @ motion).reshape(field.shape))
 
 
