@@ -6,7 +6,7 @@ import gc
 
 from orthocal.runtime.interrupts import ending_at_interrupt
 
-GARBAGE_THRESHOLD = 100_000
+GARBAGE_THRESHOLD = 400_000
 """New objects before a garbage collection: loading libraries creates many permanent ones."""
 
 
