@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -25,6 +25,7 @@ from orthocal.errors import OrthocalError
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 LossKind = Literal["squares", "huber"]
+Values = TypeVar("Values", Array, ca.SX)
 
 HUBER_WIDTH = 1.345
 """k at which the estimate is 95 % as precise as by squares where all residuals are normal."""
@@ -53,42 +54,31 @@ class Loss:
         """True if large residuals count less than their squares."""
         return self.kind == "huber"
 
-    def cost(self, r: ca.SX, width: ca.SX) -> ca.SX:
-        """ρ(r)."""
-        if not self.robust:
-            return 0.5 * r**2
+    def value(self, r: Values, width: Values | None = None) -> Values:
+        """ρ(r) of residuals in standard deviations; arguments as for all functions of a residual.
+
+        Args:
+            r: An array or an expression of any shape.
+            width: k as an expression; `width` by default.
+        """
         # not k² (√… − 1), which loses all digits of a small r
-        return r**2 / (1.0 + ca.sqrt(1.0 + (r / width) ** 2))
+        return r**2 / (1.0 + self._root(r, width)) if self.robust else 0.5 * r**2
 
-    def slope(self, r: ca.SX, width: ca.SX) -> ca.SX:
+    def influence(self, r: Values, width: Values | None = None) -> Values:
         """ρ'(r)."""
-        return r / ca.sqrt(1.0 + (r / width) ** 2) if self.robust else r
+        return r / self._root(r, width) if self.robust else r
 
-    def curvature(self, r: ca.SX, width: ca.SX) -> ca.SX:
-        """ρ''(r)."""
-        return (1.0 + (r / width) ** 2) ** -1.5 if self.robust else ca.SX(1.0)
+    def weight(self, r: Values, width: Values | None = None) -> Values:
+        """ρ'(r)/r, the weight of a squared residual, 1 at 0."""
+        return 1.0 / self._root(r, width) if self.robust else r**0
 
-    def secant(self, r: ca.SX, width: ca.SX) -> ca.SX:
-        """ρ'(r)/r, the weight of a squared residual."""
-        return 1.0 / ca.sqrt(1.0 + (r / width) ** 2) if self.robust else ca.SX(1.0)
+    def curvature(self, r: Values, width: Values | None = None) -> Values:
+        """ρ''(r), 1 at 0."""
+        return self._root(r, width) ** -3 if self.robust else r**0
 
-    def value(self, r: Array) -> Array:
-        """ρ(r) of residuals in standard deviations, shape as r."""
-        if not self.robust:
-            return np.asarray(0.5 * r**2)
-        return np.asarray(r**2 / (1.0 + np.sqrt(1.0 + (r / self.width) ** 2)))
-
-    def influence(self, r: Array) -> Array:
-        """ρ'(r) of residuals in standard deviations, shape as r."""
-        return r / np.sqrt(1.0 + (r / self.width) ** 2) if self.robust else r
-
-    def weight(self, r: Array) -> Array:
-        """ρ'(r)/r, the weight of a squared residual, 1 at 0, shape as r."""
-        return 1.0 / np.sqrt(1.0 + (r / self.width) ** 2) if self.robust else np.ones_like(r)
-
-    def bend(self, r: Array) -> Array:
-        """ρ''(r), 1 at 0, shape as r."""
-        return np.asarray((1.0 + (r / self.width) ** 2) ** -1.5) if self.robust else np.ones_like(r)
+    def _root(self, r: Values, width: Values | None) -> Values:
+        """√(1 + (r/k)²)."""
+        return (1.0 + (r / (self.width if width is None else width)) ** 2) ** 0.5
 
     def centres(self, values: Array, group: Indices, count: int, *, weights: Array) -> Array:
         """Optimal centre of the values of each group: the mean for squares.
@@ -124,7 +114,7 @@ class Loss:
             # Newton's step while the gradient decreases fast enough, otherwise bisection
             decreasing = np.abs(gradient) < 0.5 * last_gradient
             last_gradient = np.abs(gradient)
-            newton = result + gradient / np.maximum(sums(self.bend(residual)), 1e-300)
+            newton = result + gradient / np.maximum(sums(self.curvature(residual)), 1e-300)
             inside = decreasing & (newton >= low) & (newton <= high)
             trial = np.where(inside, newton, 0.5 * (low + high))
             trial = np.where(gradient == 0.0, result, trial)
@@ -145,7 +135,7 @@ class Loss:
         """
         if not self.robust or not r.size:
             return 1.0
-        curvature = self.bend(r)
+        curvature = self.curvature(r)
         mean = float(np.mean(curvature))
         return mean / (1.0 + used / r.size * float(np.var(curvature)) / mean**2)
 

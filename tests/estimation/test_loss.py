@@ -24,25 +24,26 @@ R = np.array([-30.0, -1.5, -1e-9, 0.0, 1e-5, 0.7, 4.0])
 
 def test_it_is_the_pseudo_huber_loss():
     k = HUBER_WIDTH
-    assert evaluate(HUBER.cost, R) == pytest.approx(
+    assert evaluate(HUBER.value, R) == pytest.approx(
         k**2 * (np.sqrt(1 + (R / k) ** 2) - 1), abs=1e-15
     )
     # a square for what is small, to the last digit; straight far out
-    assert evaluate(HUBER.cost, [1e-9])[0] == pytest.approx(0.5e-18, rel=1e-12)
-    assert evaluate(HUBER.slope, [1e6])[0] == pytest.approx(k)
+    assert evaluate(HUBER.value, [1e-9])[0] == pytest.approx(0.5e-18, rel=1e-12)
+    assert evaluate(HUBER.influence, [1e6])[0] == pytest.approx(k)
 
 
 @pytest.mark.parametrize("loss", [HUBER, SQUARES])
 def test_slope_and_curvature_are_its_derivatives(loss):
     step = 1e-4
-    cost = (evaluate(loss.cost, R + step) - evaluate(loss.cost, R - step)) / (2 * step)
-    slope = (evaluate(loss.slope, R + step) - evaluate(loss.slope, R - step)) / (2 * step)
-    assert evaluate(loss.slope, R) == pytest.approx(cost, abs=1e-7)
+    cost = (evaluate(loss.value, R + step) - evaluate(loss.value, R - step)) / (2 * step)
+    slope = (evaluate(loss.influence, R + step) - evaluate(loss.influence, R - step)) / (2 * step)
+    assert evaluate(loss.influence, R) == pytest.approx(cost, abs=1e-7)
     assert evaluate(loss.curvature, R) == pytest.approx(slope, abs=1e-7)
-    assert evaluate(loss.secant, R[R != 0]) == pytest.approx(
-        evaluate(loss.slope, R[R != 0]) / R[R != 0]
+    assert evaluate(loss.weight, R[R != 0]) == pytest.approx(
+        evaluate(loss.influence, R[R != 0]) / R[R != 0]
     )
-    assert loss.influence(R) == pytest.approx(evaluate(loss.slope, R))
+    for function in (loss.value, loss.influence, loss.weight, loss.curvature):
+        assert function(R) == pytest.approx(evaluate(function, R), rel=1e-14)
     curvature = evaluate(loss.curvature, R)
     assert loss.gain(R, used=0.0) == pytest.approx(curvature.mean())
     correction = 1.0 + 2.0 / R.size * curvature.var() / curvature.mean() ** 2

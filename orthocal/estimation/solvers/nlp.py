@@ -295,12 +295,12 @@ class ProgramFunctions:
             one.by_passive / noise,
         )
         row = ca.densify(row / sigma)
-        influence = weight * loss.slope(residual, width)
+        influence = weight * loss.influence(residual, width)
         gradient = (influence * row).T
         exact = self.hessian == "exact"
         # Gauss-Newton uses the secant ρ'/r, which is never below ρ'': at large residuals, where ρ
         # is nearly straight, a step with ρ'' is much too long
-        bend = loss.curvature(residual, width) if exact else loss.secant(residual, width)
+        bend = loss.curvature(residual, width) if exact else loss.weight(residual, width)
         second = weight * bend * (row.T @ row)
         if exact:
             second += influence * self._reading_curvature(one, prior_stds) / (-sigma * noise)
@@ -314,7 +314,7 @@ class ProgramFunctions:
         triangle = _triangle(n_t), _rest_of_triangle(row.numel(), n_t)
         outputs = {
             "reading": [one.reading / noise],
-            "objective": [weight * loss.cost(residual, width)],
+            "objective": [weight * loss.value(residual, width)],
             "gradient": [gradient[:n_t], gradient[n_t:]],
             "hessian": [pick(*triangle[0]), pick(*triangle[1])],
         }

@@ -180,7 +180,7 @@ class Task:
             return self._change(at, jacobian, self.weights)
         for _ in range(MOST_STEPS_WITHIN):
             residual = at.deviation - at.zeros[self.problem.observations.zero]
-            for weights in (self.loss.bend(residual), self.loss.weight(residual)):
+            for weights in (self.loss.curvature(residual), self.loss.weight(residual)):
                 change = self._change(at, jacobian, self.weights * weights)
                 trial = self.moved(at, jacobian, change)
                 if trial.objective <= at.objective:
