@@ -79,7 +79,7 @@ def test_readings_depend_on_few_variables(plan):
     problem = build_problem(plan, model="full")
     setups = list(plan.setups.values())
     for piece in SymbolicProblem(problem).readings:
-        (leg,) = {setups[i].sensor.leg for i in problem.observations.setup[piece.entries]}
+        (leg,) = {setups[i].sensor.leg for i in piece.group.setups}
         assert piece.passive_index.size == 3
         assert piece.theta_index.size == 21
         names = {problem.free[i].split("_")[0] for i in piece.theta_index}

@@ -146,10 +146,6 @@ class ProgramFunctions:
         function = self._symbolic.error_map.function
         return [tuple(function(theta, ca.DM(values))) for values in conditions]
 
-    def _variant(self, one: ReadingExpressions) -> int:
-        """Conditions of the placements of a sensor group."""
-        return self.problem.model.groups[one.group].variant
-
     def _add_readings(
         self,
         one: ReadingExpressions,
@@ -164,7 +160,7 @@ class ProgramFunctions:
 
         Local variables are (θ̂, ν̂, ẑ, q̂) in the order of x.
         """
-        count, n_t = one.entries.size, one.theta_index.size
+        count, n_t = one.group.entries.size, one.theta_index.size
         theta = np.tile(one.theta_index, (count, 1))
         variables = np.hstack([theta, self._local_variables(one)])
         local = variables[:, n_t:]
@@ -189,12 +185,12 @@ class ProgramFunctions:
 
     def _local_variables(self, one: ReadingExpressions) -> Indices:
         """Positions in x of the (ν̂, ẑ, q̂) of a sensor group's entries, shape (n, n_local)."""
-        o = self.problem.observations
+        o, entries = self.problem.observations, one.group.entries
         return np.hstack(
             [
-                self._value_of[one.nuisance_index],
-                (self._n_theta + o.zero[one.entries])[:, None],
-                self._passive_variables(o.state[one.entries], one.passive_index),
+                self._value_of[self.problem.n_machine + one.group.nuisance],
+                (self._n_theta + o.zero[entries])[:, None],
+                self._passive_variables(o.state[entries], one.passive_index),
             ]
         )
 
@@ -214,8 +210,8 @@ class ProgramFunctions:
             local = self._local_variables(one)
             arguments, masks = self._reading_arguments(one, local, x, p, shared)
             function = self._reading_functions(one)["reading"]
-            values.append(ca.vec(function.map(one.entries.size, masks, [False])(*arguments)))
-            entries.append(one.entries)
+            values.append(ca.vec(function.map(one.group.entries.size, masks, [False])(*arguments)))
+            entries.append(one.group.entries)
         order = np.argsort(np.concatenate(entries)) if entries else np.empty(0, dtype=np.int64)
         return ca.vertcat(ca.MX(0, 1), *values)[order.tolist()]
 
@@ -236,27 +232,23 @@ class ProgramFunctions:
             p: Parameters of the program.
             shared: Functions of θ̂ alone, by variant.
         """
-        problem, o = self.problem, self.problem.observations
-        count, n_u = one.nuisance_index.shape
-        variant = self._variant(one)
-        references = problem.model.reference_commands[variant]
-        prior_stds = ca.DM(problem.theta_scale[one.nuisance_index].T)
+        problem, o, group = self.problem, self.problem.observations, one.group
+        count, n_u = group.nuisance.shape
+        references = problem.model.reference_commands[group.variant]
+        prior_stds = problem.theta_scale[problem.n_machine + group.nuisance]
         separate = [
             ca.reshape(x[local[:, :n_u].reshape(-1).tolist()], n_u, count),
-            ca.MX(prior_stds),
+            _columns(prior_stds),
             x[local[:, n_u].tolist()].T,
             ca.reshape(x[local[:, n_u + 1 :].reshape(-1).tolist()], -1, count),
-            p[one.entries.tolist()].T,
-            p[(o.size + one.entries).tolist()].T,
-            p[(2 * o.size + one.entries).tolist()].T,
-            ca.MX(ca.DM(problem.states.commands[o.state[one.entries]].T)),
-            ca.MX(ca.DM(references[one.setups].T)),
-            ca.MX(ca.DM(one.table.T)),
+            *(p[(i * o.size + group.entries).tolist()].T for i in range(3)),
+            _columns(problem.states.commands[o.state[group.entries]]),
+            _columns(references[group.setups]),
+            _columns(group.constants),
         ]
-        common = [p[3 * o.size], p[3 * o.size + 2], *shared[variant]]
-        arguments = [*separate, *common]
-        masks = [*(False for _ in separate), *(True for _ in common)]
-        return arguments, masks
+        common = [p[3 * o.size], p[3 * o.size + 2], *shared[group.variant]]
+        masks = [False] * len(separate) + [True] * len(common)
+        return [*separate, *common], masks
 
     def _cached(self, name: str, build: Callable[[], ca.Function]) -> ca.Function:
         """A cached function of one posture or one reading; its constants are part of the key."""
@@ -268,7 +260,7 @@ class ProgramFunctions:
 
     def _reading_functions(self, one: ReadingExpressions) -> dict[str, ca.Function]:
         """Cached functions of a reading: value, objective, gradient and Hessian."""
-        sensor = self.problem.model.groups[one.group].reading.name
+        sensor = one.group.reading.name
         built: dict[str, ca.Function] = {}
 
         def build(name: str) -> ca.Function:
@@ -303,10 +295,12 @@ class ProgramFunctions:
         bend = loss.curvature(residual, width) if exact else loss.weight(residual, width)
         second = weight * bend * (row.T @ row)
         if exact:
-            second += influence * self._reading_curvature(one, prior_stds) / (-sigma * noise)
-        inputs = [scaled, prior_stds, zero, one.passive, y, weight, noise]
-        inputs += [one.command, one.reference, one.constants, sigma, width]
-        inputs += self._symbolic.error_map.symbols
+            second += influence * self._reading_curvature(one, zero, prior_stds) / (-sigma * noise)
+        symbolic = self._symbolic
+        passive = symbolic.passive[one.passive_index.tolist()]
+        inputs = [scaled, prior_stds, zero, passive, y, weight, noise]
+        inputs += [symbolic.command, symbolic.reference, one.constants, sigma, width]
+        inputs += symbolic.error_map.symbols
 
         def pick(rows: Indices, columns: Indices) -> ca.SX:
             return ca.vertcat(*(second[int(i), int(j)] for i, j in zip(rows, columns, strict=True)))
@@ -331,28 +325,16 @@ class ProgramFunctions:
             for name, values in outputs.items()
         }
 
-    def _reading_curvature(self, one: ReadingExpressions, prior_stds: ca.SX) -> ca.SX:
+    def _reading_curvature(self, one: ReadingExpressions, zero: ca.SX, prior_stds: ca.SX) -> ca.SX:
         """Second derivatives of h by (θ̂, ν̂, ẑ, q̂)."""
-        direct = self._symbolic.direct
-        theta = direct.theta[one.theta_index.tolist()]
-        passive = direct.passive[one.passive_index.tolist()]
-        nuisance, constants = direct.nuisance[one.group], direct.constants[one.group]
-        u = ca.vertcat(theta, nuisance, ca.SX.sym("zero"), passive)
-        second, _ = ca.hessian(direct.readings[one.group], u)
-        n_t, n = theta.numel(), u.numel()
-        scale = ca.diag(
-            ca.vertcat(ca.SX.ones(n_t), prior_stds, ca.SX.ones(n - n_t - nuisance.numel()))
-        )
-        function = ca.Function(
-            "curvature",
-            [direct.theta, nuisance, passive, direct.command, direct.reference, constants],
-            [ca.densify(second)],
-        )
-        theta = self._symbolic.error_map.symbols[0]
-        values = function(
-            theta, one.nuisance, one.passive, one.command, one.reference, one.constants
-        )
-        return scale @ values @ scale
+        symbolic = self._symbolic
+        theta = symbolic.theta[one.theta_index.tolist()]
+        passive = symbolic.passive[one.passive_index.tolist()]
+        u = ca.vertcat(theta, one.nuisance, zero, passive)
+        second, _ = ca.hessian(symbolic.direct_reading(one), u)
+        ones = ca.SX.ones(theta.numel()), ca.SX.ones(1 + passive.numel())
+        scale = ca.diag(ca.vertcat(ones[0], prior_stds, ones[1]))
+        return ca.densify(scale @ second @ scale)
 
     def _add_closures(
         self, x: ca.MX, lam_g: ca.MX, shared: list[tuple[ca.MX, ...]], hessian: SparseSum
@@ -367,7 +349,7 @@ class ProgramFunctions:
             np.array(v) for v in jacobian_f.sparsity_out(0).get_triplet()
         )
         passive = ca.reshape(x[first : first + k * n_p], n_p, k)
-        commands = ca.MX(ca.DM(problem.states.commands.T))
+        commands = _columns(problem.states.commands)
         machine = np.tile(np.arange(problem.n_machine), (k, 1))
         variables = np.hstack([machine, self._passive_variables(np.arange(k), np.arange(n_p))])
         jacobian = SparseSum(k * n_g + self._aligned.size, x.numel())
@@ -384,8 +366,8 @@ class ProgramFunctions:
             jacobian.add(rows, variables[states][:, pattern_columns], nonzeros)
         constraints = ca.vertcat(*parts)[np.argsort(np.concatenate(order)).tolist()]
         if self.hessian == "exact":
-            arguments = [passive, commands, shared[0][0]]
-            self._add_closure_curvature(arguments, lam_g[: k * n_g], variables, hessian)
+            arguments = [passive, commands, shared[0][0], ca.reshape(lam_g[: k * n_g], n_g, k)]
+            self._add_closure_curvature(arguments, variables, hessian)
         if self._aligned.size:
             matrix, start = self._alignment_constraints()
             constraints = ca.vertcat(constraints, matrix @ x + start)
@@ -397,13 +379,11 @@ class ProgramFunctions:
         """The closures of a posture, or their sparse Jacobian by (θ̂, q̂)."""
 
         def build() -> ca.Function:
-            posture = self._symbolic.posture
-            inputs = [posture.passive, posture.command, *self._symbolic.error_map.symbols]
-            values = {
-                "closure": ca.densify(posture.closure),
-                "closure_jacobian": ca.sparsify(ca.horzcat(posture.by_theta, posture.by_passive)),
-            }
-            return ca.Function(name, inputs, [values[name]])
+            symbolic = self._symbolic
+            inputs = [symbolic.passive, symbolic.command, *symbolic.error_map.symbols]
+            closure, jacobian = symbolic.closure
+            value = ca.densify(closure) if name == "closure" else ca.sparsify(jacobian)
+            return ca.Function(name, inputs, [value])
 
         return self._cached(name, build)
 
@@ -424,30 +404,33 @@ class ProgramFunctions:
         return ca.sparsify(ca.DM(matrix)), ca.DM(start)
 
     def _add_closure_curvature(
-        self, arguments: list[ca.MX], lam_g: ca.MX, variables: Indices, hessian: SparseSum
+        self, arguments: list[ca.MX], variables: Indices, hessian: SparseSum
     ) -> None:
-        """Σ λᵀ ∇²ĝ of every state; arguments are q̂, commands and θ̂."""
-        direct = self._symbolic.direct
-        k, n_g = self.problem.n_states, self.problem.robot.closure_rows
-        multiplier = ca.SX.sym("multiplier", n_g)
-        u = ca.vertcat(direct.theta, direct.passive)
-        second = ca.triu(ca.hessian(ca.dot(multiplier, direct.closure), u)[0])
+        """Σ λᵀ ∇²ĝ of every state; arguments are q̂, commands, θ̂ and λ."""
+        symbolic = self._symbolic
+        multiplier = ca.SX.sym("multiplier", self.problem.robot.closure_rows)
+        u = ca.vertcat(symbolic.theta, symbolic.passive)
+        second = ca.triu(ca.hessian(ca.dot(multiplier, symbolic.direct_closure), u)[0])
         rows, columns = (np.array(v) for v in second.sparsity().get_triplet())
         summed_part = columns < self.problem.n_machine
         function = ca.Function(
             "closure_hessian",
-            [direct.passive, direct.command, direct.theta, multiplier],
+            [symbolic.passive, symbolic.command, symbolic.theta, multiplier],
             [
                 ca.densify(second.nz[np.flatnonzero(part).tolist()])
                 for part in (summed_part, ~summed_part)
             ],
         )
-        summed, local = function.map(k, [False, False, True, False], [True, False])(
-            *arguments, ca.reshape(lam_g, n_g, k)
-        )
+        masks = [False, False, True, False], [True, False]
+        summed, local = function.map(len(variables), *masks)(*arguments)
         hessian.add(rows[summed_part], columns[summed_part], summed)
         places = variables[:, rows[~summed_part]], variables[:, columns[~summed_part]]
         hessian.add(*places, ca.vec(local))
+
+
+def _columns(rows: Array) -> ca.MX:
+    """Constants with one row for each call of a mapped function, as columns."""
+    return ca.MX(ca.DM(rows.T))
 
 
 def _triangle(n: int) -> tuple[Indices, Indices]:

@@ -17,84 +17,34 @@ from numpy.typing import NDArray
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.kinematics.error_map import SymbolicErrorMap
 from orthocal.kinematics.symbolic import SymbolicRobot
+from orthocal.observation.sensor_groups import SensorGroup
 from orthocal.robot.model import closure_row_units
 from orthocal.sensors.compiled import express_reading
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PostureExpressions:
-    """The closures of one posture and their derivatives."""
-
-    passive: ca.SX
-    """q̂, shape (n_passive,)."""
-    command: ca.SX
-    """Command of the posture, shape (n_command,)."""
-    closure: ca.SX
-    """ĝ, shape (closure_rows,)."""
-    by_passive: ca.SX
-    """∂ĝ/∂q̂, shape (closure_rows, n_passive)."""
-    by_theta: ca.SX
-    """∂ĝ/∂θ̂, shape (closure_rows, n_free)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingExpressions:
     """One reading of a sensor group, in the variables that it depends on."""
 
-    group: int
-    """Index of the sensor group."""
-    entries: Indices
-    """Entries of the group, shape (n,)."""
-    table: Array
-    """Constants of their sensors, shape (n, n_constants)."""
-    setups: Indices
-    """Setup of each entry, shape (n,)."""
-    nuisance_index: Indices
-    """Indices of their nuisance parameters among the free parameters, shape (n, n_nuisance)."""
-    nuisance: ca.SX
-    """Nuisance parameters, shape (n_nuisance,), [SI]."""
-    by_nuisance: ca.SX
-    """∂h by them, shape (1, n_nuisance)."""
+    group: SensorGroup
     passive_index: Indices
     """Indices of the passive coordinates that it depends on."""
     theta_index: Indices
-    """Indices of the free parameters that it depends on."""
-    passive: ca.SX
-    """Those coordinates q̂."""
-    command: ca.SX
-    """Command of the posture, shape (n_command,)."""
-    reference: ca.SX
-    """Command of the reference posture, shape (n_command,)."""
+    """Indices of the free parameters of the machine that it depends on."""
     constants: ca.SX
     """Constants of the sensor and conditions of the reading, shape (n_constants,)."""
+    nuisance: ca.SX
+    """Nuisance parameters, shape (n_nuisance,), [SI]."""
     reading: ca.SX
     """h, [m]."""
+    by_nuisance: ca.SX
+    """∂h by the nuisance parameters, shape (1, n_nuisance)."""
     by_passive: ca.SX
-    """∂h/∂q̂ of those coordinates, shape (1, n), [m]."""
+    """∂h/∂q̂ of the passive coordinates, shape (1, n), [m]."""
     by_theta: ca.SX
-    """∂h/∂θ̂ of those parameters, shape (1, n), [m]."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DirectExpressions:
-    """Closures and readings as direct expressions of the machine's θ̂, for second derivatives."""
-
-    theta: ca.SX
-    passive: ca.SX
-    command: ca.SX
-    reference: ca.SX
-    """Command of the reference posture, shape (n_command,)."""
-    closure: ca.SX
-    """ĝ, shape (closure_rows,)."""
-    constants: tuple[ca.SX, ...]
-    """Constants of a sensor, by sensor group."""
-    nuisance: tuple[ca.SX, ...]
-    """Nuisance parameters of a sensor, by sensor group, [SI]."""
-    readings: tuple[ca.SX, ...]
-    """h by sensor group, [m]."""
+    """∂h/∂θ̂ of the free parameters, shape (1, n), [m]."""
 
 
 class SymbolicProblem:
@@ -102,131 +52,111 @@ class SymbolicProblem:
 
     Args:
         problem: The problem.
+
+    Attributes:
+        error_map: Geometry of the machine as expressions of θ̂.
+        command: Symbol of the command of a posture, shape (n_command,).
+        reference: Symbol of the command of the reference posture, shape (n_command,).
+        passive: Symbol of q̂ of a posture, shape (n_passive,).
     """
 
     def __init__(self, problem: CalibrationProblem) -> None:
         self.problem = problem
+        self.error_map = SymbolicErrorMap(
+            problem.functions.errors, fixed=problem.closure.errors(), columns=problem.columns
+        )
+        n_command = problem.states.commands.shape[1]
+        self.command = ca.SX.sym("command", n_command)
+        self.reference = ca.SX.sym("reference", n_command)
+        self.passive = ca.SX.sym("passive", problem.robot.passive_index.size)
+
+    @property
+    def theta(self) -> ca.SX:
+        """Symbol of the machine's θ̂, shape (n_machine,)."""
+        return self.error_map.symbols[0]
 
     @cached_property
-    def error_map(self) -> SymbolicErrorMap:
-        """Geometry of the machine as expressions of θ̂."""
-        p = self.problem
-        return SymbolicErrorMap(p.functions.errors, fixed=p.closure.errors(), columns=p.columns)
-
-    @cached_property
-    def posture(self) -> PostureExpressions:
-        """The closures of one posture."""
-        functions, shared, scale = (
-            self.problem.functions,
-            self.error_map,
-            self.problem.passive_scale,
+    def closure(self) -> tuple[ca.SX, ca.SX]:
+        """ĝ of one posture, (closure_rows,), and ∂ĝ by (θ̂, q̂), (closure_rows, n)."""
+        shared, scale = self.error_map, self.problem.passive_scale
+        g, g_a, g_q, g_t = self.problem.functions.closure_expressions(
+            shared.actuated(self.command), self.passive * scale, shared.placements
         )
-        command, passive = self._posture_symbols()
-        g, g_a, g_q, g_t = functions.closure_expressions(
-            shared.actuated(command), passive * scale, shared.placements
-        )
-        columns = ca.diag(ca.SX(scale))
-        return PostureExpressions(
-            passive=passive,
-            command=command,
-            closure=g / LENGTH_SCALE,
-            by_passive=g_q @ columns / LENGTH_SCALE,
-            by_theta=shared.chain(g_t, g_a, command) / LENGTH_SCALE,
-        )
+        by_theta = shared.chain(g_t, g_a, self.command)
+        jacobian = ca.horzcat(by_theta, g_q @ ca.diag(ca.SX(scale)))
+        return g / LENGTH_SCALE, jacobian / LENGTH_SCALE
 
     @cached_property
     def readings(self) -> tuple[ReadingExpressions, ...]:
         """One reading of each sensor group."""
-        problem, shared = self.problem, self.error_map
-        result = []
-        for k, group in enumerate(problem.model.groups):
-            command, passive = self._posture_symbols()
-            reference = ca.SX.sym("reference", command.numel())
-            constants = ca.SX.sym("constants", group.constants.shape[1])
-            nuisance = ca.SX.sym("nuisance", group.nuisance.shape[1])
-            h, h_a, h_q, h_t, h_r, h_nu = group.reading.expression(
-                shared.actuated(command),
-                passive * problem.passive_scale,
-                shared.placements,
-                shared.actuated(reference),
-                constants,
-                nuisance,
-            )
-            by_theta = shared.chain(h_t, h_a, command)
-            by_theta += shared.chain(ca.SX(*h_t.shape), h_r, reference)
-            by_theta, by_passive = ca.sparsify(by_theta), ca.sparsify(h_q)
-            theta_index, used = _columns_of(by_theta), _columns_of(by_passive)
-            scale = ca.SX(problem.passive_scale[used]).T
-            result.append(
-                ReadingExpressions(
-                    group=k,
-                    entries=group.entries,
-                    table=group.constants,
-                    setups=group.setups,
-                    nuisance_index=problem.n_machine + group.nuisance,
-                    nuisance=nuisance,
-                    by_nuisance=h_nu,
-                    passive_index=used,
-                    theta_index=theta_index,
-                    passive=passive[used.tolist()],
-                    command=command,
-                    reference=reference,
-                    constants=constants,
-                    reading=h,
-                    by_passive=by_passive[0, used.tolist()] * scale,
-                    by_theta=by_theta[0, theta_index.tolist()],
-                )
-            )
-        return tuple(result)
+        return tuple(self._express(group) for group in self.problem.model.groups)
+
+    def _express(self, group: SensorGroup) -> ReadingExpressions:
+        shared, scale = self.error_map, self.problem.passive_scale
+        constants = ca.SX.sym("constants", group.constants.shape[1])
+        nuisance = ca.SX.sym("nuisance", group.nuisance.shape[1])
+        h, h_a, h_q, h_t, h_r, h_nu = group.reading.expression(
+            shared.actuated(self.command),
+            self.passive * scale,
+            shared.placements,
+            shared.actuated(self.reference),
+            constants,
+            nuisance,
+        )
+        by_theta = shared.chain(h_t, h_a, self.command)
+        by_theta += shared.chain(ca.SX(*h_t.shape), h_r, self.reference)
+        by_theta, by_passive = ca.sparsify(by_theta), ca.sparsify(h_q)
+        theta_index, passive_index = _columns_of(by_theta), _columns_of(by_passive)
+        return ReadingExpressions(
+            group=group,
+            passive_index=passive_index,
+            theta_index=theta_index,
+            constants=constants,
+            nuisance=nuisance,
+            reading=h,
+            by_nuisance=h_nu,
+            by_passive=by_passive[0, passive_index.tolist()] * ca.SX(scale[passive_index]).T,
+            by_theta=by_theta[0, theta_index.tolist()],
+        )
+
+    # ---- direct expressions of θ̂ and q̂, for second derivatives
 
     @cached_property
-    def direct(self) -> DirectExpressions:
-        """Closures and readings as direct expressions of the machine's θ̂."""
-        problem, robot = self.problem, self.problem.robot
-        command, passive = self._posture_symbols()
-        theta = ca.SX.sym("theta", problem.n_machine)
-        reference = ca.SX.sym("reference", command.numel())
+    def direct_closure(self) -> ca.SX:
+        """ĝ of one posture, shape (closure_rows,)."""
+        scale = closure_row_units(self.problem.robot) / LENGTH_SCALE
+        return self._machines[0].closure_residual() * scale
+
+    def direct_reading(self, one: ReadingExpressions) -> ca.SX:
+        """H of a reading, [m]."""
+        robot, setups = self.problem.robot, list(self.problem.session.setups.values())
+        sensor = setups[int(one.group.setups[0])].sensor
+        frames = sensor.frames(robot)
+        poses, at_zero = (
+            [machine.frame_pose(f) for f in names]
+            for machine, names in zip(
+                self._machines, (frames.in_posture, frames.at_zero), strict=True
+            )
+        )
+        return express_reading(robot, sensor, poses, at_zero, one.constants, one.nuisance)
+
+    @cached_property
+    def _machines(self) -> tuple[SymbolicRobot, SymbolicRobot]:
+        """The machine in a posture and in the reference posture."""
+        problem, robot, n = self.problem, self.problem.robot, len(self.problem.robot.drives)
         errors: dict[str, ca.SX | float] = dict(problem.fixed)
         names = problem.machine_selection.names
-        errors.update({n: theta[i] * problem.theta_scale[i] for i, n in enumerate(names)})
-        map_, n = problem.functions.errors, len(robot.drives)
-        machine, at_reference = (
-            SymbolicRobot(
-                robot, drives=u[:n], passive=q, errors=errors, conditions=map_.split(u[n:])
-            )
-            for u, q in (
-                (command, passive * problem.passive_scale),
-                (reference, ca.SX(robot.reference_passive)),
-            )
-        )
-        setups = list(problem.session.setups.values())
-        constants, nuisance, readings = [], [], []
-        for group in problem.model.groups:
-            sensor = setups[int(problem.observations.setup[group.entries[0]])].sensor
-            frames = sensor.frames(robot)
-            values = ca.SX.sym("constants", group.constants.shape[1])
-            symbols = ca.SX.sym("nuisance", group.nuisance.shape[1])
-            poses = [machine.frame_pose(f) for f in frames.in_posture]
-            at_zero = [at_reference.frame_pose(f) for f in frames.at_zero]
-            constants.append(values)
-            nuisance.append(symbols)
-            readings.append(express_reading(robot, sensor, poses, at_zero, values, symbols))
-        scale = closure_row_units(robot) / LENGTH_SCALE
-        return DirectExpressions(
-            theta,
-            passive,
-            command,
-            reference,
-            machine.closure_residual() * scale,
-            tuple(constants),
-            tuple(nuisance),
-            tuple(readings),
-        )
+        errors.update({k: self.theta[i] * problem.theta_scale[i] for i, k in enumerate(names)})
 
-    def _posture_symbols(self) -> tuple[ca.SX, ca.SX]:
+        def machine(command: ca.SX, passive: ca.SX) -> SymbolicRobot:
+            conditions = problem.functions.errors.split(command[n:])
+            return SymbolicRobot(
+                robot, drives=command[:n], passive=passive, errors=errors, conditions=conditions
+            )
+
         return (
-            ca.SX.sym("command", self.problem.states.commands.shape[1]),
-            ca.SX.sym("passive", self.problem.robot.passive_index.size),
+            machine(self.command, self.passive * problem.passive_scale),
+            machine(self.reference, ca.SX(robot.reference_passive)),
         )
 
 
