@@ -14,11 +14,12 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.errors import NotIdentifiableError, ParameterError
 from orthocal.estimation.choice import Choice, choose
 from orthocal.estimation.diagnostics.profile_likelihood import profile_interval
-from orthocal.estimation.fit import Fit, first_sigma, fit_problem
+from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.linear import linearise_at_reference
 from orthocal.estimation.loss import Loss, LossKind
 from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.weighting import stated_sigma
 from orthocal.kinematics.loop_closure import as_rows
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.observation.observations import require_conditions
@@ -105,7 +106,7 @@ def _fit_base(
     """
     information = linearise_at_reference(problem).information
     repeatability = estimate_repeatability(problem.values, problem.observations)
-    sigma = first_sigma(problem.session, repeatability)
+    sigma = stated_sigma(problem.session.gauge, repeatability)
     leads: list[str] = []
     for _ in range(MAX_BASE_ROUNDS):
         factor = information.factor[:, : problem.n_machine]

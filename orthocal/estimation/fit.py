@@ -25,7 +25,6 @@ from orthocal.estimation.weighting import (
     stated_sigma,
     weigh_gauges,
 )
-from orthocal.session.session import Session
 from orthocal.statistics.information import (
     Information,
     decompose,
@@ -60,7 +59,7 @@ class Fit:
     seconds_build: float
     """Time to build the functions and the program, [s]."""
     seconds_solve: float
-    """Time of all solutions until sigma converged, [s]."""
+    """Time to solve until sigma converged, [s]."""
     iterations: int
     """Iterations of the solver in all solutions."""
     linearisation: Linearisation
@@ -84,7 +83,7 @@ class Fit:
         """
         if math.isfinite(self.noise.sigma):
             return max(self.noise.sigma, SMALLEST_SIGMA)
-        return first_sigma(self.problem.session, (math.nan, 0))
+        return stated_sigma(self.problem.session.gauge, (math.nan, 0))
 
     @property
     def loss(self) -> Loss:
@@ -187,7 +186,7 @@ def fit_problem(
     else:
         program = program.with_problem(problem)
     built = time.perf_counter()
-    seconds, iterations = 0.0, 0
+    iterations = 0
     sigma, larger = _linearised_sigma(program, linearisation, repeatability)
     first = linearisation.solve(sigma=sigma) if start is None else np.asarray(start)
     passive: Array | None = None
@@ -204,7 +203,7 @@ def fit_problem(
             # the unmodelled errors may be too large for the stated sigma
             sigma, first = larger, linearisation.solve(sigma=larger)
             solution = program.solve(sigma=sigma, start=first)
-        seconds, iterations = seconds + solution.seconds_solve, iterations + solution.iterations
+        iterations += solution.iterations
         prediction, jacobian = problem.linearise(solution.theta, solution.passive)
         information = decompose(jacobian, problem.observations)
         residual = _residual(program, solution, prediction)
@@ -229,7 +228,7 @@ def fit_problem(
         problem=problem,
         program=program,
         seconds_build=built - began,
-        seconds_solve=seconds,
+        seconds_solve=time.perf_counter() - built,
         iterations=iterations,
         linearisation=linearisation,
         linear=linearisation.solve(sigma=weight),
@@ -308,7 +307,7 @@ def _linearised_sigma(
         stated.
     """
     problem = program.problem
-    sigma = first_sigma(problem.session, repeatability)
+    sigma = stated_sigma(problem.session.gauge, repeatability)
     stated = sigma
     use_stated = problem.session.gauge.sigma is not None and _few_are_free(linearisation, sigma)
     for i in range(MAX_SIGMA_ROUNDS if _matters(program) else 0):
@@ -333,11 +332,6 @@ def _few_are_free(linearisation: Linearisation, sigma: float) -> bool:
         sigma=sigma, precision=problem.prior_precision
     )
     return o.size - o.n_free_zeros - used < SMALL_DOF
-
-
-def first_sigma(session: Session, repeatability: tuple[float, int]) -> float:
-    """Standard deviation of a reading before the first solution, [m]."""
-    return stated_sigma(session.gauge, repeatability)
 
 
 def require_determined(problem: CalibrationProblem, information: Information) -> None:

@@ -15,12 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.variable_projection import VariableProjection
+from orthocal.estimation.solvers.variable_projection import VariableProjection, are_settled
 
 Array = NDArray[np.float64]
-
-SETTLED = 1e-8
-"""Estimated next step at which a set has converged, [prior std]."""
 
 MAX_STEPS = 30
 
@@ -129,7 +126,7 @@ class BatchProgram:
             passive[active] += linear.follow(step)
             sizes = np.roll(sizes, 1, axis=0)
             sizes[0, active] = np.abs(step).max(axis=1)
-            settled = _settled(sizes[:, active])
+            settled = are_settled(sizes[:, active])
             converged[active] = settled
             active = active[~settled & (sizes[0, active] < MAX_STEP_SIZE)]
             if not active.size:
@@ -217,14 +214,6 @@ class _Shared:
         """Rows minus the mean of those with the same free zero, shape as given."""
         means = self._free_zeros.T @ values / self._counts[:, None]
         return np.asarray(values - means[self.problem.observations.zero])
-
-
-def _settled(sizes: Array) -> NDArray[np.bool_]:
-    """Mask of the sets whose next step is negligible; sizes of their last three steps, (3, S)."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        last = np.where(np.isfinite(sizes[1]), sizes[0] / sizes[1], np.inf)
-        before = np.where(np.isfinite(sizes[2]), sizes[1] / sizes[2], 0.0)
-    return np.asarray((sizes[0] <= SETTLED) | (sizes[0] * np.maximum(last, before) <= SETTLED))
 
 
 def _parts(count: int, size: int) -> Iterator[slice]:

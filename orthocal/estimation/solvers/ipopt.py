@@ -6,7 +6,6 @@ closures of every posture are constraints (see `nlp.py`).
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,13 +19,7 @@ from orthocal.errors import OrthocalError, SolverError
 from orthocal.estimation.options import OptionValue, SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.solvers.nlp import ProgramFunctions
-from orthocal.estimation.solvers.program import (
-    LEFT_OUT,
-    Program,
-    Solution,
-    SolverInput,
-    no_convergence,
-)
+from orthocal.estimation.solvers.program import Program, Solution, SolverInput, no_convergence
 from orthocal.runtime.interrupts import noticed_interrupt
 
 Array = NDArray[np.float64]
@@ -100,7 +93,6 @@ class NonlinearProgram(Program):
     def __init__(
         self, problem: CalibrationProblem, *, options: SolverOptions | None = None
     ) -> None:
-        began = time.perf_counter()
         super().__init__(problem, options=options)
         self._n_theta = problem.n_free
         self._n_zeros = problem.observations.n_zeros
@@ -110,7 +102,6 @@ class NonlinearProgram(Program):
         )
         self._functions = self._builder.build()
         self._solver = self._start_ipopt()
-        self.seconds_build = time.perf_counter() - began
 
     def with_problem(self, problem: CalibrationProblem) -> NonlinearProgram:
         """The program for a `with_values` of its problem; nothing is built again."""
@@ -163,10 +154,8 @@ class NonlinearProgram(Program):
             widening=widening,
         )
         p = self._pack(sigma, readings.values, readings.weights, widening)
-        began = time.perf_counter()
         with noticed_interrupt():
             answer = self._solver(x0=x0, p=p, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
-        seconds = time.perf_counter() - began
         stats = self._solver.stats()
         status, iterations = str(stats["return_status"]), int(stats["iter_count"])
         if status not in CONVERGED:
@@ -189,8 +178,6 @@ class NonlinearProgram(Program):
             status=status,
             iterations=iterations,
             hessian=self.options.hessian,
-            seconds_build=self.seconds_build,
-            seconds_solve=seconds,
             closure=float(closures) * LENGTH_SCALE,
             at_bound=_at_bound(x[: self._n_theta], multipliers, lower, upper, held),
         )
@@ -284,10 +271,7 @@ class NonlinearProgram(Program):
             widening: Factor on the width of a robust loss.
         """
         y = self.problem.values if values is None else values
-        weights = np.ones(y.size)
-        if left_out is not None:
-            weights[np.asarray(left_out, dtype=np.int64)] = LEFT_OUT
-        return self._pack(sigma, y, weights, widening)
+        return self._pack(sigma, y, self._weights(left_out), widening)
 
     def _pack(self, sigma: float, values: Array, weights: Array, widening: float) -> Array:
         weighted, scale = _weighting(sigma)

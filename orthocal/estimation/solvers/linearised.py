@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 from orthocal.estimation.solvers.program import Program, Solution, SolverInput
@@ -21,9 +20,8 @@ class LinearisedProgram(Program):
     kind = "linearised"
 
     def _solve(self, readings: SolverInput) -> Solution:
-        began = time.perf_counter()
         problem = self.problem
-        task = Task.of(problem, self.options.loss, readings)
+        task = Task(problem, self.options.loss, readings)
         reference = task.at(problem.reference / problem.theta_scale, readings.start_passive)
         _, jacobian = problem.linearise(problem.reference, reference.passive)
         jacobian /= task.sigma
@@ -32,10 +30,5 @@ class LinearisedProgram(Program):
         state = task.moved(first, jacobian, task.step(first, jacobian))
         state = replace(state, theta=state.theta.clip(task.low, task.high))
         theta = state.theta * problem.theta_scale
-        return task.solution(
-            state,
-            jacobian,
-            passive=problem.close(theta, start=reference.passive),
-            iterations=1,
-            seconds=time.perf_counter() - began,
-        )
+        passive = problem.close(theta, start=reference.passive)
+        return task.solution(state, jacobian, passive=passive, iterations=1)

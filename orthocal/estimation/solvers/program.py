@@ -37,8 +37,6 @@ class Solution:
     iterations: int
     hessian: Hessian
     """Hessian of the solver; always Gauss-Newton for solvers other than Ipopt."""
-    seconds_build: float
-    seconds_solve: float
     closure: float
     """Largest remaining closure residual, rotations times characteristic length, [m]."""
     at_bound: NDArray[np.int8]
@@ -111,19 +109,23 @@ class Program(ABC):
             ClosureError: If the machine cannot reach a posture with the start values.
         """
         problem = self.problem
-        weights = np.ones(problem.observations.size)
-        if left_out is not None:
-            weights[np.asarray(left_out, dtype=np.int64)] = LEFT_OUT
         return self._solve(
             SolverInput(
                 sigma=sigma,
                 values=np.asarray(problem.values if values is None else values, dtype=np.float64),
-                weights=weights,
+                weights=self._weights(left_out),
                 start=np.array(problem.reference if start is None else start, dtype=np.float64),
                 start_passive=start_passive,
                 held=held or {},
             )
         )
+
+    def _weights(self, left_out: ArrayLike | None) -> Array:
+        """Weights of the entries, shape (n_entries,): 1, or `LEFT_OUT` for excluded ones."""
+        weights = np.ones(self.problem.observations.size)
+        if left_out is not None:
+            weights[np.asarray(left_out, dtype=np.int64)] = LEFT_OUT
+        return weights
 
     @abstractmethod
     def _solve(self, readings: SolverInput) -> Solution:

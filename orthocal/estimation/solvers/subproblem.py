@@ -46,42 +46,35 @@ class State:
     objective: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """One set of readings, with their weights and the bounds of θ̂."""
+    """One set of readings, with their weights and the bounds of θ̂.
 
-    problem: CalibrationProblem
-    loss: Loss
-    readings: SolverInput
-    low: Array
-    high: Array
-    """Bounds of θ̂, shape (n_free,)."""
+    Args:
+        problem: The problem.
+        loss: Cost of a residual.
+        readings: The readings.
 
-    @staticmethod
-    def of(problem: CalibrationProblem, loss: Loss, readings: SolverInput) -> Task:
-        """Task of a solver."""
-        lower, upper = problem.selection.lower.copy(), problem.selection.upper.copy()
+    Attributes:
+        sigma: Standard deviation of one reading, [m].
+        weights: Weights of the entries, shape (n_entries,).
+        low: Lower bounds of θ̂, shape (n_free,).
+        high: Upper bounds of θ̂, shape (n_free,).
+    """
+
+    def __init__(self, problem: CalibrationProblem, loss: Loss, readings: SolverInput) -> None:
+        self.problem, self.loss, self.readings = problem, loss, readings
+        self.sigma, self.weights = readings.sigma, readings.weights
+        self.low = problem.selection.lower / problem.theta_scale
+        self.high = problem.selection.upper / problem.theta_scale
         for i, value in readings.held.items():
-            lower[i] = upper[i] = value
-        scale = problem.theta_scale
-        return Task(problem, loss, readings, lower / scale, upper / scale)
-
-    @property
-    def sigma(self) -> float:
-        """Standard deviation of one reading, [m]."""
-        return self.readings.sigma
-
-    @property
-    def weights(self) -> Array:
-        """Weights of the entries, shape (n_entries,)."""
-        return self.readings.weights
+            self.low[i] = self.high[i] = value / problem.theta_scale[i]
 
     def clip(self, theta: Array) -> Array:
         """θ̂ within the bounds, shape (n_free,) of free parameters in SI."""
         return np.clip(theta / self.problem.theta_scale, self.low, self.high)
 
     def solution(
-        self, state: State, jacobian: Array, *, passive: Array, iterations: int, seconds: float
+        self, state: State, jacobian: Array, *, passive: Array, iterations: int
     ) -> Solution:
         """Solution of the task.
 
@@ -90,7 +83,6 @@ class Task:
             jacobian: dh/dθ̂ there, shape (n_entries, n_free), [σ per prior std].
             passive: Passive coordinates, shape (n_states, n_passive), [m, rad].
             iterations: Number of iterations.
-            seconds: Time of the solution, [s].
         """
         gradient = self.gradient(state, jacobian)
         at_bound = np.zeros(state.theta.size, dtype=np.int8)
@@ -105,8 +97,6 @@ class Task:
             status="Solve_Succeeded",
             iterations=iterations,
             hessian="gauss-newton",
-            seconds_build=0.0,
-            seconds_solve=seconds,
             closure=0.0,
             at_bound=at_bound,
         )

@@ -9,9 +9,6 @@ objective decreases. The optimum is that of the complete program, which Ipopt so
 
 from __future__ import annotations
 
-import itertools
-import time
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,20 +43,13 @@ class VariableProjection(Program):
     kind = "variable-projection"
 
     def _solve(self, readings: SolverInput) -> Solution:
-        began = time.perf_counter()
-        task = Task.of(self.problem, self.options.loss, readings)
+        task = Task(self.problem, self.options.loss, readings)
         start = task.begin()
         try:
             state, jacobian, iterations = self._descend(task, start, follow=True)
         except (ClosureError, SolverError):  # with open loops; now close them in every step
             state, jacobian, iterations = self._descend(task, task.begin(), follow=False)
-        return task.solution(
-            state,
-            jacobian,
-            passive=state.passive,
-            iterations=iterations,
-            seconds=time.perf_counter() - began,
-        )
+        return task.solution(state, jacobian, passive=state.passive, iterations=iterations)
 
     def _descend(
         self, task: Task, begin: tuple[State, Linearisation], *, follow: bool
@@ -76,14 +66,14 @@ class VariableProjection(Program):
             ClosureError: If the solution cannot reach a posture.
         """
         most = self.options.max_iterations
-        sizes: list[float] = []
+        sizes = np.full(3, np.inf)
         state, linear = begin
         for iterations in range(1, most + 1):
             jacobian = linear.jacobian
             jacobian /= task.sigma  # in place: it may be large, and is not used again
             step = task.step(state, jacobian)
-            sizes.append(float(np.abs(step).max(initial=0.0)))
-            if follow and _settled(sizes):
+            sizes = np.r_[np.abs(step).max(initial=0.0), sizes[:2]]
+            if follow and are_settled(sizes):
                 theta = np.clip(state.theta + step, task.low, task.high)
                 passive = state.passive + linear.follow(theta - state.theta)
                 return task.at(theta, passive), jacobian, iterations
@@ -92,12 +82,12 @@ class VariableProjection(Program):
                 state, linear = followed
                 continue
             state, step = self._move(task, state, step)
-            sizes[-1] = float(np.abs(step).max(initial=0.0))
-            if _settled(sizes):
+            sizes[0] = np.abs(step).max(initial=0.0)
+            if are_settled(sizes):
                 return state, jacobian, iterations
             linear = task.linearise(state.theta, state.passive)
         raise SolverError(
-            f"did not converge: the step is still {sizes[-1]:.2g} prior standard deviations "
+            f"did not converge: the step is still {sizes[0]:.2g} prior standard deviations "
             f"after {most} iterations; {no_convergence(self.options)}",
             status="Maximum_Iterations_Exceeded",
             iterations=most,
@@ -142,15 +132,16 @@ class VariableProjection(Program):
         )
 
 
-def _settled(sizes: list[float]) -> bool:
-    """True if the next step is negligible, extrapolated from the last three."""
-    last = sizes[-3:]
-    if last[-1] <= SETTLED:
-        return True
-    if len(last) < 2:
-        return False
-    shrinking = max(b / a for a, b in itertools.pairwise(last))
-    return last[-1] * shrinking <= SETTLED
+def are_settled(sizes: Array) -> NDArray[np.bool_]:
+    """Mask of the solutions whose next step is negligible, extrapolated from the last three.
+
+    Args:
+        sizes: Sizes of the last three steps, the last one first, infinite for none, shape (3, ...).
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        last = np.where(np.isfinite(sizes[1]), sizes[0] / sizes[1], np.inf)
+        before = np.where(np.isfinite(sizes[2]), sizes[1] / sizes[2], 0.0)
+        return np.asarray((sizes[0] <= SETTLED) | (sizes[0] * np.maximum(last, before) <= SETTLED))
 
 
 def _no_more_than(state: State) -> float:
